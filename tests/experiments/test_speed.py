@@ -33,7 +33,7 @@ def python(code: str) -> list[str]:
 
 def test_an_earlier_run_stands_beside_this_one(tmp_path: Path) -> None:
     path = tmp_path / "before.json"
-    path.write_text('a table\n{"cases": [{"case": "help", "wall": 2, "cpu": 0.5, "gigabytes": 0}]}\n')
+    path.write_text('{"values": {"cases": [{"case": "help", "wall": 2, "cpu": 0.5, "gigabytes": 0}]}}')
     row = speed.compared({"case": "help", "wall": 1.0, "cpu": 1.0, "gigabytes": 1.0}, speed.earlier(path)["help"])
     assert (row["wall_before"], row["wall_ratio"], row["cpu_ratio"]) == (2.0, 0.5, 2.0)
     assert "gigabytes_ratio" not in row

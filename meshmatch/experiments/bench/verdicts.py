@@ -52,6 +52,12 @@ _COLUMNS = {"maps": "maps:d", "good": "good:d", "fair": "fair:d", "poor": "poor:
 _COLUMNS |= {"under 5 cm": "right:d", "over 8 cm": "wrong:d", "mean cm": "mean_cm:.1f", "worst": "worst_cm:.1f"}
 _COLUMNS |= {"longest": "seconds:.1f"}
 _STEPS = {"confidence": "of", "vertices": "vertices:d", "mean": "confidence:.3f", "within 5 cm": "near:.3f"}
+_IN_ALL = {"maps": "maps:d", "good": "good:d", "fair": "fair:d", "poor": "poor:d"}
+_IN_ALL |= {
+    "good, over 8 cm": "good_and_wrong:d",
+    "under 5 cm": "right:d",
+    "of these good or fair": "right_and_believed:d",
+}
 _RIDGE = 0.002
 GROUPS = {"tuned": [name for name in FAMILIES if name not in KEPT], "kept": list(KEPT), "all": list(FAMILIES)}
 
@@ -249,6 +255,9 @@ def main(
     tables = [
         runner.table(
             f"{kind}: verdicts by family, {seeds} seeds from {seed} on", by_family, {"family": "of", **_COLUMNS}
+        ),
+        runner.table(
+            "In all", [bars | {word: sum(row[word] for row in by_family) for word in ("maps", *VERDICTS)}], _IN_ALL
         ),
         runner.table("By verdict", by_verdict, {"verdict": "of", **_COLUMNS}),
         runner.table("Confidence of vertices", steps, _STEPS),

@@ -48,7 +48,6 @@ from meshmatch.experiments.paper.ablation_transmatch import train_transformer, t
 from meshmatch.experiments.paper.ablation_views import BASE, CODED, VIEWS, Known, Run, all_runs, by_time, methods_of
 from meshmatch.geometry.frames import Frame
 from meshmatch.models.registry import find_model
-from meshmatch.outputs import replace_on_success
 
 PLAN_COLUMNS = {"field": "field", "constraint": "constraint", "nodes": "nodes:d", "runs": "runs:d"}
 PLAN_COLUMNS |= {"CPU ms a step": "cpu_ms:.1f", "CPU min in all": "minutes:.1f"}
@@ -277,7 +276,6 @@ def main(
     model: runner.Model = "human",
     data: runner.Data = runner.DATA,
     cache: runner.Cache = None,
-    markdown: Annotated[Path | None, Option(help="write the tables again, for docs/results.md")] = None,
     pictures: Annotated[Path | None, Option(help="folder of the figures; by default the output")] = None,
     plan: Annotated[bool, Option("--plan", help="train nothing, say what all trainings but TransMatch's take")] = False,
     show: Annotated[bool, Option("--show", help="measure nothing, show what is there")] = False,
@@ -297,9 +295,6 @@ def main(
     budget, where = kept.budget(known), [bench.name for bench in benches]
     found = claims(known, where)
     drawn = [*tables(known, names, where, budget), claims_table(found)]
-    if markdown is not None:
-        with replace_on_success(markdown) as temporary:
-            temporary.write_text("\n".join(runner.as_markdown(each) for each in drawn), encoding="utf-8")
     notes = [f"Budget: {budget}"]
     if kept.trains and (missing := [run.name for run in runs if run not in known.trained]):
         notes.append(f"Not measured: {', '.join(missing)}")
