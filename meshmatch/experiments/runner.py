@@ -113,7 +113,7 @@ def command(run: Callable[..., Report]) -> Callable[..., int]:
         def called(save: Path | None = None, **options: Any) -> None:
             body(_without_save(given), save, options)
 
-        known = inspect.signature(run)
+        known = inspect.signature(run, eval_str=True)
         last = inspect.Parameter("save", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Save)
         called.__signature__ = known.replace(parameters=[*known.parameters.values(), last])  # type: ignore[attr-defined]
         called.__annotations__ = {**run.__annotations__, "save": Save}

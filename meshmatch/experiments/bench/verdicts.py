@@ -34,8 +34,7 @@ from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.charts import Chart, Line, draw_lines
-from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, Case, Cases
-from meshmatch.experiments.bench.verdict_shapes import between, direction
+from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, Case, Cases, between, direction
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.generators.kinds import GENERATORS
