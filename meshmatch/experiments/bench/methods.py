@@ -116,8 +116,8 @@ def upright(model: str, shape: Shape, seed: int = 0) -> Shape:
 class Coded:
     """3D-CODED behind the benchmark's `Method`: its code is refined by the Chamfer distance alone.
 
-    ``model`` is a folder of `meshmatch.experiments.learned_baselines`: its losses had no constraint. ``oriented_by``: a
-    model whose unrefined fit finds the orientation, which is then told.
+    ``model`` is a folder of `meshmatch.experiments.paper.learned_baselines`: its losses had no constraint.
+    ``oriented_by``: a model whose unrefined fit finds the orientation, which is then told.
     """
 
     model: str

@@ -1,6 +1,6 @@
 """How honest verdicts and confidences are: shapes of which some can be matched and some cannot, and what is said of them.
 
-Each case (`meshmatch.experiments.verdict_cases`) is matched onto a shape that another person, or animal, made in
+Each case (`meshmatch.experiments.bench.verdict_cases`) is matched onto a shape that another person, or animal, made in
 another pose, one of two dozen, every fourth of which is cut. The error of a vertex is the straight distance on the
 target between its partner and the true one, in centimetres of a person of 1.9 m2; a map's error is the mean over the
 vertices that have a partner, and that of a shape of another kind is infinite. A map is right below 5 cm and wrong
@@ -9,8 +9,8 @@ never is. All maps weigh the same, however many vertices they have. The longest 
 
 ``--fit`` prints the weights that tell right from wrong best, of the cases of this run: those in
 `meshmatch.fitting.signs` are of nine cases of seeds 0 and 1 and the families that may tune, of as many limbs, cuts and holes
-of seed 2, of twelve stylised and pulled ones of seeds 2, 3 and 4, and of 32 people of `experiments.characters`, seed 5.
-Measure with another seed.
+of seed 2, of twelve stylised and pulled ones of seeds 2, 3 and 4, and of 32 people of `experiments.bench.characters`,
+seed 5. Measure with another seed.
 """
 
 from __future__ import annotations

@@ -135,6 +135,17 @@ def worst_candidate(
     return worst, np.array(tree.query_ball_point(found.points[worst], radius))
 
 
+def dotted(
+    shape: Shape, points: Float[Floats, "N 3"], dots: Any, label: str, colors: Any = None, radius: float = 0.02
+) -> Panel:
+    """A shape with points in one color or one of each; seen through where it has no colors of its own."""
+    each = np.broadcast_to(dots, (len(points), 3))
+    solid = colors is not None
+    return Panel(
+        shape, colors, label, sharp=solid, glass=not solid, points=points, point_colors=each, point_radius=radius
+    )
+
+
 def segmentations(template: Template, config: NodeConfig) -> tuple[list[Panel], dict[str, Any]]:
     """Parts, spectral clusters, how far one vertex is along the surface, and a candidate that would move two parts."""
     shape = template.shape
@@ -152,24 +163,14 @@ def segmentations(template: Template, config: NodeConfig) -> tuple[list[Panel], 
     panels = [
         Panel(shape, label_colors(template.labels), f"{len(np.unique(template.labels))} parts", sharp=True),
         Panel(shape, label_colors(clusters), f"{clusters.max() + 1} spectral clusters", sharp=True),
-        Panel(
+        dotted(
             shape,
-            label_colors(bands),
+            shape.verts[found.own[bad]][None],
+            NODE,
             "fifths of the diameter from one vertex",
-            sharp=True,
-            points=shape.verts[found.own[bad]][None],
-            point_colors=[NODE],
-            point_radius=0.02,
+            label_colors(bands),
         ),
-        Panel(
-            shape,
-            colors,
-            "what one refused node would move",
-            sharp=True,
-            points=found.points[bad][None],
-            point_colors=[NODE],
-            point_radius=0.02,
-        ),
+        dotted(shape, found.points[bad][None], NODE, "what one refused node would move", colors),
     ]
     numbers = {"template": template.name, "radius": config.radius}
     return panels, numbers | {"node moves": moved_parts, "vertices": int(moved.sum())}
@@ -184,34 +185,12 @@ def stages(template: Template, config: NodeConfig) -> tuple[list[Panel], dict[st
     every = np.linspace(0, len(found.points) - 1, min(3000, len(found.points))).astype(np.int64)
     kept = np.flatnonzero(~bad)
     chosen = found.points[kept][farthest_points(found.points[kept], min(config.K, len(kept)))]
+    both = np.r_[every, np.flatnonzero(bad)]
+    marked = np.where(bad[both][:, None], REFUSED, KEPT)
     panels = [
-        Panel(
-            shape,
-            None,
-            f"{len(bad):,} candidates",
-            points=found.points[every],
-            point_colors=np.tile(KEPT, (len(every), 1)),
-            glass=True,
-            point_radius=0.006,
-        ),
-        Panel(
-            shape,
-            None,
-            f"{bad.sum():,} refused by parts",
-            points=found.points[np.r_[every, np.flatnonzero(bad)]],
-            point_colors=np.where(np.r_[bad[every], bad[bad]][:, None], REFUSED, KEPT),
-            glass=True,
-            point_radius=0.006,
-        ),
-        Panel(
-            shape,
-            None,
-            f"{len(nodes)} nodes",
-            points=nodes,
-            point_colors=np.tile(NODE, (len(nodes), 1)),
-            glass=True,
-            point_radius=0.012,
-        ),
+        dotted(shape, found.points[every], KEPT, f"{len(bad):,} candidates", radius=0.006),
+        dotted(shape, found.points[both], marked, f"{bad.sum():,} refused by parts", radius=0.006),
+        dotted(shape, nodes, NODE, f"{len(nodes)} nodes", radius=0.012),
     ]
     numbers = {"template": template.name, "radius": config.radius, "candidates": len(bad), "refused": int(bad.sum())}
     numbers["by distance"] = len(chosen)

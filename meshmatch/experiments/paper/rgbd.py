@@ -1,7 +1,7 @@
 """Texture from one RGB-D cloud to another: the paper's section 6.1 and figure 13, on simulated clouds with a known answer.
 
 Generated people in sampled poses and coloured clothes, none of whom a training of the released model drew, are seen by
-one, two or four cameras (`experiments.rgbd_clouds` says how), written as .pcd (the source) and .ply (the target), and
+one, two or four cameras (`experiments.makers.rgbd_clouds` says how), written as .pcd (the source) and .ply (the target), and
 read again. The colours of the source go to the points of the target: to the same person in another pose, and to another
 person.
 
@@ -14,7 +14,7 @@ point of it lies within 3 cm): elsewhere there is nothing to carry; ``colour, al
 that fly, and points of no body, are in the clouds but have no answer.
 
 - truth: the source point nearest to the right place: the least that is possible.
-- ours: `meshmatch.transfer_colors`. coded: 3D-CODED (--coded, a folder of `experiments.learned_baselines`), its code
+- ours: `meshmatch.transfer_colors`. coded: 3D-CODED (--coded, a folder of `experiments.paper.learned_baselines`), its code
   searched by the Chamfer distance, then the nearest point; --coded-by names a model that tells it the orientation. rigid:
   scaled by area, all orientations tried, nearest point.
 
@@ -168,7 +168,7 @@ def main(
     pairs: Annotated[int, Option(min=1, help="people, each with two targets")] = 6,
     views: Annotated[str, Option(help="how many cameras: numbers with commas")] = "1,2,4",
     methods: Annotated[str, Option(help=f"of {', '.join(NAMES)}")] = ",".join(NAMES),
-    coded: Annotated[str | None, Option(help="a model folder of experiments.learned_baselines")] = None,
+    coded: Annotated[str | None, Option(help="a model folder of experiments.paper.learned_baselines")] = None,
     coded_steps: Annotated[int, Option(min=1, help="of its search over codes")] = 200,
     coded_by: Annotated[str, Option(help="a model that finds the orientation for it; none by default")] = "",
     model: runner.Model = "human",
@@ -188,7 +188,7 @@ def main(
         settings["coded"] = [find_model(coded)[1].weights_sha256, coded_steps, coded_by]
     elif "coded" in asked:
         asked.remove("coded")
-        notes.append("3D-CODED is left out: give --coded MODEL, made by experiments.learned_baselines coded")
+        notes.append("3D-CODED is left out: give --coded MODEL, made by experiments.paper.learned_baselines coded")
     make_folder(output)
     bodies = draw_bodies(pairs, seed)
 
