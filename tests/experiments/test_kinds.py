@@ -37,11 +37,7 @@ def test_every_pair_counts(agree: str, tmp_path: Path, capsys: pytest.CaptureFix
     record = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert record["all"]["pairs"] == 6
     assert sum(row["pairs"] for row in record["judged"]) == 6
-    assert {row["of"]: row["pairs"] for row in record["animals"]} == dict.fromkeys(
-        ("tr_reg_000", "tr_reg_001", "tr_reg_010"), 4
-    )
-    means = [row["mean_x100"] for row in record["animals"]]
-    assert record["all"]["mean_x100"] == pytest.approx(np.mean(means), abs=1e-3)
+    assert set(record["verdicts"]) == {"tr_reg_000", "tr_reg_001", "tr_reg_010"}
 
 
 def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
