@@ -2,14 +2,14 @@
 
 ``python -m meshmatch.experiments.pages [--check]``
 
-Every experiment writes such a file with ``--save docs/results/NAME.json``: when, on which commit and machine, and by which
-command it ran, and its tables. A page asks for a table between two comments,
+Every experiment writes such a file with ``--save docs/results/NAME.json``: when, on which commit, machine and data, and by
+which command it ran, and its tables. A page asks for a table between two comments,
 
-    <!-- results NAME 1: set, mean cm, median cm -->
+    <!-- results NAME 1: set, mean, median -->
     <!-- end -->
 
-the number of the table in the file, from 1, and which columns (all of them where none is named). A page of its own words
-may begin the table of several files with ``<!-- summary -->``. Whatever stands between the comments is replaced.
+the number of the table in the file, from 1, and which columns (all of them where none is named). A page begins the table
+of all sets (`SUMMARY`) with ``<!-- summary -->``. Whatever stands between the comments is replaced.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ import json
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from typer import Option
 
@@ -30,74 +29,39 @@ from meshmatch.experiments import runner
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = ("results.md", "paper.md")
 _BLOCK = re.compile(r"(<!-- (results|summary)([^>]*?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+_COLUMNS = ("mean", "median", "lost", "flips", "pairs")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """A row of the summary: what it is called, where it stands, and in which columns.
-
-    ``where`` picks the row of the file's table by the beginnings of its cells; ``cells`` names the file's column for each of
-    the summary's.
-    """
+class Row(NamedTuple):
+    """A row of the summary: its name, the file, which row of the file's first table, by the beginnings of cells, the file's
+    columns for `_COLUMNS` (empty where it has none), and the unit."""
 
     name: str
     file: str
     where: Mapping[str, str]
-    cells: Mapping[str, str]
+    columns: tuple[str, ...]
     unit: str
-    table: int = 1
 
 
-_CM = {"mean": "mean cm", "median": "median cm", "lost": "over 15 cm", "flips": "flips", "pairs": "pairs"}
-_PART = {"mean": "mean cm", "median": "median", "lost": "over 15 cm", "pairs": "pairs"}
-_X100 = {"mean": "mean", "median": "median pair", "lost": "over 10", "pairs": "pairs"}
+_CM = ("mean", "median", "over 15 cm", "flips", "pairs")
+_PART = ("mean", "median", "over 15 cm", "", "pairs")
+_BODY = ("mean cm", "", "", "", "pairs")
+_X100 = ("mean", "median", "off", "", "pairs")
 SUMMARY = (
-    Row(name="SCAPE", file="accuracy", where={"set": "scape", "refine": "nodes"}, cells=_CM, unit="cm"),
-    Row(name="FAUST", file="accuracy", where={"set": "faust", "refine": "nodes"}, cells=_CM, unit="cm"),
-    Row(name="SHREC'19", file="accuracy", where={"set": "shrec19", "refine": "nodes"}, cells=_CM, unit="cm"),
-    Row(
-        name="SCAPE, noisy points", file="accuracy", where={"set": "scape-pcn", "refine": "nodes"}, cells=_CM, unit="cm"
-    ),
-    Row(
-        name="FAUST, points with outliers",
-        file="outliers",
-        where={},
-        cells={"mean": "mean", "median": "median", "lost": "over 15 cm", "flips": "flips", "pairs": "pairs"},
-        unit="cm",
-    ),
-    Row(name="SCAPE, one view", file="partial", where={"set": "scape", "part": "view"}, cells=_PART, unit="cm"),
-    Row(name="SCAPE, cut", file="partial", where={"set": "scape", "part": "cut"}, cells=_PART, unit="cm"),
-    Row(name="SHREC'19, one view", file="partial", where={"set": "shrec19", "part": "view"}, cells=_PART, unit="cm"),
-    Row(name="SHREC'19, cut", file="partial", where={"set": "shrec19", "part": "cut"}, cells=_PART, unit="cm"),
-    Row(
-        name="people in clothes, generated",
-        file="characters",
-        where={"": "adults in clothes"},
-        cells={"mean": "mean cm", "pairs": "pairs"},
-        unit="cm",
-    ),
-    Row(
-        name="stylised people, generated",
-        file="characters",
-        where={"": "stylised"},
-        cells={"mean": "mean cm", "pairs": "pairs"},
-        unit="cm",
-    ),
-    Row(name="animals", file="animals", where={"geodesic error × 100 / √area": "all"}, cells=_X100, unit="% of √area"),
-    Row(
-        name="hands, generated",
-        file="hands-and-heads",
-        where={"error in percent of the length": "hand"},
-        cells=_X100,
-        unit="% of the length",
-    ),
-    Row(
-        name="heads, generated",
-        file="hands-and-heads",
-        where={"error in percent of the length": "head"},
-        cells=_X100,
-        unit="% of the length",
-    ),
+    Row("SCAPE", "accuracy", {"set": "scape"}, _CM, "cm"),
+    Row("FAUST", "accuracy", {"set": "faust"}, _CM, "cm"),
+    Row("SHREC'19", "accuracy", {"set": "shrec19"}, _CM, "cm"),
+    Row("SCAPE, noisy points", "accuracy", {"set": "scape-pcn"}, _CM, "cm"),
+    Row("FAUST, points with outliers", "outliers", {}, _CM, "cm"),
+    Row("SCAPE, one view", "partial", {"set": "scape", "part": "view"}, _PART, "cm"),
+    Row("SCAPE, cut", "partial", {"set": "scape", "part": "cut"}, _PART, "cm"),
+    Row("SHREC'19, one view", "partial", {"set": "shrec19", "part": "view"}, _PART, "cm"),
+    Row("SHREC'19, cut", "partial", {"set": "shrec19", "part": "cut"}, _PART, "cm"),
+    Row("people in clothes, generated", "characters", {"group": "clothed"}, _BODY, "cm"),
+    Row("stylised people, generated", "characters", {"group": "stylised"}, _BODY, "cm"),
+    Row("animals", "animals", {"of": "all"}, _X100, "% of √area"),
+    Row("hands, generated", "hands", {"of": "all"}, _X100, "% of the length"),
+    Row("heads, generated", "heads", {"of": "all"}, _X100, "% of the length"),
 )
 
 
@@ -124,15 +88,8 @@ def markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], "|---" * len(columns) + "|", *lines[1:], ""])
 
 
-def circumstances_line(found: Mapping[str, Any]) -> str:
-    """When, on which commit and machine, and by which command a table was made."""
-    commands = found.get("commands") or []
-    told = f"{found['date']}, commit {found['commit']}, {found['machine']}"
-    return f"*{told}.*\n" + "".join(f"\n```text\n{each}\n```\n" for each in commands[:1])
-
-
 def table_of(words: str, docs: Path) -> str:
-    """The table that a comment asks for, with its circumstances."""
+    """The table that a comment asks for, and when, on which commit and machine it was made."""
     head, _, names = words.partition(":")
     name, number = head.split()
     found = results_file(name, docs)
@@ -140,24 +97,19 @@ def table_of(words: str, docs: Path) -> str:
     wanted = [each.strip() for each in names.split(",") if each.strip()] or table["columns"]
     places = [table["columns"].index(each) for each in wanted]
     rows = [[row[place] for place in places] for row in table["rows"]]
-    return f"\n{markdown(wanted, rows)}\n{circumstances_line(found)}\n"
+    told = f"[{name}.json](results/{name}.json): {found['date']}, commit {found['commit']}, {found['machine']}"
+    return f"\n{markdown(wanted, rows)}\n{told}.\n\n"
 
 
 def summary(docs: Path) -> str:
     """A row for every set that is measured."""
-    columns = {"mean": "mean", "median": "median", "lost": "lost", "flips": "flips", "pairs": "pairs"}
     rows = []
     for each in SUMMARY:
-        table = results_file(each.file, docs)["tables"][each.table - 1]
-        names = table["columns"]
-        (row,) = [
-            row
-            for row in table["rows"]
-            if all(row[names.index(column)].startswith(value) for column, value in each.where.items())
-        ][:1]
-        values = {key: row[names.index(column)] for key, column in each.cells.items()}
-        rows.append([each.name, *(values.get(key, "") for key in columns), each.unit])
-    return f"\n{markdown(['set', *columns.values(), 'unit'], rows)}\n"
+        table = results_file(each.file, docs)["tables"][0]
+        cells = [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
+        row = next(one for one in cells if all(one[key].startswith(value) for key, value in each.where.items()))
+        rows.append([each.name, *(row[column] if column else "" for column in each.columns), each.unit])
+    return f"\n{markdown(['set', *_COLUMNS, 'unit'], rows)}\n"
 
 
 def refreshed(text: str, docs: Path) -> str:

@@ -7,15 +7,21 @@ An experiment is a function with typer annotations that returns a `Report`; `com
     def main(data: Data = DATA, seed: Seed = 0) -> Report:
         rows = [{"set": "scape", "mean_cm": 1.63}]
         return Report({"sets": rows}, [table("Errors", rows, {"set": "set", "mean": "mean_cm:.2f"})])
+
+Every experiment takes ``--save FILE``, which writes a file of results (`saved_record`): by which command, when, on which
+commit, machine and data it ran, its tables as they are printed, and its values. The pages are made from such files
+(`meshmatch.experiments.pages`).
 """
 
 from __future__ import annotations
 
 import datetime
 import functools
+import inspect
 import json
 import os
 import platform
+import shlex
 import subprocess
 import sys
 import time
@@ -61,18 +67,21 @@ class Report:
     stopped: MeshmatchError | None = None
 
 
+Save = Annotated[Path | None, typer.Option(help="write tables, values and circumstances to this JSON file")]
+
+
 def command(run: Callable[..., Report]) -> Callable[..., int]:
     """The ``main`` of an experiment: parse words, run, print, and return the exit status.
 
     0: it ran; 1: the data or a choice stopped it (one line on stderr); 2: usage. The module's docstring is its help. The
-    JSON line begins with the circumstances and the options.
+    JSON line begins with the circumstances and the options; with ``--save`` it is written to a file too, with the tables.
     """
     module = sys.modules[run.__module__]
     spec = module.__spec__  # a module that is run is called __main__
     name = str(spec.name if spec else run.__module__).removeprefix("meshmatch.experiments.").removesuffix(".__main__")
+    program = f"python -m meshmatch.experiments.{name}"
 
-    @functools.wraps(run)
-    def body(**options: Any) -> None:
+    def body(words: Sequence[str], save: Path | None, options: dict[str, Any]) -> None:
         threads, jobs = options.get("threads", 1), options.get("jobs", 1)
         set_threads(threads)
         began = time.perf_counter()
@@ -87,23 +96,53 @@ def command(run: Callable[..., Report]) -> Callable[..., int]:
         for line in report.notes:
             out.print(line, soft_wrap=True, markup=False)
         head = {"experiment": name, **circumstances(threads, jobs), "options": plain(options)}
-        seconds = round(time.perf_counter() - began, 1)
-        print(json.dumps(plain({**head, "seconds": seconds, **report.record})), flush=True)
+        head["seconds"] = round(time.perf_counter() - began, 1)
+        print(json.dumps(plain({**head, **report.record})), flush=True)
+        if save is not None:
+            record = saved_record(head, [f"{program} {shlex.join(words)}".strip()], report)
+            with replace_on_success(save) as temporary:
+                temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         if report.stopped is not None:
             explain(report.stopped)
             raise SystemExit(1)
 
     def main(words: Sequence[str] | None = None) -> int:
+        given = sys.argv[1:] if words is None else list(words)
+
+        @functools.wraps(run)
+        def called(save: Path | None = None, **options: Any) -> None:
+            body(_without_save(given), save, options)
+
+        known = inspect.signature(run, eval_str=True)
+        last = inspect.Parameter("save", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Save)
+        called.__signature__ = known.replace(parameters=[*known.parameters.values(), last])  # type: ignore[attr-defined]
+        called.__annotations__ = {**run.__annotations__, "save": Save}
         app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-        app.command(help=module.__doc__)(body)
+        app.command(help=module.__doc__)(called)
         try:
-            program = f"python -m meshmatch.experiments.{name}"
-            typer.main.get_command(app)(args=words if words is None else list(words), prog_name=program)
+            typer.main.get_command(app)(args=given, prog_name=program)
         except SystemExit as stop:
             return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
         return 0
 
     return main
+
+
+def _without_save(words: Sequence[str]) -> list[str]:
+    """Words of a command line without the option that writes the file they stand in."""
+    kept = [word for word in words if not word.startswith("--save=")]
+    if "--save" in kept:
+        at = kept.index("--save")
+        del kept[at : at + 2]
+    return kept
+
+
+def saved_record(head: Mapping[str, Any], commands: Sequence[str], report: Report) -> dict[str, Any]:
+    """A file of results: ``commands``, circumstances, ``data``, ``tables`` of words and ``values`` of numbers."""
+    data = head["options"].get("data", "generated")
+    tables = [{"title": str(each.title), **dict(zip(("columns", "rows"), words_of(each), strict=True))}
+              for each in report.tables]  # fmt: skip
+    return {**head, "commands": list(commands), "data": data, "tables": tables, "values": plain(report.record)}
 
 
 def explain(error: MeshmatchError) -> None:
@@ -185,11 +224,10 @@ def _cell(row: Mapping[str, Any], key: str, form: str) -> str:
     return format(value, form).replace("%", " %") if form != ">" else str(value)
 
 
-def as_markdown(drawn: Table) -> str:
-    """A table as lines for docs/results.md."""
-    grid = [[str(column.header), *map(str, column.cells)] for column in drawn.columns]
-    rows = [f"| {' | '.join(row)} |" for row in zip(*grid, strict=True)]
-    return "\n".join([str(drawn.title), "", rows[0], "|---" * len(grid) + "|", *rows[1:], ""])
+def words_of(drawn: Table) -> tuple[list[str], list[list[str]]]:
+    """A table's columns and rows, as words."""
+    rows = zip(*(map(str, column.cells) for column in drawn.columns), strict=True)
+    return [str(column.header) for column in drawn.columns], [list(row) for row in rows]
 
 
 def circumstances(threads: int, jobs: int = 1) -> dict[str, Any]:

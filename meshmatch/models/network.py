@@ -22,7 +22,7 @@ _MAX = {
 class NetworkConfig:
     """Sizes and choices of a deformer; saved in the model card (cards without ``field`` have moving least squares).
 
-    The defaults were chosen on generated bodies (docs/results.md, ablations).
+    The defaults were chosen on generated bodies (docs/paper.md).
 
     A pointwise field has a decoder of its own, whatever ``decoder`` says.
     """

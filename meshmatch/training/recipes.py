@@ -61,7 +61,7 @@ class Recipe:
 
 
 def default() -> Recipe:
-    """For many registered shapes; chosen on generated bodies (docs/results.md, ablations)."""
+    """For many registered shapes; chosen on generated bodies (docs/paper.md)."""
     loss = CorrespondenceLoss(volume=2e-3, arap=2e-3, blend=1e-3, robust=True)
     return Recipe(NetworkConfig(), TrainConfig(steps=13_000, decay=0.65, loss=loss), ScanConfig(), "smooth")
 

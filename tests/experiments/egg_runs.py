@@ -11,6 +11,9 @@ from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
 from meshmatch.templates.prepare import PrepareConfig, prepare
+from meshmatch.templates.prepared_folder import read_registered
+from meshmatch.templates.template import read_template
+from meshmatch.training.datasets import registered_source
 from tests.conftest import icosphere
 from tests.training.small import NETWORK, bent_eggs
 
@@ -35,8 +38,13 @@ def prepare_eggs(root: Path) -> Path:
     return root / "prepared"
 
 
-def make_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The preset "small" becomes tiny."""
+def make_small(monkeypatch: pytest.MonkeyPatch, prepared: Path) -> None:
+    """The preset "small" becomes tiny, and eggs take the place of bodies."""
+    template = read_template(prepared / "template.safetensors")
+    shapes = torch.from_numpy(read_registered(prepared, template))
+    sources = registered_source(shapes[:5]), registered_source(shapes[5:])
     monkeypatch.setattr(ablation_setting, "SMALL", TINY)
     monkeypatch.setattr(ablation_setting, "HELD_OUT_SHAPES", 5)
+    monkeypatch.setattr(ablation_setting.Setting, "resting", lambda *_: template)
+    monkeypatch.setattr(ablation_setting.Setting, "sources", lambda *_: sources)
     monkeypatch.setattr(ablation_setting, "pool_of", ablation_setting.pool_of.__wrapped__)

@@ -1,183 +1,319 @@
-"""The command on eggs: a table, figures and a line; a run that goes on; every option."""
+"""Ablations: what runs differ in, how errors and claims are counted, and the command, on eggs and little spheres."""
 
 import json
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
-from meshmatch.experiments.paper import ablation_errors, ablation_training, ablation_transmatch, ablations
-from meshmatch.experiments.paper.ablation_errors import Measure
-from meshmatch.experiments.paper.ablations import main
+from meshmatch.experiments.bench.sets import load_set
+from meshmatch.experiments.paper import ablation_errors, ablation_training, ablations
+from meshmatch.experiments.paper.ablation_claims import Sample, difference, rising
+from meshmatch.experiments.paper.ablation_errors import (
+    LINES,
+    METHODS,
+    Measure,
+    begin,
+    chosen_names,
+    descend,
+    pair_errors,
+    refinement_of,
+    subject,
+)
+from meshmatch.experiments.paper.ablation_setting import SCANS, Setting, pool_of
+from meshmatch.experiments.paper.ablation_training import fewer, new_network, timed, train_run
+from meshmatch.experiments.paper.ablation_views import BASE, CODED, CONSTRAINTS, VIEWS, Run, all_runs
+from meshmatch.fields.shape_functions import FIELDS
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.latent import LatentRefineConfig
+from meshmatch.fitting.nodes import NodeRefineConfig
+from meshmatch.fitting.system import node_system
+from meshmatch.geometry.frames import Frame, kabsch
+from meshmatch.models.registry import load_model
+from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.training.train import build_loss_points
 from tests.experiments.egg_runs import make_small, prepare_eggs
-from tests.experiments.small_bench import build
+from tests.experiments.small_bench import BODY, build, order
 from tests.fitting.eggs import egg_model, write_model
 
-LINE = {"steps": [0, 10], "seconds": [0.0, 0.2], "errors_cm": [[3.0, 5.0], [2.0, 3.0]]}
+QUICK = Measure(shapes=3, landmarks=20, code_steps=3, code_points=200, samples=300)
 
 
 @pytest.fixture(scope="module")
-def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("ablations")
-    prepare_eggs(root)
-    build(root / "bench")
-    write_model(egg_model(), root / "egg")
-    return root
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(tmp_path_factory.mktemp("bench"))
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return prepare_eggs(tmp_path_factory.mktemp("eggs"))
 
 
 @pytest.fixture
-def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
-    """How often something is measured, with everything made small."""
-    make_small(monkeypatch)
-    drawn = ablation_training.pool_of.__wrapped__
-    for module in (ablation_training, ablation_transmatch):
-        monkeypatch.setattr(module, "pool_of", lambda setting, pose, **more: drawn(setting, pose, 4, **more))
+def setting(prepared: Path, monkeypatch: pytest.MonkeyPatch) -> Setting:
+    make_small(monkeypatch, prepared)
+    return Setting()
+
+
+def test_every_view_looks_at_the_same_cells() -> None:
+    runs = all_runs(list(VIEWS))
+    assert len(runs) == len(set(runs)) == 45
+    assert runs[0] == BASE
+    assert len({run.name for run in runs}) == 45
+    assert BASE.name == "base"
+    assert Run(field="rbf", constraint="vol+arap", seed=2).name == "field-rbf.constraint-vol-arap.seed-2"
+    for view in VIEWS.values():
+        assert view.runs[0] == BASE
+    # all but table 4's runs and the repetitions differ from the base in one thing, or in two of a table
+    for run in runs:
+        apart = [each.name for each in fields(run) if getattr(run, each.name) != getattr(BASE, each.name)]
+        assert len(apart) <= (2 if run.field in ("mls", "rbf") else 3)  # others, and how much they have
+    again = all_runs(["table4", "figure9"], 3, ["table4"])
+    assert len(again) == 9 + 3 + 3 + 4 + 18
+    assert [run.seed for run in again[:19]] == [0] * 19
+
+
+def test_cells_differ_in_representation_and_constraints_alone() -> None:
+    setting = Setting(preset="paper", threads=2)
+    for field in FIELDS:
+        none, arap, vol, both, every = (setting.recipe(Run(field, each, seed=3)) for each in CONSTRAINTS)
+        assert none.network == both.network == every.network
+        assert none.network.field == field
+        assert [r.train.loss.volume for r in (none, arap, vol, both, every)] == [0, 0, 5e-3, 5e-3, 5e-3]
+        assert [r.train.loss.arap for r in (none, arap, vol, both, every)] == [0, 1e-2, 0, 1e-2, 1e-2]
+        assert [r.train.loss.blend for r in (none, arap, vol, both, every)] == [0, 0, 0, 0, 5e-3]
+        assert (none.train.threads, none.train.seed) == (2, 3)
+    assert Setting(preset="paper").recipe(BASE).train.shapes == 16
+    assert Setting(preset="default").recipe(BASE).network.encoder == "basis"
+    for preset in ("small", "default", "paper"):
+        chosen = Setting(preset=preset).recipe(replace(BASE, kernel="cubic"))  # type: ignore[arg-type]
+        assert chosen.kernel == "cubic"
+        assert chosen.network.align_basis == chosen.network.corrections == 0
+        assert not chosen.scan.upright
+
+
+def test_a_pool_is_drawn_once_and_some_of_it_is_held_out(setting: Setting) -> None:
+    drawn = pool_of(setting, "T", 7)
+    assert drawn.targets.shape == (7 * SCANS, 642, 3)
+    assert drawn.features.shape[:2] == (7 * SCANS, 24)
+    assert len(drawn.held_out.targets) == 5
+    again = pool_of(setting, "T", 7)
+    assert torch.equal(drawn.features, again.features)
+    network = new_network(BASE, setting, drawn)
+    other = new_network(replace(BASE, seed=1), setting, drawn)
+    assert torch.equal(network.encoder.basis, drawn.basis)
+    assert torch.equal(other.encoder.basis, drawn.basis)
+    # What a batch's features say is what the encoder would say of a scan.
+    batch = drawn.batch(3, 6, 2, 0, network.encoder)
+    first = drawn.targets[: 2 * SCANS]
+    for target in batch.targets:
+        assert any(torch.equal(target, each) for each in first)
+    assert torch.equal(batch.targets, drawn.batch(3, 6, 2, 0, network.encoder).targets)
+    assert not torch.equal(batch.targets, drawn.batch(4, 6, 2, 0, network.encoder).targets)
+    assert not torch.equal(batch.targets, drawn.batch(3, 6, 2, 1, network.encoder).targets)
+
+
+@pytest.mark.parametrize("run", [BASE, CODED, replace(BASE, supervised=50), replace(BASE, field="rbf")])
+def test_a_cell_is_trained_into_a_model(
+    run: Run, setting: Setting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = pool_of(setting, "T", 3)
+    monkeypatch.setattr(ablation_training, "pool_of", lambda *_: small)
+    found = train_run(run, setting, tmp_path / "model", minutes=0.005)
+    assert found["steps"] >= 1
+    assert found["seconds"] >= 0.3
+    assert 0 < found["held_out_cm"] < 200
+    assert (found["nodes"], found["rule"]) == (300, "parts")
+    assert np.mean(found["bodies_cm"]) == pytest.approx(found["held_out_cm"], abs=1e-3)
+    assert len(found["bodies_cm"]) == len(small.held_out.targets)
+    model = load_model(tmp_path / "model")
+    assert model.network.config.field == run.field
+    assert model.card.steps == found["steps"]
+
+
+def test_fewer_supervised_points_are_regularised_everywhere(setting: Setting) -> None:
+    drawn = pool_of(setting, "T", 2)
+    network = new_network(BASE, setting, drawn)
+    points = build_loss_points(setting.template(BASE), "smooth", network)
+    few = fewer(points, 50)
+    vectors = torch.randn(2, 300, 3, generator=torch.Generator().manual_seed(0)) * 0.1
+    assert torch.allclose(few.moved(vectors), points.moved(vectors)[:, :50], atol=1e-6)
+    assert torch.equal(few.field.deformation_gradient(vectors), points.field.deformation_gradient(vectors))
+    assert fewer(points, 1000) is points
+
+
+def test_a_template_of_heavy_people_stands_as_the_usual_one() -> None:
+    pytest.importorskip("anny", reason="the body model is of the extra `train`")
+    usual, heavy = (Setting().resting(pose) for pose in ("T", "T-heavy"))
+    assert (heavy.pose, heavy.shape.V) == ("T", usual.shape.V) and np.array_equal(heavy.shape.faces, usual.shape.faces)
+    assert heavy.shape.area == pytest.approx(1, abs=0.01)
+    assert np.array_equal(heavy.core, usual.core) and np.array_equal(heavy.labels, usual.labels)
+    turned = kabsch(usual.shape.verts[usual.core], heavy.shape.verts[heavy.core]).frame
+    assert np.trace(turned.rotation) > 2.99  # up and to the front as well
+    tall, short = (np.ptp(each.shape.verts[:, 1]) for each in (usual, heavy))
+    assert short < 0.95 * tall  # of the same area
+
+
+@pytest.mark.parametrize(
+    ("errors", "verdict"),
+    [
+        (([1.0, 1.1], [2.0, 2.1], [3.0, 3.1]), "supported"),
+        (([1.0, 1.1], [3.0, 3.1], [2.0, 2.1]), "not supported"),
+        (([2.0, 2.1], [2.0, 2.1], [3.0, 3.1]), "not testable at this length"),
+        (([1.0], [2.0]), "not testable at this length"),  # one seed
+        (([1.0, 4.0], [2.0, 5.0]), "not testable at this length"),
+        (([1.0, 1.1], []), "not measured"),
+    ],
+)
+def test_a_claim_needs_an_interval_beside_zero(errors: tuple[list[float], ...], verdict: str) -> None:
+    assert rising("held out", "rising", [Sample(each) for each in errors]).verdict == verdict
+
+
+def test_an_interval_of_seeds_is_the_textbooks() -> None:
+    low, high = difference(Sample([1.0, 1.2]), Sample([2.0, 2.2])) or (0.0, 0.0)
+    reach = 4.302653 * np.sqrt(0.02 / 2 + 0.02 / 2)  # two degrees of freedom
+    assert (low, high) == pytest.approx((1 - reach, 1 + reach))
+    assert difference(Sample([1.0, 5.0]), Sample([2.0, 6.0]), paired=True) == (1.0, 1.0)
+
+
+def test_pairs_must_carry_an_order_too() -> None:
+    """Half of the pairs are better and half worse: the mean of one pair more or less decides."""
+    clear, even = [1.0] * 4, [0.0, 0.0, 2.2, 2.2]
+    for pairs, verdict in (([1.1] * 4, "supported"), (even, "not testable at this length")):
+        samples = Sample([1.0, 1.01], [clear, clear]), Sample([1.1, 1.11], [pairs, pairs])
+        assert rising("scape", "rising", samples).verdict == verdict
+
+
+def subjects_of(small: Path, name: str, cache: Path, measure: Measure = QUICK):
+    bench = load_set(name, small)
+    names = chosen_names(bench, measure)
+    frames = [sqrt_area_frame(bench.shape(each)) for each in names]
+    return bench, [subject(bench, each, frame, measure, cache) for each, frame in zip(names, frames, strict=True)]
+
+
+def test_a_template_that_lies_on_the_shapes_makes_no_error(small: Path, tmp_path: Path) -> None:
+    bench, subjects = subjects_of(small, "faust", tmp_path)
+    assert [one.name for one in subjects] == ["tr_reg_000", "tr_reg_001", "tr_reg_010"]
+    # The body as the template, vertex by vertex: vertex k of it lies where each shape has it.
+    laid = [bench.shape(one.name).verts[np.argsort(order(one.name))] for one in subjects]
+    errors = pair_errors(subjects, laid)
+    assert errors.shape == (6, 20)
+    assert errors.max() == 0
+    turned = [laid[0], laid[1], laid[2][::-1]]
+    errors = pair_errors(subjects, turned)
+    # pairs in order: 01, 02, 10, 12, 20, 21; those of the third shape are wrong
+    assert errors[[0, 2]].max() == 0
+    assert errors[[1, 3, 4, 5]].mean(1).min() > 20
+
+
+def test_errors_are_lengths_along_the_target(small: Path, tmp_path: Path) -> None:
+    bench, subjects = subjects_of(small, "scape", tmp_path)
+    laid = [bench.shape(one.name).verts for one in subjects]
+    one_off = laid[1].copy()
+    mark = np.linspace(0, BODY.V - 1, 20).round().astype(int)[4]
+    near = BODY.faces[(BODY.faces == mark).any(1)][0]
+    other = near[near != mark][0]
+    one_off[mark] = laid[1][other]
+    errors = pair_errors(subjects, [laid[0], one_off])
+    edge = np.linalg.norm(laid[1][mark] - laid[1][other]) / np.sqrt(bench.shape("mesh001").area)
+    assert errors[0].max() == pytest.approx(100 * np.sqrt(1.9) * edge, rel=2e-3)
+    assert (errors[0] > 0).sum() == 1
+
+
+def test_shapes_are_spread_over_the_targets(small: Path) -> None:
+    bench = load_set("shrec19", small)
+    assert bench.pairs == (("1", "2"), ("1", "10"), ("10", "2"))
+    assert chosen_names(bench, Measure()) == ["2", "10"]
+    assert chosen_names(load_set("faust", small), Measure(shapes=2)) == ["tr_reg_000", "tr_reg_010"]
+
+
+def test_regularisers_at_test_time_are_those_of_the_run() -> None:
+    weights = {}
+    for constraint in CONSTRAINTS:
+        how = refinement_of(replace(BASE, constraint=constraint), "code", Measure(code_steps=7))
+        assert isinstance(how, LatentRefineConfig)
+        assert (how.steps, how.rate, how.points) == (7, 5e-3, 1500)
+        weights[constraint] = (how.volume, how.arap)
+    assert weights == {
+        **{"none": (0, 0), "arap": (0, 1e-3), "vol": (1e-4, 0)},
+        **{"vol+arap": (1e-4, 1e-3), "vol+arap+Z": (1e-4, 1e-3)},
+    }
+    chamfer = refinement_of(BASE, "chamfer", Measure())
+    assert isinstance(chamfer, LatentRefineConfig)
+    assert (chamfer.volume, chamfer.arap) == (0, 0)
+    assert refinement_of(BASE, "none", Measure()) is None
+    assert isinstance(refinement_of(BASE, "nodes", Measure()), NodeRefineConfig)
+
+
+def test_a_shape_is_begun_in_the_frame_of_the_reference(small: Path, tmp_path: Path) -> None:
+    # The same shape, its file turned and scaled: a network is told the same, and its answer lies on the same place.
+    model = egg_model()
+    folder = str(write_model(model, tmp_path / "egg"))
+    _, (one, *_) = subjects_of(small, "faust", tmp_path)
+    turn = Frame(2.0, np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([1.0, 2, 3]))
+    other = replace(one, frame=turn.compose(one.frame))
+    here, there = (begin(model, each, folder, QUICK) for each in (one, other))
+    assert np.allclose(here.candidate.vectors, there.candidate.vectors)
+    laid = [start.frame.undo(node_system(model).moved(start.candidate.vectors)) for start in (here, there)]
+    assert np.allclose(turn.apply(laid[1]), laid[0])
+
+
+def test_refinement_is_followed_step_by_step(setting: Setting) -> None:
+    made = setting.resting("T")
+    model = replace(egg_model(), template=made)
+    network = model.network
+    assert len(network.nodes) == made.K == 36
+    lines = {"code": (BASE, "code", (0, 2)), "nodes": (BASE, "nodes", (0, 3))}
+    assert {method for _, method, _ in LINES.values()} <= set(METHODS)
+    found = descend({BASE: model}, setting, QUICK, 2, lines)
+    assert set(found) == {"code", "nodes"}
+    for line in found.values():
+        assert [len(errors) for errors in line["errors_cm"]] == [2, 2]
+        assert line["seconds"][0] < line["seconds"][1]
+    code, nodes = found["code"]["errors_cm"], found["nodes"]["errors_cm"]
+    assert code[0] == nodes[0]  # both begin with the network's answer
+    assert code[1] != code[0]
+    assert nodes[1] != nodes[0]
+
+
+def test_the_command_goes_on(
+    small: Path, setting: Setting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawn = pool_of.__wrapped__
+    monkeypatch.setattr(ablation_training, "pool_of", lambda setting, pose, **more: drawn(setting, pose, 4, **more))
     quick = partial(FitConfig, samples=300, coarse_samples=60, careful=1)
     monkeypatch.setattr(ablation_errors, "FitConfig", quick)
     monkeypatch.setattr(ablations, "Measure", partial(Measure, landmarks=20, samples=300, code_points=200))
-    monkeypatch.setattr(ablations, "BODIES", 2)
-    monkeypatch.setattr(ablations, "LINES", {})
-    counted = {"train_run": 0, "errors_of": 0, "timed": 0, "memory": 0, "oriented": 0}
-    monkeypatch.setattr(ablations, "memory", lambda *_: {"megabytes": 1.5, "how": "guessed"})
-    monkeypatch.setattr(ablations, "descend", lambda *_: {"ours": LINE})
+    output, model = tmp_path / "out", write_model(egg_model(), tmp_path / "egg")
+    words = ["--output", str(output), "--model", str(model), "--data", str(small), "--cache", str(tmp_path / "cache")]
+    words += ["--sets", "scape", "--steps", "2", "--code-steps", "1", "--shapes", "2", "--views", "figure10"]
+    words += ["--without", "pointwise,supervised-100"]
 
-    def count(name: str) -> None:
-        real = getattr(ablations, name)
+    def run(*more: str) -> dict:
+        assert ablations.main([*words, *more]) == 0
+        return json.loads(capsys.readouterr().out.splitlines()[-1])
 
-        def call(*given, **named):
-            counted[name] += 1
-            return real(*given, **named)
-
-        monkeypatch.setattr(ablations, name, call)
-
-    for name in counted:
-        count(name)
-    return counted
-
-
-def line(capsys: pytest.CaptureFixture[str]) -> tuple[str, dict]:
-    out = capsys.readouterr().out
-    return out, json.loads(out.splitlines()[-1])
-
-
-def said(capsys: pytest.CaptureFixture[str]) -> str:
-    """What was told on stderr, which a narrow terminal folds."""
-    return " ".join(capsys.readouterr().err.split())
-
-
-@pytest.mark.slow
-def test_a_run_is_tables_figures_and_a_line_and_goes_on(
-    places: Path, tmp_path: Path, calls: dict[str, int], capsys: pytest.CaptureFixture[str]
-) -> None:
-    output = tmp_path / "out"
-    words = ["--output", str(output), "--folder", str(places / "prepared"), "--model", str(places / "egg")]
-    words += ["--data", str(places / "bench"), "--cache", str(tmp_path / "cache"), "--sets", "scape,faust"]
-    words += [
-        "--minutes",
-        "0.0005",
-        "--code-steps",
-        "2",
-        "--shapes",
-        "2",
-        "--views",
-        "figure10",
-        "--without",
-        "pointwise",
-    ]
-    assert main([*words, "--show"]) == 0
-    out, record = line(capsys)
-    rivals = [f"field-transmatch.constraint-none{few}" for few in (".supervised-50", ".supervised-100", "")]
-    assert f"Not measured: base, supervised-50, supervised-100, {', '.join(rivals)}" in out
-    assert main(words) == 0
-    assert calls == {"train_run": 3, "errors_of": 6, "timed": 0, "memory": 0, "oriented": 4}
-    out, record = line(capsys)
-    assert set(record["runs"]) == {"base", "supervised-100", "supervised-50", *rivals}
-    steps = record["runs"]["base"]["steps"]
-    assert {record["runs"][name]["steps"] for name in ("supervised-100", *rivals)} == {steps}
-    assert f"0.0005 CPU min of training a run or the base's {steps} steps, radii in units of" in out
-    assert "preset small, 2 steps on the code" in out
-    assert {"base scape chamfer", "base scape none", "supervised-50 faust code", f"{rivals[0]} faust none"} <= record[
-        "errors"
-    ].keys()
+    assert run("--show")["runs"] == {}
+    first = run()
+    runs = {
+        "base",
+        "supervised-50",
+        "field-transmatch.constraint-none",
+        "field-transmatch.constraint-none.supervised-50",
+    }
+    assert set(first["runs"]) == runs and {each["steps"] for each in first["runs"].values()} == {2}
+    assert {"base scape chamfer", "supervised-50 scape code"} <= first["errors"].keys()
     assert (output / "figure-10.png").is_file()
-
-    for name in ("trained", "error-scape-code", "error-faust-code"):
-        (output / "supervised-50" / f"{name}.json").unlink()
-    pictures = tmp_path / "pictures"
-    assert main([*words, "--show", "--pictures", str(pictures)]) == 0
-    out, record = line(capsys)
-    assert "Not measured: supervised-50" in out and set(record["runs"]) == {"base", "supervised-100", *rivals}
-    assert (pictures / "figure-10.png").is_file()
-    assert main(words) == 0
-    assert (calls["train_run"], calls["errors_of"]) == (4, 8)
-    (output / "base" / "model" / "card.json").unlink()  # what is there needs no model, more of it does
-    assert main(words) == 0
-    (output / "base" / "error-faust-code.json").unlink()
-    capsys.readouterr()
-    assert main(words) == 1
-    assert "has lost its model" in said(capsys)
-    assert main([*words, "--minutes", "0.0004"]) == 1  # runs of another budget
-    assert "other choices (minutes)" in said(capsys)
-    assert main([word for word in words if word not in ("--minutes", "0.0005")]) == 1  # equal steps are another
-    assert "other choices (minutes, steps)" in said(capsys)
+    (output / "supervised-50" / "error-scape-code.json").unlink()
+    assert "supervised-50 scape code" not in run("--show")["errors"]
+    assert run()["errors"] == first["errors"]  # the one that lacks is measured again, by the same model
+    assert ablations.main([*words, "--steps", "3"]) == 1  # runs of another budget
 
 
-@pytest.mark.slow
-def test_every_run_has_the_steps(
-    places: Path, tmp_path: Path, calls: dict[str, int], capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Table 4 too: its fields learn for as many steps, and nothing is said of minutes; of refinements, those asked for."""
-    words = ["--output", str(tmp_path), "--folder", str(places / "prepared"), "--model", str(places / "egg")]
-    words += ["--data", str(places / "bench"), "--sets", "scape", "--shapes", "2", "--code-steps", "1"]
-    words += ["--steps", "3", "--batch", "2", "--rounds", "0", "--views", "table4"]
-    assert main([*words, "--plan"]) == 0
-    assert sum(row["runs"] for row in line(capsys)[1]["plan"]) == 9
-    assert main([*words, "--plan", "--without", "rbf,pointwise"]) == 0
-    assert [(row["field"], row["runs"]) for row in line(capsys)[1]["plan"]] == [("mls", 1)] * 3
-    assert calls["train_run"] == 0
-    assert main([*words, "--methods", "code"]) == 0
-    out, record = line(capsys)
-    assert {run["steps"] for run in record["runs"].values()} == {3} and len(record["runs"]) == 9
-    assert "Budget: 3 steps of every run, batches of 2, radii in units of the template's diameter" in out
-    assert {key.rsplit(" ", 1)[1] for key in record["errors"]} == {"code"}
-
-
-def test_table_4_has_costs_without_training(
-    places: Path, tmp_path: Path, calls: dict[str, int], capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["--output", str(tmp_path / "out"), "--folder", str(places / "prepared"), "--minutes", "0"]
-    words += ["--sets", "", "--rounds", "1", "--views", "table4,figure6"]
-    assert main(words) == 0
-    assert calls == {"train_run": 0, "errors_of": 0, "timed": 1, "memory": 9, "oriented": 0}
-    out, record = line(capsys)
-    assert "cost of a training iteration" in out and "errors in cm" not in out
-    assert len(record["times"]) == len(record["memory"]) == 9
-    assert record["figure6"] is None
-    assert main([*words, "--show", "--markdown", str(tmp_path / "table.md")]) == 0
-    assert calls["timed"] == 1
-    written = (tmp_path / "table.md").read_text(encoding="utf-8")
-    assert "\n| constraint | field | CPU ms |" in written
-    assert "\n| mls: both regularisers < none |" in written
-    assert line(capsys)[1]["times"] == record["times"]
-
-
-def test_repeated_views_have_two_seeds(
-    places: Path, tmp_path: Path, calls: dict[str, int], capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["--output", str(tmp_path), "--folder", str(places / "prepared"), "--minutes", "1e-6", "--sets", ""]
-    words += ["--seeds", "2", "--rounds", "0", "--views", "table5,figure6", "--repeated", "figure6"]
-    assert main(words) == 0
-    assert calls["train_run"] == 6 + 2
-    out, record = line(capsys)
-    assert "Table 5, errors in cm" in out and "±" in out
-    assert "field-pointwise.constraint-none.seed-1" in record["runs"]
-    assert record["figure6"]["lines"] == {"ours": LINE}
-    assert any(claim["outcome"] != "not measured" for claim in record["claims"])
-    assert {path.name for path in tmp_path.glob("*.png")} == {"table-5.png", "figure-6.png"}
-
-
-def test_what_cannot_be_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--output", str(tmp_path), "--shapes", "1"]) == 2
-    assert main(["--output", str(tmp_path), "--sets", "", "--views", "table8"]) == 1
-    assert "choose from table4" in said(capsys)
+def test_cells_take_turns(setting: Setting) -> None:
+    found = timed(setting, [replace(BASE, field=field) for field in FIELDS], 2)
+    assert set(found) == {"base", "field-rbf", "field-pointwise"}
+    assert all(record["rounds"] == 2 and record["ms"] > 0 and record["cpu_ms"] > 0 for record in found.values())

@@ -7,20 +7,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from meshmatch.experiments.bench import accuracy as command
-from meshmatch.experiments.bench import methods as bench_methods
-from meshmatch.experiments.bench import orientation
 from meshmatch.experiments.bench.accuracy import main, run_set
 from meshmatch.experiments.bench.methods import OurMethod
 from meshmatch.experiments.bench.sets import load_set
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.geometry.frames import Frame
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
-from tests.experiments.small_bench import BODY, Oracle, build, truth
+from tests.experiments.small_bench import Oracle, build
 
 SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
 
@@ -61,15 +57,6 @@ def test_every_shape_is_fitted_once(small: Path, kept: Path, monkeypatch: pytest
     assert set(record["groups"]) == {"same subject", "cross subject"}
     assert len(found.map_seconds) == 6
     assert set(found.fit_seconds) == set(bench.shapes)
-
-
-def test_two_processes_find_the_same(small: Path, kept: Path) -> None:
-    bench = load_set("shrec19", small)
-    alone, together = (
-        run_set(bench, Oracle(turned=True), bench.pairs, cache=kept, jobs=jobs).scores for jobs in (1, 2)
-    )
-    assert alone.joined.mean_cm > 10
-    assert alone.as_dict() == together.as_dict()
 
 
 def test_a_shape_that_cannot_be_fitted_costs_its_pairs(small: Path, kept: Path) -> None:
@@ -133,12 +120,6 @@ def test_the_command(
     assert kept_in == {output / "fits"}
     assert main([*words[:-1], "4", "--output", str(output), "--sets", "faust"]) == 1
     assert "other choices (seed)" in capsys.readouterr().err
-    # The kept maps give the same numbers.
-    maps = str(output / "maps")
-    assert main(["--data", str(small), "--cache", str(kept), "--maps", maps, "--sets", "faust,scape"]) == 0
-    again = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-    assert again["sets"]["faust"]["mean_cm"] == 0
-    assert list(again["sets"]) == ["faust", "scape"]
     # A part says that it is one.
     assert main([*words, "--limit-pairs", "2", "--sets", "faust"]) == 0
     text = capsys.readouterr().out
@@ -153,88 +134,6 @@ def test_the_command_speaks_of_the_users_mistakes(
     assert "no shapes in" in " ".join(capsys.readouterr().err.split())
     assert main(["--data", str(small), "--sets", "tosca"]) == 1
     assert "unknown set 'tosca'" in capsys.readouterr().err
-    bench = load_set("scape", small)
-    (tmp_path / "scape").mkdir()
-    for pair in bench.pairs:
-        np.save(tmp_path / "scape" / f"{pair[0]}-{pair[1]}.npy", truth(*pair))
-    words = ["--data", str(small), "--cache", str(kept), "--maps", str(tmp_path), "--sets", "scape"]
-    assert main(words) == 0
-    np.save(tmp_path / "scape" / "mesh000-mesh001.npy", np.full(BODY.V, BODY.V + 3))
-    assert main(words) == 1
-    assert "mesh000-mesh001.npy" in capsys.readouterr().err
-
-
-TURN = Rotation.from_rotvec([1.4, 0.4, -0.9]).as_matrix()
-
-
-def test_shapes_are_turned_upright_and_the_orientation_is_told(
-    small: Path, kept: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Also a shape that was known by its mirror image is only turned; and what is measured is the file's shape."""
-    frames = {"mesh000": Frame(3.0, TURN, np.ones(3)), "mesh001": Frame(2.0, TURN * [[-1], [1], [1]], np.zeros(3))}
-    told: list[tuple[Shape, FitConfig | None]] = []
-
-    class Told:
-        """Knows every map, and keeps what it was asked to fit."""
-
-        def __init__(self, model: str, config: FitConfig, threads: int) -> None:
-            assert model == "hand"
-            self.config = config
-
-        def fit(self, shape: Shape, config: FitConfig | None = None) -> str:
-            told.append((shape, config))
-            return Path(shape.name).stem
-
-        def map(self, source: str, target: str, agree: bool) -> VertexMap:
-            return VertexMap(source, target, truth(source, target))
-
-    def frame_by(model: str, shape: Shape, seed: int) -> Frame:
-        assert (model, seed) == ("human", 3)
-        return frames[Path(shape.name).stem]
-
-    monkeypatch.setattr(bench_methods, "Matcher", Told)
-    monkeypatch.setattr(orientation, "frame_by", frame_by)
-    words = ["--data", str(small), "--cache", str(kept), "--sets", "scape", "--model", "hand", "--seed", "3"]
-    assert main(words) == 0
-    plain = capsys.readouterr().out.strip().splitlines()
-    assert [config for _, config in told] == [None, None] and "oriented" not in plain[0]
-    told.clear()
-    assert main([*words, "--oriented-by", "human"]) == 0
-    lines = capsys.readouterr().out.strip().splitlines()
-    assert "oriented by human" in " ".join(lines[:-1])
-    record = json.loads(lines[-1])
-    assert record["options"]["oriented_by"] == "human"
-    assert record["sets"]["scape"]["mean_cm"] == 0
-    assert [(config.up, config.front, config.seed) for _, config in told if config] == [("y", "z", 3)] * 2
-    for (shape, _), (name, frame) in zip(told, frames.items(), strict=True):
-        file = load_set("scape", small).shape(name)
-        assert shape.verts == pytest.approx((file.verts - frame.center) @ TURN.T / frame.scale)
-        assert np.array_equal(shape.faces, file.faces) and shape.name == file.name
-
-
-def test_samples_that_lie_anyhow_are_fitted_upright() -> None:
-    """A mesh and a cloud, each in a turn of its own, in the unit of its file."""
-    mesh, cloud = (load_shape(f"templates/samples/{name}.ply") for name in ("dancer", "climber"))
-    mesh = Shape(7 * mesh.verts @ TURN.T + 5, mesh.faces, "dancer")
-    cloud = Shape(cloud.verts[::3] @ TURN, np.empty((0, 3), np.int64), "climber")
-    method = OurMethod(refine="none", oriented_by="human")
-    fits = [method.fit(shape) for shape in (mesh, cloud)]
-    assert [(fit.up, fit.front) for fit in fits] == [("+y", "+z")] * 2
-    index = method.map(mesh, fits[0], cloud, fits[1]).index
-    assert index.shape == (mesh.V,)
-    plain = OurMethod(refine="none")
-    usual = plain.map(mesh, plain.fit(mesh), cloud, plain.fit(cloud)).index
-    apart = np.linalg.norm(cloud.verts[index] - cloud.verts[usual], axis=1) / cloud.diagonal
-    assert np.median(apart) < 0.05  # as after the model's own search; maps of no worth are 0.3 apart
-
-
-def test_what_cannot_orient_is_named_before_anything_is_fitted(
-    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["--data", str(small), "--oriented-by", "nobody"]) == 1
-    assert "nobody" in capsys.readouterr().err
-    assert main(["--data", str(small), "--oriented-by", "human", "--maps", str(tmp_path)]) == 1
-    assert "cannot be oriented anew" in capsys.readouterr().err
 
 
 def test_a_fit_that_was_kept_maps_as_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -83,12 +83,3 @@ def test_every_ordered_pair_counts_with_the_worse_verdict() -> None:
     assert (row["pairs"], row["bone"], row["verdicts"]) == (6, 1.0, "0 / 2 / 4")
     assert "mean_cm" not in row
     assert row["slowest"] >= row["seconds"] > 0
-
-
-def test_generated_groups_are_turned_anywhere(designer: Designer, tmp_path: Path) -> None:
-    cast = characters.characters_of("soldiers", 2, designer, tmp_path)
-    for turned, made in zip(cast, designer.soldiers(2), strict=True):
-        near = (np.linalg.norm(each.shape.verts[:50] - each.shape.verts[50:100], axis=1) for each in (turned, made))
-        assert np.allclose(*near)
-        assert not np.allclose(turned.shape.verts, made.shape.verts, atol=0.1)
-        assert np.array_equal(turned.bones, made.bones)

@@ -99,12 +99,6 @@ def test_something_lacks(data: Path, capsys: pytest.CaptureFixture[str], spoil: 
     assert "docs/datasets.md" in told and words in str(rows["shrec19"]["problem"])
 
 
-def test_hearts_have_a_row_for_each_vertex(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.save(data / "heart" / "1.truth.npy", np.zeros((3, 2), np.int32))
-    status, rows, _ = answer(capsys, str(data), "--sets", "heart")
-    assert status == 1 and f"({BODY.V}, 2)" in str(rows["heart"]["problem"])
-
-
 def test_the_folder_that_results_are_of(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = [name for name in CHECKS if name not in ("shrec19", "scape", "faust")]
     status, rows, told = answer(capsys, str(bench), "--sets", ",".join(small))

@@ -95,8 +95,7 @@ def test_points_are_drawn_in_under_a_plate() -> None:
 
 def test_command_writes_meshes_with_labels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = [str(tmp_path), "--kind", "table", "--count", "2", "--resolution", "32", "--first", "4"]
-    assert command.main([*words, "--picture", str(tmp_path / "tables.png")]) == 0
-    assert (tmp_path / "tables.png").stat().st_size > 5000
+    assert command.main(words) == 0
     assert "2 meshes of" in capsys.readouterr().out
     assert json.loads((tmp_path / "parts.json").read_text()) == list(KINDS["table"])
     shape = load_shape(tmp_path / "table0005.ply")

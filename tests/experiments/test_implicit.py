@@ -1,28 +1,23 @@
 """What the table of implicit surfaces counts, and how real shapes are compared."""
 
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 pytest.importorskip("skimage", reason="scikit-image is of the extra `implicit`")
 
 
-from meshmatch.errors import InputError
 from meshmatch.experiments.paper import implicit
 from meshmatch.experiments.paper.implicit import (
     FRAMES,
     chamfer,
-    draw,
     interpolation,
     label_transfer,
     labelled_points,
     means,
-    moved_colors,
     pairs_of,
     part_iou,
     pieces,
@@ -33,8 +28,6 @@ from meshmatch.implicit.model import ImplicitModel
 from meshmatch.implicit.network import ImplicitConfig, ImplicitNetwork
 from meshmatch.implicit.space import CUBE_RADIUS, cube_nodes
 from meshmatch.models.implicit_card import ImplicitCard
-from meshmatch.render.figures import Panel
-from meshmatch.render.picture import Look
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from tests.implicit.boxes import box, box_sdf
@@ -156,38 +149,6 @@ def test_errors_of_a_box_that_is_learned_in_part(share: float, monkeypatch: pyte
         assert 5 < found["chamfer"] < 25  # half of the points are up to half a side away
 
 
-def test_colors_say_how_far_the_deformation_goes() -> None:
-    for moved, color in ((0.0, (0.93, 0.93, 0.90)), (0.25, (0.70, 0.10, 0.15)), (0.125, (0.98, 0.72, 0.35))):
-        still = balls(0.6, moved=moved)
-        fit = still.known("plane0")
-        found = moved_colors(still, fit, still.surface(fit, 16))
-        assert np.allclose(found, color, atol=1e-5)
-
-
-def test_figure_12_has_a_row_for_each_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shown: list[list[Panel]] = []
-
-    def rendered(panels: list[Panel], path: Path, look: Look) -> None:
-        shown.append(panels)
-        Image.new("RGB", look.size, ("red", "blue")[len(shown) - 1]).save(path)
-
-    monkeypatch.setattr(implicit, "render_shapes", rendered)
-    models = {
-        ("plane", method): balls(0.4, 0.8, moved=moved) for method, moved in (("DIF-Net", 0.0), ("reduced", 0.25))
-    }
-    draw(tmp_path / "figure.png", models, (0, 1))
-    assert [path.name for path in tmp_path.iterdir()] == ["figure.png"]
-    picture = Image.open(tmp_path / "figure.png")
-    assert picture.size == (1500, 2 * 260)
-    assert [picture.getpixel((700, at)) for at in (259, 260)] == [(255, 0, 0), (0, 0, 255)]
-    for panels, name, color in zip(
-        shown, ("DIF-Net", "reduced"), ((0.93, 0.93, 0.90), (0.70, 0.10, 0.15)), strict=True
-    ):
-        assert [panel.label for panel in panels] == [f"plane, {name}", "0.2", "0.4", "0.6", "0.8", "1.0"]
-        assert np.all(np.diff([volume(panel.shape) for panel in panels]) > 0)  # from the small ball to the large one
-        assert all(np.allclose(panel.colors, color, atol=1e-5) for panel in panels)
-
-
 def test_means_over_trainings_keep_what_they_are_of() -> None:
     one = {"chamfer": 1.0, "label_iou": 0.5, "facing_iou": 0.6, "bend": 1.0, "asked": {"seed": 0}}
     assert "label_iou_sd" not in means([one])
@@ -200,30 +161,3 @@ def test_means_over_trainings_keep_what_they_are_of() -> None:
 def test_pairs_are_of_different_shapes() -> None:
     assert all(a != b for a, b in pairs_of(4, 50, 0))
     assert pairs_of(4, 50, 0) == pairs_of(4, 50, 0)
-
-
-@pytest.mark.parametrize(
-    ("words", "folder", "weights"),
-    [
-        (["--methods", "reduced"], "table-mls-0", (1e-3, 0.1, False)),
-        (["--methods", "reduced", "--energies", "5"], "table-mls-0-energies5", (5e-3, 0.1, False)),
-        (["--methods", "reduced", "--correct", "0.5"], "table-mls-0-correct0.5", (1e-3, 0.5, False)),
-        (["--methods", "published"], "table-published-0", (1e-3, 0.1, True)),
-        (["--methods", "published-reduced"], "table-published-mls-0", (1e-3, 0.1, True)),
-    ],
-)
-def test_what_is_trained_with_other_weights_has_its_own_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], folder: str, weights: tuple[float, float, bool]
-) -> None:
-    asked: dict[str, tuple[ImplicitConfig, Any]] = {}
-
-    def stopped(path: Path, _: object, config: ImplicitConfig, training: Any) -> None:
-        asked[path.name] = config, training.loss
-        raise InputError("that is enough")
-
-    monkeypatch.setattr(implicit, "trained", stopped)
-    assert implicit.main(["--work", str(tmp_path), "--kinds", "table", "--shapes", "4", *words]) == 1
-    config, loss = asked[folder]
-    assert (loss.volume, loss.correct, loss.published) == weights
-    assert config.field == ("pointwise" if folder == "table-published-0" else "mls")
-    assert config.layers == (4 if loss.published else 2)

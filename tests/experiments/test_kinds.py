@@ -37,31 +37,7 @@ def test_every_pair_counts(agree: str, tmp_path: Path, capsys: pytest.CaptureFix
     record = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert record["all"]["pairs"] == 6
     assert sum(row["pairs"] for row in record["judged"]) == 6
-    assert {row["of"]: row["pairs"] for row in record["animals"]} == dict.fromkeys(
-        ("tr_reg_000", "tr_reg_001", "tr_reg_010"), 4
-    )
-    means = [row["mean_x100"] for row in record["animals"]]
-    assert record["all"]["mean_x100"] == pytest.approx(np.mean(means), abs=1e-3)
-
-
-def test_without_data_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert kinds.main(["--data", str(tmp_path), "--sets", "animals"]) == 1
-    assert "no shapes" in capsys.readouterr().err
-
-
-def test_hands_with_any_model_of_theirs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
-    """Bumpy balls stand for hands, and are matched by a model of a body."""
-    balls = [load_shape(file) for file in sorted(build(tmp_path).glob("faust/*.ply"))]
-    own, kept = np.arange(balls[0].V), np.ones(balls[0].V, bool)
-    made = [CutScan(ball, ball, np.where(own < 7 * number, -1, own), kept, 2.0) for number, ball in enumerate(balls)]
-    monkeypatch.setattr(kinds, "make_scans", lambda kind, count, seed: made[:count])
-    words = ["--sets", "hand", "--model", "human", "--scans", "3", "--cache", str(tmp_path / "cache")]
-    assert kinds.main(words) == 0
-    record = json.loads(capsys.readouterr().out.splitlines()[-1])["hand"]
-    assert (record["all"]["pairs"], record["all"]["bar"]) == (6, 4.0)
-    assert record["all"]["met"] == (record["all"]["mean_x100"] <= 4.0)
-    assert sum(row["pairs"] for row in record["judged"]) == 6
-    assert set(record["verdicts"]) == {ball.name for ball in balls}
+    assert set(record["verdicts"]) == {"tr_reg_000", "tr_reg_001", "tr_reg_010"}
 
 
 def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:

@@ -1,40 +1,32 @@
 """Area distortion of fields, and what the rules for nodes refuse, beside numbers that are known."""
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from meshmatch.experiments.paper import figure_fields
 from meshmatch.experiments.paper.ablation_errors import Measure
-from meshmatch.experiments.paper.ablation_setting import Setting
-from meshmatch.experiments.paper.ablation_views import BASE
-from meshmatch.experiments.paper.figure_direct import Direct, direct_fits, fitted, in_template_frame
 from meshmatch.experiments.paper.figure_fields import (
     OFF,
     PULL,
     REFINED,
+    Direct,
     change,
-    fits,
-    pull,
+    direct_fits,
+    fitted,
     pulled_by,
     pulled_nodes,
     refinements,
+    template_frame,
     volume,
 )
-from meshmatch.experiments.paper.figure_nodes import config_of, refusals, refused, worst_candidate
-from meshmatch.experiments.paper.figures import main, stacked
+from meshmatch.experiments.paper.figures import refusals, refused, worst_candidate
 from meshmatch.maps.evaluate import CM_PER_UNIT
-from meshmatch.render.figures import Panel
-from meshmatch.render.picture import Look
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.make import choose_nodes, edge_graph
+from meshmatch.templates.make import NodeConfig, choose_nodes, edge_graph
 from meshmatch.templates.template import Template, read_template
 from tests.fitting.eggs import egg_model
 
@@ -73,20 +65,8 @@ def test_handles_are_the_nodes_of_the_arm(template: Template) -> None:
     )
 
 
-def test_a_pull_by_every_field(template: Template, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(figure_fields, "_MOST_STEPS", 3)
-    drawn = pull(template, "smooth", 0)
-    mls, rbf, pointwise = drawn.rows
-    assert [mls["what"], rbf["what"], pointwise["what"]] == ["mls", "rbf", "pointwise"]
-    assert mls["elsewhere_cm"] == pytest.approx(0, abs=1e-4)  # compact support
-    assert rbf["elsewhere_cm"] > 1e-3
-    assert rbf["missed_cm"] == pytest.approx(0, abs=0.01)
-    assert pointwise["missed_cm"] > 1
-    assert [panel.label for panel in drawn.panels] == ["handles", "mls", "rbf", "pointwise"]
-
-
 def test_the_rules_refuse_what_the_choice_of_nodes_refuses(template: Template) -> None:
-    config = config_of(template, 100, 0.2)
+    config = NodeConfig(K=100, radius=0.2)
     found, rules, _ = refused(template, config)
     kept = found.points[~rules["parts"]]
     first = kept[farthest_points(kept, config.K)]
@@ -107,7 +87,7 @@ def test_the_rules_refuse_what_the_choice_of_nodes_refuses(template: Template) -
 
 
 def test_the_worst_candidate_moves_strangers(template: Template) -> None:
-    config = config_of(template, 20, 0.25)
+    config = NodeConfig(K=20, radius=0.25)
     found, rules, _ = refused(template, config)
     worst, moved = worst_candidate(template, found, rules["parts"], 0.25)
     assert rules["parts"][worst]
@@ -116,34 +96,11 @@ def test_the_worst_candidate_moves_strangers(template: Template) -> None:
     assert len(np.unique(template.labels[moved])) > 2
 
 
-def test_rows_of_panels_are_stacked(cube: Shape, tmp_path: Path) -> None:
-    look = Look(size=(120, 80))
-    stacked([([Panel(cube)], look), ([Panel(cube), Panel(cube)], look)], tmp_path / "both.png")
-    with Image.open(tmp_path / "both.png") as image:
-        assert image.size == (120, 160)
-
-
-def test_the_command_draws_figure_7(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--figures", "7", "--pictures", str(tmp_path), "--nodes", "60", "--radius", "0.25"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    record = json.loads(lines[-1])
-    # by the radius that is drawn, which the lines below the table name; and by the paper's, as in the ablations' table 7
-    known = [(row["template"], round(row["radius"], 3)) for row in record["refused"]]
-    assert known == [("human-T", 0.25), ("human-T", 0.288), ("human-A", 0.25), ("human-A", 0.279)]
-    for pose, row in zip("TA", record["refused"][1::2], strict=True):
-        assert row["parts"] == Setting().refused(replace(BASE, pose=pose, nodes=60))
-    assert [row["radius"] for row in (*record["bad"], *record["stages"])] == [0.25] * 3
-    assert sum("'radius': 0.25" in line for line in lines[:-1]) == 3
-    assert record["stages"][0]["nodes"] >= 60 and len(record["bad"][0]["node moves"]) > 1
-    assert (tmp_path / "paper-figure-7.png").stat().st_size > 10_000
-    assert main(["--figures", "8"]) == 1
-    assert "unknown figure '8'" in capsys.readouterr().err
-
-
 def test_a_field_is_fitted_without_a_network(template: Template) -> None:
     """A still template and a moved one: where points are known exactly and nothing resists, the error goes away."""
     how = Direct(supervised=300, noise=0.0, steps=60, strained=50)
-    target = in_template_frame(template, 2 * template.shape.verts @ np.diag([-1.0, 1.0, -1.0]) + 5)
+    body = 2 * template.shape.verts @ np.diag([-1.0, 1.0, -1.0]) + 5
+    target = template_frame(template, body).apply(body)
     assert target == pytest.approx(template.shape.verts, abs=1e-6)
     bent = template.shape.verts * [1.0, 1.0, 1.0] + np.square(template.shape.verts[:, [1, 2, 0]]) * [0.1, 0.0, 0.0]
     off = np.linalg.norm(bent - template.shape.verts, axis=1).mean()
@@ -153,18 +110,6 @@ def test_a_field_is_fitted_without_a_network(template: Template) -> None:
     assert stiff["error_cm"] != free["error_cm"]
     moved = fitted("pointwise", "vol", template, bent, replace(how, steps=2))
     assert moved.shape == bent.shape
-
-
-def test_fits_of_runs_stand_as_the_body_does() -> None:
-    """Every panel is turned as the body is, whatever the file's frame: a fit that nearly lies is not drawn on its head."""
-    model = egg_model()
-    body = 3 * model.template.shape.verts @ np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]]) + 7  # upside down, elsewhere
-    drawn = fits({BASE: model}, ["egg"], body, "none", Measure(samples=300))
-    first, second = drawn.panels
-    assert first.shape.verts == pytest.approx(model.template.shape.verts, abs=1e-6)
-    assert np.array_equal(first.rotation, np.eye(3)) and np.array_equal(second.rotation, np.eye(3))
-    assert np.linalg.norm(second.shape.verts - first.shape.verts, axis=1).mean() < 0.5
-    assert drawn.rows[0]["error_cm"] > 0
 
 
 def test_refinement_is_measured_and_colored_by_the_distance_from_the_truth() -> None:

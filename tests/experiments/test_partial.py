@@ -86,8 +86,3 @@ def test_the_command_counts_what_is_left(
         assert 0.05 < found["share_over_15cm"] <= 0.25
         assert found["auc"] > 0.9
         assert found["taken_for_parts"] == 1.0
-
-
-def test_a_missing_set_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--sets", "tosca", "--data", str(tmp_path)]) == 1
-    assert "unknown set" in capsys.readouterr().err

@@ -11,7 +11,6 @@ from meshmatch.experiments import runner
 from meshmatch.experiments.runner import (
     Report,
     Seed,
-    as_markdown,
     command,
     commit,
     keep,
@@ -21,6 +20,7 @@ from meshmatch.experiments.runner import (
     recall,
     spread,
     table,
+    words_of,
 )
 
 ROWS = [{"set": "scape", "mean": 1.234, "share": 0.25}, {"set": "faust", "mean": float("nan")}]
@@ -72,9 +72,20 @@ def test_names_are_checked_and_items_are_spread() -> None:
     assert spread(items, 0) == [0]
 
 
-def test_a_table_as_markdown() -> None:
-    lines = as_markdown(table("T", ROWS, {"set": "set", "mean": "mean:.1f"})).splitlines()
-    assert lines == ["T", "", "| set | mean |", "|---|---|", "| scape | 1.2 |", "| faust |  |"]
+def test_a_table_as_words() -> None:
+    columns, rows = words_of(table("T", ROWS, {"set": "set", "mean": "mean:.1f"}))
+    assert (columns, rows) == (["set", "mean"], [["scape", "1.2"], ["faust", ""]])
+
+
+def test_a_saved_run_has_its_command_and_its_tables(tmp_path: Path) -> None:
+    path = tmp_path / "run.json"
+    assert main(["2", "--save", str(path), "--seed", "3"]) == 0
+    found = json.loads(path.read_text())
+    assert found["commands"] == ["python -m meshmatch.experiments.tests.experiments.test_runner 2 --seed 3"]
+    assert found["tables"][0]["rows"][0] == ["scape", "1.23", "25 %"]
+    assert found["values"]["array"] == [0, 1]
+    assert main(["2", f"--save={tmp_path / 'b.json'}", "--seed", "3"]) == 0
+    assert json.loads((tmp_path / "b.json").read_text())["commands"] == found["commands"]
 
 
 def test_plain_values() -> None:

@@ -27,21 +27,6 @@ def test_a_scan_wears_the_parts_of_the_template() -> None:
     assert worn <= known and len(worn) == len(known)
 
 
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([str(DANCER), "-o", str(tmp_path / "new")]) == 0
-    (row,) = json.loads(capsys.readouterr().out.splitlines()[-1])["scans"]
-    assert (row["scan"], row["verdict"]) == (DANCER.stem, "good")
-    assert (tmp_path / "new" / "scans-1.png").stat().st_size > 10_000
-    assert main([str(tmp_path / "none.ply")]) == 1
-    assert "none.ply" in capsys.readouterr().err
-
-
-def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "taken").write_text("a file")
-    assert main([str(DANCER), "-o", str(tmp_path / "taken")]) == 1
-    assert "cannot make the folder" in capsys.readouterr().err
-
-
 def test_simulated_scans_have_holes_and_a_truth(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("anny")
     assert main(["--simulated", "1"]) == 0
@@ -49,11 +34,6 @@ def test_simulated_scans_have_holes_and_a_truth(capsys: pytest.CaptureFixture[st
     assert row["verdict"] in ("good", "fair") and row["error_cm"] < 5
     (body, scan), (_, again) = (*simulated_scans(1), *simulated_scans(1))
     assert 0.6 * body.V < scan.V < 0.98 * body.V and np.array_equal(scan.verts, again.verts)
-
-
-def test_nothing_to_fit(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([]) == 1
-    assert "nothing to fit" in capsys.readouterr().err
 
 
 def test_a_camera_ring_sees_the_outside_alone(cube: Shape) -> None:

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from meshmatch.errors import InputError, OptionError, OutputError
+from meshmatch.errors import InputError
 from meshmatch.experiments.bench import scores as room
 from meshmatch.experiments.bench.scores import TruthDistances, area_under_curve, evaluate_set, summary
-from meshmatch.experiments.bench.sets import SET_NAMES, BenchSet, load_folder, load_set
+from meshmatch.experiments.bench.sets import SET_NAMES, load_set
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors, map_errors
 from meshmatch.maps.geodesics import GeodesicDistances
-from meshmatch.shapes.files import save_shape
 from tests.experiments.small_bench import BODY, build, truth
 
 
@@ -37,21 +36,6 @@ def test_pairs_and_groups(small: Path) -> None:
         ("tr_reg_001", "tr_reg_000"),
     ]
     assert {scape.group(pair) for pair in scape.pairs} == {""}
-
-
-def test_sets_that_are_not_there(small: Path, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="unknown set 'tosca'"):
-        load_set("tosca", small)
-    with pytest.raises(InputError, match="no shapes"):
-        load_set("scape", tmp_path)
-    broken = build(tmp_path)
-    (broken / "shrec19" / "pairs.txt").write_text("1 2\n7 1\n")
-    with pytest.raises(InputError, match="lacks 7"):
-        load_set("shrec19", broken)
-    (broken / "shrec19" / "pairs.txt").write_text("1 2\n")
-    np.save(broken / "shrec19" / "1.landmarks.npy", np.array([BODY.V]))
-    with pytest.raises(InputError, match="do not name its vertices"):
-        load_set("shrec19", broken).landmarks("1")
 
 
 @pytest.mark.parametrize("name", SET_NAMES)
@@ -154,21 +138,6 @@ def test_distances_are_computed_once(small: Path, tmp_path: Path, monkeypatch: p
     assert len(paths) == 3
 
 
-def test_a_folder_that_cannot_be_made(small: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    bench = load_set("scape", small)
-    with pytest.raises(OutputError, match="cannot keep distances") as caught:
-        TruthDistances(bench.shape("mesh000"), np.arange(3), tmp_path / "file" / "folder").prepare()
-    assert "--cache" in caught.value.hint
-
-
-def test_the_default_folder_can_be_moved(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv(room.CACHE_VARIABLE, str(tmp_path))
-    assert room.default_folder() == tmp_path
-    monkeypatch.delenv(room.CACHE_VARIABLE)
-    assert room.default_folder().name == "geodesics"
-
-
 def test_the_area_under_the_curve() -> None:
     assert area_under_curve([1, 2, 3, 4], [False, False, True, True]) == 1.0
     assert area_under_curve([4, 3, 2, 1], [False, False, True, True]) == 0.0
@@ -186,14 +155,6 @@ def test_a_summary_by_hand() -> None:
     assert (found["median_cm"], found["median_pair_cm"]) == pytest.approx((15, 15))
     assert found["share_over_15cm"] == pytest.approx(0.5)
     assert found["flips"] == pytest.approx(1 / 3)
-
-
-def test_a_missing_folder_or_truth_is_told(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no shapes in"):
-        load_folder(tmp_path, ".truth.npy")
-    save_shape(tmp_path / "a.ply", BODY)
-    with pytest.raises(InputError, match=r"has no \.truth\.npy"):
-        load_folder(tmp_path, ".truth.npy")
 
 
 def test_the_real_sets_have_the_protocols_pairs(bench: Path) -> None:
@@ -227,27 +188,6 @@ def test_truth_of_the_real_sets_is_a_map_of_the_surface(bench: Path) -> None:
         nearest = cKDTree(other.verts).query(placed[:, 0])[1]
         outward = np.einsum("ni,ni->n", normals, other.vertex_normals[nearest])
         assert (outward[outward != 0] > 0).mean() > 0.85
-
-
-class EveryTenthLandmark(BenchSet):
-    """Enough for a test: the distances of all 5,000 take seconds to compute."""
-
-    def landmarks(self, shape: str) -> np.ndarray:
-        return super().landmarks(shape)[::10]
-
-
-def test_a_real_pair(bench: Path, tmp_path: Path) -> None:
-    found = EveryTenthLandmark(**vars(load_set("faust", bench)))
-    pair = ("tr_reg_000", "tr_reg_011")
-    source, target = (found.landmarks(name) for name in pair)
-    right = np.zeros(found.shape(pair[0]).V, dtype=np.int64)
-    right[source] = target
-    random = np.random.default_rng(0).integers(0, found.shape(pair[1]).V, len(right))
-    good = evaluate_set(found, {pair: right}, cache=tmp_path, pairs=[pair])
-    bad = evaluate_set(found, {pair: random}, cache=tmp_path, pairs=[pair])
-    assert good.joined.mean_cm < 1.0  # not 0: several landmarks share a vertex of the source
-    assert good.joined.median == 0
-    assert 70 < bad.joined.mean_cm < 110
 
 
 def test_the_noisy_cloud_set_is_scape_without_faces_and_with_noise(tmp_path: Path) -> None:

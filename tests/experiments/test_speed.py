@@ -12,8 +12,7 @@ import pytest
 
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments.bench import speed
-from meshmatch.experiments.bench.speed import Case, cost_of, keep_to_cores, main, measure, shape_file, sized, split
-from meshmatch.shapes.files import load_shape
+from meshmatch.experiments.bench.speed import Case, cost_of, keep_to_cores, main, measure, sized, split
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 
@@ -33,7 +32,7 @@ def python(code: str) -> list[str]:
 
 def test_an_earlier_run_stands_beside_this_one(tmp_path: Path) -> None:
     path = tmp_path / "before.json"
-    path.write_text('a table\n{"cases": [{"case": "help", "wall": 2, "cpu": 0.5, "gigabytes": 0}]}\n')
+    path.write_text('{"values": {"cases": [{"case": "help", "wall": 2, "cpu": 0.5, "gigabytes": 0}]}}')
     row = speed.compared({"case": "help", "wall": 1.0, "cpu": 1.0, "gigabytes": 1.0}, speed.earlier(path)["help"])
     assert (row["wall_before"], row["wall_ratio"], row["cpu_ratio"]) == (2.0, 0.5, 2.0)
     assert "gigabytes_ratio" not in row
@@ -68,19 +67,6 @@ def test_shapes_come_in_the_size_that_is_asked(sphere: Shape) -> None:
     assert 300 <= sized(sphere, 320).V <= 340
     assert 1900 <= sized(sphere, 2000).V <= 2200
     assert not repair(sized(sphere, 2000)).notes
-
-
-def test_the_file_of_a_sample_is_made_once(tmp_path: Path) -> None:
-    path = shape_file("climber@900", tmp_path)
-    assert 850 <= load_shape(path).V <= 990
-    before = path.stat().st_mtime_ns
-    assert shape_file("climber@900", tmp_path) == path
-    assert path.stat().st_mtime_ns == before
-
-
-def test_a_sample_that_is_not_there(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(MeshmatchError, match="could not make nobody@900"):
-        shape_file("nobody@900", tmp_path)
 
 
 def test_samples_are_changed_as_a_case_asks(sphere: Shape) -> None:
@@ -142,30 +128,7 @@ def test_processes_are_kept_on_few_cores() -> None:
     cost_of(seen)
 
 
-def test_the_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    met = Case(("--help",), 1e6, 1e3)
-    missed = Case(("info", "climber@300"), 1e-6)
-    monkeypatch.setattr(speed, "CASES", {"easy": met, "hard": missed})
-    assert main(["--cases", "easy,hard", "--runs", "1", "--cores", "1"]) == 0
-    lines = capsys.readouterr().out.strip().splitlines()
-    record = json.loads(lines[-1])
-    assert {"date", "commit", "machine", "threads"} <= set(record)
-    easy, hard = record["cases"]
-    assert (easy["met"], hard["met"]) == (True, False)
-    assert (easy["bar_gigabytes"], hard["bar_gigabytes"]) == (1e3, None)
-    assert len(easy["runs"]) == 1
-    assert easy["runs"][0][0] == easy["wall"] > 0
-    table = "\n".join(lines[:-1])
-    assert all(word in table for word in ("easy", "hard", "True", "False"))
-
-
 def test_a_case_that_breaks_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(speed, "CASES", {"broken": Case(("dance",), 1.0)})
     assert main(["--cases", "broken", "--runs", "1"]) == 1
     assert "ended with 2" in " ".join(capsys.readouterr().err.split())
-
-
-def test_every_bar_of_the_house_is_a_case() -> None:
-    for name, case in speed.CASES.items():
-        assert case.seconds > 0, name
-        assert all(word.split("@")[0] in ("climber", "dancer") for word in case.words if "@" in word[1:])

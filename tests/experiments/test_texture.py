@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from meshmatch.experiments.bench import texture
-from meshmatch.experiments.bench.speed import Cost
 from meshmatch.experiments.bench.texture import colors_at, loss, main, nearest_map
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.shape import Shape
@@ -38,7 +37,7 @@ def test_colors_at_points_of_a_square() -> None:
 
 def test_a_body_to_itself(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(texture, "POINTS", 2000)
-    words = ["--cases", "itself,spot", "--size", "512", "--samples", "1", "--threads", "1", "--no-clock"]
+    words = ["--cases", "itself,spot", "--size", "512", "--samples", "1", "--threads", "1"]
     assert main([*words, "--data", str(tmp_path), "--keep", str(tmp_path / "kept")]) == 0
     heard = capsys.readouterr().out
     record = json.loads(heard.strip().splitlines()[-1])
@@ -50,27 +49,8 @@ def test_a_body_to_itself(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsy
     assert sorted(file.name for file in (tmp_path / "kept").iterdir()) == ["itself-back.glb", "itself-there.glb"]
 
 
-def test_the_clock_reads_a_whole_command(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    asked: list[list[str]] = []
-
-    def cost(command: list[str]) -> Cost:
-        asked.append(command)
-        return Cost(float(len(asked)), 2.0, 3.0)
-
-    monkeypatch.setattr(texture, "cost_of", cost)
-    monkeypatch.setattr(texture, "VERTICES", 100)
-    assert main(["--cases", "none", "--data", str(tmp_path)]) == 0
-    heard = capsys.readouterr().out
-    found = json.loads(heard.strip().splitlines()[-1])["clock"]
-    assert (found["seconds"], found["gigabytes"], found["met"]) == (3.0, 3.0, False)
-    assert "NOT met" in heard
-    assert len(asked) == 4 and "transfer-texture" in asked[0] and "2048" in asked[0]
-
-
 def test_a_size_that_cannot_be_is_told(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--cases", "itself", "--size", "1", "--no-clock"]) == 1
+    assert main(["--cases", "itself", "--size", "1"]) == 1
     assert "16 to 8192" in capsys.readouterr().err
 
 

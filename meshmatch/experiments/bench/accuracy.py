@@ -3,7 +3,7 @@
 A pair that cannot be matched is not left out: it counts as the map that sends every vertex to vertex 0. --limit-pairs
 measures a stated part and says so.
 
---output FOLDER keeps fits and maps: the same command goes on where it was stopped, and `--maps FOLDER/maps` measures anew.
+--output FOLDER keeps fits and maps: the same command goes on where it was stopped.
 
 --oriented-by MODEL asks what --model is worth where the orientation is no question: every shape is first turned into the
 frame of that model's unrefined fit, and up and front are told. Maps are between the same vertices, and measured as ever.
@@ -14,7 +14,7 @@ from __future__ import annotations
 import multiprocessing
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,7 +27,7 @@ from typer import Option
 
 from meshmatch.api.inputs import as_model
 from meshmatch.arrays import Int, Ints
-from meshmatch.errors import MeshmatchError, OptionError
+from meshmatch.errors import MeshmatchError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.methods import Method, OurMethod
 from meshmatch.experiments.bench.scores import SetScores, evaluate_set
@@ -188,12 +188,6 @@ def _map_path(folder: Path, bench: BenchSet, pair: Pair) -> Path:
     return folder / bench.name / f"{pair[0]}-{pair[1]}.npy"
 
 
-def load_maps(folder: Path, bench: BenchSet, pairs: Iterable[Pair]) -> dict[Pair, Ints]:
-    """Maps that were made elsewhere, checked against their shapes."""
-    shapes = {name: bench.shape(name) for name in sorted({name for pair in pairs for name in pair})}
-    return {pair: load_map(_map_path(folder, bench, pair), shapes[pair[0]], shapes[pair[1]]).index for pair in pairs}
-
-
 def scores_table(sets: Sequence[SetScores], oriented_by: str = "") -> Table:
     """A row for each set, and one for each kind of pair in it; the title names the model that found the orientation."""
     rows = []
@@ -225,29 +219,21 @@ def main(
     jobs: runner.Jobs = 1,
     threads: runner.Threads = 1,
     cache: runner.Cache = None,
-    maps: Annotated[Path | None, Option(help="measure DIR/set/source-target.npy instead")] = None,
     output: Annotated[Path | None, Option(help="keep fits and maps in this folder, and go on with those there")] = None,
     curve: Annotated[Path | None, Option(help="draw the cumulative curves into this file")] = None,
 ) -> runner.Report:
     benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
-    if oriented_by and maps is not None:
-        raise OptionError("maps that are given cannot be oriented anew", "leave out --oriented-by or --maps")
-    if maps is None:
-        weights = as_model(model).card.weights_sha256  # a wrong name would cost every pair
-        told = as_model(oriented_by).card.weights_sha256 if oriented_by else ""
-        if output is not None:
-            asked = {"weights": weights, "oriented_by": told, "refine": refine, "seed": seed, "threads": threads}
-            runner.once(output / "asked.json", asked, lambda: runner.circumstances(threads, jobs))
+    weights = as_model(model).card.weights_sha256  # a wrong name would cost every pair
+    told = as_model(oriented_by).card.weights_sha256 if oriented_by else ""
+    if output is not None:
+        asked = {"weights": weights, "oriented_by": told, "refine": refine, "seed": seed, "threads": threads}
+        runner.once(output / "asked.json", asked, lambda: runner.circumstances(threads, jobs))
     fits, made = (None, None) if output is None else (output / "fits", output / "maps")
     method = OurMethod(model, refine, seed, threads=threads, oriented_by=oriented_by, kept=fits)
     runs: list[SetRun] = []
     for bench in benches:
         pairs = runner.spread(bench.pairs, limit_pairs)
-        if maps is not None:
-            given = evaluate_set(bench, load_maps(maps, bench, pairs), pairs=pairs, cache=cache)
-            runs.append(SetRun(given, {}, {}, {}, {}))
-        else:
-            runs.append(run_set(bench, method, pairs, cache=cache, jobs=jobs, threads=threads, kept=made))
+        runs.append(run_set(bench, method, pairs, cache=cache, jobs=jobs, threads=threads, kept=made))
     scores = [each.scores for each in runs]
     if curve is not None:
         draw_curves({each.bench.name: each.joined for each in scores}, curve)

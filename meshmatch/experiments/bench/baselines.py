@@ -15,7 +15,7 @@ model is not given, is skipped, and the output says so.
 The first four have a second row each, with both shapes in the frames of our unrefined fits: what they do where the
 orientation is no question.
 
-The learned ones are trained by `experiments.learned_baselines`; zoomout, nricp and meshmonk need
+The learned ones are trained by `experiments.paper.learned_baselines`; zoomout, nricp and meshmonk need
 pip install 'meshmatch[bench]'. Each result, a method on a set, is one JSON file in the output folder; a second run
 measures only what is not there. --minutes starts nothing new after that time. The table says how many pairs were
 measured, and how long learned methods were trained.
@@ -25,7 +25,10 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,11 +36,11 @@ from typer import Option
 
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.accuracy import INCOMPLETE, run_set
-from meshmatch.experiments.bench.baseline_methods import METHODS, Baseline, Choices
-from meshmatch.experiments.bench.charts import Bar, draw_bars
+from meshmatch.experiments.bench.methods import Coded, Method, OurMethod, Registration, ZoomOut
 from meshmatch.experiments.bench.sets import ALL_SETS, SET_NAMES, BenchSet, load_set
 from meshmatch.maps.evaluate import LOST_CM, SKIN_M2
 from meshmatch.maps.geodesics import GEODESIC
+from meshmatch.models.registry import find_model
 from meshmatch.outputs import make_folder
 
 COLUMNS = {
@@ -45,6 +48,93 @@ COLUMNS = {
     **{"median": "median_cm:.2f", f"over {LOST_CM:g}": "share_over_15cm:.1%", "flips": "flips:.0%"},
     **{"fit s": "fit_seconds_mean:.2f", "pair s": "map_seconds_mean:.2f", "trained, min": "minutes:g"},
 }
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """One row of the comparison."""
+
+    name: str  # of its files
+    label: str  # for people
+    method: Method | None  # None where it cannot run
+    missing: str = ""  # why it cannot run
+    minutes: float | None = None  # how long it was trained; None for a method that learns nothing
+    model: str = ""  # tells its weights from others
+
+
+@dataclass(frozen=True)
+class Choices:
+    """The words of the command that methods ask for."""
+
+    model: str = "human"
+    coded: str | None = None
+    coded_steps: int = 2000
+    transmatch: Path | None = None
+    seed: int = 0
+    threads: int = 1
+
+
+def _plain(
+    choices: Choices, name: str, label: str, method: Registration | ZoomOut, package: str = ""
+) -> list[Baseline]:
+    """The rows of a method that learns nothing: by itself, and from our orientation; it cannot run without its package."""
+    method = replace(method, seed=choices.seed)
+    digest = find_model(choices.model)[1].weights_sha256
+    rows = [Baseline(name, label, method)]
+    oriented = replace(method, oriented_by=choices.model)
+    rows.append(Baseline(f"{name}-oriented", f"{label}, our orientation", oriented, model=digest))
+    if not package or find_spec(package) is not None:
+        return rows
+    missing = f"{package} is not installed: pip install 'meshmatch[bench]'"
+    return [replace(row, method=None, missing=missing) for row in rows]
+
+
+def _coded(choices: Choices) -> list[Baseline]:
+    if choices.coded is None:
+        return [Baseline("coded", "3D-CODED", None, _NOT_GIVEN.format("coded"))]
+    card, method = find_model(choices.coded)[1], Coded(choices.coded, choices.coded_steps, choices.seed)
+    oriented = replace(method, oriented_by=choices.model)
+    told = f"{card.weights_sha256} {find_model(choices.model)[1].weights_sha256}"
+    minutes = card.training_minutes
+    return [
+        Baseline("coded", "3D-CODED", method, "", minutes, card.weights_sha256),
+        Baseline("coded-oriented", "3D-CODED, our orientation", oriented, "", minutes, told),
+    ]
+
+
+def _transmatch(choices: Choices) -> list[Baseline]:
+    if choices.transmatch is None:
+        return [Baseline("transmatch", "TransMatch", None, _NOT_GIVEN.format("transmatch"))]
+    from meshmatch.experiments.paper.learned_baselines import TransMatch, load_transmatch
+
+    words = load_transmatch(choices.transmatch).words
+    method, minutes = TransMatch(str(choices.transmatch), seed=choices.seed), float(words.get("minutes", 0.0))
+    return [Baseline("transmatch", "TransMatch", method, "", minutes, f"{words.get('date')} step {words.get('steps')}")]
+
+
+def _ours(choices: Choices) -> list[Baseline]:
+    card = find_model(choices.model)[1]
+    nodes = OurMethod(choices.model, "nodes", choices.seed, threads=choices.threads)
+    none = replace(nodes, refine="none")
+    rows = ("ours-none", "ours, unrefined", none), ("ours", "ours, refined", nodes)
+    return [Baseline(*row, "", card.training_minutes, card.weights_sha256) for row in rows]
+
+
+_NOT_GIVEN = "give --{0} MODEL, made by python -m meshmatch.experiments.paper.learned_baselines {0}"
+METHODS: dict[str, Callable[[Choices], list[Baseline]]] = {
+    "rigid": partial(_plain, name="rigid", label="rigid, nearest", method=Registration("rigid")),
+    "zoomout": partial(_plain, name="zoomout", label="ZoomOut (pyfmaps)", method=ZoomOut(), package="pyFM"),
+    "nricp": partial(
+        _plain, name="nricp", label="nricp (trimesh)", method=Registration("nricp", 5000), package="trimesh"
+    ),
+    "meshmonk": partial(
+        _plain, name="meshmonk", label="meshmonk", method=Registration("meshmonk", 20_000), package="meshmonk"
+    ),
+    "coded": _coded,
+    "transmatch": _transmatch,
+    "ours": _ours,
+}
+"""The rows of each method that can be asked for. `ModelError` or `TemplateError` for a model that cannot be read."""
 
 
 def measured(
@@ -80,25 +170,6 @@ def measured(
     return runner.keep(path, asked, found)
 
 
-def draw_results(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Mean errors as bars, with medians as ticks, a group for each set; where pairs failed a bar may run off the axis.
-
-    Beside each method stands how long it was trained, on one core, or that it learned nothing of the category.
-    """
-    groups: dict[str, list[Bar]] = {}
-    for row in rows:
-        words = f"{row['mean_cm']:.1f} cm"
-        words += f", {row['failures']} failed" if row["failures"] else ""
-        trained = row.get("minutes")
-        known = "knows no category" if trained is None else f"trained {trained:.0f} min"
-        bar = Bar(f"{row['label']}; {known}", row["mean_cm"], words, row["name"].startswith("ours"), row["median_cm"])
-        groups.setdefault(f"{row['set']}: {row['measured']} pairs", []).append(bar)
-    whole = [row for row in rows if not row["failures"]]
-    longest = max((max(row["mean_cm"], row["median_cm"]) for row in whole), default=0.0)
-    axis = "mean geodesic error, cm; tick: median"
-    draw_bars(groups, path, axis, 1.1 * longest or None)
-
-
 @runner.command
 def main(
     data: runner.Data = runner.DATA,
@@ -107,11 +178,10 @@ def main(
     limit_pairs: runner.LimitPairs = None,
     minutes: Annotated[float, Option(help="start nothing new after so long")] = 1e6,
     output: Annotated[Path, Option(help="folder of the results")] = Path("out/baselines"),
-    picture: Annotated[Path | None, Option(help="the chart, by default baselines.png there")] = None,
     model: runner.Model = "human",
-    coded: Annotated[str | None, Option(help="a model folder of experiments.learned_baselines")] = None,
+    coded: Annotated[str | None, Option(help="a model folder of experiments.paper.learned_baselines")] = None,
     coded_steps: Annotated[int, Option(min=1, help="of its search over codes")] = 2000,
-    transmatch: Annotated[Path | None, Option(help="a folder of experiments.learned_baselines")] = None,
+    transmatch: Annotated[Path | None, Option(help="a folder of experiments.paper.learned_baselines")] = None,
     seed: runner.Seed = 0,
     jobs: runner.Jobs = 1,
     threads: runner.Threads = 1,
@@ -138,10 +208,6 @@ def main(
             share = {"measured": f"{scores['pairs']} of {found['of']}", "failures": len(scores["failed"])}
             rows.append({**names, **share, **{key: found[key] for key in found if key != "scores"}, **scores})
     notes = [f"skipped: {where}: {why}" for where, why in skipped.items()]
-    if rows:
-        chart = picture or output / "baselines.png"
-        draw_results(rows, chart)
-        notes.append(f"wrote {chart}")
     if not all(row["complete"] for row in rows):
         notes.append(INCOMPLETE)
     drawn = runner.table(f"Geodesic error, cm at {SKIN_M2} m2 of skin ({GEODESIC})", rows, COLUMNS)

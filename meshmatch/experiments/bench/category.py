@@ -7,7 +7,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
 from typing import Annotated, Any
@@ -44,29 +44,18 @@ RIGID = "rigid alignment, nearest vertex"
 
 Minutes = Annotated[float, Option(min=0.001, help="of training at most")]
 Steps = Annotated[int, Option(min=1, help="of training")]
-Nodes = Annotated[int, Option(min=1, help="of the template")]
-Radius = Annotated[float, Option(help="of a node, in units of sqrt(area)")]
 Work = Annotated[Path | None, Option(help="keep what was prepared and trained here, and go on from it")]
 
 
 @dataclass(frozen=True)
 class Training:
-    """How an experiment learns: minutes and steps at most, nodes of the template and their radius (units of sqrt(area)),
-    and the folder in which the prepared shapes and the model are kept. ``pointwise``: as 3D-CODED learns, a network at
-    every point without constraints."""
+    """How an experiment learns: minutes and steps at most, and the folder where prepared shapes and model are kept."""
 
     work: Path
     minutes: float
     steps: int
     threads: int
     seed: int
-    nodes: int
-    radius: float
-    pointwise: bool = False
-
-    def inside(self, name: str) -> Training:
-        """The same in a folder of this one's."""
-        return replace(self, work=self.work / name)
 
 
 @contextmanager
@@ -77,28 +66,16 @@ def training_in(work: Path | None, **how: Any) -> Iterator[Training]:
 
 
 def trained(
-    folder: Path,
-    training: Training,
-    nodes: NodeConfig,
-    *,
-    how: Align,
-    scale: Scale,
-    template: str | None = None,
-    landmarks: Path | None = None,
-    stiffness: float = 1.0,
+    folder: Path, training: Training, nodes: NodeConfig, *, how: Align, scale: Scale, stiffness: float = 1.0
 ) -> tuple[Path, dict[str, Any]]:
     """Prepare a folder and learn from it as `meshmatch train` does; the model's folder, and how that went."""
     began = time.monotonic()
     work, name = training.work, folder.name
     tell(f"preparing {name}")
-    chosen = PrepareConfig(nodes, template=template, align=how, scale=scale, landmarks=landmarks)
+    chosen = PrepareConfig(nodes, align=how, scale=scale)
     made = prepare(folder, work / "prepared", chosen)
     prepared = time.monotonic() - began
     plain = small_data() if frame_of(work / "prepared") else clouds()
-    if training.pointwise:
-        loss = replace(plain.train.loss, volume=0.0, arap=0.0, blend=0.0)
-        network = replace(plain.network, field="pointwise", corrections=0)
-        plain = replace(plain, network=network, train=replace(plain.train, loss=loss))
     asked = {key: getattr(training, key) for key in ("steps", "minutes", "threads", "seed")}
     model = train(
         work / "model",
@@ -110,7 +87,7 @@ def trained(
     card = json.loads((model / "card.json").read_text(encoding="utf-8"))
     notes = (note.removeprefix("template: ") for note in made.notes if note.startswith("template: "))
     return model, {
-        "template": template or next(notes).split(",")[0],
+        "template": next(notes).split(",")[0],
         "prepare_seconds": round(prepared, 1),
         **{key: card[key] for key in ("training_minutes", "steps")},
         "distance": card["metrics"]["validation"]["distance"],
@@ -158,11 +135,11 @@ def compared(
     return rows, maps
 
 
-def network_and_nodes(seed: int, before: str = "") -> dict[str, FitConfig]:
+def network_and_nodes(seed: int) -> dict[str, FitConfig]:
     """The two ways that all experiments compare: the network alone, and nodes refined."""
     return {
-        f"{before}network alone": FitConfig(seed=seed, refine="none", partial="no"),
-        f"{before}nodes refined": FitConfig(seed=seed, partial="no"),
+        "network alone": FitConfig(seed=seed, refine="none", partial="no"),
+        "nodes refined": FitConfig(seed=seed, partial="no"),
     }
 
 

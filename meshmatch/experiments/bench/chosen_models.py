@@ -1,11 +1,11 @@
 """Of what kind `--model auto` takes every shape of the benchmark, and things that are of none.
 
 Bodies, animals, hands and heads have a model ("spot" is the textured cow, of stylised proportions); hearts, furniture and
-plain solids have none and must be refused. Hands and heads are generated (meshmatch/experiments/cut_scans.py), and so are
-characters (character_designs.py), but for the evaluation data's two, and the chairs, tables and planes of "furniture".
-Clouds with noise, and sparse ones with outliers, are bodies too; where a cloud cannot be told alone it takes the kind of
-the shape that it is matched with ("unsure" here), which is all that can be said of "clouds" of hearts, chairs, tables and
-planes, every other one with a tenth of strays.
+plain solids have none and must be refused. Hands and heads are generated (meshmatch/experiments/makers/cut_scans.py),
+and so are characters (character_designs.py), but for the evaluation data's two, and the chairs, tables and planes of
+"furniture". Clouds with noise, and sparse ones with outliers, are bodies too; where a cloud cannot be told alone it
+takes the kind of the shape that it is matched with ("unsure" here), which is all that can be said of "clouds" of
+hearts, chairs, tables and planes, every other one with a tenth of strays.
 *Reading* is the mean distance of the shape and a model's unrefined template (units of sqrt(area)).
 """
 

@@ -2,7 +2,7 @@
 
 The fits are made by one process and by two, each from nothing, and must be the same bit for bit; the ratio of their times
 is what two processes gain. Errors count all pairs, as in `meshmatch.experiments.bench`, where the same maps made pair by
-pair are. Hearts are fitted without a model (`--model none`); their error is that of `meshmatch.experiments.hearts`.
+pair are. Hearts are fitted without a model (`--model none`); their error is that of `meshmatch.experiments.bench.hearts`.
 Bodies are generated ones, enough of them that the start of the processes does not tell; of their maps those from the first
 body are measured, in straight distances.
 """

@@ -6,10 +6,10 @@ landmark counts. The error is the distance along the target between the matched 
 times 100; "off" is the share of points beyond 10. Beside it how far the verdicts tell the truth: the worse one of the two
 fits, and the error of the pair.
 
-Hands and heads are generated (meshmatch/experiments/cut_scans.py): of people and in poses that no training drew, with other
-triangles, cut at random, turned anywhere, every other one with a thing beside it, and hands of both sides; a table says
-how many sides were found, and how many pairs of one wrong side were called good. Their errors are in percent of the length
-of the hand (wrist to fingertips) or the head (chin to crown).
+Hands and heads are generated (meshmatch/experiments/makers/cut_scans.py): of people and in poses that no training
+drew, with other triangles, cut at random, turned anywhere, every other one with a thing beside it, and hands of both
+sides; a table says how many sides were found, and how many pairs of one wrong side were called good. Their errors are
+in percent of the length of the hand (wrist to fingertips) or the head (chin to crown).
 """
 
 from __future__ import annotations
@@ -137,20 +137,12 @@ def measured_animals(
     whole = rows_of(errors, lambda _: "all")[0]
     kinds = rows_of(errors, lambda pair: f"{species_of(pair[0])} to {species_of(pair[1])}")
     judged = rows_of(errors, worse.__getitem__)
-    each = [
-        row
-        for name in shapes
-        for row in rows_of({pair: values for pair, values in errors.items() if name in pair}, lambda _, name=name: name)
-    ]
-    for row in each:  # all pairs of one animal, in both directions
-        row["verdict"] = verdicts[row["of"]]
     title = "error x 100 / sqrt(area)"
     tables = [
         runner.table(f"Animals with {matcher.model.card.name}: {title}", [*kinds, whole], {"of": "of", **_COLUMNS}),
         runner.table(f"By the worse verdict: {title}", judged, {"verdict": "of", **_COLUMNS}),
-        runner.table(f"By animal: {title}", each, {"animal": "of", "verdict": "verdict", **_COLUMNS}),
     ]
-    record: dict[str, Any] = {"all": whole, "kinds": kinds, "judged": judged, "animals": each}
+    record: dict[str, Any] = {"all": whole, "kinds": kinds, "judged": judged, "verdicts": verdicts}
     record |= {"fit_seconds": round(fitted / len(fits), 2), "map_seconds": round(mapped / len(maps), 2)}
     return record, tables
 

@@ -13,10 +13,9 @@ from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from itertools import permutations
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from typer import Option
 
 from meshmatch.api.inputs import as_model
 from meshmatch.errors import InputError
@@ -91,14 +90,13 @@ def measure(
 @runner.command
 def main(
     data: runner.Data = runner.DATA,
-    limit: Annotated[int | None, Option(min=2, help="the first N clouds only")] = None,
     limit_pairs: runner.LimitPairs = None,
     model: runner.Model = "human",
     seed: runner.Seed = 0,
     work: runner.Work = None,
 ) -> runner.Report:
     asked = {"weights": as_model(model).card.weights_sha256, "seed": seed}
-    record = measure(load_clouds(data)[:limit], OurMethod(model, seed=seed), limit_pairs, work, asked)
+    record = measure(load_clouds(data), OurMethod(model, seed=seed), limit_pairs, work, asked)
     words = ", ".join(f"{count} {verdict}" for verdict, count in record["verdicts"].items())
     title = "Clouds with outliers, straight distance in cm, outliers counted"
     return runner.Report(record, [runner.table(title, [record | {"words": words}], COLUMNS)])

@@ -2,8 +2,8 @@
 
 Fits the model's template to every file, prints how well it fits, and with -o draws each scan beside the fitted template,
 both in the colors of the template's parts: a lost or swapped limb shows at once. Of files there is no truth. --simulated
-makes scans of generated bodies instead (`meshmatch.experiments.simulated_scans`): these may be shown, and the error of the
-fitted template is known.
+makes scans of generated bodies instead (`meshmatch.experiments.makers.simulated_scans`): these may be shown, and the
+error of the fitted template is known.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The sets of the benchmark: which shapes, which pairs, and what is true.
 
-docs/datasets.md says where they come from and how to lay them out; `meshmatch.experiments.datasets` checks a folder. In
-short, *landmark k is the same body point on every shape of a set*, and a set differs from another in how a landmark names
-its vertex:
+docs/datasets.md says where they come from and how to lay them out; `meshmatch.experiments.bench.datasets` checks a
+folder. In short, *landmark k is the same body point on every shape of a set*, and a set differs from another in how a
+landmark names its vertex:
 
 - ``shrec19``: ``N.landmarks.npy`` (6890,) vertex ids; the pairs of ``pairs.txt``.
 - ``scape``: vertex i is landmark i on every shape (the triangulations differ); all ordered pairs.

@@ -6,7 +6,7 @@ seconds of CPU (both cores together), and the largest memory that a run ever hel
 processes are kept on two where the system allows that. The shapes are the two samples, split and decimated to the sizes
 that the cases ask for.
 
-``--against`` puts an earlier run beside this one: a file that ends with its JSON line, such as docs/results/speed.json.
+``--against`` puts an earlier run beside this one: the file that it wrote with --save, such as docs/results/speed.json.
 """
 
 from __future__ import annotations
@@ -199,12 +199,10 @@ RATIOS = {"s, ratio": "wall_ratio:.2f", "CPU, ratio": "cpu_ratio:.2f", "GB, rati
 def earlier(path: Path) -> dict[str, dict[str, Any]]:
     """The rows of an earlier run by the name of their case; `InputError` if the file does not hold one."""
     try:
-        rows = json.loads(path.read_text(encoding="utf-8").strip().splitlines()[-1])["cases"]
+        rows = json.loads(path.read_text(encoding="utf-8"))["values"]["cases"]
         return {row["case"]: {name: float(row[name]) for name in ("wall", "cpu", "gigabytes")} for row in rows}
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise InputError(
-            f"{path} holds no run of this experiment", "give a file that ends with its JSON line"
-        ) from error
+        raise InputError(f"{path} holds no run of this experiment", "give a file that --save wrote") from error
 
 
 def compared(row: dict[str, Any], before: dict[str, float]) -> dict[str, Any]:
@@ -221,7 +219,7 @@ def main(
     cases: Annotated[str, Option(help=f"of {', '.join(CASES)}")] = ",".join(CASES),
     runs: Annotated[int, Option(min=1, help="counted runs of each case")] = 5,
     cores: Annotated[int, Option(min=1, help="cores that all processes share")] = 2,
-    against: Annotated[Path | None, Option(help="JSON line of an earlier run, to be compared with")] = None,
+    against: Annotated[Path | None, Option(help="a file of results of an earlier run")] = None,
 ) -> runner.Report:
     before = {} if against is None else earlier(against)
     kept = keep_to_cores(cores)

@@ -10,15 +10,11 @@ bytes (0..255), the mean over points and channels, and PSNR.
   by `match`; so this one counts what the map does too.
 - Rogue, Rogue_Hooded, spot: characters and a cow of the evaluation data, to themselves with half of their triangles,
   where the data are. Maps by the nearest point.
-
-The clock: one whole command, a map at hand, a texture of 2048 x 2048 onto 10,000 vertices without texture coordinates of
-their own; the process from its start to its end, with unwrapping, baking and writing.
 """
 
 from __future__ import annotations
 
 import sys
-import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -30,16 +26,15 @@ from meshmatch.api.inputs import as_model
 from meshmatch.api.matching import match, register
 from meshmatch.arrays import Float, Floats
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.speed import cost_of, keep_to_cores, sized
+from meshmatch.experiments.bench.speed import sized
 from meshmatch.fitting.fit import dense_shape
-from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.colors import to_srgb
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.faces import seams
-from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
@@ -54,7 +49,6 @@ from meshmatch.transfer.unwrap import atlas_of
 
 POINTS = 200_000
 VERTICES = 10_000
-BAR_SECONDS, BAR_GIGABYTES = 10.0, 2.0
 CHARACTERS = {"Rogue": "Rogue.glb", "Rogue_Hooded": "Rogue_Hooded.glb", "spot": "spot_triangulated.obj"}
 _PICTURES = {"spot": "spot_texture.png"}
 CASES = ("itself", "remeshed", "re-posed", *CHARACTERS)
@@ -149,28 +143,6 @@ def measure(name: str, trip: Trip, choices: BakeOptions, keep: Path | None) -> d
     return record | {f"back_{key}": value for key, value in loss(before, after).items()}
 
 
-def clock(folder: Path, threads: int) -> dict[str, Any]:
-    """Seconds and gigabytes of the whole command, the median of three after one that does not count."""
-    source = bundled_folder() / "samples" / "dancer-textured.glb"
-    a = load_shape(source)
-    b = sized(repair(a).shape, VERTICES)
-    save_shape(folder / "b.ply", b)
-    b = load_shape(folder / "b.ply")
-    save_map(folder / "ab.npz", nearest_map(a, b))
-    words = [sys.executable, "-m", "meshmatch", "transfer-texture", str(source), str(folder / "b.ply")]
-    words += ["--map", str(folder / "ab.npz"), "-o", str(folder / "out.glb"), "--size", "2048", "-q"]
-    costs = [cost_of([*words, "--threads", str(threads)]) for _ in range(4)][1:]
-    wall, cpu, gigabytes = (
-        float(np.median([getattr(cost, part) for cost in costs])) for part in ("wall", "cpu", "gigabytes")
-    )
-    return {
-        **{"vertices": b.V, "size": 2048, "threads": threads, "seconds": round(wall, 2)},
-        **{"cpu_seconds": round(cpu, 2), "gigabytes": round(gigabytes, 3)},
-        **{"bar_seconds": BAR_SECONDS, "bar_gigabytes": BAR_GIGABYTES},
-        "met": wall <= BAR_SECONDS and gigabytes <= BAR_GIGABYTES,
-    }
-
-
 COLUMNS = {
     **{"case": "case", "A": "a:d", "B": "b:d", "mean, there": "there_mean:.2f", "PSNR": "there_psnr:.1f"},
     **{"mean, and back": "back_mean:.2f", "PSNR, and back": "back_psnr:.1f", "discontinuous": "torn:.1%"},
@@ -179,19 +151,17 @@ COLUMNS = {
 
 @runner.command
 def main(
-    cases: Annotated[str, Option(help=f"of {', '.join(CASES)}; none: the clock alone")] = ",".join(CASES),
+    cases: Annotated[str, Option(help=f"of {', '.join(CASES)}")] = ",".join(CASES),
     data: runner.Data = runner.DATA,
     size: Annotated[int, Option(min=1, help="texels a side")] = 2048,
     samples: Annotated[int, Option(min=1, help="as of the command")] = BakeOptions().samples,
     threads: runner.Threads = 2,
     keep: Annotated[Path | None, Option(help="a folder for the textured shapes, to look at them")] = None,
-    timed: Annotated[bool, Option("--clock/--no-clock", help="time the whole command too")] = True,
 ) -> runner.Report:
-    names = runner.names_of("" if cases == "none" else cases, CASES, "case")
+    names = runner.names_of(cases, CASES, "case")
     set_threads(1)  # baking alone has several
     if keep is not None:
         make_folder(keep)
-    kept = keep_to_cores(2)
     choices = replace(BakeOptions(), size=size, samples=samples, workers=threads)
     rows, notes = [], []
     for name in runner.track(names, "carrying"):
@@ -199,15 +169,7 @@ def main(
             notes.append(f"{name}: no data")
         else:
             rows.append(measure(name, trip_of(name, data), choices, keep))
-    record: dict[str, Any] = {"cases": rows, "kept_to_cores": kept}
-    if timed:
-        with tempfile.TemporaryDirectory() as place:
-            cost = record["clock"] = clock(Path(place), threads)
-        notes.append(
-            f"2048 x 2048 onto {cost['vertices']} vertices, {threads} threads on {kept} cores: "
-            f"{cost['seconds']} s ({cost['cpu_seconds']} s of CPU), {cost['gigabytes']} GB; "
-            f"bars {BAR_SECONDS:g} s and {BAR_GIGABYTES:g} GB: {'met' if cost['met'] else 'NOT met'}"
-        )
+    record = {"cases": rows}
     title = f"Textures of {size} there and back, errors of bytes"
     return runner.Report(record, [runner.table(title, rows, COLUMNS)], notes)
 

@@ -7,9 +7,9 @@ kind has none anywhere. `TUNED` families may set thresholds, by seeds other than
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 import torch
@@ -18,7 +18,6 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
-from meshmatch.experiments.bench import verdict_shapes as craft
 from meshmatch.experiments.makers.character_designs import Designer
 from meshmatch.experiments.makers.furniture import KINDS, furniture
 from meshmatch.experiments.makers.human_bodies import unseen_bodies
@@ -32,6 +31,95 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template, read_template
 
 _DRAWN = 200
+METRES = 1.7
+"""How large what is no person is made."""
+LIMBS = (
+    ("left thigh", "left shin", "left foot"), ("right thigh", "right shin", "right foot"),
+    ("left upper arm", "left forearm", "left hand"), ("right upper arm", "right forearm", "right hand"),
+    ("head", "neck"), ("left forearm", "left hand"), ("right hand",), ("left foot", "left shin"),
+    ("chest", "belly", "hips"),
+    ("hips", "left thigh", "left shin", "left foot", "right thigh", "right shin", "right foot"),
+)  # fmt: skip
+"""Labels of parts of people that are cut out together."""
+
+
+def direction(rng: np.random.Generator) -> Float[Floats, " 3"]:
+    """A random unit vector."""
+    found = rng.normal(size=3)
+    return np.asarray(found / np.linalg.norm(found))
+
+
+def faces_kept(shape: Shape, truth: Ints, kept: Bool[Bools, " F"]) -> tuple[Shape, Ints]:
+    """Only some faces, with their vertices."""
+    used, faces = np.unique(shape.faces[kept], return_inverse=True)
+    return Shape(shape.verts[used], faces.reshape(-1, 3)), truth[used]
+
+
+def between(shape: Shape, truth: Ints, axis: Float[Floats, " 3"], low: float, high: float) -> tuple[Shape, Ints]:
+    """Only the faces between two quantiles (0..1) of their places along an axis."""
+    along = shape.verts[shape.faces].mean(1) @ axis
+    first, last = np.quantile(along, [low, high])
+    return faces_kept(shape, truth, np.asarray((along > first) & (along <= last)))
+
+
+def joined(shape: Shape, other: Shape, at: Float[Floats, "W 3"]) -> Shape:
+    """Two shapes as one, the second one with its vertices elsewhere."""
+    return Shape(np.concatenate([shape.verts, at]), np.concatenate([shape.faces, other.faces + shape.V]))
+
+
+def grid(side: float, cells: int) -> Shape:
+    """A square in the plane y = 0 around the origin."""
+    x, z = np.meshgrid(*[np.linspace(-0.5 * side, 0.5 * side, cells + 1)] * 2, indexing="ij")
+    corner = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
+    a, b, c, d = corner[:-1, :-1].ravel(), corner[:-1, 1:].ravel(), corner[1:, 1:].ravel(), corner[1:, :-1].ravel()
+    faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    return Shape(np.column_stack([x.ravel(), np.zeros(x.size), z.ravel()]), faces)
+
+
+def refined(shape: Shape, F: int) -> Shape:
+    """The same surface in F triangles or a few more; where triangles of two sizes meet there are slits."""
+    verts, faces = np.asarray(shape.verts), np.asarray(shape.faces)
+    while len(faces) < F:
+        some = np.arange(min(len(faces), -(-(F - len(faces)) // 3)))
+        verts, faces = trimesh.remesh.subdivide(verts, faces, some)
+    return Shape(verts, faces)
+
+
+def solids(rng: np.random.Generator) -> Shape:
+    """A few boxes, balls and rods run together."""
+    parts = []
+    for _ in range(int(rng.integers(1, 7))):
+        size = rng.uniform(0.1, 1.0, 3)
+        made = (
+            trimesh.creation.box(size).subdivide_to_size(0.1),
+            trimesh.creation.icosphere(4, size[0]),
+            trimesh.creation.capsule(size[0] * 2, size[1] * 0.3),
+        )[rng.integers(3)]
+        made.apply_transform(trimesh.transformations.random_rotation_matrix(rng.uniform(size=3)))
+        made.apply_translation(rng.normal(size=3) * 0.4)
+        parts.append(Shape(np.asarray(made.vertices), np.asarray(made.faces)))
+    return reduce(lambda whole, part: joined(whole, part, part.verts), parts)
+
+
+def boxes(corners: Sequence[Float[Floats, "2 3"]], edge: float) -> Shape:
+    """Boxes by their lower and upper corners, which may run into each other; no edge is longer than that."""
+    parts = []
+    for low, high in corners:
+        made = trimesh.creation.box(high - low).subdivide_to_size(edge)
+        parts.append(Shape(np.asarray(made.vertices) + 0.5 * (low + high), np.asarray(made.faces)))
+    return reduce(lambda whole, part: joined(whole, part, part.verts), parts)
+
+
+def on_floor(shape: Shape, side: float) -> Shape:
+    """A shape above the middle of a square that it stands on."""
+    plane = grid(side, 40)
+    at = np.array([shape.verts[:, 0].mean(), shape.verts[:, 1].min(), shape.verts[:, 2].mean()])
+    return joined(shape, plane, plane.verts + at)
+
+
+def no_body(verts: Floats, faces: Ints) -> tuple[Shape, Ints]:
+    """A shape as large as a person, none of whose vertices has a counterpart."""
+    return Shape(verts * (METRES / np.ptp(verts, axis=0).max()), faces), np.full(len(verts), -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +158,7 @@ class Cases:
         if kind not in self._kept:
             generator = torch.Generator().manual_seed(7100 + self.seed)
             verts = self._others[kind].draw(_DRAWN, generator).double().numpy()
-            self._kept[kind] = verts * (craft.METRES / np.ptp(verts, axis=1).max(1)[:, None, None])
+            self._kept[kind] = verts * (METRES / np.ptp(verts, axis=1).max(1)[:, None, None])
         return self._kept[kind]
 
     @cached_property
@@ -122,7 +210,7 @@ class Cases:
         for _ in range(int(rng.integers(1, 9))):
             at = centers[rng.integers(shape.F)]
             kept &= np.linalg.norm(centers - at, axis=1) > rng.uniform(0.04, 0.2)
-        return craft.faces_kept(shape, truth, kept)
+        return faces_kept(shape, truth, kept)
 
     def _scan(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
@@ -168,7 +256,7 @@ class Cases:
 
     def _scaled(self, number: int, rng: np.random.Generator, factor: float) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
-        axis = np.eye(3)[rng.integers(3)] if number % 3 else craft.direction(rng)
+        axis = np.eye(3)[rng.integers(3)] if number % 3 else direction(rng)
         along = shape.verts @ axis
         return Shape(shape.verts + np.outer(along * (factor - 1), axis), shape.faces), truth
 
@@ -179,13 +267,13 @@ class Cases:
     def _limb(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
         kept = self._in_limb(truth, rng)[shape.faces].all(1)
-        return craft.faces_kept(shape, truth, np.asarray(kept))
+        return faces_kept(shape, truth, np.asarray(kept))
 
-    def _in_limb(self, truth: Ints, rng: np.random.Generator, most: int = len(craft.LIMBS)) -> Bool[Bools, " V"]:
+    def _in_limb(self, truth: Ints, rng: np.random.Generator, most: int = len(LIMBS)) -> Bool[Bools, " V"]:
         """Whether vertices are of some limb, one of the first so many: of people a named one, else a few parts."""
         names, labels = self.template.label_names or (), np.asarray(self.template.labels)
         if self.kind == "human":
-            asked = [names.index(name) for name in craft.LIMBS[int(rng.integers(most))]]
+            asked = [names.index(name) for name in LIMBS[int(rng.integers(most))]]
         else:
             first = int(rng.integers(len(names)))
             asked = list(range(first, min(first + int(rng.integers(1, 4)), len(names))))
@@ -193,16 +281,16 @@ class Cases:
 
     def _cut(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
-        return craft.between(shape, truth, craft.direction(rng), rng.uniform(0.1, 0.75), 1.0)
+        return between(shape, truth, direction(rng), rng.uniform(0.1, 0.75), 1.0)
 
     def _merged(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         (one, first), (other, second) = self.body(number, rng), self.body(number + 1, rng)
-        apart = rng.uniform(0.0, 0.8) * craft.direction(rng)
-        return craft.joined(one, other, other.verts + apart), np.concatenate([first, second])
+        apart = rng.uniform(0.0, 0.8) * direction(rng)
+        return joined(one, other, other.verts + apart), np.concatenate([first, second])
 
     def _floor(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
-        whole = craft.on_floor(shape, rng.uniform(0.8, 6.0))
+        whole = on_floor(shape, rng.uniform(0.8, 6.0))
         return whole, np.append(truth, np.full(whole.V - shape.V, -1))
 
     def _melted(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
@@ -217,21 +305,21 @@ class Cases:
         """An animal, a hand or a head."""
         kind = [name for name in GENERATORS if name != self.kind][number % 2 if self.kind != "human" else number % 3]
         verts = self._drawn(kind)
-        return craft.no_body(verts[int(rng.integers(len(verts)))], np.asarray(self._others[kind].template.shape.faces))
+        return no_body(verts[int(rng.integers(len(verts)))], np.asarray(self._others[kind].template.shape.faces))
 
     def _furniture(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         mesh = furniture(sorted(KINDS)[number % 3], 50 + self.seed, number).mesh(48)
-        return craft.no_body(np.asarray(mesh.verts), np.asarray(mesh.faces))
+        return no_body(np.asarray(mesh.verts), np.asarray(mesh.faces))
 
     def _solid(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        whole = craft.solids(rng)
-        return craft.no_body(whole.verts, whole.faces)
+        whole = solids(rng)
+        return no_body(whole.verts, whole.faces)
 
     def _kit(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         """Furniture of boxes that run into each other."""
         made = furniture(sorted(KINDS)[number % 3], 70 + self.seed, number)
-        kit = craft.boxes([solid.box for _, solid in made.solids], 0.2)
-        return craft.no_body(kit.verts, kit.faces)
+        kit = boxes([solid.box for _, solid in made.solids], 0.2)
+        return no_body(kit.verts, kit.faces)
 
     # Kept: nothing is tuned on these.
 
@@ -245,16 +333,16 @@ class Cases:
     def _amputated(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
         lost = self._in_limb(truth, rng, 8)[shape.faces].all(1)
-        return craft.faces_kept(shape, truth, np.asarray(~lost))
+        return faces_kept(shape, truth, np.asarray(~lost))
 
     def _beside(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         """Boxes and balls on or in the body."""
         shape, truth = self.body(number, rng)
         for _ in range(int(rng.integers(1, 4))):
             size = rng.uniform(0.05, 0.8, 3)
-            thing = craft.boxes([np.stack([-0.5 * size, 0.5 * size])], 0.08)
+            thing = boxes([np.stack([-0.5 * size, 0.5 * size])], 0.08)
             at = shape.verts[rng.integers(shape.V)] + rng.normal(size=3) * 0.1
-            shape = craft.joined(shape, thing, thing.verts + at)
+            shape = joined(shape, thing, thing.verts + at)
             truth = np.append(truth, np.full(thing.V, -1))
         return shape, truth
 
@@ -270,21 +358,21 @@ class Cases:
         shape, truth = self.body(number, rng)
         verts = np.array(shape.verts)
         for _ in range(12):
-            wave = craft.direction(rng) * rng.uniform(2, 9)
+            wave = direction(rng) * rng.uniform(2, 9)
             phase = rng.uniform(0, 2 * np.pi)
-            verts += np.outer(np.sin(shape.verts @ wave + phase), craft.direction(rng)) * rng.uniform(0.0, 0.05)
+            verts += np.outer(np.sin(shape.verts @ wave + phase), direction(rng)) * rng.uniform(0.0, 0.05)
         return Shape(verts, shape.faces), truth
 
     def _two_cut(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         """Two cuts: what lies between two parallel planes."""
         shape, truth = self.body(number, rng)
-        axis, low = craft.direction(rng), rng.uniform(0, 0.5)
-        return craft.between(shape, truth, axis, low, low + rng.uniform(0.3, 0.5))
+        axis, low = direction(rng), rng.uniform(0, 0.5)
+        return between(shape, truth, axis, low, low + rng.uniform(0.3, 0.5))
 
     def _dense(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         """The same surface in two million triangles."""
         shape, truth = self.body(number, rng)
-        fine = craft.refined(shape, 2_000_000)
+        fine = refined(shape, 2_000_000)
         return fine, truth[cKDTree(shape.verts).query(fine.verts)[1]]
 
     def _not_manifold(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:

@@ -1,6 +1,6 @@
 """How honest verdicts and confidences are: shapes of which some can be matched and some cannot, and what is said of them.
 
-Each case (`meshmatch.experiments.verdict_cases`) is matched onto a shape that another person, or animal, made in
+Each case (`meshmatch.experiments.bench.verdict_cases`) is matched onto a shape that another person, or animal, made in
 another pose, one of two dozen, every fourth of which is cut. The error of a vertex is the straight distance on the
 target between its partner and the true one, in centimetres of a person of 1.9 m2; a map's error is the mean over the
 vertices that have a partner, and that of a shape of another kind is infinite. A map is right below 5 cm and wrong
@@ -9,8 +9,8 @@ never is. All maps weigh the same, however many vertices they have. The longest 
 
 ``--fit`` prints the weights that tell right from wrong best, of the cases of this run: those in
 `meshmatch.fitting.signs` are of nine cases of seeds 0 and 1 and the families that may tune, of as many limbs, cuts and holes
-of seed 2, of twelve stylised and pulled ones of seeds 2, 3 and 4, and of 32 people of `experiments.characters`, seed 5.
-Measure with another seed.
+of seed 2, of twelve stylised and pulled ones of seeds 2, 3 and 4, and of 32 people of `experiments.bench.characters`,
+seed 5. Measure with another seed.
 """
 
 from __future__ import annotations
@@ -34,8 +34,7 @@ from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.charts import Chart, Line, draw_lines
-from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, Case, Cases
-from meshmatch.experiments.bench.verdict_shapes import between, direction
+from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, Case, Cases, between, direction
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.generators.kinds import GENERATORS
@@ -52,6 +51,12 @@ _COLUMNS = {"maps": "maps:d", "good": "good:d", "fair": "fair:d", "poor": "poor:
 _COLUMNS |= {"under 5 cm": "right:d", "over 8 cm": "wrong:d", "mean cm": "mean_cm:.1f", "worst": "worst_cm:.1f"}
 _COLUMNS |= {"longest": "seconds:.1f"}
 _STEPS = {"confidence": "of", "vertices": "vertices:d", "mean": "confidence:.3f", "within 5 cm": "near:.3f"}
+_IN_ALL = {"maps": "maps:d", "good": "good:d", "fair": "fair:d", "poor": "poor:d"}
+_IN_ALL |= {
+    "good, over 8 cm": "good_and_wrong:d",
+    "under 5 cm": "right:d",
+    "of these good or fair": "right_and_believed:d",
+}
 _RIDGE = 0.002
 GROUPS = {"tuned": [name for name in FAMILIES if name not in KEPT], "kept": list(KEPT), "all": list(FAMILIES)}
 
@@ -249,6 +254,9 @@ def main(
     tables = [
         runner.table(
             f"{kind}: verdicts by family, {seeds} seeds from {seed} on", by_family, {"family": "of", **_COLUMNS}
+        ),
+        runner.table(
+            "In all", [bars | {word: sum(row[word] for row in by_family) for word in ("maps", *VERDICTS)}], _IN_ALL
         ),
         runner.table("By verdict", by_verdict, {"verdict": "of", **_COLUMNS}),
         runner.table("Confidence of vertices", steps, _STEPS),

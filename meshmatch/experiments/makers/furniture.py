@@ -26,8 +26,6 @@ from meshmatch.experiments.makers.furniture_pieces import Draw, Parts
 from meshmatch.experiments.makers.furniture_planes import aeroplane
 from meshmatch.experiments.makers.furniture_solids import Assembly
 from meshmatch.outputs import make_folder, replace_on_success
-from meshmatch.render.picture import Look, Panel, render_shapes
-from meshmatch.shapes.colors import label_colors
 from meshmatch.shapes.files import save_shape
 
 KINDS = {
@@ -35,13 +33,6 @@ KINDS = {
     "table": ("top", "legs", "shelves"),
     "plane": ("fuselage", "wings", "tail"),
 }
-VIEWS = {
-    "chair": Look(up="y", front="z", turn=-35, tilt=15),
-    "table": Look(up="y", front="z", turn=-25, tilt=20),
-    "plane": Look(up="y", front="z", turn=40, tilt=40),
-}
-"""How each kind is drawn."""
-_DRAWN = 9  # shapes of a picture
 
 
 def furniture(kind: str, seed: int, number: int) -> Assembly:
@@ -64,29 +55,20 @@ def main(
     count: Annotated[int, Option(min=1)] = 500,
     first: Annotated[int, Option(min=0, help="number of the first one")] = 0,
     resolution: Annotated[int, Option(min=16, help="voxels along the longest side")] = 96,
-    picture: Annotated[
-        Path | None, Option(help="draw the first of them, in colors of their parts, into this PNG")
-    ] = None,
     seed: runner.Seed = 0,
 ) -> runner.Report:
     make_folder(folder)
     vertices = 0
-    colors = label_colors(np.arange(len(KINDS[kind]) if kind in KINDS else 1))
-    panels: list[Panel] = []
     for number in runner.track(range(first, first + count), kind):
         made = furniture(kind, seed, number)
         shape = made.mesh(resolution)
         name = f"{kind}{number:04d}"
         save_shape(folder / f"{name}.ply", shape)
         with replace_on_success(folder / f"{name}.labels.npy") as temporary:
-            np.save(temporary, parts := made.parts_at(shape.verts))
-        if picture is not None and len(panels) < _DRAWN:
-            panels.append(Panel(shape, colors[parts]))
+            np.save(temporary, made.parts_at(shape.verts))
         vertices += shape.V
     with replace_on_success(folder / "parts.json") as temporary:
         Path(temporary).write_text(json.dumps(KINDS[kind]) + "\n", encoding="utf-8")
-    if picture is not None:
-        render_shapes(panels, picture, VIEWS[kind])
     note = f"{count} meshes of {vertices // count:,} vertices on average in {folder}"
     return runner.Report({"count": count, "vertices": vertices, "parts": KINDS[kind]}, notes=[note])
 

@@ -1,15 +1,9 @@
-"""What the paper claims, and whether the ablation runs carry it.
+"""What the paper claims of errors, and whether the ablation runs carry it.
 
-Training again from another seed moves errors by as much as many choices do, and six shapes are a small sample. An order
-of two errors is therefore said to be there only where it is carried
-
-- by seeds: the 95 % interval of the difference of their means (Welch's, of at least two trainings each) leaves out 0;
-- by what was measured on too: so does the 95 % interval of a paired bootstrap over a set's pairs, or over held-out bodies.
-
-Verdicts tell the hull of both intervals of each difference.
-
-Refinements of the same networks are compared seed by seed; a single network by its pairs alone. Costs, which are medians
-of many iterations side by side, are compared as they are.
+Training again from another seed moves errors by as much as many choices do, and six shapes are a small sample. So an order
+of two errors is there only where 95 % intervals of their difference leave out 0: over seeds (Welch's, of at least two
+trainings each), and over what was measured on, the pairs of a set or held-out bodies (a paired bootstrap). A claim is
+*supported* if every next error is larger, *not supported* if one is smaller, and else *not testable at this length*.
 """
 
 from __future__ import annotations
@@ -17,177 +11,115 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from statistics import fmean
-from typing import Literal
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.stats import bootstrap, ttest_ind, ttest_rel
 
-from meshmatch.arrays import Float, Floats
-from meshmatch.experiments.paper.ablation_results import cost_of
-from meshmatch.experiments.paper.ablation_views import BASE, CLAIMS, GRID, HELD_OUT, TABLE4, Known, Run
-from meshmatch.fields.shape_functions import FIELDS, has_nodes
+from meshmatch.experiments.paper.ablation_views import BASE, CODED, GRID, HELD_OUT, TABLE4, TRANSMATCH, Known, Run
 
-Outcome = Literal["holds", "does not hold", "not told apart", "not measured"]
-_RESAMPLES, _LEVEL = 4000, 0.95
+SUPPORTED, NOT_SUPPORTED, UNTESTED = "supported", "not supported", "not testable at this length"
+CLAIMS: tuple[tuple[str, tuple[Run, ...]], ...] = (
+    (
+        "with vol+arap+Z: mls < rbf < pointwise",
+        tuple(replace(BASE, field=each) for each in ("mls", "rbf", "pointwise")),
+    ),
+    ("of it: mls < pointwise", (BASE, replace(BASE, field="pointwise"))),
+    ("without constraints: pointwise < mls", (CODED, replace(BASE, constraint="none"))),
+    ("mls: vol+arap+Z < vol+arap < none", tuple(replace(BASE, constraint=each) for each in reversed(TABLE4))),
+    ("mls: both regularisers < none", (replace(BASE, constraint="vol+arap"), replace(BASE, constraint="none"))),
+    (
+        "pointwise: vol+arap < vol+arap+Z (Z does not pay)",
+        tuple(replace(BASE, field="pointwise", constraint=each) for each in TABLE4[1:]),
+    ),
+    ("nodes by parts < uniform nodes (T)", (BASE, replace(BASE, strategy="uniform"))),
+    ("nodes by parts < uniform nodes (A)", (replace(BASE, pose="A"), replace(BASE, strategy="uniform", pose="A"))),
+    ("template pose T < I", (BASE, replace(BASE, pose="I"))),
+    (
+        "more shapes are better: 2000 < 1000 < 500 < 250",
+        tuple(replace(BASE, shapes=count) for count in (2000, 1000, 500, 250)),
+    ),
+    ("1000 supervised points < 50", (BASE, replace(BASE, supervised=50))),
+    *(
+        (f"with {words}: ours < {rival}", (replace(BASE, **few), replace(other, **few)))  # type: ignore[arg-type]
+        for rival, other in (("3D-CODED", CODED), ("TransMatch", TRANSMATCH))
+        for words, few in (("250 shapes", {"shapes": 250}), ("50 supervised points", {"supervised": 50}))
+    ),
+)
+"""What the paper says of errors: the runs in the order from the least error to the largest."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement, the numbers that it is about from the one that should be least to the largest, and what became of it.
-
-    ``where`` is empty, a set, or "held out"; ``intervals`` are of every difference of neighbours, None where there is none.
-    """
+    """A statement, where it was looked at, mean errors from the one that should be least to the largest, and what became
+    of it; an interval for every difference of neighbours, None where there are too few seeds."""
 
     words: str
-    numbers: tuple[float, ...]
-    outcome: Outcome
-    where: str = ""
+    where: str
+    verdict: str
+    numbers: tuple[float, ...] = ()
     intervals: tuple[tuple[float, float] | None, ...] = ()
-
-    @property
-    def verdict(self) -> str:
-        """What became of it, in words."""
-        if self.outcome == "not measured":
-            return self.outcome
-        numbers = ", ".join(f"{value:.2f}" for value in self.numbers)
-        if known := [f"{low:+.2f} to {high:+.2f}" for low, high in filter(None, self.intervals)]:
-            numbers += f"; differences {', '.join(known)}"
-        return f"{'DOES NOT HOLD' if self.outcome == 'does not hold' else self.outcome} ({numbers})"
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Mean errors of the trainings of one choice; the error of every pair, or body, by each of them (or none)."""
+    """Mean errors of the trainings of one choice, and the errors of every pair, or body, by each of them."""
 
     seeds: Sequence[float]
     pairs: Sequence[Sequence[float]] = ()
 
-    @property
-    def mean(self) -> float:
-        """Over seeds."""
-        return fmean(self.seeds)
-
-
-def seeds_interval(a: Sequence[float], b: Sequence[float], paired: bool) -> tuple[float, float] | None:
-    """95 % interval of the mean of b less that of a; None where there are too few to say."""
-    if paired:
-        if len(a) < 2:
-            return None
-        off = np.subtract(b, a)
-        middle, error, free = float(off.mean()), float(off.std(ddof=1) / np.sqrt(len(off))), float(len(off) - 1)
-    else:
-        if min(len(a), len(b)) < 2:
-            return None
-        parts = [float(np.var(each, ddof=1)) / len(each) for each in (a, b)]
-        middle, error = fmean(b) - fmean(a), float(np.sqrt(sum(parts)))
-        weight = sum(part**2 / (len(each) - 1) for part, each in zip(parts, (a, b), strict=True))
-        free = sum(parts) ** 2 / weight if weight else float(len(a) + len(b) - 2)
-    reach = float(student.ppf((1 + _LEVEL) / 2, free)) * error
-    return middle - reach, middle + reach
-
-
-def pairs_interval(a: Float[Floats, " P"], b: Float[Floats, " P"]) -> tuple[float, float]:
-    """95 % interval of the mean of b less that of a, by resampling pairs (or bodies)."""
-    off = b - a
-    draws = np.random.default_rng(0).integers(0, len(off), (_RESAMPLES, len(off)))
-    low, high = np.quantile(off[draws].mean(1), [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
-    return float(low), float(high)
-
 
 def difference(a: Sample, b: Sample, paired: bool = False) -> tuple[float, float] | None:
-    """The hull of the 95 % intervals of b's error less a's, by seeds and by pairs; None where there are too few seeds."""
-    intervals = [seeds_interval(a.seeds, b.seeds, paired)]
-    if a.pairs and b.pairs:
-        intervals.append(pairs_interval(np.mean(a.pairs, axis=0), np.mean(b.pairs, axis=0)))
-        if intervals[0] is None and paired:
-            intervals = intervals[1:]
-    known = [each for each in intervals if each is not None]
-    if len(known) < len(intervals):
+    """The hull of the 95 % intervals of b's error less a's, over seeds and over pairs; None where there are too few seeds.
+
+    ``paired``: both are of the same networks.
+    """
+    if min(len(a.seeds), len(b.seeds)) < 2:
         return None
-    return min(low for low, _ in known), max(high for _, high in known)
-
-
-def order(a: Sample, b: Sample, paired: bool = False) -> int:
-    """1 if b's error is carried to be larger than a's, -1 if it is to be smaller, 0 if neither is."""
-    found = difference(a, b, paired)
-    return 0 if found is None or np.sign(found[0]) != np.sign(found[1]) else int(np.sign(found[0]))
+    still = np.ptp(np.subtract(a.seeds, b.seeds)) == 0 if paired else np.ptp(a.seeds) == np.ptp(b.seeds) == 0
+    if still:
+        ends = [float(np.mean(b.seeds) - np.mean(a.seeds))] * 2
+    else:
+        test = ttest_rel(b.seeds, a.seeds) if paired else ttest_ind(b.seeds, a.seeds, equal_var=False)
+        over_seeds = test.confidence_interval(0.95)
+        ends = [float(over_seeds.low), float(over_seeds.high)]
+    if a.pairs and b.pairs:
+        off = np.mean(b.pairs, axis=0) - np.mean(a.pairs, axis=0)
+        if np.ptp(off) > 0:
+            rng = np.random.default_rng(0)
+            drawn = bootstrap((off,), np.mean, n_resamples=4000, method="percentile", rng=rng).confidence_interval
+            ends += [float(drawn.low), float(drawn.high)]
+    return min(ends), max(ends)
 
 
 def rising(where: str, words: str, samples: Sequence[Sample], paired: bool = False) -> Claim:
-    """Holds if every next error is carried to be larger, does not if one is carried to be smaller."""
-    numbers = tuple(sample.mean for sample in samples if sample.seeds)
-    if len(numbers) < len(samples):
-        return Claim(words, numbers, "not measured", where)
-    signs = [order(a, b, paired) for a, b in pairwise(samples)]
-    outcome: Outcome = (
-        "does not hold" if -1 in signs else "holds" if all(sign == 1 for sign in signs) else "not told apart"
-    )
-    return Claim(words, numbers, outcome, where, tuple(difference(a, b, paired) for a, b in pairwise(samples)))
+    """Whether every next error is larger."""
+    if not all(sample.seeds for sample in samples):
+        return Claim(words, where, "not measured")
+    numbers = tuple(float(np.mean(sample.seeds)) for sample in samples)
+    found = tuple(difference(a, b, paired) for a, b in pairwise(samples))
+    if any(each is not None and each[1] < 0 for each in found):
+        return Claim(words, where, NOT_SUPPORTED, numbers, found)
+    held = all(each is not None and each[0] > 0 for each in found)
+    return Claim(words, where, SUPPORTED if held else UNTESTED, numbers, found)
 
 
-def sample(known: Known, run: Run, where: str) -> Sample:
+def sample(known: Known, run: Run, where: str, method: str | None = None) -> Sample:
     """What is known of a run on the held-out shapes or a set."""
-    return Sample(known.error(run, where), known.pairs(run, where))
+    records = known.records(run, where, method)
+    return Sample([each["mean_cm"] for each in records], [each["pair_cm"] for each in records if each.get("pair_cm")])
 
 
 def claims(known: Known, sets: Sequence[str]) -> list[Claim]:
-    """All claims, on the held-out shapes and each set."""
-    found = _costs(known)
-    for where in (HELD_OUT, *sets):
-        for words, runs in CLAIMS:
-            found.append(rising(where, words, [sample(known, run, where) for run in runs]))
-        found.append(_best_of_grid(known, where))
-        if where != HELD_OUT:
-            found.append(_refinements(known, where))
-    return found
-
-
-def _refinements(known: Known, where: str) -> Claim:
-    hows = ("code", "chamfer", "none")
-    alike = [  # what is measured once is not compared
-        run
-        for run in known.trained
-        if replace(run, seed=BASE.seed) == BASE and all((run, where, how) in known.errors for how in hows)
-    ]
-    samples = []
-    for how in hows:
-        records = [known.errors[run, where, how] for run in alike]
-        pairs = [record["pair_cm"] for record in records if record.get("pair_cm")]
-        samples.append(Sample([record["mean_cm"] for record in records], pairs))
-    return rising(where, "refined with regularisers < by Chamfer alone < not at all", samples, paired=True)
-
-
-def _costs(known: Known) -> list[Claim]:
-    """What constraints cost: factors of the milliseconds of an iteration."""
-    factor: dict[str, float] = {}
-    full = {field: cost_of(known, field, TABLE4[-1]) for field in FIELDS}
-    for field in FIELDS:
-        plain, dear = cost_of(known, field, TABLE4[0]), full[field]
-        if plain and dear:
-            factor[field] = dear / plain
+    """All claims, on the held-out shapes and each set; 300 nodes of radius 0.2 beside the best of the other grid points."""
     found = []
-    for field in (field for field in FIELDS if has_nodes(field)):
-        words = f"an iteration of {field} takes at most 2 times as long with vol+arap+Z"
-        there = (factor[field],) if field in factor else ()
-        found.append(_plain(words, there, there[0] <= 2 if there else None))
-    both = tuple(factor[field] for field in ("mls", "pointwise") if field in factor)
-    words = "vol+arap+Z slows an iteration of mls by less than one of pointwise"
-    found.append(_plain(words, both, both[0] < both[1] if len(both) == 2 else None))
-    dear_ones = tuple(cost for cost in (full["mls"], full["pointwise"]) if cost)
-    words = "with vol+arap+Z an iteration of pointwise takes at least 3 times as long as one of mls"
-    return [*found, _plain(words, dear_ones, dear_ones[1] > 3 * dear_ones[0] if len(dear_ones) == 2 else None)]
-
-
-def _plain(words: str, numbers: tuple[float, ...], holds: bool | None) -> Claim:
-    return Claim(words, numbers, "not measured" if holds is None else "holds" if holds else "does not hold")
-
-
-def _best_of_grid(known: Known, where: str) -> Claim:
-    """The base against the best of the others, which has been chosen: in its favour."""
-    there = {run: found for run in GRID if (found := sample(known, run, where)).seeds}
-    words = "300 nodes of radius 0.2 are the best of the grid"
-    if BASE not in there or len(there) < 2:
-        return Claim(words, (), "not measured", where)
-    best = min((found for run, found in there.items() if run != BASE), key=lambda found: found.mean)
-    return rising(where, words, [there[BASE], best])
+    for where in (HELD_OUT, *sets):
+        asked = {words: [sample(known, run, where) for run in runs] for words, runs in CLAIMS}
+        others = [each for run in GRID if run != BASE and (each := sample(known, run, where)).seeds]
+        best = min(others, key=lambda each: float(np.mean(each.seeds)), default=Sample(()))
+        asked["300 nodes of radius 0.2 are the best of the grid"] = [sample(known, BASE, where), best]
+        if where != HELD_OUT:
+            hows = ("code", "chamfer", "none")
+            words = "refined with regularisers < by Chamfer alone < not at all"
+            found.append(rising(where, words, [sample(known, BASE, where, how) for how in hows], paired=True))
+        found += [rising(where, words, samples) for words, samples in asked.items()]
+    return found

@@ -23,6 +23,7 @@ from meshmatch.experiments.bench.scores import TruthDistances
 from meshmatch.experiments.bench.sets import BenchSet
 from meshmatch.experiments.paper.ablation_setting import Setting
 from meshmatch.experiments.paper.ablation_views import BASE, CODED, Run
+from meshmatch.experiments.paper.learned_baselines import TransModel, load_transmatch
 from meshmatch.experiments.runner import spread
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
@@ -41,6 +42,7 @@ from meshmatch.templates.template import Template
 
 METHODS = ("none", "code", "chamfer", "nodes")
 """Refinements: none; of the code with the run's regularisers, or without; Gauss-Newton on the nodes."""
+TRANS_POINTS, TRANS_ROUNDS = 1024, 2  # each network is asked twice, the second time in the frame of its first answer
 Refinement = LatentRefineConfig | NodeRefineConfig | None
 
 
@@ -191,6 +193,30 @@ def errors_of(
         words = {"seconds": round(seconds, 4), "how": None if how is None else asdict(how)}
         found[method] = scored(subjects, fitted) | words
     return found
+
+
+def transformer_errors(folder: Path, subjects: Sequence[Subject], reference: str, measure: Measure) -> dict[str, Any]:
+    """Errors over all pairs, as `errors_of` tells them, in the orientation that the ``reference`` model finds."""
+    model = load_transmatch(folder)
+    began = time.process_time()
+    fitted = [_fitted(model, one, reference, measure) for one in subjects]
+    seconds = (time.process_time() - began) / len(subjects)
+    return scored(subjects, fitted) | {"seconds": round(seconds, 4), "how": None}
+
+
+def _fitted(model: TransModel, one: Subject, reference: str, measure: Measure) -> Float[Floats, "V 3"]:
+    """Where the transformer puts the template on a subject, in its file's frame."""
+    frame, scan = in_core_frame(model.template, one, reference)
+    rest, core = model.template.shape.verts, model.template.core
+    for round_ in range(TRANS_ROUNDS):
+        points = scan.drawn(TRANS_POINTS, np.random.default_rng([measure.seed, round_]))
+        with torch.inference_mode():
+            at = torch.from_numpy(rest.astype(np.float32))
+            there = (at + model.network(torch.from_numpy(points).float()[None], at)[0]).double().numpy()
+        if round_ < TRANS_ROUNDS - 1:
+            pose = kabsch(rest[core], there[core])
+            frame, scan = frame.compose(pose.frame), scan.to_local(pose)
+    return frame.undo(there)
 
 
 def scored(subjects: Sequence[Subject], fitted: Sequence[Float[Floats, "V 3"]]) -> dict[str, Any]:

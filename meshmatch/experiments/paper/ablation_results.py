@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from meshmatch.experiments.bench.charts import Bar, Chart, Line, draw_bars, draw_lines
+from meshmatch.experiments.bench.charts import Chart, Line, draw_lines
 from meshmatch.experiments.paper.ablation_views import BASE, HELD_OUT, PAPER_MS, PAPER_SETS, VIEWS, Known, View
 from meshmatch.experiments.runner import table
 from meshmatch.outputs import make_folder
@@ -30,9 +30,6 @@ def number(values: Sequence[float]) -> str:
 def errors_table(view: View, known: Known, sets: Sequence[str], budget: str) -> Table:
     """Steps, held-out error, mean and median on each set beside the paper's mean, and after refining nodes."""
     columns = {head: head for head in view.heads}
-    rules = {row.run.strategy for row in view.rows}
-    if len(rules) > 1 and known.refused:
-        columns["rule refuses"] = "refused:.1%"
     columns |= {"steps": "steps:>", "held out": "held out:>"}
     for name in sets:
         columns |= {name: f"{name}:>", f"{name} median": f"{name} median:>"}
@@ -45,7 +42,6 @@ def errors_table(view: View, known: Known, sets: Sequence[str], budget: str) -> 
         run, record = each.run, known.trained.get(each.run, {})
         words = [word.format(rule=known.rule(run)) for word in each.words]
         row: dict[str, Any] = dict(zip(view.heads, words, strict=True))
-        row["refused"] = known.refused.get(run.name, {}).get("refused")
         rows.append(row)
         if "skipped" in record:
             row["steps"] = "cannot be"
@@ -74,12 +70,11 @@ def cost_table(known: Known) -> Table:
                 **{"constraint": constraint, "field": field, **time},
                 "slow": cost / reference if reference and cost else None,
                 **{"paper": paper, "paper_slow": paper / PAPER_MS["mls"][constraint]},
-                "megabytes": known.memory.get(row.run.name, {}).get("megabytes"),
             }
         )
     columns = {"constraint": "constraint", "field": "field", "CPU ms": "cpu_ms:.1f", "ms": "ms:.1f"}
     columns |= {"times mls": "slow:.1f", "paper's ms": "paper:.1f", "paper's times": "paper_slow:.1f"}
-    return table("Table 4, cost of a training iteration", rows, columns | {"MB": "megabytes:.0f"})
+    return table("Table 4, cost of a training iteration", rows, columns)
 
 
 def cost_of(known: Known, field: str, constraint: str) -> float | None:
@@ -101,38 +96,18 @@ def tables(known: Known, views: Sequence[str], sets: Sequence[str], budget: str)
 
 
 def draw_views(known: Known, views: Sequence[str], sets: Sequence[str], folder: Path) -> list[Path]:
-    """Draw the views of which something is known; the files that were written."""
+    """Draw the figures of which something is known; the files that were written."""
     make_folder(folder)
     written = []
     for name in views:
-        path = folder / f"{name.replace('table', 'table-').replace('figure', 'figure-')}.png"
+        path = folder / f"{name.replace('figure', 'figure-')}.png"
         view = VIEWS[name]
-        if name == "figure6":
-            drawn = _draw_descent(known, path)
-        else:
-            drawn = (_draw_lines if view.across else _draw_bars)(view, known, sets, path)
+        drawn = (
+            _draw_descent(known, path) if name == "figure6" else view.across and _draw_lines(view, known, sets, path)
+        )
         if drawn:
             written.append(path)
     return written
-
-
-def _draw_bars(view: View, known: Known, sets: Sequence[str], path: Path) -> bool:
-    """Bars in a group for each set; those of the base in the strong color."""
-    groups: dict[str, list[Bar]] = {}
-    for where in (HELD_OUT, *sets):
-        how = "the network alone" if where == HELD_OUT else "after the search over codes"
-        for row in view.rows:
-            errors = known.error(row.run, where)
-            if errors and row.method == "code":
-                words = ", ".join(
-                    f"{head} {word.format(rule=known.rule(row.run))}"
-                    for head, word in zip(view.heads, row.words, strict=True)
-                )
-                bar = Bar(words, fmean(errors), f"{number(errors)} cm", row.run == BASE)
-                groups.setdefault(f"{where}, {how}", []).append(bar)
-    if groups:
-        draw_bars(groups, path, _AXIS)
-    return bool(groups)
 
 
 def _draw_lines(view: View, known: Known, sets: Sequence[str], path: Path) -> bool:

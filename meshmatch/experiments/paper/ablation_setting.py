@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Literal
 
 import torch
@@ -22,10 +21,9 @@ from meshmatch.generators.bodies import human_source
 from meshmatch.generators.generator import Source
 from meshmatch.models.layers import BasisEncoder, PointEncoder
 from meshmatch.models.network import NetworkConfig
-from meshmatch.templates.make import NodeConfig, Strategy, judged, lay_nodes
-from meshmatch.templates.prepared_folder import read_registered
+from meshmatch.templates.make import NodeConfig, Strategy, lay_nodes
 from meshmatch.templates.template import Template, read_template
-from meshmatch.training.datasets import Batch, registered_source
+from meshmatch.training.datasets import Batch
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import CorrespondenceLoss
 from meshmatch.training.recipes import Recipe, recipe_for
@@ -33,9 +31,6 @@ from meshmatch.training.scans import ScanConfig
 from meshmatch.training.train import build_dataset, build_deformer
 
 Preset = Literal["small", "default", "paper"]
-Unit = Literal["diameter", "sphere"]
-SPHERE = 0.65
-"""The radius of a sphere around the body, in units of sqrt(area): the other reading of the paper's radii."""
 SCANS = 4
 """How often each shape is scanned."""
 HELD_OUT_SHAPES = 64
@@ -67,21 +62,12 @@ class Setting:
     ----------
     preset : {"small", "default", "paper"}
         The recipe: network, losses, scans.
-    folder : str, optional
-        Shapes that `meshmatch prepare` made ready; None for generated bodies.
-    identities : int
-        Of generated bodies.
-    unit : {"diameter", "sphere"}
-        Of a run's radius: the template's diameter, as the captions of the paper's tables say; or `SPHERE`.
     batch : int, optional
         Shapes of a step; None for the recipe's.
     """
 
     preset: Preset = "small"
-    folder: str | None = None
-    identities: int = 1024
     threads: int = 1
-    unit: Unit = "diameter"
     batch: int | None = None
 
     def recipe(self, run: Run) -> Recipe:
@@ -132,51 +118,32 @@ class Setting:
         """By which rule its nodes are chosen: its own, or none ("uniform") where that one leaves too few."""
         return self._chosen(run)[1]
 
-    def taken(self, run: Run) -> float:
-        """Which share of the candidates is refused by the rule that was taken: a milder one, where vertices went without."""
-        return self._chosen(run)[2]
-
-    def refused(self, run: Run) -> float:
-        """Which share of the candidates for nodes its rule refuses."""
-        template, radius = self.resting(run.pose), self._radius(run)
-        config = NodeConfig(run.strategy, run.nodes, radius)
-        return 1 - float(judged(template.shape, config, template.labels)[2].mean())
-
-    def _radius(self, run: Run) -> float:
-        return run.radius * (SPHERE if self.unit == "sphere" else diameter(self.resting(run.pose).shape))
-
-    def _chosen(self, run: Run) -> tuple[Template, Strategy, float]:
-        return _with_nodes(self.resting(run.pose), run.nodes, self._radius(run), run.strategy)
+    def _chosen(self, run: Run) -> tuple[Template, Strategy]:
+        resting = self.resting(run.pose)
+        return _with_nodes(resting, run.nodes, run.radius * diameter(resting.shape), run.strategy)
 
     def resting(self, pose: str) -> Template:
-        """The template in a pose, with the nodes that it came with; of other people in "T-heavy"; a folder has one
-        pose."""
-        return _resting(self.folder, pose)
+        """The template in a pose, with the nodes that it came with; of other people in "T-heavy"."""
+        return _resting(pose)
 
     def sources(self, pose: str) -> tuple[Source, Source]:
-        """What draws shapes to learn from, and shapes that nobody learned from: other people, or a folder's last ones."""
+        """What draws shapes to learn from, and shapes of people that nobody learned from."""
         template = self.resting(pose)
-        if self.folder is None:
-            return human_source(template, self.identities, 0), human_source(template, 64, 1)
-        shapes = torch.from_numpy(read_registered(self.folder, template))
-        kept = max(1, len(shapes) - max(1, len(shapes) // 5))
-        return registered_source(shapes[:kept]), registered_source(shapes[kept:])
+        return human_source(template, 1024, 0), human_source(template, 64, 1)
 
 
 @lru_cache(maxsize=4)
-def _resting(folder: str | None, pose: str) -> Template:
-    if folder is not None:
-        return read_template(Path(folder) / "template.safetensors")
+def _resting(pose: str) -> Template:
     template = read_template(f"human-{pose.removesuffix(HEAVY)}")
     return heavy(template) if pose.endswith(HEAVY) else template
 
 
 @lru_cache(maxsize=32)
-def _with_nodes(template: Template, K: int, radius: float, strategy: Strategy) -> tuple[Template, Strategy, float]:
+def _with_nodes(template: Template, K: int, radius: float, strategy: Strategy) -> tuple[Template, Strategy]:
     for rule in dict.fromkeys((strategy, "uniform")):
         try:
             laid = lay_nodes(template.shape, NodeConfig(rule, K, radius, grow=True), template.labels)
-            return replace(template, nodes=laid.nodes, radius=laid.radius), rule, laid.taken
+            return replace(template, nodes=laid.nodes, radius=laid.radius), rule
         except TemplateError:
             if rule == "uniform":
                 raise

@@ -2,34 +2,37 @@
 
 from __future__ import annotations
 
-import contextlib
-import multiprocessing
-import resource
 import statistics
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from meshmatch.arrays import Float
 from meshmatch.experiments.paper.ablation_setting import Pool, Setting, pool_of
 from meshmatch.experiments.paper.ablation_views import Run
-from meshmatch.experiments.paper.learned_baselines import WORDS, load_transmatch
+from meshmatch.experiments.paper.learned_baselines import (
+    TARGETS,
+    TransBatch,
+    TransConfig,
+    load_transmatch,
+    train_transmatch,
+)
 from meshmatch.fields.field import Field, PointField, PointwiseField
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.layers import BasisEncoder
-from meshmatch.models.registry import CARD, WEIGHTS, read_card
+from meshmatch.models.registry import CARD, read_card
 from meshmatch.outputs import make_folder
 from meshmatch.threads import set_threads
-from meshmatch.training.datasets import Batch
+from meshmatch.training.datasets import Batch, step_generator
 from meshmatch.training.loop import Trainer
 from meshmatch.training.losses import LossPoints, held_out_error
-from meshmatch.training.train import CardFacts, build_dataset, build_deformer, build_loss_points, export
+from meshmatch.training.train import CardFacts, build_dataset, build_deformer, build_loss_points, export, loss_vertices
 
 _BATCHES = 2
 
@@ -71,8 +74,7 @@ def train_run(run: Run, setting: Setting, folder: Path, *, minutes: float = 0.0,
     held_out = held_out_error(model, pool.held_out, loss_points)
     bodies = CM_PER_UNIT * body_errors(model, pool.held_out, loss_points)
     make_folder(folder)
-    category = "human" if setting.folder is None else Path(setting.folder).name
-    facts = CardFacts("run", category, f"{run.shapes} shapes, scanned beforehand", licence="")
+    facts = CardFacts("run", "human", f"{run.shapes} shapes, scanned beforehand", licence="")
     export(trainer, template, folder, replace(recipe, storage="float16"), facts, held_out)
     return {
         "steps": trainer.step,
@@ -126,15 +128,6 @@ def fewer(points: LossPoints, supervised: int) -> LossPoints:
     return LossPoints(points.positions[:supervised], field)
 
 
-def is_trained(folder: Path, found: dict[str, Any]) -> bool:
-    """Whether the model folder is the one that a record tells of."""
-    if not (folder / WEIGHTS).is_file() or not any((folder / each).is_file() for each in (CARD, WORDS)):
-        return False
-    if (folder / CARD).is_file():
-        return read_card(folder / CARD).weights_sha256 == found.get("model")
-    return load_transmatch(folder).words.get("weights_sha256") == found.get("model")
-
-
 def built(setting: Setting, run: Run) -> tuple[Trainer, list[Any]]:
     """A trainer at its first step, and batches for it."""
     chosen, template, source = setting.recipe(run), setting.template(run), setting.sources(run.pose)[0]
@@ -182,55 +175,36 @@ def timed(setting: Setting, runs: Sequence[Run], rounds: int) -> dict[str, dict[
     }
 
 
-def planned(setting: Setting, runs: Sequence[Run], steps: int, rounds: int = 2) -> list[dict[str, Any]]:
-    """What training the runs for so many steps takes, by what an iteration costs: rows with ``field``, ``constraint``,
-    ``nodes``, ``runs``, ``cpu_ms`` of a step and ``minutes`` in all. Scans and errors come on top."""
-    alike: dict[Run, int] = {}
-    for run in runs:
-        kind = Run(run.field, run.constraint, run.nodes)
-        alike[kind] = alike.get(kind, 0) + 1
-    rows = []
-    for kind, count in alike.items():
-        cost = timed(setting, [kind], rounds)[kind.name]["cpu_ms"]
-        minutes = round(count * steps * cost / 60_000, 2)
-        words = {"field": kind.field, "constraint": kind.constraint, "nodes": kind.nodes, "runs": count}
-        rows.append({**words, "cpu_ms": cost, "minutes": minutes})
-    return rows
+def train_transformer(
+    run: Run, setting: Setting, folder: Path, *, steps: int, config: TransConfig | None = None
+) -> dict[str, Any]:
+    """Train, or go on exactly where it was stopped, write a folder of TransMatch, and say how it went, as `train_run` does.
 
-
-def memory(setting: Setting, run: Run, iterations: int = 3) -> dict[str, Any]:
-    """Megabytes that iterations of a run need besides network, optimizer and data, in a process of their own.
-
-    Without a GPU: how far the resident set grows at its largest beyond what it was before the first iteration. With one:
-    the most that tensors took there, network and optimizer included.
+    ``seconds`` are those of this call alone.
     """
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, context) as pool:
-        grown, how = pool.submit(_grown, setting, run, iterations).result()
-    return {"megabytes": round(grown / 1e6, 1), "how": how}
-
-
-def _grown(setting: Setting, run: Run, iterations: int) -> tuple[float, str]:
     set_threads(setting.threads)
-    trainer, batches = built(setting, run)
-    before = _memory("VmRSS")
-    with contextlib.suppress(OSError):  # let the kernel count the peak from now on, where it can
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    for number in range(iterations):
-        trainer.iterate(batches[number % _BATCHES])
-    _wait(trainer)
-    peak = (
-        torch.cuda.max_memory_allocated(trainer.device) if trainer.device.type == "cuda" else None
-    )  # bytes of tensors
-    if peak is not None:
-        return float(peak), "allocated on the GPU, at most"
-    return float(max(_memory("VmHWM") - before, 0)), "growth of the resident set, at most"
+    template, train = setting.resting(run.pose), replace(setting.recipe(run).train, steps=steps)
+    pool, supervised = pool_of(setting, run.pose, read_points=True), torch.from_numpy(loss_vertices(template))
 
+    def draw(step: int) -> TransBatch:
+        scans = pool.rows(step, train.shapes, run.shapes, run.seed)
+        told = torch.randperm(min(run.supervised, len(supervised)), generator=step_generator(run.seed, step))[:TARGETS]
+        return TransBatch(pool.points[scans], supervised[told], pool.targets[scans][:, told])
 
-def _memory(what: str) -> int:
-    """Bytes of this process in memory now (VmRSS) or at its largest (VmHWM); the latter where the system does not say."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-            if line.startswith(f"{what}:"):
-                return 1024 * int(line.split()[1])
-    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    clock = time.monotonic if torch.cuda.is_available() else time.process_time
+    began = clock()
+    words = train_transmatch(folder, template, draw, train, config, {"run": asdict(run), "setting": asdict(setting)})
+    seconds = clock() - began
+    model = load_transmatch(folder)
+    rest = torch.from_numpy(template.shape.verts.astype(np.float32))[supervised]
+    with torch.inference_mode():
+        off = (rest + model.network(pool.held_out.points, rest) - pool.held_out.targets).double().norm(dim=-1).mean(1)
+    bodies = CM_PER_UNIT * off
+    return {
+        "steps": words["steps"],
+        "seconds": round(seconds, 2),
+        "clock": "wall" if torch.cuda.is_available() else "processor",
+        "held_out_cm": round(float(bodies.mean()), 4),
+        "bodies_cm": bodies.round(decimals=3).tolist(),
+        "model": words["weights_sha256"],
+    }

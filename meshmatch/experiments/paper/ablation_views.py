@@ -1,4 +1,4 @@
-"""The paper's tables and figures as data: which runs each looks at, and what the paper printed or claims.
+"""The paper's tables and figures as data: which runs each looks at, and what the paper printed.
 
 A run is one training: a choice in everything that the paper varies. All tables and figures are views of the same runs,
 most of which differ from `BASE` in one thing.
@@ -7,7 +7,7 @@ most of which differ from `BASE` in one thing.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 from meshmatch.fields.shape_functions import FIELDS, FieldName
@@ -190,35 +190,6 @@ VIEWS = {
 }
 """In the order in which their runs are trained."""
 
-CLAIMS: tuple[tuple[str, tuple[Run, ...]], ...] = (
-    (
-        "with vol+arap+Z: mls < rbf < pointwise",
-        tuple(replace(BASE, field=each) for each in ("mls", "rbf", "pointwise")),
-    ),
-    ("of it: mls < pointwise", (BASE, replace(BASE, field="pointwise"))),
-    ("without constraints: pointwise < mls", (CODED, replace(BASE, constraint="none"))),
-    ("mls: vol+arap+Z < vol+arap < none", tuple(replace(BASE, constraint=each) for each in reversed(TABLE4))),
-    ("mls: both regularisers < none", (replace(BASE, constraint="vol+arap"), replace(BASE, constraint="none"))),
-    (
-        "pointwise: vol+arap < vol+arap+Z (Z does not pay)",
-        tuple(replace(BASE, field="pointwise", constraint=each) for each in TABLE4[1:]),
-    ),
-    ("nodes by parts < uniform nodes (T)", (BASE, replace(BASE, strategy="uniform"))),
-    ("nodes by parts < uniform nodes (A)", (replace(BASE, pose="A"), replace(BASE, strategy="uniform", pose="A"))),
-    ("template pose T < I", (BASE, replace(BASE, pose="I"))),
-    (
-        "more shapes are better: 2000 < 1000 < 500 < 250",
-        tuple(replace(BASE, shapes=count) for count in (2000, 1000, 500, 250)),
-    ),
-    ("1000 supervised points < 50", (BASE, replace(BASE, supervised=50))),
-    *(
-        (f"with {words}: ours < {rival}", (replace(BASE, **few), replace(other, **few)))  # type: ignore[arg-type]
-        for rival, other in (("3D-CODED", CODED), ("TransMatch", TRANSMATCH))
-        for words, few in (("250 shapes", {"shapes": 250}), ("50 supervised points", {"supervised": 50}))
-    ),
-)
-"""What the paper says of errors: the runs in the order from the least error to the largest."""
-
 
 def all_runs(views: Sequence[str], seeds: int = 1, repeated: Sequence[str] = ()) -> list[Run]:
     """Every run of some views once; last, those of the ``repeated`` views with other seeds."""
@@ -226,15 +197,6 @@ def all_runs(views: Sequence[str], seeds: int = 1, repeated: Sequence[str] = ())
     alike = dict.fromkeys(run for view in VIEWS if view in repeated for run in VIEWS[view].runs)
     again = [replace(run, seed=seed) for seed in range(1, seeds) for run in alike if run in runs]
     return [*runs, *again]
-
-
-def by_time(run: Run) -> bool:
-    """Whether its budget is time: where representations and constraints, which differ in cost, are compared.
-
-    All others, which are compared for what they learn, take as many steps as the base does in that time.
-    """
-    alike = replace(run, field=BASE.field, constraint=BASE.constraint, seed=BASE.seed)
-    return alike == BASE and run.field != "transmatch"
 
 
 def methods_of(run: Run) -> tuple[str, ...]:
@@ -251,50 +213,29 @@ def methods_of(run: Run) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Known:
-    """What was measured: ``trained`` as `train_run` tells it or {"skipped": why}; ``errors`` by set and method.
-
-    Parameters
-    ----------
-    trained : {run: record}
-    errors : {(run, set, method): record}
-    times, memory : {name of a run: record}
-    refused : {name of a run: {"refused": share of the candidates that its rule refuses, "taken": that of the rule taken}}
-    descent : what `meshmatch.experiments.ablation_errors.descend` found, if it was measured
+    """What was measured: ``trained`` as `train_run` tells it, or {"skipped": why}; ``errors`` by run, set and method;
+    ``times`` of an iteration by name of the run; ``descent``: figure 6, as `ablation_errors.descend` tells it.
     """
 
     trained: Mapping[Run, Mapping[str, Any]]
     errors: Mapping[tuple[Run, str, str], Mapping[str, Any]]
     times: Mapping[str, Mapping[str, Any]]
-    memory: Mapping[str, Mapping[str, Any]]
     descent: Mapping[str, Any] | None = None
-    refused: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def rule(self, run: Run) -> str:
-        """How nodes were chosen in the end, in words."""
-        words = str(self.trained.get(run, {}).get("rule", run.strategy))
-        shares = self.refused.get(run.name, {})
-        milder = words == run.strategy and shares.get("taken", 1.0) < shares.get("refused", 0.0)
-        return f"{words}, milder: {shares['taken']:.1%}" if milder else words
+        """How nodes were chosen in the end."""
+        return str(self.trained.get(run, {}).get("rule", run.strategy))
+
+    def records(self, run: Run, where: str, method: str | None = None) -> list[Mapping[str, Any]]:
+        """What is known of a run and its repetitions with other seeds: on a set after a refinement (by default the first of
+        `methods_of`), or held out, as the training told it."""
+        alike = sorted((each for each in self.trained if replace(each, seed=0) == run), key=lambda r: r.seed)
+        if where == HELD_OUT:
+            kept = [self.trained[each] for each in alike]
+            return [{"mean_cm": one["held_out_cm"], "pair_cm": one.get("bodies_cm")} for one in kept if "steps" in one]
+        how = method or methods_of(run)[0]
+        return [self.errors[each, where, how] for each in alike if (each, where, how) in self.errors]
 
     def error(self, run: Run, where: str, method: str | None = None, what: str = "mean_cm") -> list[float]:
-        """Errors in cm of a run and its repetitions with other seeds; ``where`` is a set, or `HELD_OUT`.
-
-        ``method`` is by default the first of `methods_of`, ``what`` is "mean_cm", or on a set "median_cm".
-        """
-        alike = sorted((each for each in self.trained if replace(each, seed=0) == run), key=lambda r: r.seed)
-        if where == HELD_OUT:
-            records = [self.trained[each].get("held_out_cm") for each in alike]
-        else:
-            how = method or methods_of(run)[0]
-            records = [self.errors.get((each, where, how), {}).get(what) for each in alike]
-        return [record for record in records if record is not None]
-
-    def pairs(self, run: Run, where: str) -> list[list[float]]:
-        """Errors in cm of every pair of a set, or of every held-out body, by a run and its repetitions; of those alone
-        that kept them."""
-        alike = sorted((each for each in self.trained if replace(each, seed=0) == run), key=lambda r: r.seed)
-        if where == HELD_OUT:
-            kept = [self.trained[each].get("bodies_cm") for each in alike]
-        else:
-            kept = [self.errors.get((each, where, methods_of(run)[0]), {}).get("pair_cm") for each in alike]
-        return [each for each in kept if each]
+        """Errors in cm of a run and its repetitions; ``what`` is "mean_cm", or on a set "median_cm"."""
+        return [record[what] for record in self.records(run, where, method)]

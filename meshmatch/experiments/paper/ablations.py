@@ -3,9 +3,8 @@
 Tables 4 (representations and constraints: errors and cost), 5 (regularisers), 6 (nodes and radius, kernel), 7 (how nodes
 are chosen); figures 6 (refinement), 8 (template pose), 9 (training shapes), 10 (supervised points). All are views of one
 set of runs. Each run is trained once, from the beginning, and measured on shapes that it has not seen and on pairs of the
-benchmark's sets. All runs take the same number of --steps. With --minutes, apart, representations and constraints, which
-cost differently, have the same time instead (of the processor; with a GPU on the clock), and all other runs take as many
-steps as the base does in it. --plan says beforehand what the trainings will take.
+benchmark's sets. All runs take the same number of --steps; with
+--minutes the same time instead (of the processor; with a GPU on the clock), in which what is slow learns less.
 
 What is measured lies in the output folder and is not measured again, so that a stopped command goes on with what is
 missing; --show measures nothing and shows what is there. The tables say the budget. Errors are in cm at 1.9 m2 of skin:
@@ -19,7 +18,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -40,18 +39,15 @@ from meshmatch.experiments.paper.ablation_errors import (
     errors_of,
     oriented,
     subject,
+    transformer_errors,
 )
 from meshmatch.experiments.paper.ablation_results import draw_views, tables
-from meshmatch.experiments.paper.ablation_setting import SPHERE, Preset, Setting, Unit
-from meshmatch.experiments.paper.ablation_training import is_trained, memory, planned, timed, train_run
-from meshmatch.experiments.paper.ablation_transmatch import train_transformer, transformer_errors
-from meshmatch.experiments.paper.ablation_views import BASE, CODED, VIEWS, Known, Run, all_runs, by_time, methods_of
+from meshmatch.experiments.paper.ablation_setting import Preset, Setting
+from meshmatch.experiments.paper.ablation_training import timed, train_run, train_transformer
+from meshmatch.experiments.paper.ablation_views import BASE, CODED, VIEWS, Known, Run, all_runs, methods_of
 from meshmatch.geometry.frames import Frame
 from meshmatch.models.registry import find_model
-from meshmatch.outputs import replace_on_success
 
-PLAN_COLUMNS = {"field": "field", "constraint": "constraint", "nodes": "nodes:d", "runs": "runs:d"}
-PLAN_COLUMNS |= {"CPU ms a step": "cpu_ms:.1f", "CPU min in all": "minutes:.1f"}
 BODIES = 5
 """How many bodies figure 6 is measured on."""
 
@@ -71,10 +67,6 @@ class Kept:
     show: bool
     methods: Sequence[str] = METHODS
 
-    def asked(self, run: Run, **more: Any) -> dict[str, Any]:
-        """The choices that a run's file belongs to."""
-        return {"run": asdict(run), "setting": asdict(self.setting), **more}
-
     def here(self) -> dict[str, Any]:
         """The circumstances of a measurement."""
         return runner.circumstances(self.setting.threads)
@@ -93,9 +85,6 @@ class Kept:
     def train(self, run: Run) -> dict[str, Any] | None:
         """How its training went; {"skipped": why} where nodes cannot be laid."""
         budget: dict[str, Any] = {"steps": self.steps} if self.minutes is None else {"minutes": self.minutes}
-        if self.minutes is not None and not by_time(run):
-            base = self.train(BASE)
-            budget = {"steps": 0 if base is None else int(base["steps"])}
 
         def measured() -> dict[str, Any]:
             runner.tell(f"training {run.name}: {', '.join(f'{value:g} {name}' for name, value in budget.items())}")
@@ -106,11 +95,8 @@ class Kept:
                 found = {"skipped": error.message}
             return {**self.here(), **found}
 
-        return self.answer(self.folder / run.name / "trained.json", self.asked(run, **budget), measured)
-
-    def _error(self, run: Run, where: str, how: str, trained: dict[str, Any]) -> tuple[Path, dict[str, Any]]:
-        asked = {"model": trained.get("model"), "measure": asdict(self.measure), "set": where, "method": how}
-        return self.folder / run.name / f"error-{where}-{how}.json", asked | {"reference": self.reference}
+        asked = {"run": asdict(run), "setting": asdict(self.setting), **budget}
+        return self.answer(self.folder / run.name / "trained.json", asked, measured)
 
     def errors(self, run: Run, trained: dict[str, Any]) -> dict[tuple[Run, str, str], dict[str, Any]]:
         """Errors on every set after every refinement that belongs to the run.
@@ -121,22 +107,24 @@ class Kept:
             Something is missing, and the model that it would be measured with.
         """
         found: dict[tuple[Run, str, str], dict[str, Any]] = {}
+        folder = self.folder / run.name
         for bench in self.benches if "skipped" not in trained else ():
-            kept = {how: runner.recall(*self._error(run, bench.name, how, trained)) for how in METHODS}
-            missing = [how for how in methods_of(run) if kept[how] is None and how in self.methods]
-            if missing and not self.show:
-                folder = self.folder / run.name
-                if not is_trained(folder / "model", trained):
-                    raise OptionError(f"{folder} has lost its model", "remove that folder to train it again")
-                runner.tell(f"measuring {run.name} on {bench.name}")
-                subjects, model = self.subjects(bench), folder / "model"
-                if run.field == "transmatch":
-                    new = {"none": transformer_errors(model, subjects, self.model, self.measure)}
-                else:
-                    new = errors_of(as_model(model), run, subjects, self.model, missing, self.measure)
-                for how, record in new.items():
-                    kept[how] = runner.keep(*self._error(run, bench.name, how, trained), {**self.here(), **record})
-            found |= {(run, bench.name, how): record for how, record in kept.items() if record is not None}
+            for how in (each for each in methods_of(run) if each in self.methods):
+
+                def measured(bench: BenchSet = bench, how: str = how) -> dict[str, Any]:
+                    if not (folder / "model").is_dir():
+                        raise OptionError(f"{folder} has lost its model", "remove that folder to train it again")
+                    runner.tell(f"measuring {run.name} on {bench.name}: {how}")
+                    subjects, model = self.subjects(bench), folder / "model"
+                    if run.field == "transmatch":
+                        return {**self.here(), **transformer_errors(model, subjects, self.model, self.measure)}
+                    new = errors_of(as_model(model), run, subjects, self.model, [how], self.measure)
+                    return {**self.here(), **new[how]}
+
+                asked = {"model": trained.get("model"), "measure": asdict(self.measure), "set": bench.name}
+                asked |= {"method": how, "reference": self.reference}
+                if (one := self.answer(folder / f"error-{bench.name}-{how}.json", asked, measured)) is not None:
+                    found[run, bench.name, how] = one
         return found
 
     @cached_property
@@ -160,23 +148,17 @@ class Kept:
             ]
         return self._subjects[bench.name]
 
-    def cost(self, rounds: int) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Times and memory of the iterations of table 4's runs."""
+    def cost(self, rounds: int) -> dict[str, Any]:
+        """Times of the iterations of table 4's runs, which take turns."""
         runs = VIEWS["table4"].runs
 
-        def taking_turns() -> dict[str, Any]:
+        def measured() -> dict[str, Any]:
             runner.tell(f"timing {len(runs)} runs side by side")
             return {**self.here(), "times": timed(self.setting, runs, rounds)}
 
         asked = {"runs": [asdict(run) for run in runs], "setting": asdict(self.setting), "rounds": rounds}
-        times = self.answer(self.folder / "times.json", asked, taking_turns)
-        grown = {}
-        for run in runs:
-            path = self.folder / run.name / "memory.json"
-            found = self.answer(path, self.asked(run), partial(memory, self.setting, run))
-            if found is not None:
-                grown[run.name] = found
-        return {} if times is None else times["times"], grown
+        times = self.answer(self.folder / "times.json", asked, measured)
+        return {} if times is None else times["times"]
 
     def descent(self, trained: dict[Run, dict[str, Any]]) -> dict[str, Any] | None:
         """Figure 6, if its runs are there."""
@@ -193,70 +175,38 @@ class Kept:
 
         return self.answer(self.folder / "figure6.json", asked, measured)
 
-    def _refused(self, run: Run) -> dict[str, Any]:
-        return {**self.here(), "refused": self.setting.refused(run), "taken": self.setting.taken(run)}
-
-    def refused(self) -> dict[str, dict[str, Any]]:
-        """By name of table 7's runs, which share of candidates their rules refuse, and those that were taken."""
-        shares = {}
-        for run in VIEWS["table7"].runs:
-            path = self.folder / run.name / "refused.json"
-            found = self.answer(path, self.asked(run), partial(self._refused, run))
-            if found is not None:
-                shares[run.name] = found
-        return shares
-
     def known(self, runs: Sequence[Run], views: Sequence[str], rounds: int) -> Known:
         """What is there, after measuring what is missing; no runs are trained in 0 minutes or steps."""
         trained: dict[Run, dict[str, Any]] = {}
         errors: dict[tuple[Run, str, str], dict[str, Any]] = {}
-        for run in runs if self.trains else ():
+        for run in runs if (self.steps if self.minutes is None else self.minutes) else ():
             if (found := self.train(run)) is not None:
                 trained[run] = found
                 errors |= self.errors(run, found)
-        times, grown = self.cost(rounds) if "table4" in views and rounds else ({}, {})
-        descent = self.descent(trained) if "figure6" in views else None
-        return Known(trained, errors, times, grown, descent, self.refused() if "table7" in views else {})
+        times = self.cost(rounds) if "table4" in views and rounds else {}
+        return Known(trained, errors, times, self.descent(trained) if "figure6" in views else None)
 
-    @property
-    def trains(self) -> bool:
-        """Whether there is a budget to train in."""
-        return bool(self.steps if self.minutes is None else self.minutes)
-
-    def budget(self, known: Known) -> str:
+    def budget(self) -> str:
         """What the numbers cost, in words."""
-        words = [f"{self.steps} steps of every run"]
-        if self.minutes is not None:
-            clocks = {record["clock"] for record in known.trained.values() if "clock" in record}
-            words = [f"{self.minutes:g} {'CPU ' if clocks == {'processor'} else ''}min of training a run"]
-            steps = known.trained.get(BASE, {}).get("steps")
-            if steps and not all(by_time(run) for run in known.trained):
-                words[0] += f" or the base's {steps} steps"
+        words = [f"{self.steps} steps of every run" if self.minutes is None else f"{self.minutes:g} min of every run"]
         if self.setting.batch:
             words.append(f"batches of {self.setting.batch}")
-        unit = "the template's diameter" if self.setting.unit == "diameter" else f"{SPHERE} sqrt(area)"
-        words += [f"radii in units of {unit}", f"preset {self.setting.preset}"]
-        words += [f"{self.measure.code_steps} steps on the code"]
-        words += [f"the pairs of {self.measure.shapes} shapes of a set", f"{self.setting.threads} threads"]
-        return ", ".join(words)
+        words += [f"preset {self.setting.preset}", f"{self.measure.code_steps} steps on the code"]
+        return ", ".join([*words, f"the pairs of {self.measure.shapes} shapes of a set"])
 
 
 def claims_table(found: Sequence[Claim]) -> Any:
-    """Each claim in a row, its verdicts on the held-out shapes and each set (what is about costs: under "")."""
+    """Each claim in a row, its verdicts on the held-out shapes and each set."""
     rows: dict[str, dict[str, str]] = {}
     for claim in found:
-        rows.setdefault(claim.words, {"claim": claim.words})[claim.where or "costs"] = claim.verdict
-    columns = {"claim": "claim", **{(claim.where or "costs"): (claim.where or "costs") for claim in found}}
-    return runner.table(
-        "What the paper claims, and what intervals of 95 % over seeds and pairs carry here",
-        list(rows.values()),
-        columns,
-    )
+        rows.setdefault(claim.words, {"claim": claim.words})[claim.where] = claim.verdict
+    columns = {"claim": "claim", **{claim.where: claim.where for claim in found}}
+    return runner.table("What the paper claims", list(rows.values()), columns)
 
 
 @runner.command
 def main(
-    output: Annotated[Path, Option(help="folder of what is measured")],
+    output: Annotated[Path, Option(help="folder of what is measured, and of the figures")],
     views: Annotated[str, Option(help=f"of {', '.join(VIEWS)}")] = ",".join(VIEWS),
     steps: Annotated[int, Option(min=0, help="of training a run; 0: table 4's cost alone")] = 300,
     minutes: Annotated[float | None, Option(min=0, help="of training instead: equal time, see above")] = None,
@@ -270,46 +220,33 @@ def main(
     methods: Annotated[str, Option(help="refinements, where a view asks for them")] = ",".join(METHODS),
     preset: Annotated[Preset, Option(help="of the training")] = "small",
     batch: Annotated[int | None, Option(min=1, help="shapes of a step; by default the preset's")] = None,
-    unit: Annotated[Unit, Option(help="of the radii: the template's diameter, or 0.65 sqrt(area)")] = "diameter",
-    folder: Annotated[str | None, Option(help="prepared shapes to learn from, not generated bodies")] = None,
-    identities: Annotated[int, Option(min=1, help="of generated bodies")] = 1024,
     threads: runner.Threads = 1,
     model: runner.Model = "human",
     data: runner.Data = runner.DATA,
     cache: runner.Cache = None,
-    markdown: Annotated[Path | None, Option(help="write the tables again, for docs/results.md")] = None,
-    pictures: Annotated[Path | None, Option(help="folder of the figures; by default the output")] = None,
-    plan: Annotated[bool, Option("--plan", help="train nothing, say what all trainings but TransMatch's take")] = False,
     show: Annotated[bool, Option("--show", help="measure nothing, show what is there")] = False,
 ) -> runner.Report:
     names = [name for name in VIEWS if name in runner.names_of(views, VIEWS, "view")]
     runs = all_runs(names, seeds, runner.names_of(repeated, VIEWS, "view"))
     runs = [run for run in runs if not any(word in run.name for word in without.split(",") if word)]
+    if minutes is not None:  # in which a transformer cannot be stopped
+        runs = [run for run in runs if run.field != "transmatch"]
     benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
-    setting = Setting(preset, folder, identities, threads, unit, batch)
-    if plan:
-        rows = planned(setting, [run for run in runs if run.field != "transmatch"], steps)
-        return runner.Report({"plan": rows}, [runner.table(f"{steps} steps of every run", rows, PLAN_COLUMNS)])
-    measure = Measure(shapes=shapes, code_steps=code_steps)
+    setting, measure = Setting(preset, threads, batch), Measure(shapes=shapes, code_steps=code_steps)
     wanted = runner.names_of(methods, METHODS, "method")
     kept = Kept(output, setting, measure, steps, minutes, model, benches, cache, show, wanted)
     known = kept.known(runs, names, rounds)
-    budget, where = kept.budget(known), [bench.name for bench in benches]
+    where = [bench.name for bench in benches]
     found = claims(known, where)
-    drawn = [*tables(known, names, where, budget), claims_table(found)]
-    if markdown is not None:
-        with replace_on_success(markdown) as temporary:
-            temporary.write_text("\n".join(runner.as_markdown(each) for each in drawn), encoding="utf-8")
-    notes = [f"Budget: {budget}"]
-    if kept.trains and (missing := [run.name for run in runs if run not in known.trained]):
-        notes.append(f"Not measured: {', '.join(missing)}")
-    notes += [f"wrote {path}" for path in draw_views(known, names, where, pictures or output)]
+    drawn = [*tables(known, names, where, kept.budget()), claims_table(found)]
+    missing = [run.name for run in runs if run not in known.trained]
+    notes = [f"Not measured: {', '.join(missing)}"] if missing else []
+    notes += [f"wrote {path}" for path in draw_views(known, names, where, output)]
     record = {
         **{"setting": asdict(setting), "measure": asdict(measure)},
         "runs": {run.name: each for run, each in known.trained.items()},
         "errors": {f"{run.name} {name} {how}": r["mean_cm"] for (run, name, how), r in known.errors.items()},
-        **{"times": known.times, "memory": known.memory, "figure6": known.descent},
-        "claims": [asdict(claim) for claim in found],
+        **{"times": known.times, "figure6": known.descent, "claims": [asdict(claim) for claim in found]},
     }
     return runner.Report(record, drawn, notes)
 

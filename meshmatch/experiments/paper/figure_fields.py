@@ -1,12 +1,17 @@
 """What fields and losses do to a template's triangles, the paper's figures 4 and 5; what refinement changes, figure 6.
 
+In figures 4 and 5 a field itself is fitted to one body, without a network: the training's loss on one shape, the mean
+squared distance at some template points whose places on the body are known up to noise, and the weights of the paper for
+volume and rigidity. What is searched, by Adam from rest, are the node vectors; for a pointwise field, the weights of its
+network. Blends of codes (Z) need a network's codes and have no part in it.
+
 The *change* of a triangle is log2 of its area over its area before, or over its area on the true body: 0 for none, 1 for
 twice, -1 for half.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +21,8 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.experiments.paper.ablation_errors import Measure, begin_body, refined, refinement_of
-from meshmatch.experiments.paper.ablation_views import BASE, Run
+from meshmatch.experiments.paper.ablation_views import BASE
+from meshmatch.fields.field import Field, PointField, PointwiseField, pack
 from meshmatch.fields.shape_functions import FIELDS, FieldName, has_nodes, shape_functions
 from meshmatch.fitting.system import node_system
 from meshmatch.geometry.frames import Frame, kabsch
@@ -27,15 +33,15 @@ from meshmatch.models.trained import TrainedModel
 from meshmatch.render.figures import Panel
 from meshmatch.render.scales import Scale
 from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
+from meshmatch.training.losses import CorrespondenceLoss
 
 PULLED = ("left forearm", "left hand")
 PULL = (0.10, 0.16, 0.0)
 """How far the nodes of these parts are moved: out and up, units of sqrt(area) (0.1 is 14 cm)."""
-LOSSES = ("none", "vol", "arap", "vol+arap", "vol+arap+Z")
-FIGURE4 = tuple(replace(BASE, field=field) for field in FIELDS)
-FIGURE5 = tuple(replace(BASE, constraint=constraint) for constraint in LOSSES)
+CONSTRAINTS = ("none", "vol", "arap", "vol+arap")
 SCALE = Scale(-1.0, 1.0, "area of a triangle: log2 of how many times what it should be", beyond=(True, True))
 COLUMNS = {"what": "what", "mean |change|": "change:.3f", "beyond a quarter": "over_quarter:.1%"}
 COLUMNS |= {"beyond twice": "over_twice:.1%", "turned over": "turned:.2%"}
@@ -152,32 +158,6 @@ def template_frame(template: Template, body: Float[Floats, "V 3"]) -> Frame:
     return frame.compose(pose.frame)
 
 
-def fits(
-    models: Mapping[Run, TrainedModel], names: Sequence[str], body: Float[Floats, "V 3"], method: str, measure: Measure
-) -> Drawn:
-    """A body that no run learned from, and the template as each run fits it.
-
-    ``method`` is of `meshmatch.experiments.ablation_errors.METHODS`. The change is beside the true body's triangles, the
-    error the mean distance of the template's vertices from where they belong; both at 1.9 m2 of skin.
-    """
-    template = next(iter(models.values())).template
-    faces, upright = template.shape.faces, template_frame(template, body)
-    panels = [Panel(Shape(upright.apply(body), faces, "body"), None, "the body", rotation=np.eye(3))]
-    rows = []
-    size = np.sqrt(areas(body, faces).sum())
-    for name, (run, model) in zip(names, models.items(), strict=True):
-        start = begin_body(model, body, measure)
-        found_rows = refined(model, start, refinement_of(run, method, measure), measure.seed)
-        verts = start.frame.undo(node_system(model).moved(found_rows))
-        found, numbers = change(verts, body, faces)
-        off = float(np.linalg.norm(verts - body, axis=1).mean() / size * CM_PER_UNIT)
-        numbers |= {"volume": volume(verts, faces) / volume(body, faces) - 1, "error_cm": off}
-        rows.append({"what": name, **numbers})
-        stands, colors = Shape(upright.apply(verts), faces, name), SCALE.colors(found)
-        panels.append(Panel(stands, label=name, face_colors=colors, rotation=np.eye(3)))
-    return Drawn(panels, rows)
-
-
 def refinements(model: TrainedModel, bodies: Sequence[Float[Floats, "V 3"]], measure: Measure) -> list[Drawn]:
     """Bodies, and the template as a model fits each: by its network, after the search over codes, after that for nodes.
 
@@ -198,3 +178,89 @@ def refinements(model: TrainedModel, bodies: Sequence[Float[Floats, "V 3"]], mea
             panels.append(Panel(Shape(verts, faces, words), OFF.colors(off), words, rotation=np.eye(3)))
         drawn.append(Drawn(panels, rows))
     return drawn
+
+
+@dataclass(frozen=True)
+class Direct:
+    """How a field is fitted.
+
+    Parameters
+    ----------
+    supervised : how many template points have a known place, spread over the template
+    noise : of these places, units of sqrt(area); 0.007 is 1 cm
+    strained : at how many points volume and rigidity are looked at
+    steps, rate : of Adam; a network's rate is a tenth of it
+    width : of a pointwise network
+    """
+
+    supervised: int = 300
+    noise: float = 0.007
+    strained: int = 400
+    steps: int = 400
+    rate: float = 1e-2
+    width: int = 256
+    kernel: Kernel = "smooth"
+    seed: int = 0
+
+
+def fitted(
+    field: FieldName, constraint: str, template: Template, target: Float[Floats, "V 3"], how: Direct
+) -> Float[Floats, "V 3"]:
+    """The template's vertices after the fit to a body in the template's frame."""
+    torch.manual_seed(how.seed)
+    verts = template.shape.verts
+    order = farthest_points(verts, max(how.supervised, how.strained))
+    known, strained = order[: how.supervised], order[: how.strained]
+    noise = how.noise * np.random.default_rng(how.seed).standard_normal((len(known), 3))
+    places = torch.from_numpy((target[known] + noise).astype(np.float32))[None]
+    fields: list[PointField]
+    if has_nodes(field):
+        rows = torch.zeros(1, template.K, 3, requires_grad=True)
+        wanted, rate = [rows], how.rate
+
+        def on(points: Floats) -> PointField:
+            functions = shape_functions(field, points, template.nodes, template.radius, how.kernel)
+            return Field.of(functions).for_training()
+
+    else:
+        network, code = PointDecoder(1, how.width), torch.zeros(1, 1)
+        rows, wanted, rate = pack(code), list(network.parameters()), 0.1 * how.rate
+
+        def on(points: Floats) -> PointField:
+            at = torch.from_numpy(points.astype(np.float32))
+            return PointwiseField(at, at, network.displacement, 1)
+
+    fields = [on(verts[known]), on(verts[strained])]
+    loss = CorrespondenceLoss()
+    loss = replace(loss, volume=loss.volume * ("vol" in constraint), arap=loss.arap * ("arap" in constraint))
+    at = torch.from_numpy(verts[known].astype(np.float32))
+    optimiser = torch.optim.Adam(wanted, rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, how.steps)
+    for _ in range(how.steps):
+        optimiser.zero_grad()
+        total = (at + fields[0].displacement(rows) - places).square().sum(-1).mean()
+        if loss.volume or loss.arap:
+            total = total + sum(loss.rigidity(fields[1].deformation_gradient(rows)).values())
+        total.backward()
+        optimiser.step()
+        schedule.step()
+    with torch.no_grad():
+        return verts + on(verts).displacement(rows)[0].double().numpy()
+
+
+def direct_fits(
+    cases: Sequence[tuple[FieldName, str, str]], template: Template, body: Float[Floats, "V 3"], how: Direct
+) -> Drawn:
+    """A body and its fits, by cases of field, constraint and label. The change is beside the body's own triangles."""
+    faces = template.shape.faces
+    target = template_frame(template, body).apply(body)
+    panels, rows = [Panel(Shape(target, faces, "body"), None, "the body", rotation=np.eye(3))], []
+    for field, constraint, label in cases:
+        verts = fitted(field, constraint, template, target, how)
+        found, numbers = change(verts, target, faces)
+        row: dict[str, Any] = {"what": label, **numbers, "volume": volume(verts, faces) / volume(target, faces) - 1}
+        off = np.linalg.norm(verts - target, axis=1).mean()
+        rows.append(row | {"error_cm": float(off * CM_PER_UNIT)})
+        colors = SCALE.colors(found)
+        panels.append(Panel(Shape(verts, faces, label), label=label, face_colors=colors, rotation=np.eye(3)))
+    return Drawn(panels, rows)

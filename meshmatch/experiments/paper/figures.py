@@ -5,11 +5,7 @@
 - 5: the same body fitted after different regularisers.
 - 6: bodies as a trained model's network fits them, and after both refinements.
 - 7: what the rules for nodes look at, a node that they refuse, and the three stages of choosing; drawn with the templates'
-  own radius (0.13), and counted with the paper's too: 0.2 of each template's diameter, as in table 7 of the ablations.
-
-By default fields are fitted to the body themselves (`meshmatch.experiments.figure_direct`), without a network. With
---output, the fits are by runs of the ablations (`meshmatch.experiments.ablations`) with the same choices: they are trained
-where the folder lacks them, so that a stopped command goes on, and the ablations' own folder will do.
+  own radius (0.13), and counted with the paper's too: 0.2 of each template's diameter, as in table 7.
 """
 
 from __future__ import annotations
@@ -17,44 +13,45 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from PIL import Image
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 from typer import Option
 
 from meshmatch.api.inputs import as_model
-from meshmatch.arrays import Floats
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.experiments import runner
 from meshmatch.experiments.makers.human_bodies import diameter, unseen_bodies
-from meshmatch.experiments.paper import figure_nodes
-from meshmatch.experiments.paper.ablation_errors import METHODS, Measure
-from meshmatch.experiments.paper.ablation_setting import Setting
-from meshmatch.experiments.paper.ablation_views import BASE, Run
-from meshmatch.experiments.paper.ablations import Kept
-from meshmatch.experiments.paper.figure_direct import CONSTRAINTS, Direct, direct_fits
+from meshmatch.experiments.paper.ablation_errors import Measure
+from meshmatch.experiments.paper.ablation_views import BASE
 from meshmatch.experiments.paper.figure_fields import (
-    FIGURE4,
-    FIGURE5,
+    CONSTRAINTS,
     FIT_COLUMNS,
-    LOSSES,
     OFF,
     PULL_COLUMNS,
     REFINED_COLUMNS,
     SCALE,
-    Drawn,
-    fits,
+    Direct,
+    direct_fits,
     pull,
     refinements,
 )
 from meshmatch.fields.shape_functions import FIELDS, FieldName
-from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import make_folder, replace_on_success
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes
-from meshmatch.templates.template import read_template
+from meshmatch.render.scales import CLAY
+from meshmatch.shapes.colors import label_colors
+from meshmatch.shapes.sampling import farthest_points
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.make import STRATEGIES, NodeConfig, choose_nodes, edge_graph, judged, spectral_clusters
+from meshmatch.templates.template import Template, read_template
 
 FIGURES = ("4", "5", "6", "7")
 _FRONT = Look(turn=0.0, tilt=4.0)
@@ -83,105 +80,192 @@ def stacked(rows: Sequence[tuple[Sequence[Panel], Look]], path: Path) -> None:
         whole.save(temporary, format="PNG", compress_level=9)
 
 
-def models_of(kept: Kept, runs: Sequence[Run]) -> dict[Run, TrainedModel]:
-    """Trained models, trained where they lack."""
-    for run in runs:
-        kept.train(run)
-    return {run: as_model(kept.folder / run.name / "model") for run in runs}
+KEPT, REFUSED, NODE = (0.20, 0.55, 0.80), (0.85, 0.15, 0.12), (0.86, 0.30, 0.12)
+NODE_COLUMNS = {"template": "template", "radius": "radius:.3f", "candidates": "candidates:d"}
+NODE_COLUMNS |= {"refused by parts": "parts:.1%", "spectral": "spectral:.1%", "geodesic": "geodesic:.1%"}
+SHARE = 0.2  # of the diameter along the surface, by which the third panel is coloured
 
 
-def drawn_fits(figure: str, body: Floats, kept: Kept | None, method: str, how: Direct) -> Drawn:
-    """The fits of figure 4 or 5: by trained runs, or without a network where there is no folder for them."""
-    if kept is None:
-        cases: list[tuple[FieldName, str, str]]
-        cases = [(field, "vol+arap", field) for field in FIELDS] if figure == "4" else []
-        cases = cases or [("mls", constraint, constraint) for constraint in CONSTRAINTS]
-        return direct_fits(cases, read_template("human-T"), body, how)
-    runs, names = (FIGURE4, list(FIELDS)) if figure == "4" else (FIGURE5, list(LOSSES))
-    return fits(models_of(kept, runs), names, body, method, kept.measure)
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Where nodes may be: points below the surface, and the vertex each is next to."""
+
+    points: Float[Floats, "N 3"]
+    own: Int[Ints, " N"]
 
 
-def figure_7(nodes: int, radius: float | None, path: Path) -> dict[str, list[dict[str, Any]]]:
+def bordering(shape: Shape, parts: Int[Ints, " V"]) -> Bool[Bools, "P P"]:
+    """Which parts have an edge from one to the other; each has one to itself."""
+    joined = np.eye(int(parts.max()) + 1, dtype=bool)
+    joined[parts[shape.faces], parts[shape.faces[:, [1, 2, 0]]]] = True
+    return np.asarray(joined | joined.T)
+
+
+@cache
+def refused(template: Template, config: NodeConfig) -> tuple[Candidates, dict[str, Bool[Bools, " N"]], Int[Ints, " V"]]:
+    """Candidates of a template, which of them each rule refuses, and its spectral clusters."""
+    shape = template.shape
+    clusters = spectral_clusters(shape, config.clusters, np.random.default_rng(config.seed))
+    rules: dict[str, Bool[Bools, " N"]] = {}
+    for rule in STRATEGIES:
+        points, own, kept = judged(shape, replace(config, strategy=rule), template.labels)
+        rules[rule] = ~kept
+    return Candidates(points, own), rules, clusters
+
+
+def refusals(template: Template, config: NodeConfig) -> dict[str, Any]:
+    """The shares of candidates that the rules refuse, as a row."""
+    found, rules, _ = refused(template, config)
+    shares = {name: float(mask.mean()) for name, mask in rules.items()}
+    return {"template": template.name, "radius": config.radius, "candidates": len(found.points), **shares}
+
+
+def worst_candidate(
+    template: Template, found: Candidates, bad: Bool[Bools, " N"], radius: float
+) -> tuple[int, Int[Ints, " M"]]:
+    """The refused candidate that would move most vertices of parts that have no border with its own part, and all that
+    it would move."""
+    shape, labels = template.shape, template.labels
+    joined, tree = bordering(shape, labels), cKDTree(shape.verts)
+    strangers = np.zeros(len(bad), np.int64)
+    for k in np.flatnonzero(bad).tolist():
+        touched = tree.query_ball_point(found.points[k], radius)
+        strangers[k] = (~joined[labels[found.own[k]], labels[touched]]).sum()
+    worst = int(strangers.argmax())
+    return worst, np.array(tree.query_ball_point(found.points[worst], radius))
+
+
+def dotted(
+    shape: Shape, points: Float[Floats, "N 3"], dots: Any, label: str, colors: Any = None, radius: float = 0.02
+) -> Panel:
+    """A shape with points in one color or one of each; seen through where it has no colors of its own."""
+    each = np.broadcast_to(dots, (len(points), 3))
+    solid = colors is not None
+    return Panel(
+        shape, colors, label, sharp=solid, glass=not solid, points=points, point_colors=each, point_radius=radius
+    )
+
+
+def segmentations(template: Template, config: NodeConfig) -> tuple[list[Panel], dict[str, Any]]:
+    """Parts, spectral clusters, how far one vertex is along the surface, and a candidate that would move two parts."""
+    shape = template.shape
+    found, rules, clusters = refused(template, config)
+    bad, touched = worst_candidate(template, found, rules["parts"], config.radius)
+    moved = np.zeros(shape.V, bool)
+    moved[touched] = True
+    colors = np.where(moved[:, None], label_colors(template.labels), CLAY)
+    graph = edge_graph(shape)
+    distance = dijkstra(graph, indices=found.own[bad])
+    ends = dijkstra(graph, indices=farthest_points(shape.verts, 40))
+    share = distance / ends[np.isfinite(ends)].max()
+    bands = np.where(np.isfinite(share), np.floor(share / SHARE), 5).astype(np.int64)
+    moved_parts = [template.label_names[k] for k in np.unique(template.labels[moved])]
+    panels = [
+        Panel(shape, label_colors(template.labels), f"{len(np.unique(template.labels))} parts", sharp=True),
+        Panel(shape, label_colors(clusters), f"{clusters.max() + 1} spectral clusters", sharp=True),
+        dotted(
+            shape,
+            shape.verts[found.own[bad]][None],
+            NODE,
+            "fifths of the diameter from one vertex",
+            label_colors(bands),
+        ),
+        dotted(shape, found.points[bad][None], NODE, "what one refused node would move", colors),
+    ]
+    numbers = {"template": template.name, "radius": config.radius}
+    return panels, numbers | {"node moves": moved_parts, "vertices": int(moved.sum())}
+
+
+def stages(template: Template, config: NodeConfig) -> tuple[list[Panel], dict[str, Any]]:
+    """Candidates below the surface; those the rule by parts keeps and refuses; the nodes, spread over what is kept."""
+    shape = template.shape
+    found, rules, _ = refused(template, config)
+    bad = rules["parts"]
+    nodes = choose_nodes(shape, config, template.labels)
+    every = np.linspace(0, len(found.points) - 1, min(3000, len(found.points))).astype(np.int64)
+    kept = np.flatnonzero(~bad)
+    chosen = found.points[kept][farthest_points(found.points[kept], min(config.K, len(kept)))]
+    both = np.r_[every, np.flatnonzero(bad)]
+    marked = np.where(bad[both][:, None], REFUSED, KEPT)
+    panels = [
+        dotted(shape, found.points[every], KEPT, f"{len(bad):,} candidates", radius=0.006),
+        dotted(shape, found.points[both], marked, f"{bad.sum():,} refused by parts", radius=0.006),
+        dotted(shape, nodes, NODE, f"{len(nodes)} nodes", radius=0.012),
+    ]
+    numbers = {"template": template.name, "radius": config.radius, "candidates": len(bad), "refused": int(bad.sum())}
+    numbers["by distance"] = len(chosen)
+    return panels, numbers | {"added where vertices lacked nodes": len(nodes) - len(chosen), "nodes": len(nodes)}
+
+
+def figure_7(path: Path) -> dict[str, list[dict[str, Any]]]:
     """Both templates' segmentations, and the stages on one of them; what the rules refuse by the radius that is drawn, and
     by the paper's of each template."""
     templates = [read_template(name) for name in ("human-T", "human-A")]
-    configs = [figure_nodes.config_of(template, nodes, radius) for template in templates]
+    configs = [replace(NodeConfig(), K=300, radius=template.reach) for template in templates]
     rows, bad = [], []
     for template, config in zip(templates, configs, strict=True):
-        panels, numbers = figure_nodes.segmentations(template, config)
+        panels, numbers = segmentations(template, config)
         rows.append((panels, _FRONT))
         bad.append(numbers)
-    panels, steps = figure_nodes.stages(templates[1], configs[1])
+    panels, steps = stages(templates[1], configs[1])
     stacked([*rows, (panels, _FRONT)], path)
     shares = [
-        figure_nodes.refusals(template, figure_nodes.config_of(template, nodes, each))
+        refusals(template, replace(config, radius=each))
         for template, config in zip(templates, configs, strict=True)
         for each in dict.fromkeys((config.radius, BASE.radius * diameter(template.shape)))
     ]
     return {"refused": shares, "bad": bad, "stages": [steps]}
 
 
+TITLES = {
+    "pull": ("Figure 4, an arm pulled by the same handles: change of triangles (log2 of area)", PULL_COLUMNS),
+    "fits 4": ("Figure 4, one body fitted with each field", FIT_COLUMNS),
+    "fits 5": ("Figure 5, one body fitted after each loss", FIT_COLUMNS),
+    "refined": ("Figure 6, bodies fitted by the network, and refined", REFINED_COLUMNS),
+    "refused": ("Figure 7, candidates that the rules refuse by the radius drawn, and by the paper's", NODE_COLUMNS),
+}
+
+
 @runner.command
 def main(
     figures: Annotated[str, Option(help=f"of {', '.join(FIGURES)}")] = ",".join(FIGURES),
-    pictures: Annotated[Path, Option(help="folder of paper-figure-N.png, or -N-trained.png")] = Path("docs/images"),
-    output: Annotated[Path | None, Option(help="folder of trained runs; by default none are used")] = None,
-    train_steps: Annotated[int, Option(min=1, help="of training a run")] = 300,
-    batch: Annotated[int | None, Option(min=1, help="shapes of a step of training a run")] = None,
+    pictures: Annotated[Path, Option(help="folder of paper-figure-N.png")] = Path("docs/images"),
     model: Annotated[str, Option(help="whose fits figure 6 shows")] = "human",
-    method: Annotated[str, Option(help=f"refinement of a run's fits, of {', '.join(METHODS)}")] = "code",
     code_steps: Annotated[int, Option(min=1, help="of the search over codes")] = 60,
-    supervised: Annotated[int, Option(min=4, help="template points with a known place, without a network")] = 300,
     steps: Annotated[int, Option(min=1, help="of Adam, without a network")] = 400,
-    nodes: Annotated[int, Option(min=4, help="of figure 7")] = 300,
-    radius: Annotated[float | None, Option(help="of figure 7's nodes, sqrt(area); by default the template's")] = None,
     seed: runner.Seed = 4,
-    threads: runner.Threads = 1,
 ) -> runner.Report:
     wanted = runner.names_of(figures, FIGURES, "figure")
-    method = runner.names_of(method, METHODS, "method")[0]
     make_folder(pictures)
-    template, how = read_template("human-T"), Direct(supervised=supervised, steps=steps)
-    kept = None
-    if output is not None:
-        measure = Measure(code_steps=code_steps)
-        kept = Kept(output, Setting(threads=threads, batch=batch), measure, train_steps, None, "human", [], None, False)
+    template, how = read_template("human-T"), Direct(steps=steps)
+    bodies = (
+        unseen_bodies(template, _REFINED, seed=seed) if {"4", "5", "6"} & set(wanted) else np.empty((_REFINED, 0, 3))
+    )
     found: dict[str, list[dict[str, Any]]] = {}
-    notes = []
-    body = unseen_bodies(template, 1, seed=seed)[0] if {"4", "5"} & set(wanted) else np.empty((0, 3))
     for name in wanted:
-        learned = kept is not None and name in ("4", "5")
-        path = pictures / f"paper-figure-{name}{'-trained' if learned else ''}.png"
+        path = pictures / f"paper-figure-{name}.png"
         if name == "7":
-            found |= figure_7(nodes, radius, path)
+            found |= figure_7(path)
         elif name == "6":
-            bodies = list(unseen_bodies(template, _REFINED, seed=seed))
-            refined = refinements(as_model(model), bodies, Measure(code_steps=code_steps, seed=seed))
+            refined = refinements(as_model(model), list(bodies), Measure(code_steps=code_steps, seed=seed))
             found["refined"] = [row for each in refined for row in each.rows]
             stacked(
                 [(each.panels, replace(_FRONT, legend=OFF if each is refined[-1] else None)) for each in refined], path
             )
         else:
-            below = drawn_fits(name, body, kept, method, how)
+            cases: list[tuple[FieldName, str, str]] = [(field, "vol+arap", field) for field in FIELDS]
+            if name == "5":
+                cases = [("mls", constraint, constraint) for constraint in CONSTRAINTS]
+            below = direct_fits(cases, template, bodies[0], how)
             found[f"fits {name}"] = below.rows
             rows = [(below.panels, replace(_FRONT, legend=SCALE))]
-            if name == "4" and not learned:
+            if name == "4":
                 above = pull(template, "smooth", 0)
                 found["pull"] = above.rows
                 rows = [(above.panels, _FRONT), *rows]
             stacked(rows, path)
-        notes.append(f"wrote {path}")
-    titles = {
-        "pull": ("Figure 4, an arm pulled by the same handles: change of triangles (log2 of area)", PULL_COLUMNS),
-        "fits 4": ("Figure 4, one body fitted with each field", FIT_COLUMNS),
-        "fits 5": ("Figure 5, one body fitted after each loss", FIT_COLUMNS),
-        "refined": ("Figure 6, bodies fitted by the network, and refined", REFINED_COLUMNS),
-        "refused": (
-            "Figure 7, candidates that the rules refuse by the radius that is drawn, and by the paper's",
-            figure_nodes.COLUMNS,
-        ),
-    }
-    drawn = [runner.table(words, found[key], columns) for key, (words, columns) in titles.items() if key in found]
+    drawn = [runner.table(words, found[key], columns) for key, (words, columns) in TITLES.items() if key in found]
+    notes = [f"wrote {pictures / f'paper-figure-{name}.png'}" for name in wanted]
     notes += [str(row) for key in ("bad", "stages") for row in found.get(key, ())]
     return runner.Report(found, drawn, notes)
 

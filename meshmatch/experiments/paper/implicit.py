@@ -21,7 +21,6 @@ shapes between two, colored by how far the deformation moves each point to the t
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -42,7 +41,7 @@ from meshmatch.fields.field import arap_energy, volume_energy
 from meshmatch.implicit.model import ImplicitFit, ImplicitModel, load_implicit, nearest_on_template
 from meshmatch.implicit.network import ImplicitConfig
 from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
-from meshmatch.implicit.training import AS_PUBLISHED, DIF_NET, TRAINING, ImplicitDataset, build_implicit, train_implicit
+from meshmatch.implicit.training import AS_PUBLISHED, DIF_NET, TRAINING, train_implicit
 from meshmatch.models.implicit_card import IMPLICIT
 from meshmatch.outputs import make_folder
 from meshmatch.render.figures import Panel
@@ -50,7 +49,7 @@ from meshmatch.render.picture import Look, render_shapes
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
-from meshmatch.training.loop import TrainConfig, Trainer
+from meshmatch.training.loop import TrainConfig
 
 METHODS = {"DIF-Net": "pointwise", "reduced": "mls", "published": "published", "published-reduced": "published-mls"}
 """And what their folders are called."""
@@ -58,7 +57,6 @@ FRAMES = 5
 _POINTS = 2000
 _LABELLED, _PAIRS = 64, 50  # shapes whose points have labels, and pairs of them for each that is compared
 _COMPARED = ("chamfer", "label_iou", "facing_iou", "bend")
-_CORRECT: float = TRAINING.loss.correct
 _MOVED = 0.25  # of the cube's half side: the last color
 
 
@@ -181,17 +179,6 @@ def interpolation(model: ImplicitModel, pairs: list[tuple[int, int]]) -> dict[st
     return dict(zip(names, np.mean(found, 0).tolist(), strict=True))
 
 
-def step_seconds(samples: ImplicitSamples, config: ImplicitConfig, training: TrainConfig, count: int = 10) -> float:
-    """CPU seconds of a training step on one thread."""
-    trainer = Trainer(build_implicit(samples, config, training.seed), None, training)
-    data = ImplicitDataset(samples, training)
-    trainer.iterate(data[0])
-    began = time.process_time()
-    for number in range(count):
-        trainer.iterate(data[number])
-    return (time.process_time() - began) / count
-
-
 def means(trainings: list[dict[str, Any]]) -> dict[str, Any]:
     """Means over trainings, the standard deviations of those that are compared, and the numbers of each."""
     names = [name for name in trainings[0] if name != "asked"]
@@ -249,8 +236,6 @@ def main(
     steps: Annotated[int, Option(min=1)] = 1000,
     seeds: Annotated[int, Option(min=1, help="trainings of each, on the same shapes")] = 1,
     compared: Annotated[int, Option(min=1, help="shapes reconstructed, and pairs of interpolations")] = 6,
-    correct: Annotated[float, Option(min=0, help="weight of the correction's size in the loss")] = _CORRECT,
-    energies: Annotated[float, Option(min=0, help="of the reduced field, in units of the usual weights")] = 1.0,
     picture: Annotated[Path | None, Option(help="figure 12, a PNG")] = None,
     seed: runner.Seed = 0,
     threads: runner.Threads = 1,
@@ -270,14 +255,8 @@ def main(
             usual = AS_PUBLISHED if published else TRAINING
             trainings = []
             for number in range(seed, seed + seeds):
-                weights = {name: energies * getattr(usual.loss, name) for name in ("volume", "arap", "blend")}
-                loss = replace(usual.loss, correct=correct, **weights)
-                training = replace(usual, steps=steps, seed=number, checkpoint_minutes=1.0, loss=loss)
+                training = replace(usual, steps=steps, seed=number, checkpoint_minutes=1.0)
                 folder = work / f"{kind}-{METHODS[method]}-{number}"
-                if correct != _CORRECT:
-                    folder = folder.with_name(f"{folder.name}-correct{correct:g}")
-                if energies != 1.0:
-                    folder = folder.with_name(f"{folder.name}-energies{energies:g}")
                 model = trained(folder, samples, config, training)
                 models.setdefault((kind, method), model)
                 asked = {"shapes": shapes, "steps": steps, "compared": compared, "seed": seed}
@@ -288,7 +267,6 @@ def main(
                         **reconstruction(model, kind, runner.spread(range(shapes), compared), seed),  # noqa: B023
                         **label_transfer(model, points, pairs),  # noqa: B023
                         **interpolation(model, pairs_of(shapes, compared, seed + 1)),  # noqa: B023
-                        "seconds": step_seconds(samples, config, training),  # noqa: B023
                     }
 
                 trainings.append(runner.once(folder / "measured.json", asked, measure))
@@ -300,7 +278,6 @@ def main(
         **{"label IoU": "label_iou:.3f", "with normals": "facing_iou:.3f", "undeformed": "undeformed_iou:.3f"},
         **{"bend %": "bend:.3f", "of motion": "bend_share:.3f", "volume %": "volume_change:.2f"},
         **{"pieces": "pieces:.1f", "(det F-1)^2": "volume_energy:.3f", "|F'F-I|": "arap_energy:.3f"},
-        "s/step": "seconds:.3f",
     }
     tables = [runner.table(title_of(shapes, steps, seeds), rows, columns)]
     if seeds > 1:

@@ -7,7 +7,8 @@
   goes.
 
 --steps fixes the schedule and --minutes stops a run; the same command goes on exactly where it was stopped.
-`experiments.baselines` takes the folders with --coded and --transmatch; it searches 3D-CODED's code by the Chamfer distance.
+`experiments.bench.baselines` takes the folders with --coded and --transmatch; it searches 3D-CODED's code by the Chamfer
+distance.
 """
 
 from __future__ import annotations

@@ -6,13 +6,11 @@ table 2 on plain Chamfer distances, 200 steps on the code of a new shape. "ours"
 default network for small data, node vectors refined; the template with the smallest residual is taken.
 
 Two tests on what no training saw. Held-out generated shapes: each point takes the label of the nearest point of the fitted
-template; intersection over union of the parts that a shape has, its mean over shapes; beside it that of all parts of the
-kind, as ShapeNet's protocol counts: 1 for a part that is neither there nor found, 0 for one that is found and not there.
+template; intersection over union of the parts that a shape has, its mean over shapes.
 The real ones of the benchmark (SHREC'07): every ordered pair is matched through the template
-and measured as in `experiments.bench.keypoints`; real tables once more in the numbering that suits a pair best,
-which a square leaves open (eight for corners and sides, eight for legs).
+and measured as in `experiments.bench.keypoints`.
 
---work FOLDER keeps everything, and the same command goes on from it.
+The work folder keeps everything, and the same command goes on from it.
 """
 
 from __future__ import annotations
@@ -32,18 +30,10 @@ from meshmatch.api.inputs import validated
 from meshmatch.arrays import Int, Ints
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench import category
-from meshmatch.experiments.bench.category import Maps, Shapes
-from meshmatch.experiments.bench.keypoints import (
-    KEYPOINTS,
-    RIGHT,
-    category_overlap,
-    keypoint_errors,
-    mean_overlap,
-    renumbered_errors,
-    stood_alike,
-)
+from meshmatch.experiments.bench.category import Shapes
+from meshmatch.experiments.bench.keypoints import KEYPOINTS, RIGHT, keypoint_errors, mean_overlap, stood_alike
 from meshmatch.experiments.bench.sets import Pair, load_folder
-from meshmatch.experiments.makers.furniture import KINDS, VIEWS, furniture
+from meshmatch.experiments.makers.furniture import KINDS, furniture
 from meshmatch.experiments.makers.furniture_models import (
     chosen_templates,
     cloud_template,
@@ -60,8 +50,6 @@ from meshmatch.maps.build import build_map
 from meshmatch.maps.places import Places
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.trained import TrainedModel
-from meshmatch.render.picture import Panel, render_shapes
-from meshmatch.shapes.colors import label_colors
 from meshmatch.shapes.shape import Shape
 from meshmatch.training.recipes import clouds, paper_clouds
 
@@ -76,10 +64,8 @@ _UPRIGHT_ONCE: dict[str, Any] = {"partial": "no", "variants": 0, "finalists": 1,
 """Shapes are whole and stand upright: no other interpretation is tried."""
 COLUMNS = {
     **{"class": "class", "method": "method", "generated IoU": "generated_iou:.3f"},
-    **{"ShapeNet's": "shapenet_iou:.3f"},
     **{"real: mean": "mean:.3f", "median": "median:.3f", f"within {RIGHT:g}": "arrived:.1%"},
-    **{"best numbering": "renumbered_arrived:.1%", "legs": "legs_arrived:.1%", "IoU": "iou:.2f"},
-    **{"s a fit": "fit_seconds:.1f"},
+    **{"IoU": "iou:.2f", "s a fit": "fit_seconds:.1f"},
 }
 
 
@@ -102,22 +88,19 @@ def by_models(models: Sequence[TrainedModel], config: FitConfig) -> Labeller:
 def part_overlap(give: Labeller, kind: str, numbers: range, seed: int) -> dict[str, Any]:
     """Mean overlap of the parts of held-out shapes with those that their points are given."""
     shares: list[float] = []
-    every: list[float] = []
     each: dict[int, list[float]] = {}
     began = time.monotonic()
     for number in runner.track(numbers, "generated"):
         made = furniture(kind, seed, number)
         points, normals, truth = made.sample(3000, np.random.default_rng([seed, number, 2]))
         found = give(made.surface, OrientedPoints(points, normals))
-        every.append(category_overlap(found, truth, len(KINDS[kind])))
         shares.append(mean_overlap(found, truth, np.ones(len(points))))
         for part in np.unique(truth):
             ours, theirs = found == part, truth == part
             each.setdefault(int(part), []).append(float((ours & theirs).sum() / (ours | theirs).sum()))
     names = {KINDS[kind][part]: float(np.mean(values)) for part, values in sorted(each.items())}
     seconds = (time.monotonic() - began) / max(len(numbers), 1)
-    overlap = {"generated_iou": float(np.mean(shares)), "shapenet_iou": float(np.mean(every))}
-    return overlap | {"parts_iou": names, "fit_seconds": seconds}
+    return {"generated_iou": float(np.mean(shares)), "parts_iou": names, "fit_seconds": seconds}
 
 
 def best_maps(
@@ -146,27 +129,6 @@ def real_shapes(kind: str, data: Path) -> tuple[dict[str, Shape], Mapping[str, I
     return {name: Shape(each.verts @ turn.T, each.faces, each.name) for name, each in stood.items()}, keypoints
 
 
-def real_errors(kind: str, shapes: Shapes, keypoints: Mapping[str, Int[Ints, " N"]], maps: Maps) -> dict[str, Any]:
-    """Errors at the keypoints, of tables in the numbering that suits a pair best as well."""
-    found = keypoint_errors(shapes, keypoints, maps)
-    return found | (renumbered_errors(shapes, keypoints, maps, RIGHT) if kind == "table" else {})
-
-
-def labelled_picture(
-    path: Path, kind: str, models: Sequence[TrainedModel], config: FitConfig, shapes: Sequence[Shape]
-) -> None:
-    """The first template's labels, and those that fits give to other shapes."""
-    colors = label_colors(np.arange(len(KINDS[kind])))
-    template = models[0].template
-    panels = [Panel(template.shape, colors[template.labels], label="template")]
-    for shape in shapes:
-        fits = [Fitter(model, config).fit(validated(shape).shape) for model in models]
-        best = min(range(len(models)), key=lambda k: fits[k].residual)
-        near = cKDTree(fits[best].points_in_file).query(shape.verts)[1]
-        panels.append(Panel(shape, colors[models[best].template.labels[near]], label=shape.name.removesuffix(".ply")))
-    render_shapes(panels, path, VIEWS[kind])
-
-
 @dataclass(frozen=True)
 class Plan:
     """How much is learned and measured; see the options of the command."""
@@ -181,7 +143,7 @@ class Plan:
     seed: int
 
 
-def measure(kind: str, plan: Plan, methods: Sequence[str], pictures: Path | None) -> list[dict[str, Any]]:
+def measure(kind: str, plan: Plan, methods: Sequence[str]) -> list[dict[str, Any]]:
     """Train and measure one kind."""
     folder = plan.work / kind
     folder.mkdir(parents=True, exist_ok=True)
@@ -213,17 +175,12 @@ def measure(kind: str, plan: Plan, methods: Sequence[str], pictures: Path | None
 
             def both(models: list[TrainedModel] = models, config: FitConfig = config) -> dict[str, Any]:
                 generated = part_overlap(by_models(models, config), kind, held_out, plan.seed)
-                return generated | real_errors(kind, real, keypoints, best_maps(models, real, config, pairs))
+                return generated | keypoint_errors(real, keypoints, best_maps(models, real, config, pairs))
 
             kept = folder / f"{name.replace(', ', '-').replace(' ', '-')}.json"
             minutes = sum(model.card.training_minutes for model in models)
             rows.append({"class": kind, "method": name, "minutes": minutes, **runner.once(kept, asked, both)})
             runner.tell(str({key: value for key, value in rows[-1].items() if isinstance(value, float)}))
-        if pictures is not None and method == "ours":
-            some = [furniture(kind, plan.seed, number).surface for number in held_out[:4]]
-            some = [Shape(each.verts, each.faces, f"generated {n}") for each, n in zip(some, held_out, strict=False)]
-            some += [real[name] for name in list(real)[:4]]
-            labelled_picture(pictures / f"parts-{kind}.png", kind, models, config, some)
     return rows
 
 
@@ -237,19 +194,16 @@ def main(
     paper_steps: Annotated[int, Option(min=1, help="of the paper's training")] = 200,
     steps: Annotated[int, Option(min=1, help="of ours")] = 600,
     templates: Annotated[int, Option(min=1, help="of ours; each has a model")] = 6,
-    pictures: Annotated[Path | None, Option(help="draw labels as they are carried into this folder")] = None,
-    work: category.Work = None,
+    work: Annotated[Path, Option(help="what was trained and measured is kept here")] = Path("parts"),
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
 ) -> runner.Report:
     chosen = runner.names_of(kinds, KINDS, "kind")
     ways = runner.names_of(methods, METHODS, "method")
     rows = []
-    how = {"minutes": 0.0, "steps": steps, "threads": threads, "seed": seed, "nodes": 0, "radius": 0.0}
-    with category.training_in(work, **how) as training:
-        plan = Plan(training.work, data, count, test, {"paper": paper_steps, "ours": steps}, templates, threads, seed)
-        for kind in chosen:
-            rows += measure(kind, plan, ways, pictures)
+    plan = Plan(work, data, count, test, {"paper": paper_steps, "ours": steps}, templates, threads, seed)
+    for kind in chosen:
+        rows += measure(kind, plan, ways)
     title = "Labels carried by models of generated shapes: held-out generated ones, and keypoints of real ones"
     return runner.Report({"rows": rows}, [runner.table(title, rows, COLUMNS)])
 

@@ -1,7 +1,7 @@
 """Texture from one RGB-D cloud to another: the paper's section 6.1 and figure 13, on simulated clouds with a known answer.
 
 Generated people in sampled poses and coloured clothes, none of whom a training of the released model drew, are seen by
-one, two or four cameras (`experiments.rgbd_clouds` says how), written as .pcd (the source) and .ply (the target), and
+one, two or four cameras (`experiments.makers.rgbd_clouds` says how), written as .pcd (the source) and .ply (the target), and
 read again. The colours of the source go to the points of the target: to the same person in another pose, and to another
 person.
 
@@ -14,7 +14,7 @@ point of it lies within 3 cm): elsewhere there is nothing to carry; ``colour, al
 that fly, and points of no body, are in the clouds but have no answer.
 
 - truth: the source point nearest to the right place: the least that is possible.
-- ours: `meshmatch.transfer_colors`. coded: 3D-CODED (--coded, a folder of `experiments.learned_baselines`), its code
+- ours: `meshmatch.transfer_colors`. coded: 3D-CODED (--coded, a folder of `experiments.paper.learned_baselines`), its code
   searched by the Chamfer distance, then the nearest point; --coded-by names a model that tells it the orientation. rigid:
   scaled by area, all orientations tried, nearest point.
 
@@ -41,14 +41,12 @@ from meshmatch.api.matching import Matcher
 from meshmatch.api.transfer import transfer_colors
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.baseline_methods import Coded
-from meshmatch.experiments.bench.classical import Registration
+from meshmatch.experiments.bench.methods import Coded, Registration
 from meshmatch.experiments.makers.rgbd_clouds import Body, Camera, Cloud, draw_bodies, save_pcd, scan
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.models.registry import find_model
 from meshmatch.outputs import make_folder
-from meshmatch.render.picture import Look, Panel, render_shapes
 from meshmatch.shapes.files import load_shape, save_shape
 
 NAMES = {"rigid": "rigid, nearest", "coded": "3D-CODED", "ours": "ours", "truth": "the true partner"}
@@ -164,30 +162,15 @@ def cases_of(folder: Path, bodies: tuple[Body, Body, Body], number: int, views: 
     return [Case(file.stem, source[0], cloud, bodies[0], source[1], file) for cloud, file in targets]
 
 
-def draw(path: Path, folder: Path, person: int, counts: Sequence[int], methods: Sequence[str]) -> None:
-    """A person's clouds by number of views: the source, and both targets in the colours that each method gave them."""
-    panels = []
-    for count in counts:
-        panels.append(Panel(load_shape(folder / f"{person}-source-{count}.pcd"), label=f"source, views: {count}"))
-        for target, method in ((t, m) for t in TARGETS for m in methods):
-            name = f"{person}-{target}-{count}"
-            colors = np.load(folder / f"{name}-{method}.npy", allow_pickle=False) / 255.0
-            panels.append(Panel(load_shape(folder / f"{name}.ply"), colors, f"{target}: {NAMES[method]}"))
-    render_shapes(panels, path, Look(up="y", front="z", size=(2000, 520)))
-
-
 @runner.command
 def main(
     output: Annotated[Path, Option("-o", "--output", help="folder of clouds and results")] = Path("out/rgbd"),
     pairs: Annotated[int, Option(min=1, help="people, each with two targets")] = 6,
     views: Annotated[str, Option(help="how many cameras: numbers with commas")] = "1,2,4",
     methods: Annotated[str, Option(help=f"of {', '.join(NAMES)}")] = ",".join(NAMES),
-    coded: Annotated[str | None, Option(help="a model folder of experiments.learned_baselines")] = None,
+    coded: Annotated[str | None, Option(help="a model folder of experiments.paper.learned_baselines")] = None,
     coded_steps: Annotated[int, Option(min=1, help="of its search over codes")] = 200,
     coded_by: Annotated[str, Option(help="a model that finds the orientation for it; none by default")] = "",
-    picture: Annotated[Path | None, Option(help="draw the clouds of one person")] = None,
-    person: Annotated[int, Option(min=0, help="whom the picture shows")] = 0,
-    shown: Annotated[str, Option(help="numbers of views in the picture")] = "4",
     model: runner.Model = "human",
     seed: runner.Seed = 0,
     threads: runner.Threads = 1,
@@ -205,7 +188,7 @@ def main(
         settings["coded"] = [find_model(coded)[1].weights_sha256, coded_steps, coded_by]
     elif "coded" in asked:
         asked.remove("coded")
-        notes.append("3D-CODED is left out: give --coded MODEL, made by experiments.learned_baselines coded")
+        notes.append("3D-CODED is left out: give --coded MODEL, made by experiments.paper.learned_baselines coded")
     make_folder(output)
     bodies = draw_bodies(pairs, seed)
 
@@ -230,10 +213,6 @@ def main(
         {"views": count, "target": target, "method": NAMES[method], **summed(found[count, target, method])}
         for count, target, method in order
     ]
-    if picture is not None:
-        seen = [int(each) for each in runner.names_of(shown, map(str, counts), "number of views")]
-        draw(picture, output, person, seen, [method for method in asked if method != "truth"])
-        notes.append(f"wrote {picture}")
     title = "Colours from cloud to cloud, in bytes; 95 % intervals over pairs"
     return runner.Report({"rows": rows}, [runner.table(title, rows, COLUMNS)], notes)
 

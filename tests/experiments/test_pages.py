@@ -1,0 +1,68 @@
+"""Results are files of one form; the pages are made from them, are fresh, and name nothing that is not there."""
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from meshmatch.errors import InputError
+from meshmatch.experiments import pages
+from meshmatch.experiments.runner import Report, saved_record, table
+
+DOCS = pages.DOCS
+ROOT = DOCS.parent
+FILES = sorted((DOCS / "results").glob("*.json"))
+TEXTS = [(name, (DOCS / name).read_text(encoding="utf-8")) for name in pages.PAGES]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_a_file_of_results_says_how_it_was_made(path: Path) -> None:
+    found = json.loads(path.read_text(encoding="utf-8"))
+    assert {"experiment", "commands", "date", "commit", "machine", "data", "tables", "values"} <= found.keys()
+    assert found["commands"] and all(isinstance(each, str) for each in found["commands"])
+    for each in found["tables"]:
+        assert each["title"] and {len(row) for row in each["rows"]} == {len(each["columns"])}
+
+
+def test_a_file_that_an_experiment_writes_has_the_same_form() -> None:
+    drawn = table("T", [{"set": "a", "cm": 1.234}], {"set": "set", "mean": "cm:.1f"})
+    head = {"experiment": "x", "date": "d", "commit": "c", "machine": "m", "options": {"data": "there"}}
+    found = saved_record(head, ["python -m x"], Report({"rows": [1.5]}, [drawn]))
+    assert found["tables"] == [{"title": "T", "columns": ["set", "mean"], "rows": [["a", "1.2"]]}]
+    assert (found["data"], found["commands"], found["values"]) == ("there", ["python -m x"], {"rows": [1.5]})
+
+
+def test_the_pages_are_fresh() -> None:
+    assert pages.main(["--check"]) == 0
+
+
+def test_a_page_that_differs_from_its_files_is_told_and_then_made(tmp_path: Path) -> None:
+    (tmp_path / "results").mkdir()
+    record = {"date": "d", "commit": "c", "machine": "m", "tables": [{"columns": ["a", "b"], "rows": [["1", "2"]]}]}
+    (tmp_path / "results" / "few.json").write_text(json.dumps(record))
+    for name in pages.PAGES:
+        (tmp_path / name).write_text("before\n<!-- results few 1: b -->\nold\n<!-- end -->\nafter\n")
+    assert pages.main(["--check", "--docs", str(tmp_path)]) == 1
+    assert pages.main(["--docs", str(tmp_path)]) == 0
+    text = (tmp_path / pages.PAGES[0]).read_text()
+    assert "| b |\n|---|\n| 2 |\n" in text and "old" not in text and text.endswith("after\n")
+    assert pages.main(["--check", "--docs", str(tmp_path)]) == 0
+    (tmp_path / "results" / "few.json").write_text("{}")
+    with pytest.raises(InputError, match="few"):
+        pages.results_file("few", tmp_path)
+
+
+def test_results_are_one_short_page() -> None:
+    assert len((DOCS / "results.md").read_text(encoding="utf-8").split()) <= 1500
+
+
+@pytest.mark.parametrize(("name", "text"), TEXTS)
+def test_a_page_names_no_file_and_no_command_that_is_not_there(name: str, text: str) -> None:
+    links = [each.partition("#")[0] for each in re.findall(r"\]\(([^)]+)\)", text) if "://" not in each]
+    assert [each for each in links if each and not (DOCS / each).exists()] == []
+    paths = re.findall(r"`((?:\w+/)+\w*\.?\w*)`", text)
+    assert [each for each in paths if not (ROOT / each).exists() and not (ROOT / "meshmatch" / each).exists()] == []
+    modules = set(re.findall(r"python -m (meshmatch[\w.]*)", text))
+    assert [each for each in modules if importlib.util.find_spec(each) is None] == []
