@@ -1,7 +1,7 @@
 """Dense matching of non-rigid 3D shapes.
 
 The public names below are loaded when they are first used: importing `meshmatch` itself costs nothing heavy. They are
-described in docs/api.md.
+described on the site, whose pages docs/reference lists.
 """
 
 from __future__ import annotations
