@@ -73,18 +73,13 @@ def commands() -> str:
 def _entry(name: str, command: Any, level: int) -> list[str]:
     with command.make_context(name, [], resilient_parsing=True) as context:
         usage = " ".join(command.collect_usage_pieces(context))
-        rows = [(_argument(each), each.help or "") for each in command.params if each.param_type_name == "argument"]
-        rows += [record for each in command.params if (record := each.get_help_record(context)) and record not in rows]
+        rows = [record for each in command.params if (record := each.get_help_record(context))]
     text = (command.help or "").replace("\b", "").strip()
     parts = [f"\n{'#' * level} {name}\n", f"```text\n{name} {usage}\n```\n", *(f"{_escaped(text)}\n" if text else "",)]
     if not hasattr(command, "commands"):
         parts += ["| option | meaning |", "|---|---|"]
         parts += [f"| `{words}` | {_cell(meaning)} |" for words, meaning in rows]
     return parts
-
-
-def _argument(parameter: Any) -> str:
-    return str(parameter.metavar or parameter.name.upper())
 
 
 def _escaped(text: str) -> str:
