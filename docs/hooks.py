@@ -55,7 +55,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 def _relative(target: str, page: str) -> str:
     """A page of the site, seen from another; its address becomes its source, which mkdocs checks."""
-    name, mark, anchor = target.partition("#")
+    name, mark, anchor = (target or "index.html").partition("#")
     return posixpath.relpath(name.replace(".html", ".md"), posixpath.dirname(page) or ".") + mark + anchor
 
 
