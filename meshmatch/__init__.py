@@ -1,14 +1,14 @@
 """Dense matching of non-rigid 3D shapes.
 
 The public names below are loaded when they are first used: importing `meshmatch` itself costs nothing heavy. They are
-described in docs/api.md.
+described on the site, whose pages docs/reference lists.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 if TYPE_CHECKING:
     from meshmatch.api.interpolation import Interpolation as Interpolation

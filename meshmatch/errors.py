@@ -15,7 +15,22 @@ _SHOWN = {code: "\ufffd" for code in _UNSEEN if chr(code) not in "\t\n"}
 
 
 class MeshmatchError(Exception):
-    """Something that the user can put right: what is wrong, and a hint what to do (may be empty), in one line each."""
+    """Something that the user can put right. All errors of the library are of this class.
+
+    Parameters
+    ----------
+    message
+        What is wrong, in one line.
+    hint
+        What to do about it, in one line; may be empty.
+
+    Examples
+    --------
+    >>> try:
+    ...     meshmatch.load_shape("missing.ply")
+    ... except meshmatch.MeshmatchError as error:
+    ...     print(error.message, error.hint)
+    """
 
     def __init__(self, message: str, hint: str = "") -> None:
         self.message, self.hint = (_line(text) for text in (message, hint))

@@ -41,12 +41,29 @@ _ALIKE = 1.5  # sizes of files in one unit differ by less
 class InterpolationOptions:
     """What a sequence of shapes shows.
 
-    ``start`` and ``stop`` are the times of the first and the last shape, from -1 to 2; beyond 0 and 1 the motion goes on.
-    ``mesh``: the source's own moves, or the template's. ``way``: blend the rotation and stretch of the "field" everywhere,
-    or the network's "codes". ``place``: see `Interpolation`; "auto" is "files" where the sizes of the shapes differ by
-    less than a half.
+    Attributes
+    ----------
+    start
+        Time of the first shape, from -1 to 2; beyond 0 and 1 the motion is extrapolated.
+    stop
+        Time of the last shape.
+    mesh
+        Whose mesh moves: the first shape's own ("source") or the model's ("template").
+    way
+        What is blended: the rotation and stretch of the "field" everywhere, or the network's "codes".
+    place
+        Where the shapes lie, see `Interpolation`; "auto" is "files" where their sizes differ by less than a half.
 
-    `OptionError` for an unknown choice, or times out of range.
+    Raises
+    ------
+    OptionError
+        A choice is unknown, or a time out of range.
+
+    Examples
+    --------
+    >>> options = meshmatch.InterpolationOptions(start=-0.2, stop=1.2, mesh="template")
+    >>> shapes = ["templates/samples/dancer.ply", "templates/samples/climber.ply"]
+    >>> sequence = meshmatch.interpolate(shapes, frames=8, options=options)
     """
 
     start: float = 0.0
@@ -87,10 +104,29 @@ class Step:
 class Interpolation(Brief):
     """A sequence of shapes with the same vertices and faces.
 
-    ``fits`` are of the source, of the shapes on the way, of the target, and ``times`` are when each of these is met.
-    ``place`` says where the shapes lie: from where the source's file has it to where the target's has it ("files"), or
-    all in the frame and unit of the source ("source"). ``to_target`` is the mean distance of the carried vertices at time
-    1 to the target's surface, in units of sqrt(area). ``notes`` are what repair did.
+    Attributes
+    ----------
+    steps
+        Time, shape and deviation of each frame.
+    fits
+        Fits of the first shape, of those on the way, and of the last.
+    times
+        When each of these shapes is met.
+    place
+        From where the first file has the shape to where the last has it ("files"), or all in the frame and unit of the
+        first ("source").
+    to_target
+        Mean distance of the moved vertices at time 1 to the last shape's surface, in units of sqrt(area).
+    seconds
+        Wall time.
+    notes
+        What repair did.
+
+    Examples
+    --------
+    >>> sequence = meshmatch.interpolate(["templates/samples/dancer.ply", "templates/samples/climber.ply"], frames=3)
+    >>> half_way = sequence.steps[1].shape
+    >>> meshmatch.save_shape("half-way.ply", half_way)
     """
 
     steps: tuple[Step, ...]
@@ -114,10 +150,38 @@ def interpolate(
 ) -> Interpolation:
     """The shapes between two shapes: from the first at time 0 to the last at time 1.
 
-    There are at least two ``shapes``, each as in `match`; those in between are passed at even times. ``frames`` says how
-    many shapes to make, at least 2, at even times. For the rest see `match`; a sequence of configs has one for each shape.
+    Parameters
+    ----------
+    shapes
+        At least two, each as in `match`; those in between are passed at even times.
+    frames
+        How many shapes to make, at least 2, at even times.
+    options
+        Times, mesh, method and placement of the sequence.
+    model
+        As in `match`.
+    config
+        As in `match`; a sequence has one for each shape.
+    threads
+        As in `match`.
+    progress
+        As in `match`.
 
-    `MeshmatchError`: a shape that cannot be read or fitted, an unknown model, or choices that contradict each other.
+    Returns
+    -------
+    Interpolation
+        Its ``steps`` have a time and a shape each; all shapes share vertices and faces.
+
+    Raises
+    ------
+    MeshmatchError
+        A shape cannot be read or fitted, the model is unknown, or choices contradict each other.
+
+    Examples
+    --------
+    >>> shapes = ["templates/samples/dancer.ply", "templates/samples/climber.ply"]
+    >>> sequence = meshmatch.interpolate(shapes, frames=5)
+    >>> [step.shape.verts for step in sequence.steps]  # (V, 3) each
     """
     began = time.monotonic()
     options = options or InterpolationOptions()

@@ -47,24 +47,35 @@ class _Begun:
 
 
 class Matcher:
-    """One model, for many shapes: fit each of them once, then map between any two of the fits.
+    """One model for many shapes: fit each of them once, then map between any two of the fits.
 
-    ``model`` is a name in the registry, a model folder, or what `load_model` returned; with "auto" the first shapes decide
-    which of the installed models it is. ``config`` says how all shapes are fitted. ``threads`` is how many shapes are
-    fitted beside each other, each on one thread of the numerical libraries; 2 by default. A thread that no shape needs
-    helps the others' fits, whose results it does not change. The libraries have one thread for one shape alone too, and
-    more if they are asked for, which may change the last bits. Afterwards they have their threads back. ``progress`` is
-    called with the stage, the name of the shape and the share of the stage that is done (0..1).
+    A Matcher can be pickled, for `multiprocessing`, joblib or the workers of a data loader. Its model is loaded again
+    by its name or folder where the pickle is opened (`ModelError` if it is missing there, or has other weights);
+    ``progress`` is not kept.
 
-    A Matcher can be pickled, for `multiprocessing`, joblib, or the workers of a data loader. Its model is loaded again by
-    its name or folder where the pickle is opened (`ModelError` if it is missing there, or has other weights); ``progress``
-    stays behind.
+    Parameters
+    ----------
+    model
+        Name in the registry, model folder, or what `load_model` returned; with "auto" the first shapes decide.
+    config
+        How all shapes are fitted.
+    threads
+        How many shapes are fitted at once, each on one thread of the numerical libraries; 2 by default. A spare thread
+        helps the other fits and does not change their results. A single shape gets as many threads as are asked for,
+        which may change the last bits. The libraries' own limits are restored afterwards.
+    progress
+        Called with the stage, the name of the shape and the share of the stage that is done (0..1).
 
+    Raises
+    ------
+    ModelError
+        There is no such model, or it is damaged.
+
+    Examples
+    --------
     >>> matcher = meshmatch.Matcher("human")
-    >>> fits = [matcher.fit(path) for path in paths]
-    >>> maps = {(a, b): matcher.map(fits[a], fits[b]) for a, b in pairs}
-
-    `ModelError` where there is no such model, or it is damaged.
+    >>> fits = [matcher.fit(f"templates/samples/{name}.ply") for name in ("climber", "dancer")]
+    >>> climber_to_dancer = matcher.map(fits[0], fits[1])
     """
 
     def __init__(
@@ -100,16 +111,46 @@ class Matcher:
         return self._model
 
     def fit(self, shape: ShapeLike, config: FitConfig | None = None) -> Fit:
-        """Fit the model's template to one shape, with a config for this shape alone, such as its own up axis.
+        """Fit the model's template to one shape.
 
-        `MeshmatchError` where the shape cannot be read or fitted, or the choices contradict each other.
+        Parameters
+        ----------
+        shape
+            As in `match`.
+        config
+            How this shape alone is fitted, for example its up axis; by default that of the Matcher.
+
+        Returns
+        -------
+        Fit
+            The template on the shape, with its verdict.
+
+        Raises
+        ------
+        MeshmatchError
+            The shape cannot be read or fitted, or choices contradict each other.
         """
         return self.fit_all([shape], config)[0]
 
     def fit_all(self, shapes: Sequence[ShapeLike], config: FitConfig | Sequence[FitConfig] | None = None) -> list[Fit]:
-        """Fit the template to several shapes, some beside each other; where one fails, the others stop.
+        """Fit the template to several shapes, some at once; where one fails, the others stop.
 
-        There is one config for all shapes, or one for each. Errors as `fit`.
+        Parameters
+        ----------
+        shapes
+            Each as in `match`.
+        config
+            One for all shapes, or one for each.
+
+        Returns
+        -------
+        list of Fit
+            In the order of the shapes.
+
+        Raises
+        ------
+        MeshmatchError
+            As for `fit`.
         """
         clean = [usable(shape) for shape in as_shapes(shapes)]
         configs = self._configs(config, len(clean))
@@ -118,10 +159,28 @@ class Matcher:
         return [replace(fit, notes=(*kind, *fit.notes)) for kind, fit in zip(kinds, fits, strict=True)]
 
     def follow(self, shape: ShapeLike, last: Fit) -> Fit:
-        """Fit the next frame of a sequence from where the fit of the last one ended, and from nothing where that is lost.
+        """Fit the next frame of a sequence, starting from the fit of the last one; from nothing where tracking is lost.
 
-        Both are in the same coordinates. Half the time of `fit`, and no left and right that are exchanged on the way.
-        `OptionError` for a fit of another template; other errors as `fit`.
+        Takes half the time of `fit`, and left and right are never exchanged on the way.
+
+        Parameters
+        ----------
+        shape
+            As in `match`, in the same coordinates as the last frame.
+        last
+            The fit of the last frame.
+
+        Returns
+        -------
+        Fit
+            The template on this frame.
+
+        Raises
+        ------
+        OptionError
+            The last fit is of another template.
+        MeshmatchError
+            As for `fit`.
         """
         from meshmatch.fitting.following import follow
 
@@ -132,7 +191,18 @@ class Matcher:
             return self._finished(*self._best(found, clean, self.config), self.config)
 
     def dense(self, fit: Fit) -> Shape:
-        """The template in its full resolution on the shape of a fit, in the frame and unit of its file."""
+        """The template at its full resolution on the shape of a fit.
+
+        Parameters
+        ----------
+        fit
+            A fit of this model.
+
+        Returns
+        -------
+        Shape
+            In the frame and unit of the shape's file; the same triangles for every fit.
+        """
         from meshmatch.fitting.fit import dense_shape
 
         with thread_limit(1):
@@ -141,9 +211,26 @@ class Matcher:
     def map(self, source: Fit, target: Fit, *, agree: bool = True) -> VertexMap:
         """The map from the shape of one fit to the shape of another, both of the same model.
 
-        With ``agree`` both fits are first refined together, so that the template stretches alike, as `match` does: the more
-        accurate map, and a confidence that knows where they disagreed. Without it they are only composed, in a tenth of the
-        time. `OptionError` for a fit of another template, or one that does not know its shape.
+        Parameters
+        ----------
+        source
+            The fit whose vertices get a partner.
+        target
+            The fit in which the partners are looked for.
+        agree
+            Refine both fits together first, so that the template stretches alike, as `match` does: a more accurate map,
+            and a confidence that knows where the fits disagreed. Without it the fits are only composed, in a tenth of
+            the time.
+
+        Returns
+        -------
+        VertexMap
+            From the source's vertices to the target's.
+
+        Raises
+        ------
+        OptionError
+            A fit is of another template, or does not hold its shape.
         """
         with thread_limit(1):
             for fit in (source, target):
@@ -160,7 +247,24 @@ class Matcher:
         config: FitConfig | Sequence[FitConfig] | None = None,
         landmarks: LandmarkPairs | None = None,
     ) -> MatchResult:
-        """Fit both shapes and map one to the other; see `match` for the parameters."""
+        """Fit both shapes and map one to the other; parameters and errors are those of `meshmatch.match`.
+
+        Parameters
+        ----------
+        source
+            As in `meshmatch.match`.
+        target
+            As in `meshmatch.match`.
+        config
+            One for both shapes, or one for each.
+        landmarks
+            As in `meshmatch.match`.
+
+        Returns
+        -------
+        MatchResult
+            The map and both fits.
+        """
         began = time.monotonic()
         clean = [usable(as_shape(source, "source")), usable(as_shape(target, "target"))]
         configs = self._configs(config, 2)
@@ -309,14 +413,44 @@ def match(
 ) -> MatchResult:
     """Match two shapes: ``map.index[i]`` of the result is the vertex of the target matched to vertex i of the source.
 
-    ``source`` and ``target`` are meshes or point clouds of the model's category, in any unit, orientation and resolution:
-    a path, a Shape, an (N, 3) array, (vertices, faces), or an object with .vertices and .faces. ``config`` says how
-    shapes are fitted; a pair holds one for the source and one for the target, which may differ in their axes. Where the
-    whole of a file cannot be fitted, such as a body on a floor, its parts are tried apart, and ``notes`` say which were left
-    out. ``landmarks`` are known pairs, (source vertices (N,), target vertices (N,)), which pull both fits; the map says
-    which of them it misses, and is then not good. Only with ``refine="nodes"``. See `Matcher` for the rest.
+    Where a whole file cannot be fitted, such as a body on a floor, its parts are tried one by one; ``notes`` of the
+    result say which were left out.
 
-    `MeshmatchError`: a shape that cannot be read or fitted, an unknown model, or choices that contradict each other.
+    Parameters
+    ----------
+    source
+        A mesh or point cloud of the model's category, in any unit, orientation and resolution: a path, a `Shape`, an
+        (N, 3) array, a pair (vertices, faces), or a mesh of another library.
+    target
+        The same, for the shape it is matched to.
+    model
+        Name in the registry, model folder, or what `load_model` returned; "auto" chooses the installed model for this
+        kind of shape.
+    config
+        How shapes are fitted; a pair holds one for the source and one for the target, which may differ in their axes.
+    landmarks
+        Known pairs: source vertices (N,), target vertices (N,). They pull both fits; the map names the pairs it misses,
+        and is then not good. Only with ``refine="nodes"``.
+    threads
+        How many shapes are fitted at once; 2 by default.
+    progress
+        Called with the stage, the name of the shape and the share of the stage that is done (0..1).
+
+    Returns
+    -------
+    MatchResult
+        The map with its verdict and confidence, and both fits.
+
+    Raises
+    ------
+    MeshmatchError
+        A shape cannot be read or fitted, the model is unknown, or choices contradict each other.
+
+    Examples
+    --------
+    >>> result = meshmatch.match("templates/samples/climber.ply", "templates/samples/dancer.ply")
+    >>> result.map.verdict
+    >>> dancer_vertices = result.map.index  # (V_source,)
     """
     return Matcher(model, None, threads, progress).match(source, target, config, landmarks)
 
@@ -329,9 +463,37 @@ def register(
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> Fit:
-    """Fit the model's template to one shape; see `match` for the parameters and the errors.
+    """Fit the model's template to one shape (non-rigid registration).
 
-    ``points_in_file`` of the fit are the template's vertices on the shape, in its own frame and unit; all fits of a model
-    have the same vertices and triangles in the same order.
+    All fits of a model have the same vertices and triangles in the same order.
+
+    Parameters
+    ----------
+    shape
+        As in `match`.
+    model
+        As in `match`.
+    config
+        How the shape is fitted.
+    threads
+        Threads of the numerical libraries; more than one may change the last bits.
+    progress
+        As in `match`.
+
+    Returns
+    -------
+    Fit
+        Its ``points_in_file`` (V, 3) are the template's vertices on the shape, in the frame and unit of the file.
+
+    Raises
+    ------
+    MeshmatchError
+        As for `match`.
+
+    Examples
+    --------
+    >>> fit = meshmatch.register("templates/samples/climber.ply")
+    >>> fit.verdict, fit.residual
+    >>> meshmatch.save_shape("fitted.ply", fit.shape)
     """
     return Matcher(model, config, threads, progress).fit(shape)

@@ -40,17 +40,42 @@ def picture(
     look: Look | None = None,
     names: Sequence[str] | None = None,
 ) -> tuple[int, int]:
-    """Draw shapes side by side as a PNG, without a GPU, a display or OpenGL; its width and height in pixels.
+    """Draw shapes side by side as a PNG, without a GPU, a display or OpenGL.
 
-    ``shapes`` are each as in `match`, those given as files with their textures; or what one of the functions of
-    `meshmatch.render.compose` returned, such as the errors of a map. With the ``match`` or map of two shapes
-    corresponding points have one color. ``values`` are for each shape a number per vertex (V,), shown as a color map, or
-    colors (V, 3 or 4) in 0..1; ``labels`` for each shape one per vertex or face. With the ``fit`` of the one shape its
-    template is drawn over it, with its distance as a color map. ``look`` is size, background, axes and side; ``names``
-    are written below the shapes.
+    Parameters
+    ----------
+    shapes
+        Each as in `match`, files with their textures; or what a function of `meshmatch.render.compose` returned.
+    path
+        The .png to write.
+    match
+        A match or a map of two shapes: corresponding points get one color.
+    values
+        For each shape a number per vertex (V,), shown as a color map, or colors (V, 3 or 4) in 0..1.
+    labels
+        For each shape one per vertex or face.
+    fit
+        The fit of one shape: its template is drawn over the shape, with the distance as a color map.
+    look
+        Size, background, axes and side.
+    names
+        Captions below the shapes.
 
-    `MeshmatchError`: more than one of `match`, `values`, `labels` and `fit`; or one that does not belong to the
-    shapes.
+    Returns
+    -------
+    (width, height)
+        Of the picture, in pixels.
+
+    Raises
+    ------
+    MeshmatchError
+        More than one of `match`, `values`, `labels` and `fit` is given; or one does not belong to the shapes.
+
+    Examples
+    --------
+    >>> climber, dancer = "templates/samples/climber.ply", "templates/samples/dancer.ply"
+    >>> result = meshmatch.match(climber, dancer)
+    >>> meshmatch.picture([climber, dancer], "match.png", match=result)
     """
     look = look or Look()
     check_picture(path)
@@ -132,11 +157,40 @@ def view(
 ) -> Page:
     """Write a page that shows two shapes and the map between them: one .html file for any recent browser.
 
-    See `find_maps` for the shapes and the match; textures are read where the shapes are files. ``up`` and ``front`` say
-    how the source stands where a map was given, such as "z" and "-y"; guessed by default. Two ``names`` are shown instead
-    of the shapes' own; ``threads`` search on the surfaces.
+    Parameters
+    ----------
+    source
+        As in `match`; textures are read where shapes are files.
+    target
+        As in `match`.
+    path
+        The .html to write.
+    match
+        As in `find_maps`.
+    up
+        The source's up axis where a map is given, such as "z"; guessed by default.
+    front
+        The axis that the source faces, such as "-y"; guessed by default.
+    names
+        Two captions instead of the shapes' own.
+    threads
+        How many threads search on the surfaces.
 
-    `MeshmatchError`: as `meshmatch.match`; or the map belongs to other shapes.
+    Returns
+    -------
+    Page
+        What was written.
+
+    Raises
+    ------
+    MeshmatchError
+        As for `meshmatch.match`; or the map belongs to other shapes.
+
+    Examples
+    --------
+    >>> climber, dancer = "templates/samples/climber.ply", "templates/samples/dancer.ply"
+    >>> result = meshmatch.match(climber, dancer)
+    >>> meshmatch.view(climber, dancer, "match.html", result)
     """
     threads = checked_threads(threads)
     if names is not None and (isinstance(names, str) or len(names) != 2):

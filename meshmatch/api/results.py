@@ -34,10 +34,28 @@ T = TypeVar("T")
 class MatchResult:
     """What `match` found.
 
-    ``map`` is from source to target: ``map.index[i]`` is the vertex of the target matched to vertex i of the source.
-    ``source_fit`` and ``target_fit`` are the template fitted to each shape, after both fits agreed on how it stretches;
-    ``before_agreement`` the same before: where agreement moved them much, a map is not to be trusted. ``seconds`` is wall
-    time. ``notes`` say what was changed in the shapes before fitting, and which choices were replaced.
+    Attributes
+    ----------
+    map
+        From source to target: ``map.index[i]`` is the vertex of the target matched to vertex i of the source.
+    source_fit
+        The template fitted to the source, after both fits agreed on how it stretches.
+    target_fit
+        The same for the target.
+    seconds
+        Wall time.
+    notes
+        What was changed in the shapes before fitting, and which choices were replaced.
+    before_agreement
+        Both fits before they agreed: where agreement moved them much, the map is not to be trusted.
+    threads
+        How many were allowed.
+
+    Examples
+    --------
+    >>> result = meshmatch.match("templates/samples/climber.ply", "templates/samples/dancer.ply")
+    >>> print(result.map.verdict, result.source_fit.trust, result.notes)
+    >>> dancer_to_climber = result.backward()
     """
 
     map: VertexMap
@@ -57,7 +75,13 @@ class MatchResult:
         return self.source_fit.frame.turn, self.target_fit.frame.turn
 
     def backward(self) -> VertexMap:
-        """The map from target to source, made from the same fits: what pulls values from the source to the target."""
+        """The map from target to source, made from the same fits: it pulls values from the source to the target.
+
+        Returns
+        -------
+        VertexMap
+            One entry for each vertex of the target.
+        """
         source, target = self.before_agreement
         with thread_limit(1):
             return map_of_fits((self.target_fit, self.source_fit), (target, source), self.threads)
@@ -111,10 +135,27 @@ def shape_of(fit: Fit) -> Repaired:
 
 @dataclass(frozen=True)
 class ConfidenceRule:
-    """What to do where the map is not to be trusted: below a confidence of ``minimum`` (0..1).
+    """What to do where the map is not to be trusted; by default values are kept.
 
-    ``fill`` replaces values by what their neighbours have; ``blank`` by a number, one number for each column, a color
-    (sRGB, 0..1), or a label. By default they are kept. `OptionError` for both, or a minimum outside 0..1.
+    Attributes
+    ----------
+    minimum
+        Confidence (0..1) below which a value is not trusted.
+    fill
+        Replace values by those of their neighbours.
+    blank
+        Replace them by a number, one number for each column, a color (sRGB, 0..1), or a label.
+
+    Raises
+    ------
+    OptionError
+        Both ``fill`` and ``blank`` are given, or the minimum is outside 0..1.
+
+    Examples
+    --------
+    >>> rule = meshmatch.ConfidenceRule(minimum=0.5, fill=True)
+    >>> heights = meshmatch.load_shape("templates/samples/dancer.ply").verts[:, 1]
+    >>> meshmatch.transfer_values("templates/samples/dancer.ply", "templates/samples/climber.ply", heights, rule=rule).low
     """
 
     minimum: float = 0.3
@@ -130,10 +171,24 @@ class ConfidenceRule:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Transferred(Brief, Generic[T]):
-    """What arrived on the target: ``data`` is an array, Labels, SkinWeights or Landmarks.
+    """What arrived on the target.
 
-    ``confidence`` (N,) float64 is that of each vertex, face or landmark, 0 (a guess) to 1 (sure); ``low`` says how many
-    were not trusted, and what became of them; ``maps`` were followed.
+    Attributes
+    ----------
+    data
+        An array, `Labels`, `SkinWeights` or `Landmarks`.
+    confidence
+        (N,) float64 of each vertex, face or landmark, from 0 (a guess) to 1 (certain).
+    low
+        How many values were not trusted, and what became of them.
+    maps
+        The maps that were followed.
+
+    Examples
+    --------
+    >>> moved = meshmatch.transfer_landmarks("templates/samples/dancer.ply", "templates/samples/climber.ply", [0, 100])
+    >>> moved.data.points, moved.confidence
+    >>> climber_to_dancer = moved.maps.backward
     """
 
     data: T
@@ -152,12 +207,38 @@ def evaluate(
 ) -> Evaluation:
     """Measure a map: its coverage, its distortion, and its errors where the truth is known.
 
-    Errors are geodesic distances on the target, over the square root of its area; or in centimetres with the target
-    scaled to 1.9 square metres, the skin of a person. ``found`` is a map, or its file; the shapes are as in `match`.
-    ``truth`` is the true target vertex of every source vertex (V_source,); or N vertices of the source and those of the
-    target, ((N,), (N,)). ``seed`` is of the random pairs of points between which distortion is measured.
+    Errors are geodesic distances on the target, divided by the square root of its area; or in centimetres with the
+    target scaled to 1.9 square metres, the skin area of a person.
 
-    `MeshmatchError`: the map or the truth belongs to other shapes, or is something else.
+    Parameters
+    ----------
+    found
+        A match, a map, or the map's file.
+    source
+        As in `match`.
+    target
+        As in `match`.
+    truth
+        The true target vertex of every source vertex (V_source,); or N vertices of the source and those of the target,
+        ((N,), (N,)).
+    seed
+        Of the random pairs of points between which distortion is measured.
+
+    Returns
+    -------
+    Evaluation
+        The measurements; errors are None without the truth.
+
+    Raises
+    ------
+    MeshmatchError
+        The map or the truth belongs to other shapes, or is something else.
+
+    Examples
+    --------
+    >>> climber, dancer = "templates/samples/climber.ply", "templates/samples/dancer.ply"
+    >>> found = meshmatch.match(climber, dancer)
+    >>> print(meshmatch.evaluate(found, climber, dancer))
     """
     source, target = as_shape(source, "source"), as_shape(target, "target")
     if isinstance(found, str | Path):

@@ -24,9 +24,27 @@ from meshmatch.transfer.unwrap import Atlas, Keep, atlas_of
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TexturedResult(Brief):
-    """The target with its new texture: the ``mesh`` with its texture coordinates, what was ``baked`` (``image`` (size,
-    size, 4) uint8, and shares of the surface that are not trusted or discontinuous), the ``atlas`` (and why the target's
-    own coordinates were not used), the ``maps`` that were followed, and the ``seconds`` of unwrapping and baking.
+    """The target with its new texture.
+
+    Attributes
+    ----------
+    mesh
+        The target with its texture coordinates.
+    baked
+        What was baked: ``image`` (size, size, 4) uint8, and the shares of the surface that are not trusted or
+        discontinuous.
+    atlas
+        The texture coordinates, and why the target's own were not used.
+    maps
+        The maps that were followed.
+    seconds
+        Time of unwrapping and baking.
+
+    Examples
+    --------
+    >>> result = meshmatch.transfer_texture("templates/samples/dancer-textured.glb", "templates/samples/climber.ply")
+    >>> result.baked.image.shape  # (2048, 2048, 4)
+    >>> result.save("dressed.obj")  # with dressed.mtl and dressed.png
     """
 
     mesh: Textured
@@ -38,7 +56,17 @@ class TexturedResult(Brief):
     def save(self, path: str | Path) -> None:
         """Write a .glb, or an .obj with an .mtl and a .png of the same name.
 
-        `OptionError` for another suffix, `OutputError` where a file cannot be written.
+        Parameters
+        ----------
+        path
+            Where to; its suffix chooses the format.
+
+        Raises
+        ------
+        OptionError
+            The suffix is another one.
+        OutputError
+            A file cannot be written.
         """
         save_textured(path, self.mesh, self.baked.image)
 
@@ -54,16 +82,44 @@ def transfer_texture(
     look: Appearance | None = None,
     progress: ProgressCallback | None = None,
 ) -> TexturedResult:
-    """Bake the texture of the source into one of the target; ``save("target.glb")`` of the result writes it.
+    """Bake the texture of the source into a texture of the target.
 
-    See `find_maps` for the shapes and the match; textures and texture coordinates are read where the shapes are files.
-    ``image`` is a picture for the source's texture coordinates, instead of those that its file names. ``uv``: reuse the
-    target's texture coordinates if they are valid ("auto"); reuse them or fail ("keep"); or unwrap the target anew
-    ("new"). ``look`` is of the source, where it is not a file; else its vertex colors are baked. See `Matcher` for
-    ``progress``.
+    Parameters
+    ----------
+    source
+        The shape with a texture, as in `find_maps`; textures and texture coordinates are read where shapes are files.
+    target
+        The mesh that receives it.
+    match
+        As in `find_maps`.
+    image
+        A picture for the source's texture coordinates, instead of the one that its file names.
+    uv
+        Reuse the target's texture coordinates if they are valid ("auto"); reuse them or fail ("keep"); or unwrap the
+        target anew ("new").
+    options
+        Size, sampling and padding of the texture, and what is done where the map is not to be trusted.
+    look
+        The source's appearance, where it is not a file; otherwise its vertex colors are baked.
+    progress
+        As in `match`.
 
-    `MeshmatchError`: the source has neither a texture nor colors, the target is a point cloud, its texture
-    coordinates are to be kept and are not valid; or as `meshmatch.match`.
+    Returns
+    -------
+    TexturedResult
+        Its ``save("target.glb")`` writes the target with its texture.
+
+    Raises
+    ------
+    MeshmatchError
+        The source has neither a texture nor colors, the target is a point cloud, its texture coordinates are to be kept
+        and are not valid; or as for `meshmatch.match`.
+
+    Examples
+    --------
+    >>> dancer, climber = "templates/samples/dancer-textured.glb", "templates/samples/climber.ply"
+    >>> dressed = meshmatch.transfer_texture(dancer, climber, options=meshmatch.BakeOptions(size=512))
+    >>> dressed.save("dressed.glb")
     """
     if uv not in get_args(Keep):
         raise OptionError(f"invalid uv {uv!r}", f"choose one of {', '.join(get_args(Keep))}")

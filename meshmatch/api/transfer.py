@@ -43,12 +43,32 @@ checked: a `Matcher`, or a function of both shapes."""
 
 
 def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> MapPair:
-    """The maps between two shapes, given as in `match`, which transfers follow; several transfers can share one pair.
+    """The maps between two shapes that transfers follow; several transfers can share one pair.
 
-    ``match`` is a match or a map from source to target that is there already, or its path; or a `Matcher`, with which the
-    shapes are matched, by default a new one.
+    Parameters
+    ----------
+    source
+        The shape whose attributes are transferred, as in `match`.
+    target
+        The shape that receives them.
+    match
+        A match or a map from source to target, or its path; or a `Matcher` that makes it, by default a new one.
 
-    `MeshmatchError`: the map belongs to other shapes or has the opposite direction; or as `meshmatch.match`.
+    Returns
+    -------
+    MapPair
+        Both shapes and the maps in both directions.
+
+    Raises
+    ------
+    MeshmatchError
+        The map belongs to other shapes or has the opposite direction; or as for `meshmatch.match`.
+
+    Examples
+    --------
+    >>> maps = meshmatch.find_maps("templates/samples/dancer.ply", "templates/samples/climber.ply")
+    >>> heights = meshmatch.load_shape("templates/samples/dancer.ply").verts[:, 1]
+    >>> moved = meshmatch.transfer_values(maps.source, maps.target, heights, maps)
     """
     source, target = as_shape(source, "source"), as_shape(target, "target")
     label = Path(match).name if isinstance(match, str | Path) else "the map"
@@ -80,13 +100,39 @@ def transfer_values(
     directions: bool = False,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[Floats]:
-    """Numbers of the source's vertices on the target's vertices, interpolated within the source's faces: ``data`` is an
-    array (V_target,) or (V_target, D).
+    """Numbers of the source's vertices on the target's vertices, interpolated within the source's faces.
 
-    ``values`` are (V_source,) or (V_source, D); those that are not finite take no part. ``directions``: they are
-    directions (V_source, 3), such as normals, and are turned as the surface turns from source to target, to unit length.
+    Parameters
+    ----------
+    source
+        As in `find_maps`.
+    target
+        As in `find_maps`.
+    values
+        (V_source,) or (V_source, D). Values that are not finite take no part.
+    match
+        As in `find_maps`.
+    directions
+        The values are directions (V_source, 3), such as normals: they turn as the surface turns from source to target,
+        and have unit length afterwards.
+    rule
+        What is done where the map is not to be trusted.
 
-    `MeshmatchError`: not a row for each vertex; or as `find_maps`.
+    Returns
+    -------
+    Transferred
+        ``data`` is an array (V_target,) or (V_target, D).
+
+    Raises
+    ------
+    MeshmatchError
+        There is not a row for each vertex; or as for `find_maps`.
+
+    Examples
+    --------
+    >>> heights = meshmatch.load_shape("templates/samples/dancer.ply").verts[:, 1]
+    >>> moved = meshmatch.transfer_values("templates/samples/dancer.ply", "templates/samples/climber.ply", heights)
+    >>> moved.data, moved.confidence  # (V_target,) each
     """
     source = as_shape(source, "source")
     numbers = as_numbers(values, "values")
@@ -118,13 +164,37 @@ def transfer_colors(
     colors: ArrayLike | Appearance | None = None,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[Floats]:
-    """Vertex colors of the source on the target's vertices, mixed as light: ``data`` is (V_target, 4), red, green, blue
-    (sRGB) and alpha in 0..1.
+    """Vertex colors of the source on the target's vertices, averaged in linear light.
 
-    ``colors`` (V_source, 3 or 4) in 0..1 (sRGB) are other ones than those of the source's file; an `Appearance` is
-    sampled with its textures.
+    Parameters
+    ----------
+    source
+        As in `find_maps`.
+    target
+        As in `find_maps`.
+    match
+        As in `find_maps`.
+    colors
+        (V_source, 3 or 4), sRGB in 0..1, instead of the colors in the source's file; an `Appearance` is sampled with
+        its textures.
+    rule
+        What is done where the map is not to be trusted.
 
-    `MeshmatchError`: the source has no vertex colors; or as `find_maps`.
+    Returns
+    -------
+    Transferred
+        ``data`` is (V_target, 4): red, green, blue (sRGB) and alpha in 0..1.
+
+    Raises
+    ------
+    MeshmatchError
+        The source has no vertex colors; or as for `find_maps`.
+
+    Examples
+    --------
+    >>> dancer, climber = "templates/samples/dancer-textured.glb", "templates/samples/climber.ply"
+    >>> colored = meshmatch.transfer_colors(dancer, climber, colors=[[0.8, 0.2, 0.2]] * meshmatch.load_shape(dancer).V)
+    >>> colored.data  # (V_target, 4)
     """
     source = as_shape(source, "source")
     given = None if isinstance(colors, Appearance) else light_of(source, colors)
@@ -153,13 +223,39 @@ def transfer_labels(
     to: On | None = None,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[Labels]:
-    """Labels of the source's vertices or faces on the target, voted on, never averaged: ``data.values`` is the label of
-    each vertex or face.
+    """Labels of the source's vertices or faces on the target: chosen by vote, never averaged.
 
-    ``labels`` are (V_source,) or (F_source,) integers or words, or a path; `Labels` where their number does not tell what
-    they belong to. ``to`` is what gets labels; by default what has them on the source, and the points of a cloud.
+    Parameters
+    ----------
+    source
+        As in `find_maps`.
+    target
+        As in `find_maps`.
+    labels
+        (V_source,) or (F_source,) integers or words, or a path; `Labels` where their number does not tell whether they
+        belong to vertices or faces.
+    match
+        As in `find_maps`.
+    to
+        "vertices" or "faces" of the target; by default as on the source, and the points of a cloud.
+    rule
+        What is done where the map is not to be trusted.
 
-    `MeshmatchError`: labels that do not belong to the source, faces of a cloud; or as `find_maps`.
+    Returns
+    -------
+    Transferred
+        ``data.values`` is the label of each vertex (V_target,) or face (F_target,).
+
+    Raises
+    ------
+    MeshmatchError
+        The labels do not belong to the source, or are wanted for faces of a cloud; or as for `find_maps`.
+
+    Examples
+    --------
+    >>> dancer = meshmatch.load_shape("templates/samples/dancer.ply")
+    >>> labels = ["upper" if y > dancer.verts[:, 1].mean() else "lower" for y in dancer.verts[:, 1]]
+    >>> meshmatch.transfer_labels(dancer, "templates/samples/climber.ply", labels).data.values
     """
     source, target = as_shape(source, "source"), as_shape(target, "target")
     if isinstance(labels, str | Path):
@@ -197,12 +293,38 @@ def transfer_weights(
     influences: int = 4,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[SkinWeights]:
-    """Skin weights of the source's vertices on the target's: ``data.matrix`` is sparse, (V_target, J), its rows sum to 1.
+    """Skin weights of the source's vertices on the target's vertices.
 
-    ``weights`` are (V_source, J), dense, sparse or in a file. ``influences`` is how many joints may move a vertex; the
-    heaviest are kept. By the ``rule`` weights are filled in or kept, never left blank.
+    Parameters
+    ----------
+    source
+        As in `find_maps`.
+    target
+        As in `find_maps`.
+    weights
+        (V_source, J), dense, sparse or in a file.
+    match
+        As in `find_maps`.
+    influences
+        How many joints may move a vertex; the heaviest are kept.
+    rule
+        Weights are filled in or kept where the map is not to be trusted, never left blank.
 
-    `MeshmatchError`: weights that do not belong to the source; or as `find_maps`.
+    Returns
+    -------
+    Transferred
+        ``data.matrix`` is sparse, (V_target, J); its rows sum to 1.
+
+    Raises
+    ------
+    MeshmatchError
+        The weights do not belong to the source; or as for `find_maps`.
+
+    Examples
+    --------
+    >>> dancer = meshmatch.load_shape("templates/samples/dancer.ply")
+    >>> arm = (abs(dancer.verts[:, 0]) > 0.3).astype(float)
+    >>> meshmatch.transfer_weights(dancer, "templates/samples/climber.ply", [[a, 1 - a] for a in arm]).data.matrix
     """
     source = as_shape(source, "source")
     if rule.blank is not None:
@@ -231,13 +353,37 @@ def transfer_landmarks(
     *,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[Landmarks]:
-    """Landmarks of the source at exact points of the target's surface: ``data.points`` (N, 3) in the target's frame; also
-    their vertex, or face and barycentric weights.
+    """Landmarks of the source at exact points of the target's surface.
 
-    ``landmarks`` are vertices (N,), positions (N, 3), which stand for the nearest point of the source, or a path. Those
-    below the minimum of the ``rule`` are counted, and kept.
+    Parameters
+    ----------
+    source
+        As in `find_maps`.
+    target
+        As in `find_maps`.
+    landmarks
+        Vertices (N,); positions (N, 3) in the source's frame, which stand for the nearest point of the source; or a
+        path.
+    match
+        As in `find_maps`.
+    rule
+        Landmarks of less confidence than its minimum are counted, and kept.
 
-    `MeshmatchError`: landmarks that are not on the source; or as `find_maps`.
+    Returns
+    -------
+    Transferred
+        ``data.points`` (N, 3) in the target's frame and unit; also their vertex, or face and barycentric weights.
+
+    Raises
+    ------
+    MeshmatchError
+        The landmarks are not on the source; or as for `find_maps`.
+
+    Examples
+    --------
+    >>> moved = meshmatch.transfer_landmarks("templates/samples/dancer.ply", "templates/samples/climber.ply", [0, 100, 200])
+    >>> moved.data.points  # (3, 3), unit of the climber's file
+    >>> moved.confidence  # (3,)
     """
     space = mesh_space(source) if isinstance(source, str | Path) else ""
     source = as_shape(source, "source")

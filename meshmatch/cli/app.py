@@ -36,7 +36,7 @@ app = typer.Typer(
     help="Dense matching of non-rigid 3D shapes: two meshes in, a vertex map out.",
     no_args_is_help=True,
     add_completion=False,
-    rich_markup_mode=None,  # plain text: it comes at once, and docs/cli.md shows it as it is
+    rich_markup_mode=None,  # plain text: it comes at once
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )

@@ -223,9 +223,9 @@ def evaluate(
 ) -> None:
     """Measure how good a map is.
 
-    Coverage always, distortion between meshes, and errors where the truth is known: geodesic distances on
-    TARGET, over the square root of its area and times 100; and in centimetres with TARGET scaled to 1.9
-    square metres, the skin of a person.
+    Reports coverage and, between meshes, distortion. With --truth or --points also geodesic errors on TARGET:
+    in percent of the square root of its area, and in centimetres with TARGET scaled to 1.9 square metres,
+    the skin area of a person.
     """
     told = options.check_truth(truth, points)
     for what, file in (("curve", curve), ("picture", picture)):

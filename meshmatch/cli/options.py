@@ -152,8 +152,8 @@ class FitOptions:
     model: str = Option(
         AUTO,
         metavar="NAME",
-        help="Model: a name (see `meshmatch models list`), a model folder, or auto: of the installed ones, that of the "
-        "shape's kind.",
+        help="Model: a name (see `meshmatch models list`), a model folder, or auto: the installed model for this kind "
+        "of shape.",
     )
     only: list[str] | None = Option(
         None,
@@ -164,11 +164,11 @@ class FitOptions:
     without: list[str] | None = Option(
         None,
         metavar="NAME",
-        help="Or all but these: weapons, capes, the floor. Their vertices are matched like the nearest.",
+        help="Exclude these from the fit: weapons, capes, the floor. Their vertices follow the nearest fitted ones.",
     )
     refine: Refine = Option(
         "nodes",
-        help="Refinement of the fit. nodes: Gauss-Newton on the nodes; latent: search over the network's codes; "
+        help="Refinement of the fit. nodes: least squares on the nodes; latent: search over the network's codes; "
         "none: the network alone.",
     )
     up: Axis | None = Option(

@@ -83,9 +83,7 @@ class TrainOptions:
     licence: str = Option("unstated", help="Terms of use of the weights; written on the card.")
     steps: int | None = Option(None, min=1, help="Training steps; default: the preset's.")
     minutes: float | None = Option(None, min=0.0, help="Stop after so many minutes; the same command goes on later.")
-    points: int | None = Option(
-        None, min=64, help="Points of a scan that are learned from; fewer are quicker at first. Default: the preset's."
-    )
+    points: int | None = Option(None, min=64, help="Points sampled per training scan. Default: the preset's.")
     identities: int | None = Option(None, min=1, help="How many people (default: 4096) or animals (1024) are made.")
     bodies: int | None = Option(
         None, min=0, help="Learn from so many bodies, drawn once; 0 (default): ever new ones. Preset paper: 1,000."

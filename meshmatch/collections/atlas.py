@@ -48,18 +48,37 @@ class Atlas(Brief, Pickled):
 
     Attributes
     ----------
-    mean : (V, 3) the mean shape, in the unit of the shapes; its surface's center is the origin, its axes are the shapes'
-    modes : (M, V, 3) the modes, the first vary the most; orthonormal in the mean product over the surface
-    deviations : (M,) standard deviations along the modes: root mean square displacements, in the unit of the shapes
-    scores : (S, M) of each shape along each mode, in standard deviations
-    sizes : (S,) root mean square distance of each shape from its center, before it was scaled, unit of its file
-    faces : (F, 3) triangles of all shapes
-    weights : (V,) share of the surface around each vertex
-    names : of the shapes
-    total : variance along all modes, also those that are not kept
-    scale : whether the shapes keep their sizes, or all have been scaled to one
-    robust : whether outliers were kept from mattering
-    template : hash of the template whose fits the shapes are; empty if that is not known
+    mean
+        (V, 3) the mean shape, in the unit of the shapes; the center of its surface is the origin, its axes are the
+        shapes'.
+    modes
+        (M, V, 3) the modes, largest variance first; orthonormal in the mean product over the surface.
+    deviations
+        (M,) standard deviations along the modes: root mean square displacements, in the unit of the shapes.
+    scores
+        (S, M) of each shape along each mode, in standard deviations.
+    sizes
+        (S,) root mean square distance of each shape from its center, before it was scaled, unit of its file.
+    faces
+        (F, 3) triangles of all shapes.
+    weights
+        (V,) share of the surface around each vertex.
+    names
+        Of the shapes.
+    total
+        Variance along all modes, also those that are not kept.
+    scale
+        Whether the shapes keep their sizes ("keep"), or all were scaled to one ("remove").
+    robust
+        Whether the mean and modes resist outliers.
+    template
+        Hash of the template whose fits the shapes are; empty if not known.
+
+    Examples
+    --------
+    >>> base = meshmatch.load_shape("templates/samples/dancer.ply")
+    >>> atlas = meshmatch.Atlas.of([base.verts * [1, height, 1] for height in (0.9, 1.0, 1.2)], base.faces)
+    >>> taller = atlas.shape([1.5])  # 1.5 standard deviations along the first mode
     """
 
     mean: Float[Floats, "V 3"]
@@ -89,15 +108,40 @@ class Atlas(Brief, Pickled):
     ) -> Atlas:
         """The atlas of S shapes with the same vertices and faces.
 
-        ``points`` (S, V, 3) may be a list, or a memory-mapped array: only some shapes are in memory at a time, beside the
-        modes and, of up to 3,000 shapes, an S x S matrix. They are laid over one another by rotation and translation
-        (generalised Procrustes analysis, each vertex weighted with its share of the surface), and with
-        ``scale="remove"`` scaled to one size. At most ``modes`` are kept, of S - 1. ``robust``: the mean is the spatial
-        median, the modes are spherical principal components (Locantore et al. 1999), which a few shapes that are nothing
-        like the others hardly change.
+        The shapes are aligned by rotation and translation (generalised Procrustes analysis, each vertex weighted with
+        its share of the surface). Only some shapes are in memory at a time, beside the modes and, of up to 3,000
+        shapes, an S x S matrix.
 
-        `InputError`: fewer than three shapes, shapes that do not have the same vertices or do not differ, names that are
-        not one for each or not different. `OptionError`: another ``scale``, no modes.
+        Parameters
+        ----------
+        points
+            (S, V, 3), which may be a list or a memory-mapped array.
+        faces
+            (F, 3).
+        names
+            One for each shape, all different.
+        modes
+            Largest number of modes to keep, of S - 1.
+        scale
+            "keep" or "remove": scale all shapes to one size.
+        robust
+            The mean is the spatial median, the modes are spherical principal components (Locantore et al. 1999), which
+            a few outliers hardly change.
+        template
+            Hash of the template whose fits the shapes are.
+
+        Returns
+        -------
+        Atlas
+            The mean and the modes.
+
+        Raises
+        ------
+        InputError
+            Fewer than three shapes, shapes that do not have the same vertices or do not differ, names that are not one
+            for each or not different.
+        OptionError
+            Another ``scale``, or no modes.
         """
         if scale not in get_args(Scale):
             raise OptionError(f"invalid scale {scale!r}", f"choose one of {', '.join(get_args(Scale))}")
@@ -159,14 +203,38 @@ class Atlas(Brief, Pickled):
         return Superimposed(self.mean, self.weights, size)
 
     def offsets(self, scores: Float[Floats, "N M"]) -> Float[Floats, "N V 3"]:
-        """What scores (N, M), in standard deviations, add to the mean; of fewer than all modes, the first."""
+        """What scores add to the mean.
+
+        Parameters
+        ----------
+        scores
+            (N, M) in standard deviations; of fewer than all modes, the first.
+
+        Returns
+        -------
+        (N, V, 3)
+            Displacements, in the unit of the shapes.
+        """
         count = scores.shape[-1]
         return np.asarray(np.tensordot(scores * self.deviations[:count], self.modes[:count], 1))
 
     def shape(self, scores: ArrayLike) -> Shape:
-        """The shape with these scores (M,), in standard deviations; modes that are not given count as 0.
+        """The shape with these scores.
 
-        `InputError` for more scores than modes, or scores that are not finite.
+        Parameters
+        ----------
+        scores
+            (M,) in standard deviations; modes that are not given count as 0.
+
+        Returns
+        -------
+        Shape
+            In the unit of the shapes.
+
+        Raises
+        ------
+        InputError
+            More scores than modes, or scores that are not finite.
         """
         given = as_numbers(scores, "scores", finite=True)
         if given.ndim != 1 or len(given) > len(self.modes):
@@ -174,7 +242,20 @@ class Atlas(Brief, Pickled):
         return Shape(self.mean + self.offsets(given[None])[0], self.faces)
 
     def sample(self, count: int, seed: int = 0) -> list[Shape]:
-        """Random shapes: scores from a normal distribution. The same seed gives the same shapes, however many."""
+        """Random shapes, their scores drawn from a normal distribution.
+
+        Parameters
+        ----------
+        count
+            How many.
+        seed
+            The same seed gives the same shapes, whatever the count.
+
+        Returns
+        -------
+        list of Shape
+            In the unit of the shapes.
+        """
         if count < 0:
             raise OptionError(f"cannot make {count} shapes")
         draws = np.random.default_rng(seed).standard_normal((count, len(self.modes)))
@@ -182,15 +263,40 @@ class Atlas(Brief, Pickled):
         return [Shape(self.mean + each, self.faces, f"sample-{k:03d}") for k, each in enumerate(offsets)]
 
     def align(self, points: Float[Floats, "N V 3"]) -> tuple[Float[Floats, "N V 3"], Poses]:
-        """Shapes laid over the mean, and how they were moved."""
+        """Lay shapes over the mean.
+
+        Parameters
+        ----------
+        points
+            (N, V, 3).
+
+        Returns
+        -------
+        (N, V, 3), Poses
+            The shapes as they lie then, and how they were moved.
+        """
         poses = self.laid.poses(points)
         return poses.apply(points), poses
 
     def project(self, points: ArrayLike | Fit) -> Projection:
-        """A further shape, registered like the others: its scores, and how much the modes cannot say of it.
+        """A further shape, registered like the others: its scores, and what the modes cannot express.
 
-        ``points`` are the template's vertices (V, 3) on the shape, or a fit; of a fit the result is in the shape's file.
-        `InputError` for points that are not an array (V, 3), or not finite; `OptionError` for a fit of another template.
+        Parameters
+        ----------
+        points
+            The template's vertices (V, 3) on the shape, or a fit.
+
+        Returns
+        -------
+        Projection
+            Of a fit, in the frame and unit of the shape's file.
+
+        Raises
+        ------
+        InputError
+            The points are not an array (V, 3), or not finite.
+        OptionError
+            The fit is of another template.
         """
         if isinstance(points, Fit):
             if self.template:
@@ -212,14 +318,43 @@ class Atlas(Brief, Pickled):
         return Projection(scores, Shape(back, self.faces), distance, float(self.weights @ distance))
 
     def distance_from_mean(self, name: str) -> Float[Floats, " V"]:
-        """(V,) how far each vertex of a shape of the collection is from the mean, as far as the modes have it.
+        """How far each vertex of a shape of the collection is from the mean, as far as the modes express it.
 
-        `InputError` for a name that the atlas does not have.
+        Parameters
+        ----------
+        name
+            Name of the shape.
+
+        Returns
+        -------
+        (V,)
+            In the unit of the shapes.
+
+        Raises
+        ------
+        InputError
+            The atlas does not have the name.
         """
         return np.linalg.norm(self.offsets(self.scores[self.rows([name])])[0], axis=1)
 
     def rows(self, names: Sequence[str]) -> Int[Ints, " N"]:
-        """Which shapes have these names; `InputError` for a name that the atlas does not have."""
+        """Which shapes have these names.
+
+        Parameters
+        ----------
+        names
+            Names of shapes.
+
+        Returns
+        -------
+        (N,) int64
+            Rows of ``scores``.
+
+        Raises
+        ------
+        InputError
+            The atlas does not have a name.
+        """
         known = {name: k for k, name in enumerate(self.names)}
         for name in names:
             if name not in known:
@@ -236,13 +371,32 @@ class Atlas(Brief, Pickled):
         permutations: int = 10_000,
         seed: int = 0,
     ) -> Comparison:
-        """Where two groups of shapes differ, given by their names, and whether by more than chance.
+        """Where two groups of shapes differ, and whether by more than chance. What the modes do not keep plays no part.
 
-        ``kind``: displacement along the normal of the mean ("normal"), or in any direction ("hotelling"). What the modes
-        do not keep plays no part.
+        Parameters
+        ----------
+        first
+            Names of the first group.
+        second
+            Names of the second group.
+        kind
+            "normal": displacement along the normal of the mean; "hotelling": in any direction.
+        permutations
+            How many relabellings the p-values come from.
+        seed
+            Of the relabellings.
 
-        `InputError`: a name that the atlas does not have, or that both groups have. `OptionError`: a group of fewer than
-        two shapes, too few shapes for the statistic, no permutations.
+        Returns
+        -------
+        Comparison
+            Differences and p-values for each vertex.
+
+        Raises
+        ------
+        InputError
+            The atlas does not have a name, or both groups have it.
+        OptionError
+            A group of fewer than two shapes, too few shapes for the statistic, no permutations.
         """
         both = set(first) & set(second)
         if both:
@@ -256,7 +410,18 @@ class Atlas(Brief, Pickled):
         )  # fmt: skip
 
     def save(self, path: str | Path) -> None:
-        """Write ``atlas.npz``: the attributes as arrays, and the version. `OutputError` where it cannot be written."""
+        """Write ``atlas.npz``: the attributes as arrays, and the version.
+
+        Parameters
+        ----------
+        path
+            Where to.
+
+        Raises
+        ------
+        OutputError
+            It cannot be written.
+        """
         arrays: dict[str, Any] = {each.name: np.asarray(getattr(self, each.name)) for each in fields(self)}
         arrays["version"] = np.int64(VERSION)
         with replace_on_success(path) as temporary, temporary.open("wb") as file:
@@ -264,9 +429,22 @@ class Atlas(Brief, Pickled):
 
     @classmethod
     def load(cls, path: str | Path) -> Atlas:
-        """Read an atlas: the folder that ``meshmatch atlas`` made, or its ``atlas.npz``.
+        """Read an atlas.
 
-        `InputError` if there is none, or it is damaged or of another version.
+        Parameters
+        ----------
+        path
+            The folder that ``meshmatch atlas`` made, or its ``atlas.npz``.
+
+        Returns
+        -------
+        Atlas
+            As it was saved.
+
+        Raises
+        ------
+        InputError
+            There is none, or it is damaged or of another version.
         """
         file = Path(path) / FILE if Path(path).is_dir() else Path(path)
         if not file.is_file():

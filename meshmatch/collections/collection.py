@@ -43,19 +43,25 @@ _KEPT = 64  # fits in memory
 
 
 class Collection:
-    """A folder of fits of shapes of one kind, named by its path or a URL; it may be yet to be filled by `fit`.
-
-    ``workers`` are so many processes, by default one a core, or those of a Dask scheduler, named by its address.
-    ``progress`` is called with the stage, the folder and the share of the stage that is done (0..1).
+    """A folder of fits of shapes of one kind; `fit` fills it.
 
     Fits are read when they are asked for, and some are kept in memory. Of a folder without fits, all but `fit` is an
     `InputError`.
 
-    A Collection can be pickled: the pickle holds the folder and ``workers``, not the fits, and not ``progress``.
+    Parameters
+    ----------
+    folder
+        Path or URL.
+    workers
+        Number of processes, by default one a core; or the address of a Dask scheduler.
+    progress
+        Called with the stage, the folder and the share of the stage that is done (0..1).
 
+    Examples
+    --------
     >>> collection = meshmatch.Collection("fits")
-    >>> collection.fit("scans")
-    >>> collection.map("anna", "ben").index
+    >>> collection.fit(["templates/samples/climber.ply", "templates/samples/dancer.ply"], model="human")
+    >>> collection.map("climber", "dancer").index
     """
 
     def __init__(
@@ -91,20 +97,40 @@ class Collection:
         """Fit every shape once, and let all fits agree on how the template stretches.
 
         With the model "none" the shapes themselves make a template: one of them is fitted to all others, and then their
-        mean. They must be complete, and of one kind; nothing agrees then, and no fit is better than fair.
+        mean. They must be complete, and of one kind; nothing agrees then, and no fit is better than fair. A run that
+        was stopped goes on where it was, and shapes that were added since are fitted; the fits are those of a run that
+        nobody stopped, bit for bit. A shape that cannot be read or fitted is a record and stops nothing else.
 
-        ``shapes`` are files, folders, patterns such as ``scans/*.ply``, or URLs of folders; ``only`` and ``without`` as in
-        `load_shape`. With ``sequence`` the shapes of a folder are frames, in the natural order of their names, and each
-        fit starts where the last one ended. A run that was stopped goes on where it was, and shapes that were added since
-        are fitted; the fits are those of a run that nobody stopped, bit for bit. ``tell`` is called with the record of
-        each shape, as they come in.
+        Parameters
+        ----------
+        shapes
+            Files, folders, patterns such as ``scans/*.ply``, or URLs of folders.
+        model
+            Name, folder, "auto" or "none".
+        config
+            How all shapes are fitted.
+        only
+            As in `load_shape`.
+        without
+            As in `load_shape`.
+        sequence
+            The shapes of a folder are frames, in the natural order of their names, and each fit starts where the last
+            one ended.
+        agree
+            Whether fits agree.
+        tell
+            Called with the record of each shape, as they come in.
 
-        Parts of a file that are no part of what is fitted, such as a floor, are left out as by `match`; records say which.
-        A shape that cannot be read or fitted becomes a record, and the others go on. Where no processes can be started, this
-        one does the work, and warns.
+        Returns
+        -------
+        Fitted
+            What became of each shape.
 
-        `MeshmatchError`: there is no shape, two have the same name, none could be fitted, or the folder holds fits of
-        another model or made in another way, or is written to by somebody else.
+        Raises
+        ------
+        MeshmatchError
+            There is no shape, two have the same name, none could be fitted, or the folder holds fits of another model
+            or made in another way, or another process writes to it.
         """
         sources = find_sources(shapes, self.store)
         wish = Setting(self.store, str(model), config or FitConfig(), tuple(only), tuple(without), sequence)
@@ -135,8 +161,17 @@ class Collection:
         return str(self._about()["model"])
 
     def to_learn(self) -> RegisteredShapes:
-        """The fitted shapes, without poor fits, for `train` to learn from; `InputError` where fewer than three are left, or
-        they were fitted without a model, which says nothing sure of correspondence.
+        """The fitted shapes, without poor fits, for `train` to learn from.
+
+        Returns
+        -------
+        RegisteredShapes
+            In the template's vertices.
+
+        Raises
+        ------
+        InputError
+            Fewer than three are left, or they were fitted without a model, which says nothing sure of correspondence.
         """
         if self.model == NO_MODEL:
             raise InputError(
@@ -147,21 +182,73 @@ class Collection:
             return RegisteredShapes(self.template, np.array(found.points), name, self.model)
 
     def fit_of(self, name: str) -> Fit:
-        """The fit of a shape, after all have agreed. It does not know the shape itself: its ``verts`` are none."""
+        """The fit of a shape, after all have agreed.
+
+        Parameters
+        ----------
+        name
+            Name of the shape.
+
+        Returns
+        -------
+        Fit
+            Without the shape itself: its ``verts`` are empty.
+        """
         return self._read(name)[0]
 
     def places_of(self, name: str) -> Places:
-        """Where the vertices of a shape belong on the template."""
+        """Where the vertices of a shape belong on the template.
+
+        Parameters
+        ----------
+        name
+            Name of the shape.
+
+        Returns
+        -------
+        Places
+            A point of the template for every vertex.
+        """
         return self._read(name)[1]
 
     def map(self, source: str, target: str) -> VertexMap:
-        """The map between two shapes, by their names: nothing is fitted, only looked up."""
+        """The map between two shapes: nothing is fitted, only looked up.
+
+        Parameters
+        ----------
+        source
+            Name of the source.
+        target
+            Name of the target.
+
+        Returns
+        -------
+        VertexMap
+            From source to target.
+        """
         return build_map(self.places_of(source), self.places_of(target))
 
     def maps_between(self, source: ShapeLike, target: ShapeLike) -> MapPair:
         """The maps between two shapes themselves, in both directions, for transfers and `evaluate`.
 
-        They are found among the fits by their vertices and faces; `InputError` if one is not there.
+        They are found among the fits by their vertices and faces.
+
+        Parameters
+        ----------
+        source
+            As in `match`.
+        target
+            As in `match`.
+
+        Returns
+        -------
+        MapPair
+            Both shapes and both maps.
+
+        Raises
+        ------
+        InputError
+            A shape is not among the fits.
         """
         shapes = as_shape(source, "source"), as_shape(target, "target")
         names = {self._hash_of(name): name for name in self.names}
@@ -177,7 +264,18 @@ class Collection:
             return str(load_words(path)[0].get("shape_hash", ""))
 
     def pairs(self, to: str | None = None) -> list[Pair]:
-        """All ordered pairs of names, or those that lead to one."""
+        """All ordered pairs of names.
+
+        Parameters
+        ----------
+        to
+            Only those that lead to this name.
+
+        Returns
+        -------
+        list of (source, target)
+            Names.
+        """
         names = self.names
         if to is None:
             return list(permutations(names, 2))
@@ -185,10 +283,26 @@ class Collection:
         return [(name, to) for name in names if name != to]
 
     def save_maps(self, output: str | Path, pairs: Sequence[Pair] | None = None, *, suffix: str = ".npz") -> int:
-        """Write the maps of pairs of names, by default of all, and return how many there are.
+        """Write maps; the one from A to B is ``output/A/B`` with the suffix. Maps that are as new as the fits are kept.
 
-        The one from A to B is ``output/A/B`` with the suffix, which chooses the format. Maps that are as new as the fits
-        are kept. `MeshmatchError`: an unknown name or format, or the folder cannot be written, or is by somebody else.
+        Parameters
+        ----------
+        output
+            A folder.
+        pairs
+            Pairs of names, by default all.
+        suffix
+            Chooses the format.
+
+        Returns
+        -------
+        int
+            How many maps there are.
+
+        Raises
+        ------
+        MeshmatchError
+            An unknown name or format, or the folder cannot be written, or another program made it.
         """
         suffix = f".{suffix.removeprefix('.')}"
         check_suffix(Path(f"map{suffix}"))
@@ -201,14 +315,45 @@ class Collection:
             return map_all(self.store, maps, wanted, suffix, crew, self.progress)
 
     def atlas(self, *, modes: int = 100, scale: Scale = "keep", robust: bool = False, poor: bool = False) -> Atlas:
-        """The mean and the modes of the fitted shapes, see `Atlas.of`; poor fits count only if asked for."""
+        """The mean and the modes of the fitted shapes.
+
+        Parameters
+        ----------
+        modes
+            As in `Atlas.of`.
+        scale
+            As in `Atlas.of`.
+        robust
+            As in `Atlas.of`.
+        poor
+            Whether poor fits count.
+
+        Returns
+        -------
+        Atlas
+            Of all fits that count.
+        """
         with self.registered(poor) as shapes:
             return shapes.atlas(modes=modes, scale=scale, robust=robust)
 
     @contextmanager
     def registered(self, poor: bool = False) -> Iterator[Registered]:
-        """The template on every shape, in the unit of its file and with the axes of the template, without poor fits unless
-        asked for; held in memory, or in a file until the block ends. `InputError` where fewer than three are left.
+        """The template on every shape, held in memory, or in a file until the block ends.
+
+        Parameters
+        ----------
+        poor
+            Whether poor fits count.
+
+        Yields
+        ------
+        Registered
+            Points (S, V, 3) in the unit of the files, with the axes of the template.
+
+        Raises
+        ------
+        InputError
+            Fewer than three shapes are left.
         """
         verdicts = {}
         for name in self.names:

@@ -74,16 +74,45 @@ def measure_atlas(
     seed: int = 0,
     progress: ProgressCallback | None = None,
 ) -> Measures:
-    """Measure an atlas on the shapes (S, V, 3) that it was made of; see `Measures`.
+    """Measure an atlas on the shapes that it was made of: compactness, generalisation and specificity.
 
-    ``surfaces`` are the shapes themselves, each in the frame of its points, if they are to be compared with these rather
-    than with the registered template. Of more than 1,000 shapes so many are measured. They are left out one at a time, or
-    of more than 100 in 100 parts; the mean and the modes are made of the others, and the shape is laid over that mean.
-    ``samples`` random shapes have normal scores. Between surfaces a random shape is compared with the two nearest by
-    points.
+    Of more than 1,000 shapes so many are measured. They are left out one at a time, or of more than 100 in 100 parts;
+    the mean and the modes are made of the others, and the shape is laid over that mean. Between surfaces a random shape
+    is compared with the two nearest by points.
 
-    `InputError` where the shapes are not those of the atlas, or fewer than four: a model of what is left needs three.
-    `OptionError` for fewer than two random shapes.
+    Parameters
+    ----------
+    atlas
+        The atlas.
+    points
+        (S, V, 3) the shapes that it was made of.
+    surfaces
+        The shapes themselves, each in the frame of its points, to compare with these rather than with the registered
+        template.
+    samples
+        Random shapes with normal scores.
+    seed
+        Of the random shapes.
+    progress
+        As in `match`.
+
+    Returns
+    -------
+    Measures
+        For each number of modes.
+
+    Raises
+    ------
+    InputError
+        The shapes are not those of the atlas, or fewer than four: a model of what is left needs three.
+    OptionError
+        Fewer than two random shapes.
+
+    Examples
+    --------
+    >>> base = meshmatch.load_shape("templates/samples/dancer.ply")
+    >>> shapes = [base.verts * [1, height, 1] for height in (0.9, 1.0, 1.1, 1.2)]
+    >>> meshmatch.measure_atlas(meshmatch.Atlas.of(shapes, base.faces), shapes, samples=2)
     """
     S = len(points)
     if S != len(atlas.names) or (surfaces is not None and len(surfaces) != S):

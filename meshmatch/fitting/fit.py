@@ -63,30 +63,61 @@ class Reason(str):
 
 @dataclass(frozen=True, eq=False)
 class Fit(Pickled):
-    """A template moved onto one shape.
+    """A template fitted to one shape.
 
     Attributes
     ----------
-    template_hash : which template; fits of two templates cannot be joined
-    frame : from the shape's file to the core frame (template's orientation, area about 1)
-    points : (V, 3) template vertices (low resolution) on the shape, core frame
-    vectors : (K, 3) node vectors, core frame
-    resting : (V, 3) the same vertices on the resting template, template frame
-    faces : (F, 3) the template's triangles
-    residual : mean distance, normals included, between template and shape, both ways, in units of sqrt(area)
-    verts : (N, 3) vertices of the shape, in the frame and unit of its file
-    verdict, reasons : "good", "fair" or "poor", and why it is not good
-    trust : probability (0..1) that the fit is right: on a person, to 8 cm on average
-    signs : by what it was judged; None if it was read from a file
-    regularity : share of template vertices where the deformation folds (det F <= 0), and mean change of volume, of these
-        node vectors; None if it was read from a file that does not say
-    up, front : the axes of the file that the fit took for up and front, such as "+y" and "-z"
-    seconds, seed : how long the fit took, and with which random numbers
-    partial : the shape was taken for a part; the residual is from the shape to the template only
-    repaired : the shape itself, with the way back to the vertices of its file
-    notes : what was changed in the shape before fitting, and which choices were replaced
-    model : name of the model
-    left_out : numbers of the shape's parts that were left out, where a fit of the whole failed; see `meshmatch info`
+    template_hash
+        Hash of the template; fits of two templates cannot be joined.
+    frame
+        From the shape's file to the core frame (the template's orientation, area about 1).
+    points
+        (V, 3) template vertices (low resolution) on the shape, core frame.
+    vectors
+        (K, 3) node vectors, core frame.
+    resting
+        (V, 3) the same vertices on the resting template, template frame.
+    faces
+        (F, 3) the template's triangles.
+    residual
+        Mean distance, normals included, between template and shape, both ways, in units of sqrt(area).
+    verts
+        (N, 3) vertices of the shape, in the frame and unit of its file.
+    verdict
+        "good", "fair" or "poor".
+    reasons
+        Why it is not good.
+    up
+        The axis of the file that the fit took for up, such as "+y".
+    front
+        The axis of the file that the fit took for front, such as "-z".
+    seconds
+        Wall time of the fit.
+    seed
+        Of its random numbers.
+    partial
+        The shape was taken for a part; the residual is from the shape to the template only.
+    repaired
+        The shape itself, with the way back to the vertices of its file.
+    notes
+        What was changed in the shape before fitting, and which choices were replaced.
+    model
+        Name of the model.
+    trust
+        Probability (0..1) that the fit is right: on a person, to 8 cm on average.
+    signs
+        The measurements by which it was judged; None if it was read from a file.
+    left_out
+        Numbers of the shape's parts that were left out, where a fit of the whole failed; see `meshmatch info`.
+    regularity
+        Share of template vertices where the deformation folds (det F <= 0), and mean change of volume, of these node
+        vectors; None if it was read from a file that does not say.
+
+    Examples
+    --------
+    >>> fit = meshmatch.register("templates/samples/climber.ply")
+    >>> print(fit.verdict, fit.trust, fit.up, fit.front)
+    >>> fit.points_in_file  # (V, 3), unit of the file
     """
 
     template_hash: str
@@ -134,11 +165,28 @@ class Fit(Pickled):
         return Shape(self.points_in_file, facing_out(self.faces, self.frame))
 
     def to_trimesh(self) -> Trimesh:
-        """The fitted template as a `trimesh.Trimesh`, in the frame and unit of the shape's file."""
+        """The fitted template as a mesh of trimesh.
+
+        Returns
+        -------
+        trimesh.Trimesh
+            In the frame and unit of the shape's file.
+        """
         return self.shape.to_trimesh()
 
     def check_template(self, expected: str) -> None:
-        """Refuse a fit of another template than the one with this hash (`OptionError`)."""
+        """Refuse a fit of another template.
+
+        Parameters
+        ----------
+        expected
+            Hash of the template that the fit should be of.
+
+        Raises
+        ------
+        OptionError
+            It is of another one.
+        """
         if self.template_hash != expected:
             raise OptionError(
                 f"the fit is of another template ({self.template_hash}, not {expected})",

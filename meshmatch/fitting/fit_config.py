@@ -87,31 +87,61 @@ class LatentRefineConfig:
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How hard to look and how to refine.
+    """How hard a fit searches, and how it is refined.
 
     Attributes
     ----------
-    refine : "none" the network alone, "latent" the paper's search over codes, or "nodes" Gauss-Newton on the nodes
-    seed : of all random numbers
-    up, front : axes of the file, such as "y" or "-z"; searched where not given
-    partial : whether the shape may be a part: "auto" tries it where a fit of the whole leaves template without surface,
-        "yes" always, "no" never
-    mirror : whether the shape may be the mirror image of what the model knows, such as the other hand: "auto" fits both and
-        keeps the better, "no" never; by default as the model's card says
-    samples, coarse_samples : points drawn on the surface, and how many of them are used to screen orientations
-    copies : turned copies of the samples that vote on the orientation
-    hypotheses : voted orientations that are tried, each with its flips
-    careful : how many of the best of these are fitted again with all samples
-    variants, tilt : how many further interpretations of the best of these are tried: predictions from frames tilted at
-        random, by about so many degrees
-    finalists, screening : how many interpretations are refined by a few node steps, and by how many, before the best one
-        gets all steps
-    device : where the network is evaluated and codes are searched: "cpu", or one of torch's, such as "cuda" (needs the
-        extra ``train``)
-    nodes, latent : how node vectors, or codes, are refined
+    refine
+        "none": the network alone; "latent": the paper's search over codes; "nodes": the node vectors are refined.
+    seed
+        Of all random numbers.
+    up
+        Up axis of the file, such as "y" or "-z"; searched if not given.
+    front
+        Axis of the file that the shape faces; searched if not given.
+    partial
+        Whether the shape may be a part: "auto" tries it where a fit of the whole leaves template without surface, "yes"
+        always, "no" never.
+    mirror
+        Whether the shape may be the mirror image of what the model knows, such as the other hand: "auto" fits both and
+        keeps the better, "no" never; by default as the model's card says.
+    samples
+        Points drawn on the surface.
+    coarse_samples
+        How many of them screen orientations.
+    copies
+        Turned copies of the samples that vote on the orientation.
+    hypotheses
+        Voted orientations that are tried, each with its flips.
+    careful
+        How many of the best of these are fitted again with all samples.
+    variants
+        Further interpretations of the best of these: predictions from frames tilted at random.
+    tilt
+        Typical tilt of these frames, in degrees.
+    finalists
+        Interpretations that are refined by a few node steps before the best one gets all steps.
+    screening
+        How many steps these few are.
+    device
+        Where the network is evaluated and codes are searched: "cpu", or one of torch's, such as "cuda" (needs the extra
+        ``train``).
+    nodes
+        How node vectors are refined.
+    latent
+        How codes are refined.
 
-    `OptionError` for an unknown refinement, axis or word for ``partial``; up and front along the same axis; or a count
-    that is too small or not an integer.
+    Raises
+    ------
+    OptionError
+        An unknown refinement, axis or word for ``partial``; up and front along the same axis; or a count that is too
+        small or not an integer.
+
+    Examples
+    --------
+    >>> config = meshmatch.FitConfig(up="z", front="-y", partial="yes")
+    >>> fit = meshmatch.register("templates/samples/climber.ply", config=meshmatch.FitConfig(refine="none", seed=1))
+    >>> fit.seed
     """
 
     refine: Refine = "nodes"
@@ -154,11 +184,33 @@ class FitConfig:
         return self.refine in ON_NODES
 
     def for_model(self, model: TrainedModel) -> FitConfig:
-        """The same for a model: where there are no nodes to refine (pointwise), the code is refined instead."""
+        """The same for a model: where there are no nodes to refine (pointwise), the code is refined instead.
+
+        Parameters
+        ----------
+        model
+            The model that will be fitted.
+
+        Returns
+        -------
+        FitConfig
+            Itself where nothing changes.
+        """
         return replace(self, refine="latent") if self.moves_nodes and not model.has_nodes else self
 
     def for_noise(self, roughness: float) -> FitConfig:
-        """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): more samples, refined more stiffly."""
+        """The same for a noisy cloud: more samples, refined more stiffly.
+
+        Parameters
+        ----------
+        roughness
+            0..1, see `Shape.roughness`.
+
+        Returns
+        -------
+        FitConfig
+            Itself where nothing changes.
+        """
         if roughness <= 0:
             return self
         return replace(self, samples=round(self.samples * (1 + roughness)), nodes=self.nodes.for_noise(roughness))

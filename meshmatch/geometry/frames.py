@@ -13,8 +13,24 @@ from meshmatch.errors import InputError
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Frame(Brief, Pickled):
-    """A similarity: the way from a file's own coordinates into a model's, and back; for a shape that is known by its
-    mirror image, a reflection too."""
+    """A similarity from a file's coordinates to a model's, and back; for a shape that is known by its mirror image, a
+    reflection too.
+
+    Attributes
+    ----------
+    scale
+        Length of one model unit, in the unit of the file.
+    rotation
+        (3, 3) acts on column vectors; determinant -1 of a reflection.
+    center
+        (3,) the model's origin, in the file's coordinates.
+
+    Examples
+    --------
+    >>> frame = meshmatch.Frame(2.0, np.eye(3), np.zeros(3))
+    >>> frame.apply([[2.0, 0.0, 0.0]])  # (1, 3): one model unit along x
+    >>> frame.undo(frame.apply([[2.0, 0.0, 0.0]]))
+    """
 
     scale: float  # length in the file that becomes 1; positive
     rotation: Float[Floats, "3 3"]  # applied after centering; orthonormal, determinant +1, or -1 in the mirror
@@ -35,7 +51,13 @@ class Frame(Brief, Pickled):
 
     @classmethod
     def identity(cls) -> Frame:
-        """The frame that changes nothing."""
+        """The frame that changes nothing.
+
+        Returns
+        -------
+        Frame
+            Scale 1, no rotation, the file's origin.
+        """
         return cls(1.0, np.eye(3), np.zeros(3))
 
     @property
@@ -49,15 +71,48 @@ class Frame(Brief, Pickled):
         return self.rotation * [[-1], [1], [1]] if self.mirrored else self.rotation
 
     def apply(self, points: ArrayLike) -> Float[Floats, "... 3"]:
-        """Points (..., 3) of the file, in the model's frame: ``((points - center) @ rotation.T) / scale``."""
+        """From the file to the model: ``((points - center) @ rotation.T) / scale``.
+
+        Parameters
+        ----------
+        points
+            (..., 3) in the file's coordinates.
+
+        Returns
+        -------
+        (..., 3) float64
+            In the model's frame.
+        """
         return ((np.asarray(off_torch(points), np.float64) - self.center) @ self.rotation.T) / self.scale
 
     def undo(self, points: ArrayLike) -> Float[Floats, "... 3"]:
-        """Points (..., 3) of the model's frame, back in the file's."""
+        """From the model back to the file.
+
+        Parameters
+        ----------
+        points
+            (..., 3) in the model's frame.
+
+        Returns
+        -------
+        (..., 3) float64
+            In the file's coordinates.
+        """
         return (np.asarray(off_torch(points), np.float64) * self.scale) @ self.rotation + self.center
 
     def compose(self, outer: Frame) -> Frame:
-        """This frame first, then `outer`: ``self.compose(outer).apply(x) = outer.apply(self.apply(x))``."""
+        """This frame first, then `outer`: ``self.compose(outer).apply(x) = outer.apply(self.apply(x))``.
+
+        Parameters
+        ----------
+        outer
+            The second frame.
+
+        Returns
+        -------
+        Frame
+            Both in one.
+        """
         return Frame(self.scale * outer.scale, outer.rotation @ self.rotation, self.undo(outer.center))
 
 

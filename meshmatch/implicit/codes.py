@@ -31,11 +31,35 @@ def fit_implicit(
 ) -> ImplicitFit:
     """The code of a shape, so that the model's surface is the shape's.
 
-    ``shape`` is a mesh, a cloud, or the path of one or of `.npz` samples (docs/formats.md); it must stand as the shapes of
-    the training did. Of meshes that are not watertight only the surface is known, as of clouds. The same ``seed`` gives
-    the same code.
+    Parameters
+    ----------
+    model
+        The model.
+    shape
+        A mesh, a cloud, or the path of one or of ``.npz`` samples (the page on formats), oriented as the shapes of the
+        training were. Of meshes that are not watertight only the surface is known, as of clouds.
+    steps
+        Of the search.
+    seed
+        The same seed gives the same code.
+    progress
+        As in `match`.
 
-    `MeshmatchError`: a shape that cannot be read, or has fewer than four points; steps below 1.
+    Returns
+    -------
+    ImplicitFit
+        The code, and how well the model knows the shape.
+
+    Raises
+    ------
+    MeshmatchError
+        The shape cannot be read, or has fewer than four points; or steps are below 1.
+
+    Examples
+    --------
+    >>> model = meshmatch.load_implicit("chair-model")
+    >>> chair = meshmatch.fit_implicit(model, "chair.ply")
+    >>> chair.verdict, chair.reasons
     """
     if steps < 1:
         raise OptionError(f"a code is not found in {steps} steps", "200 are usual")

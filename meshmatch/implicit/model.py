@@ -41,11 +41,28 @@ _LONGEST = 100.0  # code at first
 
 @dataclass(frozen=True, eq=False)
 class ImplicitFit:
-    """A shape as a model has it: a code, and the way from its file into the cube from -1 to 1.
+    """A shape as a model has it.
 
-    ``residual`` is the mean distance that the model gives points of its surface, % of the longest side; ``missed`` the
-    share of these points that the model's surface comes nowhere near, ``invented`` the share of the model's surface that
-    is nowhere near the shape. NaN is not known.
+    Attributes
+    ----------
+    name
+        Of the shape.
+    code
+        (D,).
+    frame
+        From the shape's file into the cube from -1 to 1.
+    residual
+        Mean distance that the model gives points of the shape's surface, % of the longest side; NaN is not known.
+    missed
+        Share of these points that the model's surface comes nowhere near.
+    invented
+        Share of the model's surface that is nowhere near the shape.
+
+    Examples
+    --------
+    >>> chair = meshmatch.load_implicit("chair-model").known("chair-17")
+    >>> chair.code  # (D,)
+    >>> chair.verdict, chair.residual
     """
 
     name: str
@@ -86,6 +103,15 @@ class ImplicitFit:
 class ImplicitModel:
     """A category as one deformed template. Make one with `load_implicit` or `train_implicit`.
 
+    Attributes
+    ----------
+    card
+        What the model is, and its hashes.
+    network
+        Its networks and codes.
+
+    Examples
+    --------
     >>> model = meshmatch.load_implicit("chair-model")
     >>> a, b = (meshmatch.fit_implicit(model, path) for path in ("a.ply", "b.ply"))
     >>> half_way = model.surface(model.blend(a, b, 0.5))
@@ -95,7 +121,23 @@ class ImplicitModel:
     network: ImplicitNetwork
 
     def known(self, name: str) -> ImplicitFit:
-        """A shape of the training by its name; `OptionError` if there was none of that name."""
+        """A shape of the training.
+
+        Parameters
+        ----------
+        name
+            Its name.
+
+        Returns
+        -------
+        ImplicitFit
+            With the code that the training found.
+
+        Raises
+        ------
+        OptionError
+            The training had no shape of that name.
+        """
         names = self.card.shapes
         if name not in names:
             some = ", ".join(names[:5])
@@ -105,7 +147,22 @@ class ImplicitModel:
         return ImplicitFit(name, self.network.codes[number].detach(), Frame(scale, np.eye(3), np.array(center)))
 
     def blend(self, a: ImplicitFit, b: ImplicitFit, time: float) -> ImplicitFit:
-        """The shape on the way from one to another: at time 0 the first, at 1 the last; before and beyond too."""
+        """The shape on the way from one to another.
+
+        Parameters
+        ----------
+        a
+            The shape at time 0.
+        b
+            The shape at time 1.
+        time
+            Before 0 and beyond 1 too.
+
+        Returns
+        -------
+        ImplicitFit
+            The blended code.
+        """
         scale = a.frame.scale ** (1 - time) * b.frame.scale**time
         center = (1 - time) * a.frame.center + time * b.frame.center
         code = (1 - time) * a.code + time * b.code
@@ -115,21 +172,63 @@ class ImplicitModel:
     def distance(
         self, points: Float[Floats, "P 3"], code: Float[torch.Tensor, " D"]
     ) -> tuple[Float[Floats, " P"], Float[Floats, "P 3"]]:
-        """Signed distances of points of the cube, and where each lies on the template."""
+        """Signed distances of points, and where each lies on the template.
+
+        Parameters
+        ----------
+        points
+            (P, 3) in the cube from -1 to 1.
+        code
+            (D,) of a shape.
+
+        Returns
+        -------
+        (P,), (P, 3)
+            Distances, negative inside, and points of the template, in the cube.
+        """
         parts = torch.from_numpy(np.array(points, np.float32)).split(_AT_ONCE)
         found = [self.network.distance(part[None], code[None]) for part in parts]
         values, places = (torch.cat(each, 1)[0].double().numpy() for each in zip(*found, strict=True))
         return values, places
 
     def to_template(self, points: Float[Floats, "P 3"], shape: ImplicitFit) -> Float[Floats, "P 3"]:
-        """Where points of a shape's file (its vertices, say) lie on the template."""
+        """Where points of a shape lie on the template.
+
+        Parameters
+        ----------
+        points
+            (P, 3) in the frame and unit of the shape's file, such as its vertices.
+        shape
+            The shape.
+
+        Returns
+        -------
+        (P, 3)
+            In the template's cube.
+        """
         return self.distance(np.clip(shape.frame.apply(points), -1, 1), shape.code)[1]
 
     def match(self, a: ImplicitFit, b: ImplicitFit, source: Shape, target: Shape) -> VertexMap:
-        """Each vertex of ``source``, which is ``a``, to that of ``target``, which is ``b``, nearest to it on the template.
+        """Map each vertex of one shape to the vertex of another that lies nearest to it on the template.
 
-        Between meshes normals count too: shapes stand alike, and both sides of a thin board should not be taken for each
-        other. Confidence falls with the distance; the verdict is the worse of the two.
+        Between meshes normals count too, so that the two sides of a thin board are not taken for each other. Confidence
+        falls with the distance; the verdict is the worse of the two.
+
+        Parameters
+        ----------
+        a
+            The fit of the source.
+        b
+            The fit of the target.
+        source
+            The source itself.
+        target
+            The target itself.
+
+        Returns
+        -------
+        VertexMap
+            From source to target.
         """
         places = [self.to_template(shape.verts, fit) for shape, fit in ((source, a), (target, b))]
         signed = not (
@@ -145,16 +244,48 @@ class ImplicitModel:
         return VertexMap.between(source, target, index, confidence=trust, verdict=verdict, reasons=reasons)
 
     def surface(self, shape: ImplicitFit, resolution: int = 64) -> Shape:
-        """The surface of a shape by marching cubes, in the file's frame.
+        """The surface of a shape by marching cubes.
 
-        ``resolution`` (even) is the number of cells along each side of the cube. `OptionError` for a resolution that is odd
-        or out of 8..512, or without scikit-image; `ModelError` where the distances enclose nothing.
+        Parameters
+        ----------
+        shape
+            The shape.
+        resolution
+            Even number of cells along each side of the cube, 8..512.
+
+        Returns
+        -------
+        Shape
+            In the file's frame and unit.
+
+        Raises
+        ------
+        OptionError
+            The resolution is odd or out of range, or scikit-image is missing.
+        ModelError
+            The distances enclose nothing.
         """
         found = zero_surface(lambda points: self.distance(points, shape.code)[0], resolution, shape.name)
         return Shape(shape.frame.undo(found.verts), found.faces, shape.name)
 
     def template(self, resolution: int = 64) -> Shape:
-        """The template's own surface, in the cube; ``resolution`` and errors as of `surface`."""
+        """The template's own surface.
+
+        Parameters
+        ----------
+        resolution
+            As in `surface`.
+
+        Returns
+        -------
+        Shape
+            In the cube from -1 to 1.
+
+        Raises
+        ------
+        MeshmatchError
+            As for `surface`.
+        """
 
         @torch.no_grad()
         def distance(points: Float[Floats, "P 3"]) -> Float[Floats, " P"]:
@@ -164,10 +295,27 @@ class ImplicitModel:
         return zero_surface(distance, resolution, "template")
 
     def register(self, shape: ImplicitFit, resolution: int = 64) -> Shape:
-        """The template's surface on a shape, in the file's frame: for all shapes the same vertices and triangles in order.
+        """The template's surface on a shape: for all shapes the same vertices and triangles in the same order.
 
-        Each vertex goes where the deformation comes from, and from there along the distance's slope to the surface.
-        ``resolution`` and errors as of `surface`.
+        Each vertex goes where the deformation takes it from, and from there along the gradient of the distance to the
+        surface.
+
+        Parameters
+        ----------
+        shape
+            The shape.
+        resolution
+            As in `surface`.
+
+        Returns
+        -------
+        Shape
+            In the file's frame and unit.
+
+        Raises
+        ------
+        MeshmatchError
+            As for `surface`.
         """
         rest = self.template(resolution)
         places = torch.from_numpy(rest.verts.astype(np.float32))
@@ -192,7 +340,22 @@ class ImplicitModel:
         return at.detach()
 
     def shares(self, shape: ImplicitFit, points: Float[Floats, "P 3"], seed: int = 0) -> tuple[float, float]:
-        """Shares of a shape's points (in the cube) and of the model's surface that are far from the other."""
+        """Shares of a shape's points and of the model's surface that are far from the other.
+
+        Parameters
+        ----------
+        shape
+            The shape.
+        points
+            (P, 3) of its surface, in the cube.
+        seed
+            Of the points on the model's surface.
+
+        Returns
+        -------
+        (float, float)
+            Missed and invented, see `ImplicitFit`.
+        """
         try:
             surface = sample_surface(self.surface(shape, _COARSE), len(points), np.random.default_rng(seed)).points
         except ModelError:
@@ -250,8 +413,28 @@ def percent_of_side(distance: float) -> float:
 
 
 def load_implicit(folder: str | Path) -> ImplicitModel:
-    """A model that `train_implicit` wrote, by its folder or its name in the registry; `ModelError` if there is none, or a
-    file is damaged or another's.
+    """A model that `train_implicit` wrote.
+
+    Parameters
+    ----------
+    folder
+        Its folder, or its name in the registry.
+
+    Returns
+    -------
+    ImplicitModel
+        The model, checked.
+
+    Raises
+    ------
+    ModelError
+        There is none, or a file is damaged or of another model.
+
+    Examples
+    --------
+    >>> model = meshmatch.load_implicit("chair-model")
+    >>> chair = meshmatch.fit_implicit(model, "chair.ply")
+    >>> meshmatch.save_shape("surface.ply", model.surface(chair))
     """
     folder = locate_model(folder)
     card = read_implicit_card(folder)

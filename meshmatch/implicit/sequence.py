@@ -36,12 +36,46 @@ def implicit_sequence(
     seed: int = 0,
     progress: ProgressCallback | None = None,
 ) -> ImplicitSequence:
-    """Surfaces at even times from that of one shape to that of another, by their codes in an implicit model or its folder.
+    """Surfaces from one shape to another, by their codes in an implicit model.
 
-    The shapes are as in `fit_implicit`; surfaces go from the place and size of the one file to those of the other.
-    ``times`` are of the first and the last surface, from -1 to 2; for ``resolution`` see `ImplicitModel.surface`.
+    Surfaces go from the place and size of the one file to those of the other.
 
-    `MeshmatchError` as these; `OptionError` for fewer than two frames, or times out of range.
+    Parameters
+    ----------
+    model
+        The model or its folder.
+    source
+        As in `fit_implicit`.
+    target
+        As in `fit_implicit`.
+    frames
+        How many, at even times.
+    times
+        Of the first and the last surface, from -1 to 2.
+    resolution
+        As in `ImplicitModel.surface`.
+    seed
+        Of both codes.
+    progress
+        As in `match`.
+
+    Returns
+    -------
+    ImplicitSequence
+        The surfaces and both fits.
+
+    Raises
+    ------
+    MeshmatchError
+        As for `fit_implicit` and `ImplicitModel.surface`.
+    OptionError
+        Fewer than two frames, or times out of range.
+
+    Examples
+    --------
+    >>> sequence = meshmatch.implicit_sequence("chair-model", "a.ply", "b.ply", frames=5)
+    >>> surfaces = [step.shape for step in sequence.steps]
+    >>> meshmatch.save_shape("half-way.ply", surfaces[2])
     """
     start, stop = times
     if frames < 2 or not -1 <= start < stop <= 2:

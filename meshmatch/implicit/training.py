@@ -78,12 +78,46 @@ def train_implicit(
 ) -> Path:
     """Learn a folder of shapes as one deformed template (`ImplicitModel`), or go on from the checkpoint, exactly.
 
-    ``shapes`` is a folder of watertight meshes, clouds or .npz samples (docs/formats.md) that stand alike; they are centred
-    and scaled, not turned. ``ImplicitConfig(field="pointwise")`` chooses DIF-Net's deformation, "mls" (the default) that of
-    control nodes. Returns the folder ``output``, with ``weights.safetensors`` and last ``implicit.json``.
+    Parameters
+    ----------
+    output
+        The model's folder.
+    shapes
+        A folder of watertight meshes, clouds or .npz samples (the page on formats) that share an orientation; they are
+        centred and scaled, not turned.
+    config
+        The network; ``ImplicitConfig(field="pointwise")`` is DIF-Net's deformation, "mls" (the default) that of control
+        nodes.
+    training
+        Steps, batches, learning rate and device.
+    facts
+        What the card says of the model.
+    resume
+        Go on from a checkpoint if there is one.
+    report
+        Called with losses and validation.
 
-    `InputError` for shapes that cannot be learned from; `OptionError` for a training in bfloat16; `ModelError` for a
-    checkpoint of another training; `OutputError` if the folder cannot be written, or another training writes to it.
+    Returns
+    -------
+    Path
+        The folder, with ``weights.safetensors`` and last ``implicit.json``.
+
+    Raises
+    ------
+    InputError
+        The shapes cannot be learned from.
+    OptionError
+        A training in bfloat16.
+    ModelError
+        The checkpoint is of another training.
+    OutputError
+        The folder cannot be written, or another training writes to it.
+
+    Examples
+    --------
+    >>> meshmatch.train_implicit("chair-model", "chairs")
+    >>> model = meshmatch.load_implicit("chair-model")
+    >>> meshmatch.save_shape("template.ply", model.template())
     """
     output, checkpoint = Path(output), Path(output) / CHECKPOINT
     facts, config = facts or CardFacts(), config or ImplicitConfig()

@@ -42,8 +42,27 @@ check_suffix = partial(table_files.check_suffix, suffixes=MAP_SUFFIXES, what="ma
 def save_map(path: str | Path, vertex_map: VertexMap) -> None:
     """Write a map in the format of the suffix, whole or not at all.
 
-    `OptionError`: unsupported suffix; see `meshmatch.maps.MAP_SUFFIXES`. `InputError`: it is no `VertexMap`.
-    `OutputError`: the file cannot be written.
+    Parameters
+    ----------
+    path
+        Where to; see `meshmatch.maps.MAP_SUFFIXES`.
+    vertex_map
+        The map.
+
+    Raises
+    ------
+    OptionError
+        The suffix is not supported.
+    InputError
+        It is no `VertexMap`.
+    OutputError
+        The file cannot be written.
+
+    Examples
+    --------
+    >>> dancer = meshmatch.load_shape("templates/samples/dancer.ply")
+    >>> found = meshmatch.VertexMap.identity(dancer)
+    >>> meshmatch.save_map("itself.csv", found)
     """
     check_map(vertex_map)
     write = _FORMATS[check_suffix(path)][0]
@@ -54,10 +73,33 @@ def save_map(path: str | Path, vertex_map: VertexMap) -> None:
 def load_map(path: str | Path, source: ShapeLike | None = None, target: ShapeLike | None = None) -> VertexMap:
     """Read a map, and check it against the shapes if they are given (`VertexMap.for_shapes`).
 
-    What the file does not contain is filled in from the shapes (names, counts, hashes) or stays unknown.
+    Parameters
+    ----------
+    path
+        Its suffix names the format, see `meshmatch.maps.MAP_SUFFIXES`.
+    source
+        Fills in name, count and hash where the file does not have them.
+    target
+        The same, and the faces.
 
-    `InputError`: the file is missing or damaged, or holds no map; or the map was made for other shapes, or runs from
-    `target` to `source`. `OptionError`: unsupported suffix; see `meshmatch.maps.MAP_SUFFIXES`.
+    Returns
+    -------
+    VertexMap
+        From source to target.
+
+    Raises
+    ------
+    InputError
+        The file is missing or damaged, or holds no map; or the map was made for other shapes, or runs from `target` to
+        `source`.
+    OptionError
+        The suffix is not supported.
+
+    Examples
+    --------
+    >>> climber, dancer = "templates/samples/climber.ply", "templates/samples/dancer.ply"
+    >>> meshmatch.save_map("map.npz", meshmatch.match(climber, dancer).map)
+    >>> meshmatch.load_map("map.npz", climber, dancer).verdict
     """
     check_suffix(path)
     readers = dict.fromkeys(_FORMATS, _read)

@@ -27,24 +27,53 @@ _READ_WITH_SHAPES = "read it with load_map(path, source, target)"
 
 @dataclass(frozen=True, eq=False)
 class VertexMap(Pickled):
-    """A map from every vertex of a source to a target: *index[i] is the vertex of the target matched to
-    vertex i of the source.*
+    """A map from every vertex of a source to a target: *index[i] is the vertex of the target matched to vertex i of the
+    source.*
 
-    Valid once built; its arrays are read-only. `VertexMap.between` fills in names, counts and hashes from two
-    shapes; `for_shapes` does so for a map that was read from a file.
+    Valid once built; its arrays are read-only. `VertexMap.between` fills in names, counts and hashes from two shapes;
+    `for_shapes` does so for a map that was read from a file.
 
-    `index` has the target vertex of each source vertex, `face` the target face in which the matched point lies (-1 where
-    it is that vertex itself; always for a cloud), `barycentric` the weights of that face's corners: not negative, rows
-    sum to 1, (1, 0, 0) where the face is -1. `confidence` goes from 0 (a guess) to 1 (certain, and where nothing is
-    known about it). `verdict` is "good", "fair" or "poor", of the map as a whole, or "unknown" if a file does not say;
-    `reasons` why it is not good, a line each.
+    Attributes
+    ----------
+    source
+        Name of the source, for people.
+    target
+        Name of the target, for people.
+    index
+        (V_source,) the target vertex of each source vertex.
+    face
+        (V_source,) the target face in which the matched point lies; -1 where it is the vertex itself, always for a
+        cloud.
+    barycentric
+        (V_source, 3) weights of that face's corners: not negative, rows sum to 1, (1, 0, 0) where the face is -1.
+    confidence
+        (V_source,) float32 from 0 (a guess) to 1 (certain, and where nothing is known about it).
+    verdict
+        "good", "fair" or "poor", of the map as a whole; "unknown" if a file does not say.
+    reasons
+        Why it is not good, one line each.
+    source_vertices
+        Number of vertices of the source.
+    target_vertices
+        The same of the target; -1 where not known (a plain list of indices does not contain it).
+    source_hash
+        `Shape.hash` of the source; empty where not known.
+    target_hash
+        `Shape.hash` of the target; empty where not known.
+    target_faces
+        (F_target, 3) triangles whose corners ``barycentric`` weights; not written to files.
 
-    `source` and `target` are names, for people; `source_vertices` and `target_vertices` counts, the latter -1 where not
-    known (a plain list of indices does not contain it); both hashes are `Shape.hash`, empty where not known.
-    `target_faces` are the target's triangles, whose corners `barycentric` weights; they are not written to files.
+    Raises
+    ------
+    InputError
+        Arrays of the wrong shape or kind, an index outside the target, weights that do not sum to 1, or an unknown
+        verdict.
 
-    `InputError`: arrays of the wrong shape or kind, an index outside the target, weights that do not sum to 1, or an
-    unknown verdict.
+    Examples
+    --------
+    >>> found = meshmatch.match("templates/samples/climber.ply", "templates/samples/dancer.ply").map
+    >>> dancer = meshmatch.load_shape("templates/samples/dancer.ply")
+    >>> heights = found.apply(dancer.verts[:, 1])  # (V_source,)
     """
 
     source: str
@@ -105,26 +134,73 @@ class VertexMap(Pickled):
 
     @classmethod
     def between(cls, source: Shape, target: Shape, index: ArrayLike, **rest: Any) -> VertexMap:
-        """A map between two shapes in memory; `rest` are the other fields (face, barycentric, confidence, verdict, ...).
+        """A map between two shapes in memory.
 
-        `InputError` as `VertexMap`, or for a face that the target does not have.
+        Parameters
+        ----------
+        source
+            Gives the source's name, count and hash.
+        target
+            Gives the same of the target, and its faces.
+        index
+            (V_source,) the target vertex of each source vertex.
+        rest
+            The other attributes: face, barycentric, confidence, verdict, reasons.
+
+        Returns
+        -------
+        VertexMap
+            The map, checked.
+
+        Raises
+        ------
+        InputError
+            As for the class, or a face that the target does not have.
         """
         fields = _side("source", source) | _side("target", target)
         return cls(index=np.asarray(index), target_faces=target.faces, **fields, **rest)
 
     @classmethod
     def identity(cls, shape: Shape) -> VertexMap:
-        """Every vertex to itself, with confidence 1."""
+        """The map of a shape to itself.
+
+        Parameters
+        ----------
+        shape
+            Source and target.
+
+        Returns
+        -------
+        VertexMap
+            Every vertex to itself, with confidence 1.
+        """
         return cls.between(shape, shape, np.arange(shape.V), verdict="good")
 
     def for_shapes(self, source: Shape | None, target: Shape | None, label: str = "the map") -> VertexMap:
         """This map, checked to be one from `source` to `target`, with names, counts and hashes filled in.
 
-        Vertex counts must agree, and hashes where the map has them: a map of another pose, or of a mesh that was
-        edited since, is refused. A shape that is None is not checked.
+        Vertex counts must agree, and hashes where the map has them: a map of another pose, or of a mesh that was edited
+        since, is refused.
 
-        `InputError`: the map was made for another mesh, runs from target to source, or names a vertex or a face that
-        the target does not have. The message calls it `label`.
+        Parameters
+        ----------
+        source
+            None is not checked.
+        target
+            None is not checked.
+        label
+            What error messages call the map.
+
+        Returns
+        -------
+        VertexMap
+            The map with what the shapes say.
+
+        Raises
+        ------
+        InputError
+            The map was made for another mesh, runs from target to source, or names a vertex or a face that the target
+            does not have.
         """
         sides = [(side, shape) for side, shape in (("source", source), ("target", target)) if shape is not None]
         misfits = [self._misfit(side, shape) for side, shape in sides]
@@ -160,18 +236,39 @@ class VertexMap(Pickled):
         return np.asarray((self.face < 0) | (self.barycentric.max(axis=1) >= 1.0 - 1e-12))
 
     def corners(self) -> Int[Ints, "V_source 3"]:
-        """The three target vertices that ``barycentric`` weights; three times ``index`` where the face is -1.
+        """The three target vertices that ``barycentric`` weights.
 
-        `InputError` if points lie in faces that are not known: the map was read without its target.
+        Returns
+        -------
+        (V_source, 3) int64
+            Three times ``index`` where the face is -1.
+
+        Raises
+        ------
+        InputError
+            Points lie in faces that are not known: the map was read without its target.
         """
         if self.target_faces is None and self.face.max() >= 0:
             raise InputError(f"the faces that the map {_way(self)} leads to are unknown", _READ_WITH_SHAPES)
         return corners_of(self.target_faces, self.face, self.index)
 
     def points(self, target: Shape) -> Float[Floats, "V_source 3"]:
-        """The matched points on `target`, in its own frame and unit; another pose of it with the same faces will do.
+        """The matched points on `target`.
 
-        `InputError` if `target` has other vertices or faces than the shape that this map leads to.
+        Parameters
+        ----------
+        target
+            The map's target; another pose of it with the same faces will do.
+
+        Returns
+        -------
+        (V_source, 3) float64
+            In the target's frame and unit.
+
+        Raises
+        ------
+        InputError
+            The target has other vertices or faces than the shape that this map leads to.
         """
         if self.target_vertices not in (UNKNOWN, checked_shape(target, "the target").V):
             led = f"the map leads to {self.target} with {self.target_vertices} vertices"
@@ -181,9 +278,17 @@ class VertexMap(Pickled):
         return interpolate(target.verts, corners_of(target.faces, self.face, self.index), self.barycentric)
 
     def sparse(self) -> csr_array:
-        """(V_source, V_target) float64 matrix P of the map: ``P @ values`` is `apply`. Rows sum to 1.
+        """The map as a matrix P: ``P @ values`` is `apply`.
 
-        `InputError` if the map was read without its target, whose vertices or faces are unknown.
+        Returns
+        -------
+        (V_source, V_target) csr_array, float64
+            Rows sum to 1.
+
+        Raises
+        ------
+        InputError
+            The map was read without its target, whose vertices or faces are unknown.
         """
         if self.target_vertices == UNKNOWN:
             what = f"the number of vertices that the map {_way(self)} leads to is unknown"
@@ -196,11 +301,22 @@ class VertexMap(Pickled):
         return matrix
 
     def apply(self, values: ArrayLike) -> Floats:
-        """Values of the *target's* vertices, pulled back to the source: at each source vertex the value at its
-        matched point, interpolated between the corners of the target's face.
+        """Pull values of the *target's* vertices back to the source, interpolated within the target's faces.
 
-        (V_target,) becomes (V_source,), and (V_target, D) becomes (V_source, D), float64. `InputError` as `sparse`, or
-        if there is not one row for each vertex of the target.
+        Parameters
+        ----------
+        values
+            (V_target,) or (V_target, D).
+
+        Returns
+        -------
+        (V_source,) or (V_source, D) float64
+            At each source vertex the value at its matched point.
+
+        Raises
+        ------
+        InputError
+            As for `sparse`, or there is not one row for each vertex of the target.
         """
         numbers = as_numbers(values, "values")
         matrix = self.sparse()
@@ -210,13 +326,27 @@ class VertexMap(Pickled):
         return np.asarray(matrix @ numbers)
 
     def functional(self, basis_source: ArrayLike, basis_target: ArrayLike) -> Float[Floats, "K_source K_target"]:
-        """The functional map C of this map (Ovsjanikov et al. 2012), which goes the other way: it takes coefficients
-        of a function on the *target* to those of the pulled-back function on the *source*.
+        """The functional map C of this map (Ovsjanikov et al. 2012), which goes the other way: it takes coefficients of
+        a function on the *target* to those of the pulled-back function on the *source*.
 
-        ``basis_source @ C`` is the least-squares fit to ``apply(basis_target)``. A basis (V, K) has linearly independent
-        functions on the vertices, such as Laplacian eigenvectors, a column each.
+        ``basis_source @ C`` is the least-squares fit to ``apply(basis_target)``.
 
-        `InputError`: as `apply`; the source's functions do not have a row for each vertex; or a value is not finite.
+        Parameters
+        ----------
+        basis_source
+            (V_source, K_source) linearly independent functions, such as Laplacian eigenvectors, one a column.
+        basis_target
+            (V_target, K_target), the same on the target.
+
+        Returns
+        -------
+        (K_source, K_target) float64
+            C.
+
+        Raises
+        ------
+        InputError
+            As for `apply`; the source's functions do not have a row for each vertex; or a value is not finite.
         """
         basis = as_numbers(basis_source, "a basis", finite=True)
         V = self.source_vertices
@@ -229,7 +359,22 @@ class VertexMap(Pickled):
         """This map, then `other`: from this source to the other's target.
 
         The point of a vertex is where `other` puts the vertex ``index[i]``; the confidence is the lower of the two, the
-        verdict the worse. `InputError` if `other` is no map, or does not start on the shape where this one ends.
+        verdict the worse.
+
+        Parameters
+        ----------
+        other
+            A map that starts where this one ends.
+
+        Returns
+        -------
+        VertexMap
+            From this source to the other's target.
+
+        Raises
+        ------
+        InputError
+            `other` is no map, or does not start on the shape where this one ends.
         """
         check_map(other)
         counts = {self.target_vertices, other.source_vertices} - {UNKNOWN}

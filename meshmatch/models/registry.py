@@ -139,12 +139,31 @@ def check_weights(folder: Path, card: ModelCard | ImplicitCard) -> None:
 
 
 def load_model(name: str | Path = "human") -> TrainedModel:
-    """Load a model by its registry name or folder; processes share the weights of a model of the registry.
+    """Load a model; processes share the weights of a model of the registry.
 
-    The model can be pickled, see `TrainedModel`: the pickle holds its name or folder, and it is loaded again from there.
+    Parameters
+    ----------
+    name
+        Registry name or folder.
 
-    `ModelError` for an unknown name, damaged files, a kernel that is not known here, weights that are not those of the
-    card's network, or a template that is not the one the model was trained with; `TemplateError` if its file is damaged.
+    Returns
+    -------
+    TrainedModel
+        For `match`, `register`, `Matcher` and `interpolate`.
+
+    Raises
+    ------
+    ModelError
+        Unknown name, damaged files, an unknown kernel, weights that are not those of the card's network, or a template
+        that is not the one the model was trained with.
+    TemplateError
+        The template's file is damaged.
+
+    Examples
+    --------
+    >>> model = meshmatch.load_model("human")
+    >>> model.card.name
+    >>> fit = meshmatch.register("templates/samples/climber.ply", model=model)
     """
     from meshmatch.models.trained import trained_model  # torch
 

@@ -48,19 +48,39 @@ Choice: TypeAlias = str | int | Sequence[str | int]
 
 
 def load_shape(path: str | Path, *, only: Choice = (), without: Choice = ()) -> Shape:
-    """Read a mesh or a point cloud as it is: all vertices, in file order, in the file's frame and unit.
+    """Read a mesh or a point cloud as it is: all vertices, in file order.
 
-    A vertex whose position is not a number is kept in its place and marked in `Shape.invalid`; its `verts` row is then
-    the centroid of the others. The scene of a glb or gltf is one shape: its meshes one after the other, each where the
-    scene puts it. An stl has no shared vertices: every corner of every triangle is a vertex, 3 F of them.
+    A vertex whose position is not a number is kept in its place and marked in `Shape.invalid`. The scene of a glb or
+    gltf is one shape: its meshes one after the other, each where the scene puts it. An stl has no shared vertices:
+    every corner of every triangle is a vertex, 3 F of them.
 
-    ``only`` these meshes of a scene or parts of a mesh, or all ``without`` those, are to be trusted: the vertices of the
-    others have weight 0, so that no fit looks at them, and keep their places. Meshes are chosen by their own name or their
-    node's, which may hold ``*`` and ``?``; upper and lower case count the same. Connected parts are chosen by number, from
-    1, the largest area first, as `meshmatch info` lists them; a mesh that is called "2" goes before part 2.
+    Parameters
+    ----------
+    path
+        Its suffix names the format.
+    only
+        Parts or, of a scene, meshes to trust; the vertices of all others get weight 0, so that no fit looks at them,
+        and keep their places. A name is that of a mesh or its node and may hold ``*`` and ``?``; upper and lower case
+        count the same. A number is that of a part, see `meshmatch info`.
+    without
+        The opposite: not to be trusted.
 
-    `InputError`: the file is missing, empty, cut short, of an unknown kind, or holds no usable vertex; or nothing in it has
-    a name or number that is given.
+    Returns
+    -------
+    Shape
+        In the file's frame and unit.
+
+    Raises
+    ------
+    InputError
+        The file is missing, empty, cut short, of an unknown kind, or holds no usable vertex; or none of its meshes has
+        a name that is given.
+
+    Examples
+    --------
+    >>> dancer = meshmatch.load_shape("templates/samples/dancer.ply")
+    >>> dancer.verts, dancer.faces  # (V, 3) unit of the file, (F, 3)
+    >>> dressed = meshmatch.load_shape("templates/samples/dancer-textured.glb")
     """
     return load_shapes([path], only=only, without=without)[0]
 
@@ -184,12 +204,31 @@ def check_suffix(path: Path) -> str:
 def save_shape(path: str | Path, shape: ShapeLike) -> None:
     """Write a shape, in the format that the suffix names. The file appears whole or not at all.
 
-    ply, obj, off, xyz and npy keep every bit of the positions; stl and glb hold 32-bit floats, and stl no
-    shared vertices. Colors go into ply, obj, off and glb. An invalid vertex is written as nan where the
-    format allows (all but stl and glb, which take its stand-in).
+    ply, obj, off, xyz and npy keep every bit of the positions; stl and glb hold 32-bit floats, and stl no shared
+    vertices. Colors go into ply, obj, off and glb. An invalid vertex is written as nan where the format allows (all but
+    stl and glb, which take its stand-in).
 
-    `OptionError`: the suffix is not one that can be written, or holds no clouds (stl) or no faces (xyz, npy).
-    `InputError`: as `as_shape`. `OutputError`: the folder is missing or cannot be written.
+    Parameters
+    ----------
+    path
+        Where to.
+    shape
+        As in `match`.
+
+    Raises
+    ------
+    OptionError
+        The suffix cannot be written, or holds no clouds (stl) or no faces (xyz, npy).
+    InputError
+        It is no shape.
+    OutputError
+        The folder is missing or cannot be written.
+
+    Examples
+    --------
+    >>> dancer = meshmatch.load_shape("templates/samples/dancer.ply")
+    >>> meshmatch.save_shape("dancer.obj", dancer)
+    >>> meshmatch.save_shape("triangle.stl", (np.eye(3), [[0, 1, 2]]))
     """
     path, shape = as_path(path), as_shape(shape)
     suffix = check_suffix(path)

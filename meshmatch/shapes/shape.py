@@ -27,14 +27,32 @@ LARGEST = 1e60
 class Shape(Pickled):
     """A triangle mesh, or a point cloud if it has no faces. Valid once built; its arrays are read-only.
 
-    `verts` are positions in the file's own frame and unit, always finite; `faces` the corners of each triangle, (0, 3)
-    for a cloud; `name` is for people: usually the file's name without its folder. `colors` are red, green, blue as
-    screens show them (sRGB), and alpha, in 0..1; whatever the file has. `invalid` is True for a vertex whose position in
-    the file was not a number: it keeps its place in the order (the map answers for it too) but its `verts` row is only
-    a stand-in, and faces that touch it have no area. `weights` say how far a fit trusts each vertex, from 0 (not at all)
-    to 1; fully where not given.
+    Attributes
+    ----------
+    verts
+        (V, 3) positions in the file's own frame and unit, always finite.
+    faces
+        (F, 3) corners of each triangle; (0, 3) for a cloud.
+    name
+        For people: usually the file's name without its folder.
+    colors
+        (V, 4) red, green, blue (sRGB) and alpha in 0..1, whatever the file stores.
+    invalid
+        (V,) True for a vertex whose position in the file was not a number. It keeps its place in the order (the map
+        answers for it too), but its ``verts`` row is only a stand-in, and faces that touch it have no area.
+    weights
+        (V,) how far a fit trusts each vertex, from 0 (not at all) to 1; fully where not given.
 
-    `InputError`: wrong array shapes, no vertices, a position that is not finite, or a face that names no vertex.
+    Raises
+    ------
+    InputError
+        Wrong array shapes, no vertices, a position that is not finite, or a face that names no vertex.
+
+    Examples
+    --------
+    >>> triangle = meshmatch.Shape(np.eye(3), np.array([[0, 1, 2]]), "triangle")
+    >>> triangle.V, triangle.F, triangle.is_cloud
+    >>> meshmatch.save_shape("triangle.ply", triangle)
     """
 
     verts: Float[Floats, "V 3"]
@@ -85,10 +103,29 @@ class Shape(Pickled):
     def with_invalid(
         cls, verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], name: str, colors: Float[Floats, "V 4"] | None = None
     ) -> Shape:
-        """A shape some of whose positions may be NaN or infinite: these are marked in `invalid`, and moved to the
+        """A shape some of whose positions may be NaN or infinite: these are marked in ``invalid``, and moved to the
         centroid of the others.
 
-        `InputError`: as for the class; or no position is finite.
+        Parameters
+        ----------
+        verts
+            (V, 3), file frame and unit.
+        faces
+            (F, 3).
+        name
+            For people.
+        colors
+            (V, 4), sRGB and alpha in 0..1.
+
+        Returns
+        -------
+        Shape
+            With all vertices, in order.
+
+        Raises
+        ------
+        InputError
+            As for the class; or no position is finite.
         """
         if len(verts) == 0:
             raise InputError(f"{name or 'the shape'} holds no vertices", "is it a mesh or a point cloud at all?")
@@ -223,9 +260,14 @@ class Shape(Pickled):
         return digest.hexdigest()[:16]
 
     def to_trimesh(self) -> Trimesh:
-        """The shape as a `trimesh.Trimesh`, vertices and faces in the same order; a cloud as one without faces.
+        """The shape as a mesh of trimesh, vertices and faces in the same order; a cloud as one without faces.
 
         Invalid vertices keep their stand-in positions; colors become 8-bit vertex colors.
+
+        Returns
+        -------
+        trimesh.Trimesh
+            In the file's frame and unit.
         """
         from trimesh import Trimesh
 

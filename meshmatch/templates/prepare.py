@@ -76,9 +76,38 @@ def prepare(
     (samples of all shapes in the template's frame), ``normalised/NAME.ply`` and, last, ``prepared.json``. Shapes are
     registered if all have the vertex count and triangles of the template's file.
 
-    `InputError` if no shape is usable (files of a folder that cannot be read are named in the notes instead), or the
-    template is nothing like the shapes; `OptionError` if there are no landmarks where they should be, or choices do not
-    go together; `TemplateError` if the nodes do not reach every vertex; `OutputError` if the folder cannot be written.
+    Parameters
+    ----------
+    shapes
+        A folder of shapes, or one file.
+    output
+        A new folder.
+    config
+        Template, nodes and decimation.
+    progress
+        As in `match`.
+
+    Returns
+    -------
+    Prepared
+        The folder, its template, and notes on files that cannot be read.
+
+    Raises
+    ------
+    InputError
+        No shape is usable, or the template is nothing like the shapes.
+    OptionError
+        There are no landmarks where they should be, or choices do not go together.
+    TemplateError
+        The nodes do not reach every vertex.
+    OutputError
+        The folder cannot be written.
+
+    Examples
+    --------
+    >>> prepared = meshmatch.prepare("my-shapes", "prepared")
+    >>> meshmatch.train("my-model", shapes="prepared")
+    >>> meshmatch.match("a.ply", "b.ply", model="./my-model")
     """
     shapes, output, config = as_path(shapes), as_path(output), config or PrepareConfig()
     if (config.nodes.strategy == "parts") != (config.labels is not None):

@@ -62,20 +62,55 @@ def train(
     progress: ProgressCallback | None = None,
     report: Callable[[StepReport], None] | None = None,
 ) -> Path:
-    """Train a model, or (with ``resume``) go on training it from the checkpoint in its folder, exactly; returns the folder.
+    """Train a model, or go on training it from the checkpoint in its folder, exactly.
 
-    The folder ``output`` receives ``checkpoint/last.safetensors`` on the way and, at every stop, ``template.safetensors``,
-    ``weights.safetensors`` and last ``card.json``. It learns from ``shapes``, a folder that `prepare` made, which also has
-    the template; from fits of a model, which goes on learning (``Collection(FITS).to_learn()``); or else from generated
-    shapes of a ``kind``: human (the default), quadruped, hand or head, or `Bodies` or a `Kind` with choices. The recipe is
-    `recipe_for` or, of fits, `going_on` of these unless another is given, such as ``recipe_for(shapes,
-    ...).changed(steps=..., minutes=...)``. ``progress`` is called with (stage, name, share),
-    ``report`` with losses and validation every 50 steps.
+    The folder receives ``checkpoint/last.safetensors`` on the way and, at every stop, ``template.safetensors``,
+    ``weights.safetensors`` and last ``card.json``.
 
-    `InputError` if the folder is not prepared or has too few shapes; `OptionError` for choices that do not go together, or
-    if the extra ``train`` is not installed; `ModelError` for a name that cannot be one, or a checkpoint of another
-    training; `TemplateError` for a template that is missing or damaged; `OutputError` if the folder cannot be written, or
-    another training writes to it.
+    Parameters
+    ----------
+    output
+        The model's folder.
+    shapes
+        A folder that `prepare` made, which also has the template; or fits of a model, which goes on learning from them
+        (``Collection(FITS).to_learn()``).
+    kind
+        Or generated shapes: "human" (the default), "quadruped", "hand" or "head"; or `Bodies` or a `Kind` with choices.
+    recipe
+        Losses, sizes and steps, such as ``recipe_for(shapes, ...).changed(minutes=60)``; by default chosen for the
+        shapes.
+    facts
+        What the card says of the model: name, category, licence.
+    resume
+        Go on from a checkpoint if there is one.
+    progress
+        As in `match`.
+    report
+        Called with losses and validation every 50 steps.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    InputError
+        The folder is not prepared or has too few shapes.
+    OptionError
+        Choices do not go together, or the extra ``train`` is not installed.
+    ModelError
+        The name cannot be one, or the checkpoint is of another training.
+    TemplateError
+        The template is missing or damaged.
+    OutputError
+        The folder cannot be written, or another training writes to it.
+
+    Examples
+    --------
+    >>> from meshmatch.training.recipes import recipe_for
+    >>> recipe = recipe_for("prepared").changed(minutes=60)
+    >>> meshmatch.train("my-model", shapes="prepared", recipe=recipe)
     """
     output, facts = Path(output), facts or CardFacts()
     facts = replace(facts, name=check_name(facts.name or output.resolve().name))

@@ -36,12 +36,36 @@ _CHUNK = 1 << 16
 
 @dataclass(frozen=True)
 class BakeOptions:
-    """How a texture of ``size`` texels along each side is baked, by so many threads (``workers``).
+    """How a texture is baked.
 
-    A texel that covers a seam or much detail of the source is seen at ``samples x samples`` points, others at one.
-    ``padding`` texels lie between charts of a new atlas; 0 also leaves the texels past the seams empty. Texels of less
-    than ``min_confidence`` can get the colors of their neighbours in the atlas (``fill``), or one color, sRGB and alpha
-    in 0..1 (``blank``). `OptionError` for sizes that are out of range, and choices that contradict each other.
+    Attributes
+    ----------
+    size
+        Texels along each side.
+    samples
+        A texel that covers a seam or much detail of the source is averaged over ``samples x samples`` points; others
+        need one.
+    padding
+        Texels between charts of new texture coordinates; 0 also leaves the texels past the seams empty.
+    min_confidence
+        Confidence (0..1) below which a texel is not trusted.
+    fill
+        Give such texels the colors of their neighbours in the texture.
+    blank
+        Or one color: sRGB and alpha, in 0..1.
+    workers
+        Threads.
+
+    Raises
+    ------
+    OptionError
+        A size is out of range, or choices contradict each other.
+
+    Examples
+    --------
+    >>> options = meshmatch.BakeOptions(size=1024, blank=(0.5, 0.5, 0.5, 1.0))
+    >>> dancer, climber = "templates/samples/dancer-textured.glb", "templates/samples/climber.ply"
+    >>> meshmatch.transfer_texture(dancer, climber, options=options).save("dressed.glb")
     """
 
     size: int = 2048

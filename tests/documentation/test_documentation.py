@@ -1,4 +1,4 @@
-"""The pages lead somewhere, and the command line's page is fresh. What they tell people to type is judged in
+"""The pages lead somewhere, and the reference is whole. What they tell people to type is judged in
 ``tests/test_readme.py``.
 """
 
@@ -6,9 +6,7 @@ import re
 import shlex
 from pathlib import Path
 
-import pytest
-
-from meshmatch.experiments import reference
+import meshmatch
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -53,30 +51,19 @@ def test_the_pages_match_the_shapes_that_ship() -> None:
     assert sorted(samples) == sorted((ROOT / "templates" / "samples").glob("*.ply"))
 
 
-def test_the_references_are_fresh() -> None:
-    assert (ROOT / "docs" / "cli.md").read_text(encoding="utf-8") == reference.reference()
-    assert (ROOT / "docs" / "api.md").read_text(encoding="utf-8") == reference.api_reference()
+def test_the_reference_lists_every_public_name_once() -> None:
+    listed = [
+        name
+        for page in sorted((ROOT / "docs" / "reference").glob("*.md"))
+        for name in re.findall(r"^::: meshmatch\.(\w+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    ]
+    assert sorted(listed) == sorted(set(meshmatch.__all__) - {"__version__"})
 
 
-def test_the_page_does_not_depend_on_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    page = reference.reference()
-    monkeypatch.setenv("COLUMNS", "40")
-    assert reference.reference() == page
-
-
-def test_the_check_of_the_page_fails_on_a_stale_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert reference.main(["--check", str(tmp_path)]) == 1
-    assert reference.main([str(tmp_path)]) == 0
-    assert reference.main(["--check", str(tmp_path)]) == 0
-    for name in ("cli.md", "api.md"):
-        page = (tmp_path / name).read_text()
-        (tmp_path / name).write_text(page + "old words\n")
-        assert reference.main(["--check", str(tmp_path)]) == 1
-        (tmp_path / name).write_text(page)
-    assert "api.md is stale" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        reference.main(["--help"])
-    assert not Path("--help").exists()
+def test_every_page_is_in_the_navigation_of_the_site() -> None:
+    named = set(re.findall(r"^ +- ([\w/-]+\.md)$", (ROOT / "docs" / "mkdocs.yml").read_text("utf-8"), re.MULTILINE))
+    there = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+    assert named == there | {"index.md", "contributing.md"}
 
 
 def test_the_paper_page_names_what_there_is() -> None:
