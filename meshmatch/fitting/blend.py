@@ -25,8 +25,10 @@ from scipy.spatial.transform import Rotation
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.nodes import nearest_rotations
-from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.fit_config import Schedule
+from meshmatch.fitting.solve.driver import Problem, minimise
+from meshmatch.fitting.solve.priors import FixedGradient, RotatedReference
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.fitting.task import take_samples
 from meshmatch.geometry.frames import Frame
 from meshmatch.models.trained import TrainedModel
@@ -41,8 +43,9 @@ Path = Callable[[Float[Floats, " n"]], Float[Floats, "K 3"]]
 
 _MIN_STRETCH = 1e-3  # smaller ones count as this: a logarithm must stay finite
 _MAX_LOG = 5.0  # a stretch of 150, which only a far extrapolation reaches
-_ROUNDS = 3  # of local and global steps; their damping, and before it that of the first solve. Set by hand.
-_DAMPING_FIRST, _DAMPING = 1e-7, 1e-4
+# The first solve holds the blended gradients; in the rounds after it every point chooses its own rotation. Set by hand.
+_FIRST = Schedule(steps=1, prior=(1.0, 1.0), damping=1e-7)
+_ROUNDS = Schedule(steps=3, prior=(1.0, 1.0), damping=1e-4)
 _MIN_COST = 1e-6  # of an edge over which rotations do not change: a graph drops edges of cost 0
 
 
@@ -245,8 +248,6 @@ class FieldPath:
             own[child] = whole[self._parent[child]].transpose(0, 2, 1) @ whole[child]
         self._joints = RotationBlend(relative)
         self._core = np.asarray(system.phi[core].mean(0)).ravel()  # of the node vectors: how the core moves
-        V = len(system.verts)
-        self._free = np.zeros((V, 6)), np.zeros((V, 3))
 
     def __call__(self, weights: Float[Floats, " n"]) -> Float[Floats, "K 3"]:
         """Node vectors for weights of the keys that sum to one."""
@@ -255,23 +256,16 @@ class FieldPath:
         turned = self._joints.at(weights)
         for level in self._levels:
             turned[level] = turned[self._parent[level]] @ turned[level]
-        vectors = self._solve(turned @ stretch, _DAMPING_FIRST, straight, straight)
-        for _ in range(_ROUNDS):
-            own = nearest_rotations(self._system.deformation_gradient(vectors), stretch)
-            vectors = self._solve(own @ stretch, _DAMPING, vectors, straight)
-        return vectors
 
-    def _solve(
-        self,
-        targets: Float[Floats, "G 3 3"],
-        damping: float,
-        near: Float[Floats, "K 3"],
-        straight: Float[Floats, "K 3"],
-    ) -> Float[Floats, "K 3"]:
-        """Node vectors with the gradients asked for; the core goes where it goes on the straight way."""
-        system = self._system
-        vectors = system.solve(*self._free, 1.0 / len(targets), targets, damping / system.K, near)
-        return vectors + self._core @ (straight - vectors)
+        def anchored(vectors: Float[Floats, "K 3"]) -> Float[Floats, "K 3"]:
+            """The core goes where it goes on the straight way."""
+            return vectors + self._core @ (straight - vectors)
+
+        first, rounds = (
+            Problem(system=self._system, terms=(), schedule=schedule, anchor=anchored) for schedule in (_FIRST, _ROUNDS)
+        )
+        vectors = minimise(first, FixedGradient(turned @ stretch), straight)
+        return minimise(rounds, RotatedReference(stretch), vectors)
 
 
 def _spanning_order(

@@ -24,7 +24,7 @@ from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try
 from meshmatch.fitting.network_fit import Candidate, Predictor, best_first, one_way_residual, sized, two_way_residual
 from meshmatch.fitting.signs import area_share, visible_vertices
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.task import FitTask, Refine, Registration
 from meshmatch.fitting.verdict import judge_registration
 from meshmatch.geometry.frames import RigidPose

@@ -10,7 +10,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints, Pickled
 from meshmatch.errors import OptionError
-from meshmatch.fitting.regularity import Regularity
+from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.quick_scipy import cKDTree
 from meshmatch.shapes.repair import Repaired

@@ -16,9 +16,9 @@ from meshmatch.fitting.candidates import fit_part, fit_whole
 from meshmatch.fitting.fit import Fit, Reason, Verdict, axis_name
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.network_fit import mirror_of
-from meshmatch.fitting.nodes import Landmarks
 from meshmatch.fitting.refinement import REFINEMENTS
 from meshmatch.fitting.signs import empty_share
+from meshmatch.fitting.solve.terms import Landmarks
 from meshmatch.fitting.task import FitTask, Registration
 from meshmatch.fitting.verdict import EVEN_TRUST, FAIR_RESIDUAL, judge_registration
 from meshmatch.geometry.oriented import quick_tree

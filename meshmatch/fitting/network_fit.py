@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
 from meshmatch.errors import TemplateError
 from meshmatch.fields.shape_functions import ShapeFunctions
-from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints, nearest_unsigned, with_normals
 from meshmatch.models.network import Network

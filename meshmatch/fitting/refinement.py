@@ -30,9 +30,9 @@ from meshmatch.fitting.network_fit import (
     two_way_residual,
     weighted_mean,
 )
-from meshmatch.fitting.nodes import refine_nodes
 from meshmatch.fitting.signs import USUAL_SPREAD
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.solve.nodes import refine_nodes
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.task import FitTask, Refine
 from meshmatch.fitting.tears import Pairs, neighbours, torn_share
 from meshmatch.geometry.frames import RigidPose

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.fitting.network_fit import two_way_residual, weighted_mean
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.tears import neighbours, torn_share
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.symmetric import entries_of, logarithm, matrices_of

@@ -12,8 +12,8 @@ import numpy as np
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.initial_frames import scan_frame
 from meshmatch.fitting.network_fit import Candidate, Predictor
-from meshmatch.fitting.nodes import Landmarks
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.solve.system import NodeSystem
+from meshmatch.fitting.solve.terms import Landmarks
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel

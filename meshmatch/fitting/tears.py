@@ -6,7 +6,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fitting.network_fit import weighted_mean
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import is_discontinuous
 

@@ -10,7 +10,7 @@ from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.fitting.fit import Fit, Reason, ReasonCode, Verdict
 from meshmatch.fitting.network_fit import reads_alike
 from meshmatch.fitting.signs import Signs, built_allowance, cloud_allowance, connected_parts, signs_of, unexplained
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.task import Registration, without_inside
 
 # Trust from which on a fit is good, and fair: more likely right than wrong; a part is fair at best.

@@ -1,9 +1,8 @@
 """A template fitted without a network, to a shape that stands as it does: one of a collection of scans.
 
-Node vectors are found by Gauss-Newton. The prior differs from that of a fit by a trained model, which keeps the template's
-stretch: here the deformation gradient at every strain point is held near the mean of its neighbours' in the step before.
-So the stretch may be any, but changes slowly from place to place, and what a step has gained is kept (a viscous prior, as
-in meshmonk's registration of surfaces).
+Node vectors are found by the least squares of `meshmatch.fitting.solve.driver`. The prior differs from that of a fit by a
+trained model, which keeps the template's stretch: here the deformation gradient at every gradient point is held near the
+mean of its neighbours' in the step before (a viscous prior, as in meshmonk's registration of surfaces).
 """
 
 from __future__ import annotations
@@ -12,17 +11,17 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.fitting.fit import Fit, Reason, axis_name
-from meshmatch.fitting.fit_config import NodeRefineConfig, geometric_between
+from meshmatch.fitting.fit_config import Pairing, Schedule
 from meshmatch.fitting.network_fit import two_way_residual
-from meshmatch.fitting.nodes import pair_terms
 from meshmatch.fitting.signs import signs_of
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.solve.driver import Problem, minimise
+from meshmatch.fitting.solve.priors import ViscousGradient
+from meshmatch.fitting.solve.system import NodeSystem
+from meshmatch.fitting.solve.terms import PairTerm
 from meshmatch.fitting.task import take_samples
 from meshmatch.fitting.verdict import EVEN_TRUST, judge
 from meshmatch.geometry.oriented import OrientedPoints
@@ -40,8 +39,8 @@ _TURNED = (
 )
 
 
-@dataclass(frozen=True)
-class ViscousConfig:
+@dataclass(frozen=True, kw_only=True)
+class ViscousConfig(Pairing):
     """Nodes of a template, and the schedule of its fits; lengths in units of sqrt(area). Tuned on three hearts."""
 
     nodes: int = 600
@@ -56,9 +55,19 @@ class ViscousConfig:
     point_share: float = 0.01
     pair_normals: float = 0.012  # of normals in the search for pairs
     back_points: int = 8000
-    near: int = 5  # strain points, itself included, whose gradients are averaged
+    near: int = 5  # gradient points, itself included, whose gradients are averaged
     damping: float = 1e-6
     seed: int = 0
+
+    @property
+    def schedule(self) -> Schedule:
+        """The same as the driver of the least squares takes it."""
+        return Schedule(
+            steps=self.steps,
+            prior=(self.strain_first, self.strain_last),
+            scale=(self.scale_first, self.scale_last),
+            damping=self.damping,
+        )
 
 
 def template_of(shape: Shape, name: str, config: ViscousConfig) -> Template:
@@ -75,22 +84,9 @@ def viscous_system(template: Template) -> NodeSystem:
 
 def viscous_vectors(system: NodeSystem, samples: OrientedPoints, config: ViscousConfig) -> Float[Floats, "K 3"]:
     """Node vectors that move the template onto the shape of the samples, which stands as it does."""
-    places = system.verts[system.strain_points]
-    near = cKDTree(places).query(places, config.near)[1]
-    rows = np.repeat(np.arange(len(places)), config.near)
-    mean = csr_matrix((np.full(near.size, 1 / config.near), (rows, near.reshape(-1))), (len(places),) * 2)
-    vectors = np.zeros((system.K, 3))
-    pairing = NodeRefineConfig(
-        point_share=config.point_share, pair_normals=config.pair_normals, back_points=config.back_points
-    )
-    for step in range(config.steps):
-        t = step / max(config.steps - 1, 1)
-        strain = geometric_between(config.strain_first, config.strain_last, t)
-        scale = geometric_between(config.scale_first, config.scale_last, t)
-        terms = pair_terms(system, samples, vectors, scale, pairing)
-        wanted = (mean @ system.deformation_gradient(vectors).reshape(-1, 9)).reshape(-1, 3, 3)
-        vectors = system.solve(*terms, strain / len(places), wanted, config.damping / system.K, vectors)
-    return vectors
+    prior = ViscousGradient.over(system.verts[system.strain_points], config.near)
+    problem = Problem(system=system, terms=[PairTerm(samples, config)], schedule=config.schedule)
+    return minimise(problem, prior, np.zeros((system.K, 3)))
 
 
 def fit_viscously(template: Template, system: NodeSystem, shape: Shape, config: ViscousConfig | None = None) -> Fit:

@@ -22,7 +22,7 @@ from meshmatch.experiments.paper.refinement import (
     pair_errors,
     refined,
 )
-from meshmatch.fitting.system import node_system
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.normalise import sqrt_area_frame

@@ -12,7 +12,7 @@ from meshmatch.errors import OptionError
 from meshmatch.fitting import blend as blend_module
 from meshmatch.fitting.blend import Blend, RotationBlend, StretchBlend, _spanning_order, polar
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.system import node_system
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape

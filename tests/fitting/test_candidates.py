@@ -18,7 +18,7 @@ from meshmatch.fitting.refinement import (
     differ,
     stands_as_usual,
 )
-from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.fitting.task import FitTask
 from meshmatch.fitting.tears import neighbours, torn_share
 from meshmatch.geometry.frames import RigidPose

@@ -6,14 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from meshmatch.fitting.agree import AgreeConfig, agreed_fits
+from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.candidates import estimate_scale, isolated_points
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.network_fit import Candidate, two_way_residual
-from meshmatch.fitting.nodes import pair_terms, refine_nodes
 from meshmatch.fitting.signs import cloud_allowance, unexplained
-from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.solve.agreement import AgreeConfig
+from meshmatch.fitting.solve.nodes import refine_nodes
+from meshmatch.fitting.solve.system import NodeSystem, node_system
+from meshmatch.fitting.solve.terms import PairTerm
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.sampling import sample_surface
@@ -196,9 +198,11 @@ def test_fits_of_rough_clouds_are_suited_to_them(system: NodeSystem, monkeypatch
         asked.append(config.strain_last)
         return refine_nodes(system, scan, vectors, config, fixed)
 
-    def pairs(system, scan, vectors, scale, config, one_sided):
-        paired.append(config.back_points)
-        return pair_terms(system, scan, vectors, scale, config, one_sided)
+    quadratic = PairTerm.quadratic
+
+    def paired_again(term, system, vectors, scale):
+        paired.append(term.config.back_points)
+        return quadratic(term, system, vectors, scale)
 
     monkeypatch.setattr("meshmatch.fitting.refinement.refine_nodes", refined)
     config = FitConfig(partial="no", variants=2, finalists=1, careful=1)
@@ -209,7 +213,7 @@ def test_fits_of_rough_clouds_are_suited_to_them(system: NodeSystem, monkeypatch
         expected = config.nodes.strain_last * 10**cloud.roughness
         assert asked and asked == pytest.approx([expected] * len(asked))
     assert clouds[1].roughness > clouds[0].roughness + 0.3
-    monkeypatch.setattr("meshmatch.fitting.agree.pair_terms", pairs)
+    monkeypatch.setattr(PairTerm, "quadratic", paired_again)
     how = AgreeConfig(steps=1, back_points=100)
     agreed_fits(egg_model(), clouds, fits, config, how=how)
     assert paired == [round(100 * (1 + cloud.roughness)) for cloud in clouds]

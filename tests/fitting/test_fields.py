@@ -20,8 +20,8 @@ from meshmatch.fitting.fit import dense_shape
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.latent import LatentRefineConfig
-from meshmatch.fitting.nodes import refine_nodes
-from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.solve.nodes import refine_nodes
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.models.network import NetworkConfig
 from meshmatch.models.registry import load_model
 from meshmatch.models.trained import TrainedModel

@@ -18,7 +18,7 @@ from meshmatch.fitting.initial_frames import axis_vector
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.fitting.network_fit import Candidate, Mirror, Predictor
 from meshmatch.fitting.refinement import REFINEMENTS
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.task import take_samples
 from meshmatch.geometry.frames import Frame, RigidPose
 from meshmatch.geometry.oriented import OrientedPoints

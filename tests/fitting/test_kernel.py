@@ -17,7 +17,7 @@ from meshmatch.fitting.fit_config import FitConfig, Refine
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy
 from meshmatch.fitting.refinement import REFINEMENTS
-from meshmatch.fitting.system import node_system
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.kernels import KERNELS, Kernel
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.registry import built_in_folder, load_model

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.fitting import network_fit
 from meshmatch.fitting.network_fit import Predictor, one_way_residual, two_way_residual
-from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints, with_normals
 from meshmatch.models.trained import TrainedModel

@@ -11,7 +11,7 @@ from meshmatch.errors import InputError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.network_fit import one_way_residual, two_way_residual
-from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.fitting.task import take_samples, without_inside, without_outliers
 from meshmatch.fitting.tears import neighbours, torn_share
 from meshmatch.geometry.frames import RigidPose

@@ -19,7 +19,7 @@ from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try
 from meshmatch.fitting.network_fit import Candidate, one_way_residual
 from meshmatch.fitting.refinement import REFINEMENTS
 from meshmatch.fitting.signs import Signs, empty_share, signs_of
-from meshmatch.fitting.system import node_system
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.fitting.task import FitTask, take_samples
 from meshmatch.fitting.verdict import Judgement, judge
 from meshmatch.geometry.frames import RigidPose

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import meshmatch
-from meshmatch.fitting.agree import AgreeConfig, Member, agree, agreed_fits
+from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_config import NodeRefineConfig
-from meshmatch.fitting.regularity import Regularity, opened
-from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree
+from meshmatch.fitting.solve.regularity import Regularity, opened
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.fitting.verdict import with_vectors
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
@@ -95,7 +95,7 @@ def test_what_all_fits_have_in_common_hardly_drifts(system: NodeSystem, model: T
 
     def drifted(drift: float) -> float:
         members = [Member(scan, start, AgreeConfig(steps=8, strain=0.01, drift=drift))] * 2
-        found = agree(system, members, NodeRefineConfig())[0]
+        found = agree(system, members)[0]
         return float(np.abs(system.deformation_gradient(found) - system.deformation_gradient(start)).mean())
 
     assert drifted(0.0) < drifted(AgreeConfig().drift) < drifted(1.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from meshmatch.fitting.system import NodeSystem, _EveryPair, node_system
+from meshmatch.fitting.solve.system import NodeSystem, _EveryPair, node_system
 from meshmatch.geometry.kernels import KERNELS
 from meshmatch.models.trained import TrainedModel
 from tests.fitting.eggs import egg_model, gentle_vectors
@@ -74,7 +74,7 @@ def test_products_too_many_to_be_kept_are_formed_anew(
     kept = int((np.diff(system.phi.indptr) ** 2).sum())
     shape, problem = model.template.shape, Problem(system)
     for most, formed in ((kept, False), (kept - 1, True)):
-        monkeypatch.setattr("meshmatch.fitting.system._MAX_PRODUCTS", most)
+        monkeypatch.setattr("meshmatch.fitting.solve.system._MAX_PRODUCTS", most)
         other = NodeSystem(shape, model.field(shape.verts), strain_points=40)
         assert isinstance(other.equations.pairs, _EveryPair) == formed
         assert np.allclose(problem.solve(other), problem.solve(system), atol=1e-8)

@@ -22,7 +22,7 @@ from meshmatch.fitting.signs import (
     unevenness,
     unexplained,
 )
-from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.fitting.tears import neighbours, torn_share
 from meshmatch.fitting.verdict import FAIR_TRUST, GOOD_TRUST, Judgement, judge, judge_excused
 from meshmatch.geometry.frames import RigidPose

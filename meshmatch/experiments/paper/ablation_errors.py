@@ -24,12 +24,12 @@ from meshmatch.experiments.bench.sets import BenchSet
 from meshmatch.experiments.paper.ablation_setting import Setting
 from meshmatch.experiments.paper.ablation_views import BASE, CODED, Run
 from meshmatch.experiments.runner import spread
-from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit_config import FitConfig, NodeRefineConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.latent import LatentRefineConfig, refine_code
 from meshmatch.fitting.network_fit import Candidate, Predictor
-from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
-from meshmatch.fitting.system import node_system
+from meshmatch.fitting.solve.nodes import refine_nodes
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame, RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.evaluate import CM_PER_UNIT, LOST_CM

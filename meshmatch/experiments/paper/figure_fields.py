@@ -18,7 +18,7 @@ from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.experiments.paper.ablation_errors import Measure, begin_body, refined, refinement_of
 from meshmatch.experiments.paper.ablation_views import BASE, Run
 from meshmatch.fields.shape_functions import FIELDS, FieldName, has_nodes, shape_functions
-from meshmatch.fitting.system import node_system
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.maps.evaluate import CM_PER_UNIT

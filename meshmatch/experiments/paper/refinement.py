@@ -38,10 +38,10 @@ from meshmatch.experiments import runner
 from meshmatch.experiments.bench.scores import evaluate_set
 from meshmatch.experiments.bench.sets import SET_NAMES, load_set
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit_config import FitConfig, NodeRefineConfig
 from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy, refine_code
-from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
-from meshmatch.fitting.system import node_system
+from meshmatch.fitting.solve.nodes import refine_nodes
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.trained import TrainedModel

@@ -23,7 +23,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fields.shape_functions import ShapeFunctions
-from meshmatch.fitting.regularity import Regularity, Unfolding
+from meshmatch.fitting.solve.regularity import Regularity, Unfolding
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import triangle_vectors
 from meshmatch.models.trained import TrainedModel, once_per_model
