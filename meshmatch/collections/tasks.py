@@ -21,12 +21,11 @@ from meshmatch.collections.fit_files import StoredFit, load_words, regularity_of
 from meshmatch.collections.setting import AGREEING, ALONE, FITS, SUFFIX, Record, Setting, Source, digest_of
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError
-from meshmatch.fitting.agree import member_of
+from meshmatch.fitting.agree import member_of, with_vectors
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree_step, log_stretch
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.system import node_system
-from meshmatch.fitting.verdict import with_vectors
-from meshmatch.fitting.viscous import NO_MODEL
+from meshmatch.fitting.without_model import NO_MODEL
 from meshmatch.maps.places import Places
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.input_files import read_npy

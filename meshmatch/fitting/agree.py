@@ -8,12 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.judge.reasons import Verdict
+from meshmatch.fitting.judge.verdict import folded_by_agreement
+from meshmatch.fitting.search.task import Landmarks, take_samples, without_inside
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree
 from meshmatch.fitting.solve.system import NodeSystem, node_system
-from meshmatch.fitting.task import Landmarks, take_samples, without_inside
-from meshmatch.fitting.verdict import with_vectors
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
 
@@ -61,3 +63,18 @@ def member_of(
     normals = samples.normals @ frame.rotation @ fit.frame.rotation.T
     samples = replace(samples, points=points, normals=normals).facing(system.surface(fit.vectors))
     return Member(samples, fit.vectors, how.for_noise(shape.roughness), local, fit.partial)
+
+
+def with_vectors(system: NodeSystem, fit: Fit, vectors: Float[Floats, "K 3"]) -> Fit:
+    """The same fit with other node vectors, such as agreement finds.
+
+    Residual, trust and verdict stay those that it had, but a deformation that folds more than right ones do, or clearly more
+    than before, is not good.
+    """
+    regularity = system.regularity(vectors)
+    moved = replace(fit, vectors=vectors, points=system.moved(vectors), regularity=regularity)
+    folded = folded_by_agreement(fit.regularity, regularity)
+    if folded is None or any(reason.code == "folded" for reason in fit.reasons):
+        return moved
+    verdict: Verdict = "fair" if fit.verdict == "good" else fit.verdict
+    return replace(moved, verdict=verdict, reasons=(*fit.reasons, folded))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from meshmatch.shapes.normalise import Mirroring
 
 Refine = Literal["none", "latent", "nodes"]
-"""How a fit is refined, see `meshmatch.fitting.refinement.REFINEMENTS`."""
+"""How a fit is refined, see `meshmatch.fitting.search.refinement.REFINEMENTS`."""
 Partial = Literal["auto", "yes", "no"]
 """Whether a shape may be a part of a whole, such as a scan from one side."""
 ON_NODES: tuple[Refine, ...] = ("nodes",)

@@ -12,15 +12,15 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, off_torch
 from meshmatch.errors import OptionError
-from meshmatch.fitting.candidates import fit_part, fit_whole
-from meshmatch.fitting.fit import Fit, Reason, Verdict, axis_name
+from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.network_fit import mirror_of
-from meshmatch.fitting.refinement import REFINEMENTS
-from meshmatch.fitting.signs import empty_share
+from meshmatch.fitting.judge.features import empty_share
+from meshmatch.fitting.judge.reasons import Reason, Verdict
+from meshmatch.fitting.judge.verdict import EVEN_TRUST, FAIR_RESIDUAL, judge_registration
+from meshmatch.fitting.search.predictor import mirror_of
+from meshmatch.fitting.search.refinement import REFINEMENTS, fit_part, fit_whole
+from meshmatch.fitting.search.task import FitTask, Registration
 from meshmatch.fitting.solve.terms import Landmarks
-from meshmatch.fitting.task import FitTask, Registration
-from meshmatch.fitting.verdict import EVEN_TRUST, FAIR_RESIDUAL, judge_registration
 from meshmatch.geometry.oriented import quick_tree
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
@@ -68,7 +68,7 @@ class Fitter:
         for k, mirrored in enumerate((False, True) if both else (False,)):
             stretch = progress.between(k / 2, (k + 1) / 2) if both else progress
             task = FitTask.of(self.model, self.config, shape, landmarks, stretch, mirrored)
-            wholes.append(fit_whole(task, REFINEMENTS[task.config.refine].whole))
+            wholes.append(fit_whole(task))
         # A shape that one side explains as a whole is no part in the mirror.
         parts = landmarks is None and _may_be_part(min(wholes, key=_cost))
         sides = [_as_part_if_closer(whole) if parts else (whole, False) for whole in wholes]
@@ -91,12 +91,19 @@ def _as_part_if_closer(whole: Registration) -> tuple[Registration, bool]:
     """A fit of the whole, or one as a part if that may be and is better; and which it is."""
     if not _may_be_part(whole):
         return whole, False
-    task = whole.task
-    part = fit_part(task.bare, REFINEMENTS[task.config.refine].part)
+    part = _best_part(whole.task.bare)
     # A part explains the shape better than the whole, and lacks some of it.
     closer = part.candidate.cost < _CLOSER * whole.candidate.residual
     partial = closer and part.candidate.share < 1 - _MISSING
     return (part, True) if partial else (whole, False)
+
+
+def _best_part(task: FitTask) -> Registration:
+    """The best fit of a part; where that is poor, also from more orientations."""
+    found = fit_part(task)
+    if judge_registration(found, partial=True).verdict != "poor":
+        return found
+    return min(found, fit_part(task, wide=True), key=_cost)
 
 
 def doubted(fit: Fit, doubts: Sequence[Reason]) -> Fit:

@@ -24,7 +24,7 @@ from meshmatch.experiments.paper.ablation_errors import (
 from meshmatch.experiments.paper.ablation_setting import Setting
 from meshmatch.experiments.paper.ablation_views import BASE, CONSTRAINTS
 from meshmatch.fitting.fit_config import NodeRefineConfig
-from meshmatch.fitting.latent import LatentRefineConfig
+from meshmatch.fitting.search.latent import LatentRefineConfig
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.normalise import sqrt_area_frame

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.search.task import Landmarks
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree, likeness, log_stretch, mean_log, stretch_of
 from meshmatch.fitting.solve.system import NodeSystem, node_system
-from meshmatch.fitting.task import Landmarks
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel

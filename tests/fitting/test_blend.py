@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import OptionError
 from meshmatch.fitting import blend as blend_module
-from meshmatch.fitting.blend import Blend, RotationBlend, StretchBlend, _spanning_order, polar
+from meshmatch.fitting.blend import Blend
 from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.solve.blend import RotationBlend, StretchBlend, _spanning_order, polar
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame
 from meshmatch.models.trained import TrainedModel

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from meshmatch.fitting import candidates, refinement
-from meshmatch.fitting.candidates import fit_whole
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.network_fit import Candidate, Predictor
-from meshmatch.fitting.refinement import (
+from meshmatch.fitting.search import candidates, refinement
+from meshmatch.fitting.search.candidates import candidates_of_whole
+from meshmatch.fitting.search.discontinuities import neighbours, torn_share
+from meshmatch.fitting.search.predictor import Candidate, Predictor
+from meshmatch.fitting.search.refinement import (
     CandidateScorer,
     PartComparison,
     WholeComparison,
@@ -18,9 +19,8 @@ from meshmatch.fitting.refinement import (
     differ,
     stands_as_usual,
 )
+from meshmatch.fitting.search.task import FitTask
 from meshmatch.fitting.solve.system import NodeSystem, node_system
-from meshmatch.fitting.task import FitTask
-from meshmatch.fitting.tears import neighbours, torn_share
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
@@ -59,7 +59,7 @@ def test_a_shape_that_the_network_misses_is_tried_with_its_core_further_down(
         return [Candidate(pose, np.zeros((task.system.K, 3)), residual) for _, pose in starts]
 
     monkeypatch.setattr(Predictor, "fit_all", fit_all)
-    fit_whole(task, lambda task, found: found[0])
+    candidates_of_whole(task)
     assert sum(map(len, asked[:-1])) == tried * len(frames)
     assert len(asked[-1]) == careful
     if tried > 1:

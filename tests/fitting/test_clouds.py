@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from meshmatch.fitting.agree import agreed_fits
-from meshmatch.fitting.candidates import estimate_scale, isolated_points
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.network_fit import Candidate, two_way_residual
-from meshmatch.fitting.signs import cloud_allowance, unexplained
+from meshmatch.fitting.judge.features import cloud_allowance, unexplained
+from meshmatch.fitting.search.candidates import estimate_scale, isolated_points
+from meshmatch.fitting.search.predictor import Candidate, two_way_residual
 from meshmatch.fitting.solve.agreement import AgreeConfig
 from meshmatch.fitting.solve.nodes import refine_nodes
 from meshmatch.fitting.solve.system import NodeSystem, node_system
@@ -204,7 +204,7 @@ def test_fits_of_rough_clouds_are_suited_to_them(system: NodeSystem, monkeypatch
         paired.append(term.config.back_points)
         return quadratic(term, system, vectors, scale)
 
-    monkeypatch.setattr("meshmatch.fitting.refinement.refine_nodes", refined)
+    monkeypatch.setattr("meshmatch.fitting.search.refinement.refine_nodes", refined)
     config = FitConfig(partial="no", variants=2, finalists=1, careful=1)
     fits = []
     for cloud in clouds:

@@ -19,7 +19,7 @@ from meshmatch.fitting.blend import Blend
 from meshmatch.fitting.fit import dense_shape
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.latent import LatentRefineConfig
+from meshmatch.fitting.search.latent import LatentRefineConfig
 from meshmatch.fitting.solve.nodes import refine_nodes
 from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.models.network import NetworkConfig

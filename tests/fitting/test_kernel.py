@@ -15,8 +15,8 @@ from meshmatch.fields.shape_functions import build_field
 from meshmatch.fitting.fit import dense_shape
 from meshmatch.fitting.fit_config import FitConfig, Refine
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy
-from meshmatch.fitting.refinement import REFINEMENTS
+from meshmatch.fitting.search.latent import LatentRefineConfig, PaperEnergy
+from meshmatch.fitting.search.refinement import REFINEMENTS
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.kernels import KERNELS, Kernel
 from meshmatch.geometry.oriented import OrientedPoints

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.fitting.fit_config import NodeRefineConfig
-from meshmatch.fitting.network_fit import two_way_residual
+from meshmatch.fitting.search.predictor import two_way_residual
 from meshmatch.fitting.solve.nodes import refine_nodes
 from meshmatch.fitting.solve.priors import nearest_rotations
 from meshmatch.fitting.solve.system import NodeSystem, node_system

@@ -10,10 +10,10 @@ from meshmatch.api.matching import register
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.network_fit import one_way_residual, two_way_residual
+from meshmatch.fitting.search.discontinuities import neighbours, torn_share
+from meshmatch.fitting.search.predictor import one_way_residual, two_way_residual
+from meshmatch.fitting.search.task import take_samples, without_inside, without_outliers
 from meshmatch.fitting.solve.system import NodeSystem, node_system
-from meshmatch.fitting.task import take_samples, without_inside, without_outliers
-from meshmatch.fitting.tears import neighbours, torn_share
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.files import load_shape
@@ -115,7 +115,7 @@ def test_a_cloud_is_tried_as_a_part_only_where_it_leaves_the_template_bare(
     """A residual says that a cloud is sparse and noisy, not that something is missing."""
     tried = []
 
-    def part(task, refine):
+    def part(task):
         tried.append(task)
         raise KeyboardInterrupt
 

@@ -10,18 +10,18 @@ import pytest
 from meshmatch.api.inputs import as_model
 from meshmatch.api.matching import Matcher
 from meshmatch.errors import OptionError
-from meshmatch.fitting import candidates
-from meshmatch.fitting.candidates import SHARES
+from meshmatch.fitting import fitter
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import boundary_length
-from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try
-from meshmatch.fitting.network_fit import Candidate, one_way_residual
-from meshmatch.fitting.refinement import REFINEMENTS
-from meshmatch.fitting.signs import Signs, empty_share, signs_of
+from meshmatch.fitting.judge.features import Signs, empty_share, signs_of
+from meshmatch.fitting.judge.verdict import Judgement, judge
+from meshmatch.fitting.search import candidates
+from meshmatch.fitting.search.candidates import SHARES
+from meshmatch.fitting.search.frames import frames_of_part, frames_to_try
+from meshmatch.fitting.search.predictor import Candidate, one_way_residual
+from meshmatch.fitting.search.task import FitTask, take_samples
 from meshmatch.fitting.solve.system import node_system
-from meshmatch.fitting.task import FitTask, take_samples
-from meshmatch.fitting.verdict import Judgement, judge
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import unit
@@ -136,12 +136,10 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
     for verdict in ("fair", "poor"):
         monkeypatch.setattr(candidates, "frames_of_part", frames)
         monkeypatch.setattr(
-            candidates,
-            "judge_registration",
-            lambda found, partial, verdict=verdict: Judgement(verdict, (), Signs(0.02)),
+            fitter, "judge_registration", lambda found, partial, verdict=verdict: Judgement(verdict, (), Signs(0.02))
         )
         asked.clear()
-        best = candidates.fit_part(task, REFINEMENTS["none"].part)
+        best = fitter._best_part(task)
         found[verdict] = best.candidate.cost
         assert asked == ({(48, 2, False)} if verdict == "fair" else {(48, 2, False), (96, 4, True)})
     assert found["poor"] <= found["fair"]

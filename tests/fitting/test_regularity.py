@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 import meshmatch
-from meshmatch.fitting.agree import agreed_fits
+from meshmatch.fitting.agree import agreed_fits, with_vectors
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree
 from meshmatch.fitting.solve.regularity import Regularity, opened
 from meshmatch.fitting.solve.system import NodeSystem, node_system
-from meshmatch.fitting.verdict import with_vectors
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
 from meshmatch.templates.location import bundled_folder

@@ -10,10 +10,9 @@ import trimesh
 
 from meshmatch.api.matching import Matcher
 from meshmatch.arrays import Floats, Ints
-from meshmatch.fitting.fit import Reason
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter, doubted
-from meshmatch.fitting.signs import (
+from meshmatch.fitting.judge.features import (
     Signs,
     built_allowance,
     connected_parts,
@@ -22,9 +21,10 @@ from meshmatch.fitting.signs import (
     unevenness,
     unexplained,
 )
+from meshmatch.fitting.judge.reasons import Reason
+from meshmatch.fitting.judge.verdict import FAIR_TRUST, GOOD_TRUST, Judgement, judge, judge_excused
+from meshmatch.fitting.search.discontinuities import neighbours, torn_share
 from meshmatch.fitting.solve.system import NodeSystem, node_system
-from meshmatch.fitting.tears import neighbours, torn_share
-from meshmatch.fitting.verdict import FAIR_TRUST, GOOD_TRUST, Judgement, judge, judge_excused
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.files import load_shape
@@ -276,7 +276,7 @@ def test_a_registration_is_judged_by_the_parts_of_its_shape(monkeypatch: pytest.
     shape = Shape(np.concatenate(verts), np.concatenate(faces))
     assert shape.face_parts.max() == 11
     shown = Shape(shape.verts, shape.faces[shape.face_parts < 3])
-    monkeypatch.setattr("meshmatch.fitting.verdict.without_inside", lambda *_: shown)
+    monkeypatch.setattr("meshmatch.fitting.judge.verdict.without_inside", lambda *_: shown)
     asked = []
 
     def watched(*args, **kwargs):
@@ -287,8 +287,8 @@ def test_a_registration_is_judged_by_the_parts_of_its_shape(monkeypatch: pytest.
         asked.append(residual)
         return judge_excused(signs, residual)
 
-    monkeypatch.setattr("meshmatch.fitting.verdict.signs_of", watched)
-    monkeypatch.setattr("meshmatch.fitting.verdict.judge_excused", excused)
+    monkeypatch.setattr("meshmatch.fitting.judge.verdict.signs_of", watched)
+    monkeypatch.setattr("meshmatch.fitting.judge.verdict.judge_excused", excused)
     fit = Fitter(egg_model(), FitConfig(samples=900, variants=0, finalists=1, careful=1, partial="no")).fit(shape)
     assert fit.signs is not None
     assert fit.signs.residual == pytest.approx(unexplained(fit.residual, built_allowance(shape, shown)))

@@ -14,7 +14,7 @@ from meshmatch.experiments.bench.methods import Method, OurMethod
 from meshmatch.experiments.bench.orientation import upright
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.latent import LatentRefineConfig
+from meshmatch.fitting.search.latent import LatentRefineConfig
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import find_model
 from meshmatch.shapes.shape import Shape

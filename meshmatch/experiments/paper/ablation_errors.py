@@ -26,8 +26,8 @@ from meshmatch.experiments.paper.ablation_views import BASE, CODED, Run
 from meshmatch.experiments.runner import spread
 from meshmatch.fitting.fit_config import FitConfig, NodeRefineConfig
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.latent import LatentRefineConfig, refine_code
-from meshmatch.fitting.network_fit import Candidate, Predictor
+from meshmatch.fitting.search.latent import LatentRefineConfig, refine_code
+from meshmatch.fitting.search.predictor import Candidate, Predictor
 from meshmatch.fitting.solve.nodes import refine_nodes
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame, RigidPose, kabsch

@@ -39,7 +39,7 @@ from meshmatch.experiments.bench.scores import evaluate_set
 from meshmatch.experiments.bench.sets import SET_NAMES, load_set
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig, NodeRefineConfig
-from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy, refine_code
+from meshmatch.fitting.search.latent import LatentRefineConfig, PaperEnergy, refine_code
 from meshmatch.fitting.solve.nodes import refine_nodes
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.oriented import OrientedPoints

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.fitting.network_fit import weighted_mean
+from meshmatch.fitting.search.predictor import weighted_mean
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import is_discontinuous

@@ -6,12 +6,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from meshmatch.arrays import Bool, Bools, Float, Floats
-from meshmatch.fitting.fit import Fit, Reason, ReasonCode, Verdict
-from meshmatch.fitting.network_fit import reads_alike
-from meshmatch.fitting.signs import Signs, built_allowance, cloud_allowance, connected_parts, signs_of, unexplained
-from meshmatch.fitting.solve.system import NodeSystem
-from meshmatch.fitting.task import Registration, without_inside
+from meshmatch.arrays import Bool, Bools
+from meshmatch.fitting.judge.features import (
+    Signs,
+    built_allowance,
+    cloud_allowance,
+    connected_parts,
+    signs_of,
+    unexplained,
+)
+from meshmatch.fitting.judge.reasons import Reason, ReasonCode, Verdict
+from meshmatch.fitting.search.predictor import reads_alike
+from meshmatch.fitting.search.task import Registration, without_inside
+from meshmatch.fitting.solve.regularity import Regularity
 
 # Trust from which on a fit is good, and fair: more likely right than wrong; a part is fair at best.
 GOOD_TRUST, FAIR_TRUST = 0.99, 0.5
@@ -128,18 +135,9 @@ def _folds(inverted: float) -> str:
     return f"the template is folded or inside out at {100 * inverted:.1f} % of its vertices"
 
 
-def with_vectors(system: NodeSystem, fit: Fit, vectors: Float[Floats, "K 3"]) -> Fit:
-    """The same fit with other node vectors, such as agreement finds.
-
-    Residual, trust and verdict stay those that it had, but a deformation that folds more than right ones do, or clearly more
-    than before, is not good.
-    """
-    regularity = system.regularity(vectors)
-    moved = replace(fit, vectors=vectors, points=system.moved(vectors), regularity=regularity)
-    before = 0.0 if fit.regularity is None else fit.regularity.inverted
-    if regularity.inverted <= min(_FOLDED, before + _FOLDED_SINCE) or any(
-        reason.code == "folded" for reason in fit.reasons
-    ):
-        return moved
-    verdict: Verdict = "fair" if fit.verdict == "good" else fit.verdict
-    return replace(moved, verdict=verdict, reasons=(*fit.reasons, Reason("folded", _folds(regularity.inverted))))
+def folded_by_agreement(before: Regularity | None, after: Regularity) -> Reason | None:
+    """Why a fit is no longer good whose deformation folds more than right ones do, or clearly more than before."""
+    folded = 0.0 if before is None else before.inverted
+    if after.inverted <= min(_FOLDED, folded + _FOLDED_SINCE):
+        return None
+    return Reason("folded", _folds(after.inverted))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from weakref import WeakKeyDictionary
@@ -10,8 +9,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.initial_frames import scan_frame
-from meshmatch.fitting.network_fit import Candidate, Predictor
+from meshmatch.fitting.search.frames import scan_frame
+from meshmatch.fitting.search.predictor import Candidate, Predictor
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.solve.terms import Landmarks
 from meshmatch.geometry.frames import Frame
@@ -89,10 +88,6 @@ class FitTask:
             return replace(self, frame=frame, samples=samples, shown=samples)
         all_samples, shown = (replace(each, points=each.points / scale) for each in (self.samples, self.shown))
         return replace(self, frame=frame, samples=all_samples, shown=shown)
-
-
-# Of a task's candidates, best first, to the fit.
-Refine = Callable[[FitTask, list[Candidate]], Candidate]
 
 
 @dataclass(frozen=True, eq=False)

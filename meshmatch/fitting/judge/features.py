@@ -15,9 +15,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
-from meshmatch.fitting.network_fit import two_way_residual, weighted_mean
+from meshmatch.fitting.judge.calibration import CALIBRATION
+from meshmatch.fitting.search.discontinuities import neighbours, torn_share
+from meshmatch.fitting.search.predictor import USUAL_SPREAD, two_way_residual, weighted_mean
+from meshmatch.fitting.search.visibility import area_share, visible_vertices
 from meshmatch.fitting.solve.system import NodeSystem
-from meshmatch.fitting.tears import neighbours, torn_share
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.symmetric import entries_of, logarithm, matrices_of
 from meshmatch.shapes.sampling import Samples, sample_surface
@@ -25,19 +27,14 @@ from meshmatch.shapes.shape import Shape
 
 # Further from the other surface than this (units of sqrt(area)), a point of shape or template is without counterpart.
 _REACH = 0.06
-# A template vertex is visible if a sample is this near, and if the nearest sample belongs this near to the vertex on the
-# resting template (units of sqrt(area)). Set by hand.
-_NEAR, _HOME = 0.06, 0.06
 # More noise than this (units of sqrt(area), 3.4 cm on a person) is a wrong fit rather than noise.
 _MAX_NOISE = 0.025
 _TEAR_SAMPLES = 4096  # enough to see tears
 _SHORTEST = 0.2  # what is shortened more is torn
 _EVEN = 0.2  # a stretch that varies less says no more
-USUAL_SPREAD = 0.03  # of fits that no network read
 _LEAST_SPREAD = 0.01  # less of it says no more
 _MIN_SQUARE = 1e-6  # of a stretch: a logarithm must stay finite
-# Of the logit of a wrong fit, in the order of `Signs.trust`.
-_WEIGHTS, _OFFSET = (0.909, 3.628, 1.163, 2.653, 5.308, 2.133), 9.935
+_WEIGHTS, _OFFSET = CALIBRATION.weights, CALIBRATION.offset
 # Residual (units of sqrt(area)) of even a right fit of a figure built of many solids, which no skin follows: the likeliest
 # one, given right fits and upside-down ones of robots, and fits of solids and of furniture in pieces, that are not those of
 # docs/results.md. Between so many parts of equal area and so many, set by hand, it grows to that.
@@ -203,22 +200,3 @@ def built_allowance(shape: Shape, shown: Shape) -> float:
 def connected_parts(shape: Shape, samples: OrientedPoints) -> Int[Ints, " P"] | None:
     """Number of the connected part that each sample of a mesh is on; None where there is but one, and for a cloud."""
     return shape.vertex_parts[samples.vertex] if isinstance(samples, Samples) and shape.face_parts.any() else None
-
-
-def visible_vertices(system: NodeSystem, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> Bool[Bools, " V"]:
-    """Whether samples (core frame) show each vertex of the template as fitted.
-
-    Vertices beyond a cut have the edge of the samples near by, but the edge belongs elsewhere on the template.
-    """
-    surface = system.surface(vectors)
-    local = local.facing(surface)
-    distance, nearest = local.tree.query(surface.features)
-    home = surface.tree.query(local.features)[1]
-    away = np.linalg.norm(system.verts[home[nearest]] - system.verts, axis=1)
-    return np.asarray((distance < _NEAR) & (away < _HOME))
-
-
-def area_share(system: NodeSystem, vertices: Bool[Bools, " V"]) -> float:
-    """Share (0..1) of the resting template's area around some vertices."""
-    area = Shape(system.verts, system.faces).vertex_areas
-    return float(area[vertices].sum() / area.sum())

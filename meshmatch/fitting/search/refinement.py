@@ -10,7 +10,7 @@ as front and back of a robot do, by what the network reads in copies of the shap
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -21,20 +21,21 @@ from scipy.spatial import cKDTree
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import needs
 from meshmatch.fitting import fit_config
-from meshmatch.fitting.candidates import STAGE, completed
-from meshmatch.fitting.network_fit import (
+from meshmatch.fitting.search.candidates import STAGE, candidates_of_part, candidates_of_whole, completed
+from meshmatch.fitting.search.discontinuities import Pairs, neighbours, torn_share
+from meshmatch.fitting.search.predictor import (
+    USUAL_SPREAD,
     Candidate,
     best_first,
     one_way_residual,
     reads_alike,
+    sized,
     two_way_residual,
     weighted_mean,
 )
-from meshmatch.fitting.signs import USUAL_SPREAD
+from meshmatch.fitting.search.task import FitTask, Registration
 from meshmatch.fitting.solve.nodes import refine_nodes
 from meshmatch.fitting.solve.system import NodeSystem
-from meshmatch.fitting.task import FitTask, Refine
-from meshmatch.fitting.tears import Pairs, neighbours, torn_share
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
@@ -60,6 +61,27 @@ _PART_FINALISTS = 4  # interpretations of a part that get a few steps each
 _SCREENED_SAMPLES = 4096  # enough to tell interpretations apart
 
 
+Refine = Callable[[FitTask, list[Candidate]], Candidate]
+"""From a task's candidates, best first, to the fit."""
+
+
+def fit_whole(task: FitTask) -> Registration:
+    """Fit the template to a shape that is taken for complete."""
+    task, candidates = candidates_of_whole(task)
+    return Registration(task.bare, REFINEMENTS[task.config.refine].whole(task, candidates))
+
+
+def fit_part(task: FitTask, wide: bool = False) -> Registration:
+    """Fit the template to a shape that may show only a part, from more orientations if the search is to be ``wide``.
+
+    The residual is from the samples to the template only.
+    """
+    task, candidates = candidates_of_part(task, wide)
+    best = REFINEMENTS[task.config.refine].part(task, candidates)
+    root = float(np.sqrt(best.share))
+    return Registration(task.rescaled(1 / root, sized(task.samples, best.share)), best)
+
+
 @dataclass(frozen=True)
 class Refinement:
     """What makes one fit of the network's candidates, for `fit_whole` and for `fit_part`.
@@ -79,7 +101,7 @@ def _first(task: FitTask, candidates: list[Candidate]) -> Candidate:
 def _search_code(task: FitTask, candidates: list[Candidate]) -> Candidate:
     """The best candidate, refined by the paper's search over codes."""
     with needs("torch", "train"):
-        from meshmatch.fitting.latent import refine_code
+        from meshmatch.fitting.search.latent import refine_code
 
     best = candidates[0]
     local = task.samples.to_local(best.pose)

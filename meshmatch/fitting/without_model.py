@@ -1,30 +1,20 @@
-"""A template fitted without a network, to a shape that stands as it does: one of a collection of scans.
-
-Node vectors are found by the least squares of `meshmatch.fitting.solve.driver`. The prior differs from that of a fit by a
-trained model, which keeps the template's stretch: here the deformation gradient at every gradient point is held near the
-mean of its neighbours' in the step before (a viscous prior, as in meshmonk's registration of surfaces).
-"""
+"""A template fitted without a network, to a shape that stands as it does: one of a collection of scans."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats
 from meshmatch.fields.shape_functions import build_field
-from meshmatch.fitting.fit import Fit, Reason, axis_name
-from meshmatch.fitting.fit_config import Pairing, Schedule
-from meshmatch.fitting.network_fit import two_way_residual
-from meshmatch.fitting.signs import signs_of
-from meshmatch.fitting.solve.driver import Problem, minimise
-from meshmatch.fitting.solve.priors import ViscousGradient
+from meshmatch.fitting.fit import Fit, axis_name
+from meshmatch.fitting.judge.features import signs_of
+from meshmatch.fitting.judge.reasons import Reason
+from meshmatch.fitting.judge.verdict import EVEN_TRUST, judge
+from meshmatch.fitting.search.predictor import two_way_residual
+from meshmatch.fitting.search.task import take_samples
 from meshmatch.fitting.solve.system import NodeSystem
-from meshmatch.fitting.solve.terms import PairTerm
-from meshmatch.fitting.task import take_samples
-from meshmatch.fitting.verdict import EVEN_TRUST, judge
-from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.fitting.solve.viscous import ViscousConfig, viscous_vectors
 from meshmatch.shapes.normalise import align
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
@@ -34,40 +24,8 @@ from meshmatch.templates.template import Template
 NO_MODEL = "none"
 """In place of a model's name."""
 _ALIGNED_BY = 2400  # samples
-_TURNED = (
-    0.12  # a residual (units of sqrt(area)) beyond which a shape does not stand as the template does: it is turned
-)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViscousConfig(Pairing):
-    """Nodes of a template, and the schedule of its fits; lengths in units of sqrt(area). Tuned on three hearts."""
-
-    nodes: int = 600
-    radius: float = 0.085
-    faces: int = 10_000  # of a template
-    samples: int = 16_000  # of a shape
-    steps: int = 24
-    strain_first: float = 1e-3
-    strain_last: float = 1e-6
-    scale_first: float = 0.1  # of the robust weight
-    scale_last: float = 0.02
-    point_share: float = 0.01
-    pair_normals: float = 0.012  # of normals in the search for pairs
-    back_points: int = 8000
-    near: int = 5  # gradient points, itself included, whose gradients are averaged
-    damping: float = 1e-6
-    seed: int = 0
-
-    @property
-    def schedule(self) -> Schedule:
-        """The same as the driver of the least squares takes it."""
-        return Schedule(
-            steps=self.steps,
-            prior=(self.strain_first, self.strain_last),
-            scale=(self.scale_first, self.scale_last),
-            damping=self.damping,
-        )
+# With a residual beyond this (units of sqrt(area)) a shape does not stand as the template does: it is turned.
+_TURNED = 0.12
 
 
 def template_of(shape: Shape, name: str, config: ViscousConfig) -> Template:
@@ -80,13 +38,6 @@ def viscous_system(template: Template) -> NodeSystem:
     """The least-squares system of a template without a model."""
     verts = template.shape.verts
     return NodeSystem(template.shape, build_field(verts, template.nodes, template.radius, "smooth"))
-
-
-def viscous_vectors(system: NodeSystem, samples: OrientedPoints, config: ViscousConfig) -> Float[Floats, "K 3"]:
-    """Node vectors that move the template onto the shape of the samples, which stands as it does."""
-    prior = ViscousGradient.over(system.verts[system.strain_points], config.near)
-    problem = Problem(system=system, terms=[PairTerm(samples, config)], schedule=config.schedule)
-    return minimise(problem, prior, np.zeros((system.K, 3)))
 
 
 def fit_viscously(template: Template, system: NodeSystem, shape: Shape, config: ViscousConfig | None = None) -> Fit:

@@ -1,4 +1,4 @@
-"""The network's candidates for a shape that is taken for complete, or for a part, and the fit that refinement makes of them.
+"""The network's candidates for a shape that is taken for complete, or for a part.
 
 The area of a cloud is only estimated, too small where points are few and noisy, and outliers look like surface. The
 network's own fit knows better: its template has the area of a body, and a point far from it, with few others around, is
@@ -21,12 +21,18 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats
-from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try
-from meshmatch.fitting.network_fit import Candidate, Predictor, best_first, one_way_residual, sized, two_way_residual
-from meshmatch.fitting.signs import area_share, visible_vertices
+from meshmatch.fitting.search.frames import frames_of_part, frames_to_try
+from meshmatch.fitting.search.predictor import (
+    Candidate,
+    Predictor,
+    best_first,
+    one_way_residual,
+    sized,
+    two_way_residual,
+)
+from meshmatch.fitting.search.task import FitTask
+from meshmatch.fitting.search.visibility import area_share, visible_vertices
 from meshmatch.fitting.solve.system import NodeSystem
-from meshmatch.fitting.task import FitTask, Refine, Registration
-from meshmatch.fitting.verdict import judge_registration
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import vertex_areas
@@ -64,8 +70,10 @@ _COARSE = 2048
 _MAX_ADDED = 3  # points that complete the samples, for each of them, at most
 
 
-def fit_whole(task: FitTask, refine: Refine) -> Registration:
-    """Fit the template to a shape that is taken for complete; ``refine`` turns the network's candidates into one fit."""
+def candidates_of_whole(task: FitTask) -> tuple[FitTask, list[Candidate]]:
+    """The network's fits of a shape that is taken for complete, best first; and the task, a cloud's in the scale, and
+    without the outliers, that the best fit tells.
+    """
     orientation = task.progress.stage("orientation")
     orientation(0.0)
     # A cloud's residual says little before its core frame is found; a second round finds it.
@@ -87,7 +95,7 @@ def fit_whole(task: FitTask, refine: Refine) -> Registration:
         task, candidates = _rescaled(task, candidates)
     best = task.predictor.fit_all([(task.samples, each.pose) for each in candidates[:careful]])
     orientation(1.0)
-    return Registration(task.bare, refine(task, best_first(best)))
+    return task, best_first(best)
 
 
 def _rescaled(task: FitTask, candidates: list[Candidate]) -> tuple[FitTask, list[Candidate]]:
@@ -151,24 +159,17 @@ def isolated_points(points: Float[Floats, "P 3"]) -> Bool[Bools, " P"]:
     return np.asarray((reach > _ISOLATED * np.median(reach))[which.reshape(-1)])
 
 
-def fit_part(task: FitTask, refine: Refine) -> Registration:
-    """Fit the template to a shape that may show only a part; where that is poor, from more orientations.
+def candidates_of_part(task: FitTask, wide: bool = False) -> tuple[FitTask, list[Candidate]]:
+    """The network's fits of a shape that may show only a part, best first, each with the share that it shows; and the task,
+    whose predictor draws from its seed anew: each search draws the same random numbers.
 
-    ``refine`` turns the network's candidates into one fit, whose residual is from the samples to the template only.
+    A ``wide`` search starts from more orientations. Residuals are from the samples to the template only.
     """
-    found = _search(task, refine, wide=False)
-    if judge_registration(found, partial=True).verdict != "poor":
-        return found
-    config = replace(task.config, copies=2 * task.config.copies, hypotheses=2 * task.config.hypotheses)
-    again = _search(replace(task, config=config), refine, wide=True)
-    return min(found, again, key=lambda each: each.candidate.cost)
-
-
-def _search(task: FitTask, refine: Refine, wide: bool) -> Registration:
-    """The best fit of a part from some orientations; each search draws the same random numbers."""
-    task = replace(
-        task, predictor=Predictor.of(task.model, np.random.default_rng(task.config.seed), task.config.device)
-    )
+    config = task.config
+    if wide:
+        config = replace(config, copies=2 * config.copies, hypotheses=2 * config.hypotheses)
+    predictor = Predictor.of(task.model, np.random.default_rng(config.seed), config.device)
+    task = replace(task, config=config, predictor=predictor)
     progress = task.progress.stage(STAGE)
     candidates = _careful(task, wide, progress.between(0.0, 0.4))
     for number, count in enumerate(_COMPLETED):
@@ -183,9 +184,7 @@ def _search(task: FitTask, refine: Refine, wide: bool) -> Registration:
         for each in task.predictor.variants(whole, near, candidate.pose, config.variants, config.tilt):
             residual = one_way_residual(task.system, local, each.vectors)
             candidates.append(replace(each, residual=residual, share=candidate.share))
-    best = refine(task, best_first(candidates))
-    root = float(np.sqrt(best.share))
-    return Registration(task.rescaled(1 / root, sized(task.samples, best.share)), best)
+    return task, best_first(candidates)
 
 
 def _careful(task: FitTask, wide: bool, progress: Progress) -> list[Candidate]:
