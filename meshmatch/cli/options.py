@@ -168,7 +168,7 @@ class FitOptions:
     )
     refine: Refine = Option(
         "nodes",
-        help="Refinement of the fit. nodes: Gauss-Newton on the nodes; latent: search over the network's codes; "
+        help="Refinement of the fit. nodes: least squares on the nodes; latent: search over the network's codes; "
         "none: the network alone.",
     )
     up: Axis | None = Option(

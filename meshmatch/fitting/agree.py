@@ -13,7 +13,7 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.reasons import Verdict
 from meshmatch.fitting.judge.verdict import folded_by_agreement
-from meshmatch.fitting.search.task import Landmarks, take_samples, without_inside
+from meshmatch.fitting.search.task import Landmarks, take_samples, without_interior
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree
 from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.models.trained import TrainedModel
@@ -58,7 +58,7 @@ def member_of(
     """What agreement needs of a repaired shape and its fit; landmarks are in the shape's file frame."""
     local = None if landmarks is None else (landmarks[0], fit.frame.apply(landmarks[1]))
     own = config.for_noise(shape.roughness)
-    frame, samples = take_samples(without_inside(shape, system), own.samples, np.random.default_rng(own.seed))
+    frame, samples = take_samples(without_interior(shape, system), own.samples, np.random.default_rng(own.seed))
     points = fit.frame.apply(frame.undo(samples.points))
     normals = samples.normals @ frame.rotation @ fit.frame.rotation.T
     samples = replace(samples, points=points, normals=normals).facing(system.surface(fit.vectors))

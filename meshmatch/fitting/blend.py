@@ -104,7 +104,7 @@ class Blend:
         beside = verts[cKDTree(verts).query(model.template.nodes)[1]]
         self._node_field = model.field(beside) if way == "codes" and model.has_nodes else None
         if self._node_field is not None:
-            turns = np.stack([polar(self._node_field.strain(vectors))[0] for vectors in met])
+            turns = np.stack([polar(self._node_field.deformation_gradient_at(vectors))[0] for vectors in met])
             self._correction = np.einsum("nkij,nki->nkj", turns, self._correction)
         self._turns = RotationBlend([fit.frame.turn[None] for fit in fits])
         self._scales = np.array([fit.frame.scale for fit in fits])
@@ -126,7 +126,7 @@ class Blend:
             return self._keys[weights.argmax()]
         there, correction = self._path(weights), np.tensordot(weights, self._correction, 1)
         if self._node_field is not None:
-            correction = np.einsum("kij,kj->ki", polar(self._node_field.strain(there))[0], correction)
+            correction = np.einsum("kij,kj->ki", polar(self._node_field.deformation_gradient_at(there))[0], correction)
         return there + correction
 
     def points(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3"]:
@@ -135,7 +135,7 @@ class Blend:
 
     def turns(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3 3"]:
         """Rotations by which the field of a pose turns each template vertex."""
-        return polar(self._system.field.strain(vectors))[0]
+        return polar(self._system.field.deformation_gradient_at(vectors))[0]
 
     def frame(self, time: float) -> Frame:
         """Between the frames of the fits: it turns, moves and grows from one to the next."""

@@ -138,7 +138,7 @@ class FitConfig:
 
     Attributes
     ----------
-    refine : "none" the network alone, "latent" the paper's search over codes, or "nodes" Gauss-Newton on the nodes
+    refine : "none" the network alone, "latent" the paper's search over codes, or "nodes" least squares on the nodes
     seed : of all random numbers
     up, front : axes of the file, such as "y" or "-z"; searched where not given
     partial : whether the shape may be a part: "auto" tries it where a fit of the whole leaves template without surface,

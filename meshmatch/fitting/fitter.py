@@ -14,7 +14,7 @@ from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, off_torch
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.judge.features import empty_share
+from meshmatch.fitting.judge.features import uncovered_share
 from meshmatch.fitting.judge.reasons import Reason, Verdict
 from meshmatch.fitting.judge.verdict import EVEN_TRUST, FAIR_RESIDUAL, judge_registration
 from meshmatch.fitting.search.predictor import mirror_of
@@ -80,7 +80,7 @@ class Fitter:
         if not card.correspondence:
             doubts.append(Reason("unsupervised", f"{card.name} was learned without correspondence: near may be wrong"))
         fit = replace(as_fit(found, partial, began), notes=notes)
-        return doubted(fit, doubts)
+        return cap_verdict(fit, doubts)
 
 
 def _cost(found: Registration) -> float:
@@ -91,7 +91,7 @@ def _as_part_if_closer(whole: Registration) -> tuple[Registration, bool]:
     """A fit of the whole, or one as a part if that may be and is better; and which it is."""
     if not _may_be_part(whole):
         return whole, False
-    part = _best_part(whole.task.bare)
+    part = _best_part(whole.task.on_visible_samples)
     # A part explains the shape better than the whole, and lacks some of it.
     closer = part.candidate.cost < _CLOSER * whole.candidate.residual
     partial = closer and part.candidate.share < 1 - _MISSING
@@ -106,7 +106,7 @@ def _best_part(task: FitTask) -> Registration:
     return min(found, fit_part(task, wide=True), key=_cost)
 
 
-def doubted(fit: Fit, doubts: Sequence[Reason]) -> Fit:
+def cap_verdict(fit: Fit, doubts: Sequence[Reason]) -> Fit:
     """A fit that near says nothing for, in some way: it is fair at best, and as likely wrong as right."""
     if not doubts:
         return fit
@@ -126,7 +126,7 @@ def _may_be_part(whole: Registration) -> bool:
     # the residual of a cloud says how sparse and noisy it is
     if not task.shape.is_cloud and whole.candidate.residual > FAIR_RESIDUAL:
         return True
-    return empty_share(whole.local, whole.surface.points) > _EMPTY
+    return uncovered_share(whole.local, whole.surface.points) > _EMPTY
 
 
 def may_show_part(shape: Shape, config: FitConfig) -> bool:

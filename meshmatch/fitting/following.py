@@ -52,7 +52,7 @@ def follow(fitter: Fitter, shape: Shape, last: Fit) -> Fit:
     tried: list[Fit] = []
     for candidates in (asked, held):
         best = REFINEMENTS[task.config.refine].whole(task, candidates())
-        tried.append(as_fit(Registration(task.bare, best), False, began))
+        tried.append(as_fit(Registration(task.on_visible_samples, best), False, began))
         if tried[-1].verdict != "poor" and tried[-1].residual <= _LOST * last.residual:
             return tried[-1]
     tried.append(fitter.fit(shape))

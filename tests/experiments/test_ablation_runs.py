@@ -246,7 +246,7 @@ def test_fewer_supervised_points_are_regularised_everywhere(setting: Setting) ->
 
 def test_fewer_supervised_points_of_a_network_at_every_point(setting: Setting) -> None:
     network = new_network(CODED, setting, pool_of(setting, "T", 2))
-    points = build_loss_points(setting.template(CODED), "smooth", network, strained=200)
+    points = build_loss_points(setting.template(CODED), "smooth", network, gradients=200)
     few = fewer(points, 50)
     rows = network.decoder(torch.randn(2, network.config.code, generator=torch.Generator().manual_seed(0)))
     assert torch.allclose(few.moved(rows), points.moved(rows)[:, :50], atol=1e-6)

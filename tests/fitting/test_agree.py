@@ -76,7 +76,7 @@ def slid(system: NodeSystem, nodes: np.ndarray, turn: float) -> np.ndarray:
 
 
 def test_two_that_slid_apart_come_closer(system: NodeSystem, model: TrainedModel) -> None:
-    scan, nodes, config = scan_of(system), model.template.nodes, AgreeConfig(steps=6, strain=0.01)
+    scan, nodes, config = scan_of(system), model.template.nodes, AgreeConfig(steps=6, prior=0.01)
     apart = [slid(system, nodes, 0.15), slid(system, nodes, -0.15)]
     nearer = agree(system, [Member(scan, each, config) for each in apart])
 
@@ -110,7 +110,7 @@ def test_a_thick_and_a_thin_one_keep_their_stretch(system: NodeSystem, model: Tr
     vectors = [np.zeros_like(nodes), nodes * [0.5, 0, 0.5]]
 
     def apart(alike: float) -> float:
-        config = AgreeConfig(steps=6, strain=1.0, alike=alike)
+        config = AgreeConfig(steps=6, prior=1.0, alike=alike)
         members = [Member(each, start, config) for each, start in zip((scan, thick), vectors, strict=True)]
         one, other = (log_stretch(system.deformation_gradient(each)) for each in agree(system, members))
         return float(np.linalg.norm((one - other).reshape(len(one), -1), axis=1).mean())
@@ -142,7 +142,7 @@ def test_fits_agree_in_their_own_frames(system: NodeSystem, model: TrainedModel)
     vectors = [slid(system, model.template.nodes, turn) for turn in (0.15, -0.15)]
     fits = [fit_of(system, each) for each in vectors]
     shape = Shape(fits[0].frame.undo(system.verts), system.faces)
-    how = AgreeConfig(steps=6, strain=0.01)
+    how = AgreeConfig(steps=6, prior=0.01)
     agreed = agreed_fits(model, [shape, shape], fits, FitConfig(samples=1500), how=how)
     before, after = (np.linalg.norm(a.points - b.points, axis=1).mean() for a, b in (fits, agreed))
     assert after < before
@@ -171,7 +171,7 @@ def test_the_card_says_how_stiff(system: NodeSystem, model: TrainedModel) -> Non
         return agreed_fits(which, [shape, shape], fits, FitConfig(samples=1500), how=how)[0].points
 
     plain = AgreeConfig()
-    assert np.array_equal(points(soft), points(model, replace(plain, strain=0.25 * plain.strain)))
+    assert np.array_equal(points(soft), points(model, replace(plain, prior=0.25 * plain.prior)))
     assert np.array_equal(points(model), points(model, plain))
     assert not np.array_equal(points(soft), points(model))
 
@@ -181,7 +181,7 @@ def test_momentum_goes_further_in_as_many_steps(model: TrainedModel, system: Nod
     apart = [slid(system, nodes, amount) for amount in (0.1, -0.1)]
 
     def left(momentum: float) -> float:
-        config = AgreeConfig(steps=3, strain=0.01, momentum=momentum)
+        config = AgreeConfig(steps=3, prior=0.01, momentum=momentum)
         found = agree(system, [Member(scan, each, config) for each in apart])
         return float(np.abs(found[0] - found[1]).mean())
 

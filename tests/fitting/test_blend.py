@@ -93,7 +93,7 @@ def test_polar_of_a_reflection_is_a_rotation_with_a_very_small_stretch() -> None
 
 
 def fake_system(verts: np.ndarray, faces: np.ndarray) -> Any:
-    return SimpleNamespace(verts=verts, faces=faces, strain_points=np.arange(len(verts)))
+    return SimpleNamespace(verts=verts, faces=faces, gradient_points=np.arange(len(verts)))
 
 
 def test_the_tree_goes_round_a_tear() -> None:

@@ -9,7 +9,7 @@ import pytest
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.judge.features import cloud_allowance, unexplained
+from meshmatch.fitting.judge.features import cloud_allowance, subtract_in_quadrature
 from meshmatch.fitting.search.candidates import estimate_scale, isolated_points
 from meshmatch.fitting.search.predictor import Candidate, two_way_residual
 from meshmatch.fitting.solve.agreement import AgreeConfig
@@ -152,8 +152,8 @@ def test_noise_has_a_limit(system: NodeSystem) -> None:
 
 
 def test_squares_add_up_in_what_is_explained() -> None:
-    assert unexplained(0.05, 0.03) == pytest.approx(0.04)
-    assert unexplained(0.02, 0.03) == 0.0
+    assert subtract_in_quadrature(0.05, 0.03) == pytest.approx(0.04)
+    assert subtract_in_quadrature(0.02, 0.03) == 0.0
 
 
 def test_a_repeated_point_is_no_company(system: NodeSystem) -> None:
@@ -179,7 +179,7 @@ def test_noise_makes_a_cloud_rough_and_its_fit_stiff(system: NodeSystem) -> None
     assert stiff.nodes.scale_last > config.nodes.scale_last and stiff.samples > config.samples
     assert config.for_noise(0.0) is config
     agree = AgreeConfig()
-    assert agree.for_noise(1.0).strain == pytest.approx(80 * agree.strain)
+    assert agree.for_noise(1.0).prior == pytest.approx(80 * agree.prior)
     assert (stiff.nodes.shared, agree.for_noise(1.0).shared, agree.for_noise(0.25).shared) == (1.0, 1.0, 0.25)
     assert agree.for_noise(0.0) == agree
 

@@ -147,7 +147,7 @@ def test_the_dense_system_is_the_sparse_one(rbf: TrainedModel) -> None:
     assert np.allclose(*found, rtol=1e-6, atol=1e-8)
 
 
-def test_gauss_newton_works_on_radial_basis_functions(rbf: TrainedModel) -> None:
+def test_least_squares_work_on_radial_basis_functions(rbf: TrainedModel) -> None:
     system = node_system(rbf)
     bent = system.moved(gentle_vectors(rbf))
     scan = scan_of(replace(rbf.template.shape, verts=bent), 2000)

@@ -1,4 +1,4 @@
-"""Gauss-Newton on the nodes: its parts by hand, and laws of the whole."""
+"""Least squares on the nodes: its parts by hand, and laws of the whole."""
 
 from dataclasses import replace
 

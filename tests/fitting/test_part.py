@@ -14,7 +14,7 @@ from meshmatch.fitting import fitter
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import boundary_length
-from meshmatch.fitting.judge.features import Signs, empty_share, signs_of
+from meshmatch.fitting.judge.features import Signs, signs_of, uncovered_share
 from meshmatch.fitting.judge.verdict import Judgement, judge
 from meshmatch.fitting.search import candidates
 from meshmatch.fitting.search.candidates import SHARES
@@ -66,7 +66,7 @@ def test_what_is_not_visible_is_not_held_against_a_part() -> None:
     samples = sample_surface(Shape(system.verts, system.faces), 3000, np.random.default_rng(0))
     half = samples.points[:, 1] > 0
     scan, still = OrientedPoints(samples.points[half], samples.normals[half]), np.zeros((system.K, 3))
-    assert 0.3 < empty_share(scan, system.verts) < 0.6
+    assert 0.3 < uncovered_share(scan, system.verts) < 0.6
     assert judge(signs_of(system, still, scan, 0.02, egg_model().template.labels)).verdict == "poor"
     judged = judge(replace(signs_of(system, still, scan, 0.02, egg_model().template.labels, partial=True), hidden=0.5))
     assert judged.verdict == "fair"

@@ -11,19 +11,19 @@ import trimesh
 from meshmatch.api.matching import Matcher
 from meshmatch.arrays import Floats, Ints
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fitter import Fitter, doubted
+from meshmatch.fitting.fitter import Fitter, cap_verdict
 from meshmatch.fitting.judge.features import (
     Signs,
-    built_allowance,
     connected_parts,
-    shortened_to,
+    multipart_allowance,
+    shortening,
     signs_of,
-    unevenness,
-    unexplained,
+    stretch_spread_of,
+    subtract_in_quadrature,
 )
 from meshmatch.fitting.judge.reasons import Reason
-from meshmatch.fitting.judge.verdict import FAIR_TRUST, GOOD_TRUST, Judgement, judge, judge_excused
-from meshmatch.fitting.search.discontinuities import neighbours, torn_share
+from meshmatch.fitting.judge.verdict import FAIR_TRUST, GOOD_TRUST, Judgement, judge, judge_with_allowance
+from meshmatch.fitting.search.discontinuities import discontinuous_share, neighbours
 from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
@@ -85,9 +85,9 @@ def test_where_verdicts_change() -> None:
 def test_where_nearness_says_nothing_a_fit_is_as_likely_wrong_as_right() -> None:
     doubt = Reason("side", "its mirror image fits as well")
     sound = some_fit(np.eye(3), np.array([[0, 1, 2]]))
-    assert doubted(sound, []) is sound
+    assert cap_verdict(sound, []) is sound
     for verdict, trust in (("good", 0.99), ("fair", 0.7), ("poor", 0.2)):
-        found = doubted(replace(sound, verdict=verdict, trust=trust), [doubt])
+        found = cap_verdict(replace(sound, verdict=verdict, trust=trust), [doubt])
         assert found.verdict == ("fair" if verdict == "good" else verdict)
         assert (found.trust, found.reasons) == (min(trust, 0.5), (doubt,))
 
@@ -150,21 +150,21 @@ def test_signs_of_a_template_pressed_flat() -> None:
 
 
 def test_how_much_a_surface_is_shortened_is_its_least_stretch() -> None:
-    rng, points = np.random.default_rng(0), system().strain_points
+    rng, points = np.random.default_rng(0), system().gradient_points
     gradient = np.eye(3) + 0.4 * rng.normal(size=(len(points), 3, 3))
     normals = system().normals(system().verts)[points]
     inside = np.linalg.svd(normals[:, None])[2][:, 1:]  # two directions of each surface
     least = np.linalg.svd(gradient @ inside.transpose(0, 2, 1), compute_uv=False)[:, 1]
-    assert shortened_to(system(), gradient)[points] == pytest.approx(np.clip(least, 0.2, 1), abs=1e-6)
-    assert np.allclose(shortened_to(system(), np.broadcast_to(2 * np.eye(3), gradient.shape)), 1)
+    assert shortening(system(), gradient)[points] == pytest.approx(np.clip(least, 0.2, 1), abs=1e-6)
+    assert np.allclose(shortening(system(), np.broadcast_to(2 * np.eye(3), gradient.shape)), 1)
 
 
 def test_stretch_is_uneven_about_the_mean_of_its_part() -> None:
     rng, parts = np.random.default_rng(0), np.repeat([0, 2, 3], 40)
     own = rng.normal(size=(4, 3, 3))[parts]
-    assert unevenness(own, parts) == pytest.approx(0, abs=1e-12)
+    assert stretch_spread_of(own, parts) == pytest.approx(0, abs=1e-12)
     away = rng.normal(size=(60, 3, 3)).repeat(2, 0) * np.tile([1, -1], 60)[:, None, None]
-    assert unevenness(own + away, parts) == pytest.approx(np.median(np.linalg.norm(away, axis=(1, 2))))
+    assert stretch_spread_of(own + away, parts) == pytest.approx(np.median(np.linalg.norm(away, axis=(1, 2))))
 
 
 def test_parts_of_other_proportions_are_even() -> None:
@@ -179,7 +179,7 @@ def test_parts_of_other_proportions_are_even() -> None:
 
 def test_a_shortened_template_is_not_torn() -> None:
     short, pressed = pressed_egg(1, 0.3)
-    assert torn_share(system(), neighbours(pressed), pressed, short) > 0.03
+    assert discontinuous_share(system(), neighbours(pressed), pressed, short) > 0.03
     assert signs_of(system(), short, pressed, 0.02, labels()).torn < 0.005
 
 
@@ -214,22 +214,22 @@ def test_the_residual_of_many_solids_is_allowed_for() -> None:
         verts = np.concatenate([egg.verts + 3.0 * k for k in range(count)])
         return Shape(verts, np.concatenate([egg.faces + len(egg.verts) * k for k in range(count)]))
 
-    allowed = [built_allowance(each, each) for each in map(solids, (1, 2, 5, 8, 12))]
+    allowed = [multipart_allowance(each, each) for each in map(solids, (1, 2, 5, 8, 12))]
     assert allowed == pytest.approx([0.0, 0.0, 0.033 * np.sqrt(0.5), 0.033, 0.033], abs=1e-6)
     many = solids(12)
     shown = Shape(many.verts, many.faces[: 5 * len(egg.faces)])  # the others are inside
-    assert built_allowance(many, shown) == pytest.approx(allowed[2])
+    assert multipart_allowance(many, shown) == pytest.approx(allowed[2])
 
 
 def test_what_is_excused_lets_a_fit_be_fair_but_not_good() -> None:
     fair, poor = replace(SOUND, residual=0.06), replace(SOUND, residual=0.1)
     assert [judge(each).verdict for each in (SOUND, fair, poor)] == ["good", "fair", "poor"]
-    assert judge_excused(SOUND, 0.024) == judge(SOUND)
-    judged = judge_excused(SOUND, 0.055)
+    assert judge_with_allowance(SOUND, 0.024) == judge(SOUND)
+    judged = judge_with_allowance(SOUND, 0.055)
     assert (judged.verdict, judged.signs, [reason.code for reason in judged.reasons]) == ("fair", SOUND, ["residual"])
     assert "5.5 %" in judged.reasons[0]
-    assert judge_excused(fair, 0.1) == judge(fair)
-    assert judge_excused(poor, 0.11) == judge(poor)
+    assert judge_with_allowance(fair, 0.1) == judge(fair)
+    assert judge_with_allowance(poor, 0.11) == judge(poor)
 
 
 def _two_sheets() -> tuple[Shape, OrientedPoints]:
@@ -276,7 +276,7 @@ def test_a_registration_is_judged_by_the_parts_of_its_shape(monkeypatch: pytest.
     shape = Shape(np.concatenate(verts), np.concatenate(faces))
     assert shape.face_parts.max() == 11
     shown = Shape(shape.verts, shape.faces[shape.face_parts < 3])
-    monkeypatch.setattr("meshmatch.fitting.judge.verdict.without_inside", lambda *_: shown)
+    monkeypatch.setattr("meshmatch.fitting.judge.verdict.without_interior", lambda *_: shown)
     asked = []
 
     def watched(*args, **kwargs):
@@ -285,18 +285,18 @@ def test_a_registration_is_judged_by_the_parts_of_its_shape(monkeypatch: pytest.
 
     def excused(signs: Signs, residual: float) -> Judgement:
         asked.append(residual)
-        return judge_excused(signs, residual)
+        return judge_with_allowance(signs, residual)
 
     monkeypatch.setattr("meshmatch.fitting.judge.verdict.signs_of", watched)
-    monkeypatch.setattr("meshmatch.fitting.judge.verdict.judge_excused", excused)
+    monkeypatch.setattr("meshmatch.fitting.judge.verdict.judge_with_allowance", excused)
     fit = Fitter(egg_model(), FitConfig(samples=900, variants=0, finalists=1, careful=1, partial="no")).fit(shape)
     assert fit.signs is not None
-    assert fit.signs.residual == pytest.approx(unexplained(fit.residual, built_allowance(shape, shown)))
+    assert fit.signs.residual == pytest.approx(subtract_in_quadrature(fit.residual, multipart_allowance(shape, shown)))
     assert 0 < fit.signs.residual < fit.residual
     (system, vectors, local, *_, connected), residual = asked[-2:]
     assert residual == fit.residual
     assert np.array_equal(connected, shape.vertex_parts[local.vertex])
     pairs, strict = neighbours(local), neighbours(local, connected)
     assert 0 < len(strict[0]) < len(pairs[0])
-    shortened = shortened_to(system, system.deformation_gradient(vectors))
-    assert fit.signs.torn == torn_share(system, strict, local, vectors, shortened)
+    shortened = shortening(system, system.deformation_gradient(vectors))
+    assert fit.signs.torn == discontinuous_share(system, strict, local, vectors, shortened)

@@ -40,7 +40,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 
 METHODS = ("none", "code", "chamfer", "nodes")
-"""Refinements: none; of the code with the run's regularisers, or without; Gauss-Newton on the nodes."""
+"""Refinements: none; of the code with the run's regularisers, or without; least squares on the nodes."""
 Refinement = LatentRefineConfig | NodeRefineConfig | None
 
 
@@ -217,7 +217,7 @@ def pair_errors(subjects: Sequence[Subject], fitted: Sequence[Float[Floats, "V 3
 
 CODE_STEPS, NODE_STEPS = (0, 10, 30, 100, 300), (0, 1, 2, 4, 7, 10)
 LINES = {
-    "ours, nodes (Gauss-Newton)": (BASE, "nodes", NODE_STEPS),
+    "ours, nodes (least squares)": (BASE, "nodes", NODE_STEPS),
     "ours, code (Adam)": (BASE, "code", CODE_STEPS),
     "3D-CODED, code (Adam)": (CODED, "chamfer", CODE_STEPS),
 }

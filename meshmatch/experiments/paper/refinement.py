@@ -1,4 +1,4 @@
-"""Gauss-Newton on the nodes against the paper's refinement.
+"""Least squares on the nodes against the paper's refinement.
 
 Both start from the same node vectors, the network's own answer in the orientation that a fit finds, and see the same
 samples of the same shapes, in one process with one thread, taking turns at going first.
@@ -6,7 +6,7 @@ samples of the same shapes, in one process with one thread, taking turns at goin
 - code: 2,000 Adam steps on the shape code, Chamfer distance (3,000 points each way) plus volume and rigidity with the
   paper's weights. Its neighbors come from KD-trees, only the code's gradient is computed, the template's shape functions
   and their transposes are kept, and the best step of all is returned: no cost is left in it that we know how to avoid.
-- nodes: the Gauss-Newton steps that `meshmatch match` ends with, on all samples; also fewer of them, for the race to
+- nodes: the steps of least squares that `meshmatch match` ends with, on all samples; also fewer of them, for the race to
   equal error: the fewest that are no worse than the search over codes.
 
 Measured is the refinement alone, after one warm-up of each; what is computed once per template is not counted for
@@ -51,7 +51,7 @@ from meshmatch.shapes.shape import Shape
 FEWER = {"nodes, 1 step": 1, "nodes, 2 steps": 2, "nodes, 4 steps": 4}
 METHODS = ("network", "code", *FEWER, "nodes")
 BAR = 50.0
-"""How many times faster than the search over codes the Gauss-Newton steps have to be, at a lower error."""
+"""How many times faster than the search over codes the steps of least squares have to be, at a lower error."""
 COLUMNS = {
     **{"set": "set", "method": "method", "CPU s a shape": "cpu:.3f", "mean error, cm": "error_cm:.2f"},
     **{"paper's energy": "energy:.6f", "times as fast": "times_as_fast:.0f", "race": "race"},

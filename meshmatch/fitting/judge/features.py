@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.fitting.judge.calibration import CALIBRATION
-from meshmatch.fitting.search.discontinuities import neighbours, torn_share
+from meshmatch.fitting.search.discontinuities import discontinuous_share, neighbours
 from meshmatch.fitting.search.predictor import USUAL_SPREAD, two_way_residual, weighted_mean
 from meshmatch.fitting.search.visibility import area_share, visible_vertices
 from meshmatch.fitting.solve.system import NodeSystem
@@ -117,10 +117,10 @@ def signs_of(
     return Signs(
         residual,
         float(weighted_mean(gap > _REACH, local.weights)),
-        0.0 if partial else empty_share(local, surface.points),
-        torn_share(system, neighbours(some, connected), some, vectors, shortened_to(system, gradient)),
+        0.0 if partial else uncovered_share(local, surface.points),
+        discontinuous_share(system, neighbours(some, connected), some, vectors, shortening(system, gradient)),
         float(np.sqrt(np.square(stretches).sum((1, 2)).mean())),
-        unevenness(stretches, parts[system.strain_points]),
+        stretch_spread_of(stretches, parts[system.gradient_points]),
         float(weighted_mean(against, local.weights)) if local.signed else _AGAINST_IF_UNSIGNED,
         partial,
         1 - area_share(system, shown) if partial else 0.0,
@@ -129,18 +129,18 @@ def signs_of(
     )
 
 
-def unevenness(stretches: Float[Floats, "G 3 3"], parts: Int[Ints, " G"]) -> float:
+def stretch_spread_of(stretches: Float[Floats, "G 3 3"], parts: Int[Ints, " G"]) -> float:
     """Median norm of the logarithms of stretches about the mean of their part."""
     member = np.eye(int(parts.max()) + 1)[parts]
     means = np.einsum("gp,gij->pij", member, stretches) / np.maximum(member.sum(0), 1)[:, None, None]
     return float(np.median(np.linalg.norm(stretches - means[parts], axis=(1, 2))))
 
 
-def shortened_to(system: NodeSystem, gradient: Float[Floats, "G 3 3"]) -> Float[Floats, " V"]:
-    """By the deformation gradient at the strain points: the share of its length that a line on the template's surface keeps
-    around each vertex, in the direction in which it keeps least; from `_SHORTEST` to 1.
+def shortening(system: NodeSystem, gradient: Float[Floats, "G 3 3"]) -> Float[Floats, " V"]:
+    """The share of its length that a line on the template's surface keeps around each vertex, in the direction in which it
+    keeps least; from `_SHORTEST` to 1. By the deformation ``gradient`` at the gradient points.
     """
-    points = system.strain_points
+    points = system.gradient_points
     normals = system.normals(system.verts)[points]
     along = gradient - (gradient @ normals[:, :, None]) @ normals[:, None]  # of what lies in the surface
     a, b, c = gradient.transpose(2, 0, 1)
@@ -152,12 +152,12 @@ def shortened_to(system: NodeSystem, gradient: Float[Floats, "G 3 3"]) -> Float[
     return np.asarray(np.clip(least, _SHORTEST, 1.0)[near])
 
 
-def unexplained(residual: float, allowance: float) -> float:
+def subtract_in_quadrature(residual: float, allowance: float) -> float:
     """What is left of a residual where squares add up."""
     return float(np.sqrt(max(residual**2 - allowance**2, 0.0)))
 
 
-def empty_share(local: OrientedPoints, points: Float[Floats, "V 3"]) -> float:
+def uncovered_share(local: OrientedPoints, points: Float[Floats, "V 3"]) -> float:
     """Share (0..1) of the fitted template's vertices without any of the shape near."""
     return float((cKDTree(local.points).query(points)[0] > _REACH).mean())
 
@@ -184,10 +184,10 @@ def cloud_allowance(
     cloud = Shape(drawn + noise * rng.standard_normal(drawn.shape), np.empty((0, 3), np.int64))
     expected = two_way_residual(system, OrientedPoints(cloud.verts, cloud.vertex_normals, signed=False), vectors)
     clear = two_way_residual(system, clean, vectors)
-    return unexplained(expected, clear)
+    return subtract_in_quadrature(expected, clear)
 
 
-def built_allowance(shape: Shape, shown: Shape) -> float:
+def multipart_allowance(shape: Shape, shown: Shape) -> float:
     """The part of the residual that even a right fit has on a mesh of several connected parts; squares add up.
 
     Only those count that are ``shown``, the same mesh without the faces that are hidden.

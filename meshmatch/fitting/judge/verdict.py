@@ -9,15 +9,15 @@ import numpy as np
 from meshmatch.arrays import Bool, Bools
 from meshmatch.fitting.judge.features import (
     Signs,
-    built_allowance,
     cloud_allowance,
     connected_parts,
+    multipart_allowance,
     signs_of,
-    unexplained,
+    subtract_in_quadrature,
 )
 from meshmatch.fitting.judge.reasons import Reason, ReasonCode, Verdict
 from meshmatch.fitting.search.predictor import reads_alike
-from meshmatch.fitting.search.task import Registration, without_inside
+from meshmatch.fitting.search.task import Registration, without_interior
 from meshmatch.fitting.solve.regularity import Regularity
 
 # Trust from which on a fit is good, and fair: more likely right than wrong; a part is fair at best.
@@ -56,8 +56,8 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
     if task.shape.is_cloud:
         allowance = cloud_allowance(task.system, found.local, task.shape.V, vectors, task.config.seed)
     else:
-        allowance = built_allowance(task.shape, without_inside(task.shape, task.system))
-    residual = unexplained(found.candidate.residual, allowance)
+        allowance = multipart_allowance(task.shape, without_interior(task.shape, task.system))
+    residual = subtract_in_quadrature(found.candidate.residual, allowance)
 
     def spread_at(vertices: Bool[Bools, " V"]) -> float:
         return task.predictor.spread(found.local, vectors, vertices)
@@ -67,10 +67,10 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
     connected = connected_parts(task.shape, found.local)
     known = residual, parts, partial, spread_at if told else None, connected
     signs = signs_of(task.system, vectors, found.local, *known)
-    return judge(signs) if task.shape.is_cloud else judge_excused(signs, found.candidate.residual)
+    return judge(signs) if task.shape.is_cloud else judge_with_allowance(signs, found.candidate.residual)
 
 
-def judge_excused(signs: Signs, residual: float) -> Judgement:
+def judge_with_allowance(signs: Signs, residual: float) -> Judgement:
     """Verdict, reasons and trust of a fit of a mesh that has that ``residual``, some of it excused in ``signs``.
 
     What is excused makes no fit good: front and back of a figure of solids differ by no more than that.

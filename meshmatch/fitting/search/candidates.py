@@ -27,7 +27,7 @@ from meshmatch.fitting.search.predictor import (
     Predictor,
     best_first,
     one_way_residual,
-    sized,
+    scaled_to_area,
     two_way_residual,
 )
 from meshmatch.fitting.search.task import FitTask
@@ -196,7 +196,7 @@ def _careful(task: FitTask, wide: bool, progress: Progress) -> list[Candidate]:
     best: dict[int, float] = {}  # residuals of the frames that all shares have in common
     order = sorted(SHARES, key=lambda share: wide and share not in _WIDE_SHARES)
     for number, share in enumerate(order):
-        samples = sized(task.samples, share)
+        samples = scaled_to_area(task.samples, share)
         frames, others = frames_of_part(task.model, samples, task.config, wide)
         tried = list(range(len(others)))
         if wide and number >= len(_WIDE_SHARES):

@@ -28,7 +28,7 @@ def neighbours(samples: OrientedPoints, part: Int[Ints, " P"] | None = None) -> 
     return start, end
 
 
-def torn_share(
+def discontinuous_share(
     system: NodeSystem,
     pairs: Pairs,
     local: OrientedPoints,

@@ -59,7 +59,7 @@ class Candidate:
 
     def local(self, samples: OrientedPoints) -> OrientedPoints:
         """Samples of area 1 as large as their share, in the core frame."""
-        return sized(samples, self.share).to_local(self.pose)
+        return scaled_to_area(samples, self.share).to_local(self.pose)
 
     @property
     def cost(self) -> float:
@@ -72,7 +72,7 @@ def best_first(candidates: Sequence[Candidate]) -> list[Candidate]:
     return sorted(candidates, key=lambda candidate: candidate.cost)
 
 
-def sized(samples: OrientedPoints, share: float) -> OrientedPoints:
+def scaled_to_area(samples: OrientedPoints, share: float) -> OrientedPoints:
     """Samples of area 1, scaled to area ``share``."""
     return replace(samples, points=samples.points * np.sqrt(share))
 

@@ -22,14 +22,14 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.errors import needs
 from meshmatch.fitting import fit_config
 from meshmatch.fitting.search.candidates import STAGE, candidates_of_part, candidates_of_whole, completed
-from meshmatch.fitting.search.discontinuities import Pairs, neighbours, torn_share
+from meshmatch.fitting.search.discontinuities import Pairs, discontinuous_share, neighbours
 from meshmatch.fitting.search.predictor import (
     USUAL_SPREAD,
     Candidate,
     best_first,
     one_way_residual,
     reads_alike,
-    sized,
+    scaled_to_area,
     two_way_residual,
     weighted_mean,
 )
@@ -68,7 +68,7 @@ Refine = Callable[[FitTask, list[Candidate]], Candidate]
 def fit_whole(task: FitTask) -> Registration:
     """Fit the template to a shape that is taken for complete."""
     task, candidates = candidates_of_whole(task)
-    return Registration(task.bare, REFINEMENTS[task.config.refine].whole(task, candidates))
+    return Registration(task.on_visible_samples, REFINEMENTS[task.config.refine].whole(task, candidates))
 
 
 def fit_part(task: FitTask, wide: bool = False) -> Registration:
@@ -79,7 +79,7 @@ def fit_part(task: FitTask, wide: bool = False) -> Registration:
     task, candidates = candidates_of_part(task, wide)
     best = REFINEMENTS[task.config.refine].part(task, candidates)
     root = float(np.sqrt(best.share))
-    return Registration(task.rescaled(1 / root, sized(task.samples, best.share)), best)
+    return Registration(task.rescaled(1 / root, scaled_to_area(task.samples, best.share)), best)
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def _search_code(task: FitTask, candidates: list[Candidate]) -> Candidate:
 
 
 def _fit_nodes(task: FitTask, candidates: list[Candidate]) -> Candidate:
-    """The best of the candidates and of variants of the best one, refined by Gauss-Newton on the nodes."""
+    """The best of the candidates and of variants of the best one, refined by least squares on the nodes."""
     config, coarse, pose = task.config, task.coarse, candidates[0].pose
     local = task.samples.to_local(pose)
     pool = task.predictor.variants(local, coarse.to_local(pose), pose, config.variants, config.tilt)
@@ -121,11 +121,13 @@ def _fit_nodes(task: FitTask, candidates: list[Candidate]) -> Candidate:
         residual = two_way_residual(task.system, coarse.to_local(each.pose), each.vectors)
         pool.append(replace(each, residual=residual))
     found = best_first(pool)
-    return choose(found, config.finalists, WholeComparison(task.bare, found), task.progress.stage("refinement"))
+    return choose(
+        found, config.finalists, WholeComparison(task.on_visible_samples, found), task.progress.stage("refinement")
+    )
 
 
 def _fit_nodes_to_part(task: FitTask, candidates: list[Candidate]) -> Candidate:
-    """The best of several interpretations of a part, refined by Gauss-Newton on the nodes."""
+    """The best of several interpretations of a part, refined by least squares on the nodes."""
     return choose(candidates, _PART_FINALISTS, PartComparison(task), task.progress.stage(STAGE, 0.6, 1.0))
 
 
@@ -221,7 +223,7 @@ class WholeComparison:
         cost = replace(candidate, residual=residual).cost
         if not in_full:
             return cost
-        return cost + (0.0 if stands_as_usual(candidate.pose) else _UNUSUAL) + self.doubt(candidate)
+        return cost + (0.0 if has_common_axes(candidate.pose) else _UNUSUAL) + self.doubt(candidate)
 
     def doubt(self, candidate: Candidate) -> float:
         """What is added to the residual of an interpretation that the network reads less surely."""
@@ -274,7 +276,7 @@ class CandidateScorer:
         residual, rough = candidate.residual, self._roughness
         if rough > 0:
             residual += rough * (self.scatter(local, candidate.vectors) - residual)
-        return residual + _DISCONTINUITY_COST * torn_share(self._system, self._pairs, local, candidate.vectors)
+        return residual + _DISCONTINUITY_COST * discontinuous_share(self._system, self._pairs, local, candidate.vectors)
 
     def scatter(self, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> float:
         """Root of the mean squared distance of nearest points, both ways, normals left out (units of sqrt(area))."""
@@ -285,7 +287,7 @@ class CandidateScorer:
         return float(np.sqrt(0.5 * (squares[0].mean() + weighted_mean(squares[1], local.weights))))
 
 
-def stands_as_usual(pose: RigidPose) -> bool:
+def has_common_axes(pose: RigidPose) -> bool:
     """Whether a core frame stands as shapes do in most files: up along y and front along z, or up along z and front
     along -y.
     """

@@ -40,7 +40,7 @@ class FitTask:
     roughness: float  # of the shape without outliers (0..1, see `Shape.roughness`)
     frame: Frame  # from the file to the frame of the samples: area about 1, centroid 0
     samples: OrientedPoints  # of the shape without outliers, for the network, which knows what may be hidden in shapes
-    shown: OrientedPoints  # the same, or of what can be seen from outside, for all else
+    visible_samples: OrientedPoints  # the same, or of what can be seen from outside, for all else
     landmarks: Landmarks | None  # template vertices (N,), positions (N, 3) in the file
     progress: Progress
 
@@ -60,11 +60,11 @@ class FitTask:
         clean = without_outliers(shape)
         frame, samples = take_samples(clean, config.samples, rng, scan_frame(model, clean, mirrored))
         predictor = Predictor.of(model, rng, config.device)
-        shown = samples
-        if (bare := without_inside(shape, predictor.system)) is not shape:
-            shown = sample_surface(bare, config.samples, np.random.default_rng(config.seed)).in_frame(frame)
+        visible = samples
+        if (shown := without_interior(shape, predictor.system)) is not shape:
+            visible = sample_surface(shown, config.samples, np.random.default_rng(config.seed)).in_frame(frame)
         progress = progress or Progress()
-        return cls(model, config, predictor, shape, clean.roughness, frame, samples, shown, landmarks, progress)
+        return cls(model, config, predictor, shape, clean.roughness, frame, samples, visible, landmarks, progress)
 
     @property
     def system(self) -> NodeSystem:
@@ -77,17 +77,19 @@ class FitTask:
         return self.samples.first(self.config.coarse_samples)
 
     @property
-    def bare(self) -> FitTask:
+    def on_visible_samples(self) -> FitTask:
         """The same task with samples of what can be seen alone."""
-        return replace(self, samples=self.shown)
+        return replace(self, samples=self.visible_samples)
 
     def rescaled(self, scale: float, samples: OrientedPoints | None = None) -> FitTask:
         """The same task with lengths divided by ``scale``; where samples were left out, with those that are left."""
         frame = self.frame.compose(Frame(scale, np.eye(3), np.zeros(3)))
         if samples is not None:
-            return replace(self, frame=frame, samples=samples, shown=samples)
-        all_samples, shown = (replace(each, points=each.points / scale) for each in (self.samples, self.shown))
-        return replace(self, frame=frame, samples=all_samples, shown=shown)
+            return replace(self, frame=frame, samples=samples, visible_samples=samples)
+        all_samples, visible = (
+            replace(each, points=each.points / scale) for each in (self.samples, self.visible_samples)
+        )
+        return replace(self, frame=frame, samples=all_samples, visible_samples=visible)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +130,7 @@ def without_outliers(shape: Shape) -> Shape:
     return _CLEAN[shape] or shape
 
 
-def without_inside(shape: Shape, system: NodeSystem) -> Shape:
+def without_interior(shape: Shape, system: NodeSystem) -> Shape:
     """A mesh without what cannot be seen from outside (found once), where the template has nothing of the kind."""
     if not system.shows_all:
         return shape

@@ -39,7 +39,7 @@ class AgreeConfig(Pairing):
     """
 
     steps: int = 8
-    strain: float = 0.0001  # weight of the common stretch
+    prior: float = 0.0001  # weight of the common stretch
     scale: float = 0.05  # of the robust weight (units of sqrt(area))
     momentum: float = 0.6  # how far each step goes on along the last: what slides along the surface has far to go
     drift: float = 0.4  # how far the common stretch follows the fits as they move, against where they began
@@ -54,7 +54,7 @@ class AgreeConfig(Pairing):
         """The same as the driver of the least squares takes it."""
         return Schedule(
             steps=self.steps,
-            prior=(self.strain, self.strain),
+            prior=(self.prior, self.prior),
             scale=(self.scale, self.scale),
             damping=self.damping,
             momentum=self.momentum,
@@ -63,7 +63,7 @@ class AgreeConfig(Pairing):
     @classmethod
     def for_model(cls, model: TrainedModel) -> AgreeConfig:
         """As stiff as the model's card says."""
-        return cls(strain=cls.strain * model.card.stiffness)
+        return cls(prior=cls.prior * model.card.stiffness)
 
     @classmethod
     def for_collection(cls, model: TrainedModel) -> AgreeConfig:
@@ -74,7 +74,7 @@ class AgreeConfig(Pairing):
         """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): all samples, shared, a stiffer template."""
         return replace(
             self,
-            strain=geometric_between(self.strain, 80 * self.strain, roughness),
+            prior=geometric_between(self.prior, 80 * self.prior, roughness),
             momentum=self.momentum * (1 - roughness),
             alike=self.alike / max(1 - roughness, 1e-9),  # noise stretches too
             point_share=geometric_between(self.point_share, max(self.point_share, 3.0), roughness),

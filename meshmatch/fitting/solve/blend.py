@@ -77,7 +77,7 @@ def polar(F: Float[Floats, "N 3 3"]) -> tuple[Float[Floats, "N 3 3"], Float[Floa
 
 
 class FieldPath:
-    """The poses between several fits of one template, by what the field does at its strain points.
+    """The poses between several fits of one template, by what the field does at its gradient points.
 
     Keys are node vectors (K, 3) of the fits, each in its core frame; vertices of the core stay in the middle.
     """
@@ -117,12 +117,12 @@ class FieldPath:
 def _spanning_order(
     system: NodeSystem, rotations: Sequence[Floats], core: Int[Ints, " C"]
 ) -> tuple[Int[Ints, " G"], list[Ints]]:
-    """Parents (G,) of the strain points, -1 for roots, and the other points level by level below their roots.
+    """Parents (G,) of the gradient points, -1 for roots, and the other points level by level below their roots.
 
     One tree for each connected part, along the edges over which the rotations change least. Its root is the point
     nearest to the middle of the core.
     """
-    at = system.verts[system.strain_points]
+    at = system.verts[system.gradient_points]
     G = len(at)
     a, b = _neighbours(system)
     jump = np.full(len(a), _MIN_COST)
@@ -144,15 +144,16 @@ def _spanning_order(
 
 
 def _neighbours(system: NodeSystem) -> tuple[Ints, Ints]:
-    """Pairs (a < b) of strain points whose regions of the surface touch."""
-    V, G = len(system.verts), len(system.strain_points)
+    """Pairs (a < b) of gradient points whose regions of the surface touch."""
+    V, G = len(system.verts), len(system.gradient_points)
     edges = np.concatenate([system.faces[:, [0, 1]], system.faces[:, [1, 2]], system.faces[:, [2, 0]]])
     length = np.linalg.norm(system.verts[edges[:, 0]] - system.verts[edges[:, 1]], axis=1)
     graph = csr_matrix((np.maximum(length, 1e-12), (edges[:, 0], edges[:, 1])), (V, V))
-    found = dijkstra(graph, directed=False, indices=system.strain_points, min_only=True, return_predecessors=True)
+    found = dijkstra(graph, directed=False, indices=system.gradient_points, min_only=True, return_predecessors=True)
     number = np.full(V + 1, -1)
-    number[system.strain_points] = np.arange(G)
-    region = number[np.where(found[2] < 0, V, found[2])]  # the nearest strain point along the surface, -1 out of reach
+    number[system.gradient_points] = np.arange(G)
+    # Of the nearest gradient point along the surface, -1 out of reach.
+    region = number[np.where(found[2] < 0, V, found[2])]
     pairs = region[edges]
     pairs = np.sort(pairs[(pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])], axis=1)
     code = np.unique(pairs[:, 0] * G + pairs[:, 1])

@@ -53,6 +53,6 @@ class ViscousConfig(Pairing):
 
 def viscous_vectors(system: NodeSystem, samples: OrientedPoints, config: ViscousConfig) -> Float[Floats, "K 3"]:
     """Node vectors that move the template onto the shape of the samples, which stands as it does."""
-    prior = ViscousGradient.over(system.verts[system.strain_points], config.near)
+    prior = ViscousGradient.over(system.verts[system.gradient_points], config.near)
     problem = Problem(system=system, terms=[PairTerm(samples, config)], schedule=config.schedule)
     return minimise(problem, prior, np.zeros((system.K, 3)))
