@@ -20,11 +20,11 @@ from meshmatch.shapes.shape import Shape
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
-    from meshmatch.fitting.judge.features import Signs
+    from meshmatch.fitting.judge.features import FitFeatures
     from meshmatch.models.trained import TrainedModel
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Fit(Pickled):
     """A template moved onto one shape.
 
@@ -71,7 +71,7 @@ class Fit(Pickled):
     notes: tuple[str, ...] = ()
     model: str = ""
     trust: float = 1.0
-    signs: Signs | None = None
+    signs: FitFeatures | None = None
     left_out: tuple[int, ...] = ()
     regularity: Regularity | None = None
 

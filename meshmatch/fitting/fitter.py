@@ -151,7 +151,7 @@ def as_fit(found: Registration, partial: bool, began: float) -> Fit:
         verdict=judged.verdict,
         reasons=judged.reasons,
         trust=judged.trust,
-        signs=judged.signs,
+        signs=judged.features,
         regularity=task.system.regularity(found.candidate.vectors),
         up=axis_name(frame.rotation[1]),
         front=axis_name(frame.rotation[2]),

@@ -8,7 +8,7 @@ import numpy as np
 
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.fitting.fit import Fit, axis_name
-from meshmatch.fitting.judge.features import signs_of
+from meshmatch.fitting.judge.features import compute_features
 from meshmatch.fitting.judge.reasons import Reason
 from meshmatch.fitting.judge.verdict import EVEN_TRUST, judge
 from meshmatch.fitting.search.predictor import two_way_residual
@@ -56,7 +56,7 @@ def fit_viscously(template: Template, system: NodeSystem, shape: Shape, config: 
     vectors = viscous_vectors(system, local, config)
     points = system.moved(vectors)
     residual = two_way_residual(system, local, vectors)
-    judged = judge(signs_of(system, vectors, local, residual, template.labels))
+    judged = judge(compute_features(system, vectors, local, residual, template.labels))
     unsure = Reason("unsupervised", "fitted without a trained model: surfaces that lie close need not correspond")
     return Fit(
         template_hash=template.hash,
@@ -70,7 +70,7 @@ def fit_viscously(template: Template, system: NodeSystem, shape: Shape, config: 
         verdict="fair" if judged.verdict == "good" else judged.verdict,
         reasons=(*judged.reasons, unsure),
         trust=min(judged.trust, EVEN_TRUST),
-        signs=judged.signs,
+        signs=judged.features,
         regularity=system.regularity(vectors),
         up=axis_name(core.rotation[1]),
         front=axis_name(core.rotation[2]),

@@ -14,7 +14,7 @@ from meshmatch.fitting import fitter
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import boundary_length
-from meshmatch.fitting.judge.features import Signs, signs_of, uncovered_share
+from meshmatch.fitting.judge.features import FitFeatures, compute_features, uncovered_share
 from meshmatch.fitting.judge.verdict import Judgement, judge
 from meshmatch.fitting.search import candidates
 from meshmatch.fitting.search.candidates import SHARES
@@ -67,11 +67,14 @@ def test_what_is_not_visible_is_not_held_against_a_part() -> None:
     half = samples.points[:, 1] > 0
     scan, still = OrientedPoints(samples.points[half], samples.normals[half]), np.zeros((system.K, 3))
     assert 0.3 < uncovered_share(scan, system.verts) < 0.6
-    assert judge(signs_of(system, still, scan, 0.02, egg_model().template.labels)).verdict == "poor"
-    judged = judge(replace(signs_of(system, still, scan, 0.02, egg_model().template.labels, partial=True), hidden=0.5))
+    assert judge(compute_features(system, still, scan, 0.02, egg_model().template.labels)).verdict == "poor"
+    features = compute_features(system, still, scan, 0.02, egg_model().template.labels, partial=True)
+    judged = judge(replace(features, hidden=0.5))
     assert judged.verdict == "fair"
     assert judged.reasons == ("taken for a part: 50 % of the template has no counterpart",)
-    assert judge(signs_of(system, still, scan, 0.05, egg_model().template.labels, partial=True)).verdict == "poor"
+    assert (
+        judge(compute_features(system, still, scan, 0.05, egg_model().template.labels, partial=True)).verdict == "poor"
+    )
     whole = OrientedPoints(samples.points, samples.normals)
     assert one_way_residual(system, scan, still) == pytest.approx(one_way_residual(system, whole, still), rel=0.1)
 
@@ -136,7 +139,9 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
     for verdict in ("fair", "poor"):
         monkeypatch.setattr(candidates, "frames_of_part", frames)
         monkeypatch.setattr(
-            fitter, "judge_registration", lambda found, partial, verdict=verdict: Judgement(verdict, (), Signs(0.02))
+            fitter,
+            "judge_registration",
+            lambda found, partial, verdict=verdict: Judgement(verdict, (), FitFeatures(residual=0.02)),
         )
         asked.clear()
         best = fitter._best_part(task)

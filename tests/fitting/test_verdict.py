@@ -13,11 +13,11 @@ from meshmatch.arrays import Floats, Ints
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter, cap_verdict
 from meshmatch.fitting.judge.features import (
-    Signs,
+    FitFeatures,
+    compute_features,
     connected_parts,
     multipart_allowance,
     shortening,
-    signs_of,
     stretch_spread_of,
     subtract_in_quadrature,
 )
@@ -35,15 +35,15 @@ from tests.conftest import some_fit
 from tests.fitting.eggs import egg_model, scan_of
 
 RANK = {"good": 0, "fair": 1, "poor": 2}
-SOUND = Signs(0.023, torn=0.001, stretch=0.5, uneven=0.22, against=0.015, spread=0.02)
+SOUND = FitFeatures(residual=0.023, discontinuous=0.001, stretch=0.5, stretch_spread=0.22, flipped=0.015, spread=0.02)
 RISING = {
     "residual": np.linspace(0.02, 0.1, 30),
-    "missed": np.linspace(0, 1, 30),
-    "empty": np.linspace(0, 1, 30),
-    "torn": np.linspace(0, 1, 30),
+    "uncovered_shape": np.linspace(0, 1, 30),
+    "uncovered_template": np.linspace(0, 1, 30),
+    "discontinuous": np.linspace(0, 1, 30),
     "stretch": np.linspace(0.1, 4, 30),
-    "uneven": np.linspace(0.05, 2, 30),
-    "against": np.linspace(0, 1, 30),
+    "stretch_spread": np.linspace(0.05, 2, 30),
+    "flipped": np.linspace(0, 1, 30),
     "partial": [False, True],
     "hidden": np.linspace(0, 1, 30),
     "spread": np.geomspace(0.005, 0.3, 30),
@@ -51,26 +51,27 @@ RISING = {
 }
 
 
-APART = {"empty", "stretch", "against", "partial", "inverted"}  # bound the verdict by themselves, or are reasons alone
+# These bound the verdict by themselves, or are reasons alone.
+APART = {"uncovered_template", "stretch", "flipped", "partial", "inverted"}
 
 
 def test_all_signs_are_tried() -> None:
-    assert list(RISING) == [each.name for each in fields(Signs)]
+    assert list(RISING) == [each.name for each in fields(FitFeatures)]
     assert len(SOUND.values()) == len(RISING) - len(APART)
 
 
 @pytest.mark.parametrize("sign", RISING)
 def test_trust_falls_as_a_sign_rises_and_verdicts_never_improve(sign: str) -> None:
     found = [replace(SOUND, **{sign: value}) for value in RISING[sign]]
-    trust = [each.trust for each in found]
+    trust = [each.p_correct for each in found]
     assert trust == sorted(trust, reverse=True) and (trust[-1] < trust[0] or sign in APART)
     judged = [judge(each) for each in found]
     ranks = [RANK[each.verdict] for each in judged]
     assert ranks == sorted(ranks) and ranks[0] == 0
-    assert ranks[-1] > 0 or sign == "against"
+    assert ranks[-1] > 0 or sign == "flipped"
     for each in judged:
         assert bool(each.reasons) == (each.verdict != "good")
-        assert each.trust == each.signs.trust
+        assert each.trust == each.features.p_correct
 
 
 def test_where_verdicts_change() -> None:
@@ -118,18 +119,19 @@ def labels() -> Ints:
 
 def test_signs_of_a_template_on_itself() -> None:
     still = np.zeros((system().K, 3))
-    signs = signs_of(system(), still, scan_of(egg_model().template.shape, 2000), 0.02, labels())
-    assert (signs.residual, signs.missed, signs.empty, signs.partial) == (0.02, 0.0, 0.0, False)
-    assert signs.stretch < 0.01 and signs.against < 0.02 and signs.torn < 0.02
+    features = compute_features(system(), still, scan_of(egg_model().template.shape, 2000), 0.02, labels())
+    assert (features.residual, features.partial) == (0.02, False)
+    assert (features.uncovered_shape, features.uncovered_template) == (0.0, 0.0)
+    assert features.stretch < 0.01 and features.flipped < 0.02 and features.discontinuous < 0.02
 
 
 def test_signs_of_a_template_on_a_part_and_on_more() -> None:
     still, scan = np.zeros((system().K, 3)), scan_of(egg_model().template.shape, 2000)
     half = replace(scan.rows(scan.points[:, 1] > 0))
-    assert 0.3 < signs_of(system(), still, half, 0.02, labels()).empty < 0.6
-    assert signs_of(system(), still, half, 0.02, labels(), partial=True).empty == 0.0
+    assert 0.3 < compute_features(system(), still, half, 0.02, labels()).uncovered_template < 0.6
+    assert compute_features(system(), still, half, 0.02, labels(), partial=True).uncovered_template == 0.0
     more = replace(scan, points=scan.points + np.where(scan.points[:, 1:2] > 0, [0.0, 1.0, 0.0], 0.0))
-    assert 0.3 < signs_of(system(), still, more, 0.02, labels()).missed < 0.6
+    assert 0.3 < compute_features(system(), still, more, 0.02, labels()).uncovered_shape < 0.6
 
 
 def pressed_egg(axis: int, left: float) -> tuple[Floats, OrientedPoints]:
@@ -142,11 +144,11 @@ def pressed_egg(axis: int, left: float) -> tuple[Floats, OrientedPoints]:
 def test_signs_of_a_template_pressed_flat() -> None:
     scan = scan_of(egg_model().template.shape, 2000)
     flat, pressed = pressed_egg(2, 0.02)
-    signs = signs_of(system(), flat, pressed, 0.025, labels())
-    assert signs.stretch > 2 and judge(signs).verdict == "poor"
-    assert "crushed" in {reason.code for reason in judge(signs).reasons}
+    features = compute_features(system(), flat, pressed, 0.025, labels())
+    assert features.stretch > 2 and judge(features).verdict == "poor"
+    assert "crushed" in {reason.code for reason in judge(features).reasons}
     turned = replace(scan, normals=-scan.normals)
-    assert signs_of(system(), np.zeros_like(flat), turned, 0.025, labels()).against > 0.9
+    assert compute_features(system(), np.zeros_like(flat), turned, 0.025, labels()).flipped > 0.9
 
 
 def test_how_much_a_surface_is_shortened_is_its_least_stretch() -> None:
@@ -171,16 +173,19 @@ def test_parts_of_other_proportions_are_even() -> None:
     upper, nodes = system().verts[:, 1] > 0, egg_model().template.nodes
     short = -0.7 * np.maximum(nodes, 0) * [0, 1, 0]
     scan = scan_of(egg_model().template.shape, 2000)
-    one, two = (signs_of(system(), short, scan, 0.02, parts).uneven for parts in (0 * labels(), upper.astype(int)))
+    one, two = (
+        compute_features(system(), short, scan, 0.02, parts).stretch_spread
+        for parts in (0 * labels(), upper.astype(int))
+    )
     assert 0.2 < one and two < 0.5 * one
-    even, level = (replace(SOUND, uneven=value).trust for value in (0.05, 0.2))
-    assert even == level > replace(SOUND, uneven=0.3).trust
+    even, level = (replace(SOUND, stretch_spread=value).p_correct for value in (0.05, 0.2))
+    assert even == level > replace(SOUND, stretch_spread=0.3).p_correct
 
 
 def test_a_shortened_template_is_not_torn() -> None:
     short, pressed = pressed_egg(1, 0.3)
     assert discontinuous_share(system(), neighbours(pressed), pressed, short) > 0.03
-    assert signs_of(system(), short, pressed, 0.02, labels()).torn < 0.005
+    assert compute_features(system(), short, pressed, 0.02, labels()).discontinuous < 0.005
 
 
 def test_the_network_reads_what_it_knows_alike_and_a_box_in_many_ways() -> None:
@@ -226,7 +231,11 @@ def test_what_is_excused_lets_a_fit_be_fair_but_not_good() -> None:
     assert [judge(each).verdict for each in (SOUND, fair, poor)] == ["good", "fair", "poor"]
     assert judge_with_allowance(SOUND, 0.024) == judge(SOUND)
     judged = judge_with_allowance(SOUND, 0.055)
-    assert (judged.verdict, judged.signs, [reason.code for reason in judged.reasons]) == ("fair", SOUND, ["residual"])
+    assert (judged.verdict, judged.features, [reason.code for reason in judged.reasons]) == (
+        "fair",
+        SOUND,
+        ["residual"],
+    )
     assert "5.5 %" in judged.reasons[0]
     assert judge_with_allowance(fair, 0.1) == judge(fair)
     assert judge_with_allowance(poor, 0.11) == judge(poor)
@@ -280,23 +289,23 @@ def test_a_registration_is_judged_by_the_parts_of_its_shape(monkeypatch: pytest.
     asked = []
 
     def watched(*args, **kwargs):
-        asked.append(args)
-        return signs_of(*args, **kwargs)
+        asked.append((*args[:3], kwargs["connected"]))
+        return compute_features(*args, **kwargs)
 
-    def excused(signs: Signs, residual: float) -> Judgement:
+    def excused(features: FitFeatures, residual: float) -> Judgement:
         asked.append(residual)
-        return judge_with_allowance(signs, residual)
+        return judge_with_allowance(features, residual)
 
-    monkeypatch.setattr("meshmatch.fitting.judge.verdict.signs_of", watched)
+    monkeypatch.setattr("meshmatch.fitting.judge.verdict.compute_features", watched)
     monkeypatch.setattr("meshmatch.fitting.judge.verdict.judge_with_allowance", excused)
     fit = Fitter(egg_model(), FitConfig(samples=900, variants=0, finalists=1, careful=1, partial="no")).fit(shape)
     assert fit.signs is not None
     assert fit.signs.residual == pytest.approx(subtract_in_quadrature(fit.residual, multipart_allowance(shape, shown)))
     assert 0 < fit.signs.residual < fit.residual
-    (system, vectors, local, *_, connected), residual = asked[-2:]
+    (system, vectors, local, connected), residual = asked[-2:]
     assert residual == fit.residual
     assert np.array_equal(connected, shape.vertex_parts[local.vertex])
     pairs, strict = neighbours(local), neighbours(local, connected)
     assert 0 < len(strict[0]) < len(pairs[0])
     shortened = shortening(system, system.deformation_gradient(vectors))
-    assert fit.signs.torn == discontinuous_share(system, strict, local, vectors, shortened)
+    assert fit.signs.discontinuous == discontinuous_share(system, strict, local, vectors, shortened)

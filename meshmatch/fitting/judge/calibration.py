@@ -13,7 +13,7 @@ from dataclasses import dataclass
 class Calibration:
     """The logit of a wrong fit: ``offset`` plus the sum of ``weights`` times what is measured of the fit."""
 
-    weights: tuple[float, ...]  # in the order of `Signs.values`
+    weights: tuple[float, ...]  # in the order of `FitFeatures.values`
     offset: float
     data: str  # of which shapes
     seeds: tuple[int, ...]

@@ -1,4 +1,4 @@
-"""Signs that tell right fits from wrong ones, and how far they let a fit be trusted.
+"""Features that tell right fits from wrong ones, and the probability of a right fit that they give.
 
 What a fit says of itself is not only how near template and shape come: a template can be crushed onto a plane, or its legs
 both onto one. Each sign alone errs; together they give the probability that a fit is right, that is to say that its
@@ -39,24 +39,25 @@ _WEIGHTS, _OFFSET = CALIBRATION.weights, CALIBRATION.offset
 # one, given right fits and upside-down ones of robots, and fits of solids and of furniture in pieces, that are not those of
 # docs/results.md. Between so many parts of equal area and so many, set by hand, it grows to that.
 _BUILT, _FEW, _MANY = 0.033, 2.0, 8.0
-_AGAINST_IF_UNSIGNED = 0.015  # normals of a cloud have no side: taken for a usual share
+_FLIPPED_IF_UNSIGNED = 0.015  # normals of a cloud have no side: taken for a usual share
 
 
-@dataclass(frozen=True)
-class Signs:
+@dataclass(frozen=True, kw_only=True)
+class FitFeatures:
     """What tells right fits from wrong ones.
 
     Attributes
     ----------
     residual : mean distance of template and shape, normals included, without what a cloud, or a figure of many solids,
         explains (units of sqrt(area))
-    missed : share (0..1) of the shape that the template does not reach
-    empty : share (0..1) of the template where the shape has no surface; a part has none of it
-    torn : share (0..1) of neighbours on the shape that belong far apart on the template, further than it is shortened there
+    uncovered_shape : share (0..1) of the shape that the template does not reach
+    uncovered_template : share (0..1) of the template where the shape has no surface; a part has none of it
+    discontinuous : share (0..1) of neighbouring samples whose template points are farther apart than local shortening
+        explains
     stretch : root mean square of the logarithms of the template's stretches
-    uneven : median over the template of how far the logarithm of the stretch there is from its mean over the body part,
-        which proportions explain: short legs are no worse a sign than long ones
-    against : share (0..1) of the shape that faces the other way than the template
+    stretch_spread : median over the template of how far the logarithm of the stretch there is from its mean over the body
+        part, which proportions explain: short legs are no worse a sign than long ones
+    flipped : share (0..1) of the shape that faces the other way than the template
     partial : whether the shape was taken for a part
     hidden : share (0..1) of the template that a part does not show
     spread : how far the network's readings of tilted copies lie from the fit (units of sqrt(area)), see `Predictor.spread`
@@ -64,36 +65,36 @@ class Signs:
     """
 
     residual: float
-    missed: float = 0.0
-    empty: float = 0.0
-    torn: float = 0.0
+    uncovered_shape: float = 0.0
+    uncovered_template: float = 0.0
+    discontinuous: float = 0.0
     stretch: float = 0.0
-    uneven: float = 0.0
-    against: float = 0.0
+    stretch_spread: float = 0.0
+    flipped: float = 0.0
     partial: bool = False
     hidden: float = 0.0
     spread: float = USUAL_SPREAD
     inverted: float = 0.0
 
     def values(self) -> tuple[float, ...]:
-        """Numbers that grow about as the doubt does; ``empty``, ``stretch``, ``against`` and ``partial`` told nothing beside
-        them; ``inverted`` was not tried."""
+        """Numbers that grow about as the doubt does; ``uncovered_template``, ``stretch``, ``flipped`` and ``partial`` added
+        nothing to them; ``inverted`` was not tried."""
         return (
             100 * self.residual,
-            float(np.sqrt(10 * min(self.missed, 0.2))),
-            float(np.log(self.torn + 0.003)),
-            float(np.log(max(self.uneven, _EVEN))),
+            float(np.sqrt(10 * min(self.uncovered_shape, 0.2))),
+            float(np.log(self.discontinuous + 0.003)),
+            float(np.log(max(self.stretch_spread, _EVEN))),
             self.hidden,
             float(np.log(max(self.spread, _LEAST_SPREAD))),
         )
 
     @property
-    def trust(self) -> float:
+    def p_correct(self) -> float:
         """Probability (0..1) that the fit is right."""
         return float(1 / (1 + np.exp(_OFFSET + np.dot(_WEIGHTS, self.values()))))
 
 
-def signs_of(
+def compute_features(
     system: NodeSystem,
     vectors: Float[Floats, "K 3"],
     local: OrientedPoints,
@@ -102,10 +103,10 @@ def signs_of(
     partial: bool = False,
     spread_at: Callable[[Bool[Bools, " V"]], float] | None = None,
     connected: Int[Ints, " P"] | None = None,
-) -> Signs:
-    """The signs of a fit; ``local`` are samples of the shape in the core frame, ``parts`` the body parts of the template's
-    vertices, ``spread_at`` gives the spread over those that the shape shows (a usual one if there is no network), and
-    ``connected`` numbers the connected part of the shape that each sample is on, where there are several.
+) -> FitFeatures:
+    """The features of a fit; ``local`` are samples of the shape in the core frame, ``parts`` the body parts of the
+    template's vertices, ``spread_at`` gives the spread over those that the shape shows (a usual one if there is no network),
+    and ``connected`` numbers the connected part of the shape that each sample is on, where there are several.
     """
     shown = visible_vertices(system, local, vectors)
     surface = system.surface(vectors)
@@ -113,19 +114,21 @@ def signs_of(
     some = local.first(_TEAR_SAMPLES)
     gradient = system.deformation_gradient(vectors)
     stretches = matrices_of(0.5 * logarithm(entries_of(gradient.transpose(0, 2, 1) @ gradient), _MIN_SQUARE))
-    against = (surface.normals[nearest] * local.normals).sum(1) < 0
-    return Signs(
-        residual,
-        float(weighted_mean(gap > _REACH, local.weights)),
-        0.0 if partial else uncovered_share(local, surface.points),
-        discontinuous_share(system, neighbours(some, connected), some, vectors, shortening(system, gradient)),
-        float(np.sqrt(np.square(stretches).sum((1, 2)).mean())),
-        stretch_spread_of(stretches, parts[system.gradient_points]),
-        float(weighted_mean(against, local.weights)) if local.signed else _AGAINST_IF_UNSIGNED,
-        partial,
-        1 - area_share(system, shown) if partial else 0.0,
-        USUAL_SPREAD if spread_at is None or not shown.any() else spread_at(shown),
-        system.regularity(vectors).inverted,
+    flipped = (surface.normals[nearest] * local.normals).sum(1) < 0
+    return FitFeatures(
+        residual=residual,
+        uncovered_shape=float(weighted_mean(gap > _REACH, local.weights)),
+        uncovered_template=0.0 if partial else uncovered_share(local, surface.points),
+        discontinuous=discontinuous_share(
+            system, neighbours(some, connected), some, vectors, shortening(system, gradient)
+        ),
+        stretch=float(np.sqrt(np.square(stretches).sum((1, 2)).mean())),
+        stretch_spread=stretch_spread_of(stretches, parts[system.gradient_points]),
+        flipped=float(weighted_mean(flipped, local.weights)) if local.signed else _FLIPPED_IF_UNSIGNED,
+        partial=partial,
+        hidden=1 - area_share(system, shown) if partial else 0.0,
+        spread=USUAL_SPREAD if spread_at is None or not shown.any() else spread_at(shown),
+        inverted=system.regularity(vectors).inverted,
     )
 
 

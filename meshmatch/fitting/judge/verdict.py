@@ -1,4 +1,4 @@
-"""Good, fair or poor: how a fit is judged, by its signs, and why."""
+"""Good, fair or poor: how a fit is judged, by its features, and why."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from meshmatch.arrays import Bool, Bools
 from meshmatch.fitting.judge.features import (
-    Signs,
+    FitFeatures,
     cloud_allowance,
+    compute_features,
     connected_parts,
     multipart_allowance,
-    signs_of,
     subtract_in_quadrature,
 )
 from meshmatch.fitting.judge.reasons import Reason, ReasonCode, Verdict
@@ -38,16 +38,16 @@ FAIR_RESIDUAL = 0.031
 
 @dataclass(frozen=True)
 class Judgement:
-    """A verdict, why it is not good, and by what signs."""
+    """A verdict, why it is not good, and by what features."""
 
     verdict: Verdict
     reasons: tuple[Reason, ...]
-    signs: Signs
+    features: FitFeatures
 
     @property
     def trust(self) -> float:
         """How far (0..1) the fit can be trusted."""
-        return self.signs.trust
+        return self.features.p_correct
 
 
 def judge_registration(found: Registration, partial: bool) -> Judgement:
@@ -62,66 +62,83 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
     def spread_at(vertices: Bool[Bools, " V"]) -> float:
         return task.predictor.spread(found.local, vectors, vertices)
 
-    parts = task.model.template.labels
-    told = task.model.has_nodes and reads_alike(task.model)
-    connected = connected_parts(task.shape, found.local)
-    known = residual, parts, partial, spread_at if told else None, connected
-    signs = signs_of(task.system, vectors, found.local, *known)
-    return judge(signs) if task.shape.is_cloud else judge_with_allowance(signs, found.candidate.residual)
+    predicted = task.model.has_nodes and reads_alike(task.model)
+    features = compute_features(
+        task.system,
+        vectors,
+        found.local,
+        residual,
+        task.model.template.labels,
+        partial=partial,
+        spread_at=spread_at if predicted else None,
+        connected=connected_parts(task.shape, found.local),
+    )
+    return judge(features) if task.shape.is_cloud else judge_with_allowance(features, found.candidate.residual)
 
 
-def judge_with_allowance(signs: Signs, residual: float) -> Judgement:
-    """Verdict, reasons and trust of a fit of a mesh that has that ``residual``, some of it excused in ``signs``.
+def judge_with_allowance(features: FitFeatures, residual: float) -> Judgement:
+    """Verdict, reasons and trust of a fit of a mesh that has that ``residual``, some of it excused in ``features``.
 
     What is excused makes no fit good: front and back of a figure of solids differ by no more than that.
     """
-    judged = judge(signs)
-    if judged.verdict != "good" or judge(replace(signs, residual=residual)).verdict == "good":
+    judged = judge(features)
+    if judged.verdict != "good" or judge(replace(features, residual=residual)).verdict == "good":
         return judged
     return replace(judged, verdict="fair", reasons=(Reason("residual", _gap(residual)),))
 
 
-def judge(signs: Signs) -> Judgement:
+def judge(features: FitFeatures) -> Judgement:
     """Verdict, reasons and trust."""
-    trust, reasons = signs.trust, _reasons(signs)
-    lacking = max(signs.missed, signs.empty)
-    if signs.partial:
-        lost = f"{100 * signs.hidden:.0f} % of the template has no counterpart"
+    trust, reasons = features.p_correct, _reasons(features)
+    lacking = max(features.uncovered_shape, features.uncovered_template)
+    if features.partial:
+        lost = f"{100 * features.hidden:.0f} % of the template has no counterpart"
         reasons.append(Reason("part", f"taken for a part: {lost}"))
-    if trust < FAIR_TRUST or signs.empty > _FAIR_SHARE or signs.hidden > _HIDDEN or signs.stretch > _FLAT:
+    if (
+        trust < FAIR_TRUST
+        or features.uncovered_template > _FAIR_SHARE
+        or features.hidden > _HIDDEN
+        or features.stretch > _FLAT
+    ):
         verdict: Verdict = "poor"
     elif (
         trust < GOOD_TRUST
-        or signs.partial
+        or features.partial
         or lacking > _GOOD_SHARE
-        or signs.stretch > _CRUSHED
-        or signs.inverted > _FOLDED
+        or features.stretch > _CRUSHED
+        or features.inverted > _FOLDED
     ):
         verdict = "fair"
     else:
-        return Judgement("good", (), signs)
+        return Judgement("good", (), features)
     if trust < GOOD_TRUST and not reasons:
         likely = f"{int(100 * trust)} % likely to be right, where a good fit needs {100 * GOOD_TRUST:.0f} %"
         reasons.append(Reason("doubt", likely))
-    return Judgement(verdict, tuple(reasons), signs)
+    return Judgement(verdict, tuple(reasons), features)
 
 
-def _reasons(signs: Signs) -> list[Reason]:
-    """Signs that speak against the fit."""
-    unreached = f"{100 * signs.missed:.0f} % of the shape is not reached by the template"
-    empty = f"{100 * signs.empty:.0f} % of the template lies where the shape has no surface"
-    crushed = f"the template had to be stretched or compressed {np.exp(signs.stretch):.1f}-fold on average"
-    facing = f"{100 * signs.against:.0f} % of the shape faces the other way than the template"
-    unsure = f"what the network predicts for tilted and mirrored copies is {100 * signs.spread:.0f} % of sqrt(area) off"
+def _reasons(features: FitFeatures) -> list[Reason]:
+    """Features that speak against the fit."""
+    unreached = f"{100 * features.uncovered_shape:.0f} % of the shape is not reached by the template"
+    empty = f"{100 * features.uncovered_template:.0f} % of the template lies where the shape has no surface"
+    crushed = f"the template had to be stretched or compressed {np.exp(features.stretch):.1f}-fold on average"
+    facing = f"{100 * features.flipped:.0f} % of the shape faces the other way than the template"
+    unsure = (
+        f"what the network predicts for tilted and mirrored copies is {100 * features.spread:.0f} % of sqrt(area) off"
+    )
     told: list[tuple[bool, ReasonCode, str]] = [
-        (signs.residual > 0.0285, "residual", _gap(signs.residual)),
-        (signs.missed > _GOOD_SHARE, "unreached", unreached),
-        (signs.empty > _GOOD_SHARE, "empty", empty),
-        (signs.torn > 0.02, "torn", f"{100 * signs.torn:.0f} % of neighbours on the shape belong far apart"),
-        (signs.stretch > _CRUSHED, "crushed", crushed),
-        (signs.inverted > _FOLDED, "folded", _folds(signs.inverted)),
-        (signs.against > 0.1, "facing", facing),
-        (signs.spread > 0.06, "unsure", unsure),
+        (features.residual > 0.0285, "residual", _gap(features.residual)),
+        (features.uncovered_shape > _GOOD_SHARE, "unreached", unreached),
+        (features.uncovered_template > _GOOD_SHARE, "empty", empty),
+        (
+            features.discontinuous > 0.02,
+            "torn",
+            f"{100 * features.discontinuous:.0f} % of neighbours on the shape belong far apart",
+        ),
+        (features.stretch > _CRUSHED, "crushed", crushed),
+        (features.inverted > _FOLDED, "folded", _folds(features.inverted)),
+        (features.flipped > 0.1, "facing", facing),
+        (features.spread > 0.06, "unsure", unsure),
     ]
     return [Reason(code, words) for speaks, code, words in told if speaks]
 
