@@ -169,7 +169,13 @@ def _member(read: StoredFit, how: AgreeConfig) -> Member:
     roughness = read.words.get("roughness")
     if read.samples is None or type(roughness) is not float:
         raise InputError("a fit that should agree has no samples", "remove the folder of fits, and make it again")
-    return Member(read.samples, read.fit.vectors, how.for_noise(roughness), None, read.fit.partial)
+    return Member(
+        samples=read.samples,
+        vectors=read.fit.vectors,
+        config=how.for_noise(roughness),
+        landmarks=None,
+        partial=read.fit.partial,
+    )
 
 
 def _starts(members: Sequence[Member], now: Floats, before: Floats) -> list[Floats]:

@@ -62,7 +62,13 @@ def member_of(
     points = fit.frame.apply(frame.undo(samples.points))
     normals = samples.normals @ frame.rotation @ fit.frame.rotation.T
     samples = replace(samples, points=points, normals=normals).facing(system.surface(fit.vectors))
-    return Member(samples, fit.vectors, how.for_noise(shape.roughness), local, fit.partial)
+    return Member(
+        samples=samples,
+        vectors=fit.vectors,
+        config=how.for_noise(shape.roughness),
+        landmarks=local,
+        partial=fit.partial,
+    )
 
 
 def with_vectors(system: NodeSystem, fit: Fit, vectors: Float[Floats, "K 3"]) -> Fit:

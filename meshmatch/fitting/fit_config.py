@@ -120,7 +120,7 @@ def geometric_between(low: float, high: float, share: float) -> float:
     return low if low <= 0 or low == high else low ** (1 - share) * high**share
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LatentRefineConfig:
     """The paper's test-time weights L1..L3, steps and rate."""
 
@@ -132,7 +132,7 @@ class LatentRefineConfig:
     points: int = 3000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FitConfig:
     """How hard to look and how to refine.
 

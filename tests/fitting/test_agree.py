@@ -78,18 +78,18 @@ def slid(system: NodeSystem, nodes: np.ndarray, turn: float) -> np.ndarray:
 def test_two_that_slid_apart_come_closer(system: NodeSystem, model: TrainedModel) -> None:
     scan, nodes, config = scan_of(system), model.template.nodes, AgreeConfig(steps=6, prior=0.01)
     apart = [slid(system, nodes, 0.15), slid(system, nodes, -0.15)]
-    nearer = agree(system, [Member(scan, each, config) for each in apart])
+    nearer = agree(system, [Member(samples=scan, vectors=each, config=config) for each in apart])
 
     def gap(pair: list[np.ndarray]) -> float:
         return float(np.linalg.norm(system.moved(pair[0]) - system.moved(pair[1]), axis=1).mean())
 
     assert gap(nearer) < 0.75 * gap(apart)
-    alone = agree(system, [Member(scan, apart[0], config)])
+    alone = agree(system, [Member(samples=scan, vectors=apart[0], config=config)])
     assert gap([alone[0], apart[1]]) > gap(nearer)
 
 
 def test_two_that_are_equal_stay_so_and_the_same_twice(system: NodeSystem, model: TrainedModel) -> None:
-    member = Member(scan_of(system), slid(system, model.template.nodes, 0.1), AgreeConfig())
+    member = Member(samples=scan_of(system), vectors=slid(system, model.template.nodes, 0.1), config=AgreeConfig())
     first, again = (agree(system, [member, member]) for _ in range(2))
     assert np.array_equal(first[0], first[1])
     assert np.array_equal(first[0], again[0])
@@ -111,7 +111,10 @@ def test_a_thick_and_a_thin_one_keep_their_stretch(system: NodeSystem, model: Tr
 
     def apart(alike: float) -> float:
         config = AgreeConfig(steps=6, prior=1.0, alike=alike)
-        members = [Member(each, start, config) for each, start in zip((scan, thick), vectors, strict=True)]
+        members = [
+            Member(samples=each, vectors=start, config=config)
+            for each, start in zip((scan, thick), vectors, strict=True)
+        ]
         one, other = (log_stretch(system.deformation_gradient(each)) for each in agree(system, members))
         return float(np.linalg.norm((one - other).reshape(len(one), -1), axis=1).mean())
 
@@ -126,7 +129,7 @@ def test_landmarks_hold(system: NodeSystem, model: TrainedModel) -> None:
     config = AgreeConfig(steps=3)
 
     def missed(known: Landmarks | None) -> float:
-        moved = system.moved(agree(system, [Member(scan, start, config, known)])[0])
+        moved = system.moved(agree(system, [Member(samples=scan, vectors=start, config=config, landmarks=known)])[0])
         return float(np.linalg.norm(moved[at] - places, axis=1).max())
 
     assert missed((at, places)) < 0.25 * missed(None)
@@ -182,7 +185,7 @@ def test_momentum_goes_further_in_as_many_steps(model: TrainedModel, system: Nod
 
     def left(momentum: float) -> float:
         config = AgreeConfig(steps=3, prior=0.01, momentum=momentum)
-        found = agree(system, [Member(scan, each, config) for each in apart])
+        found = agree(system, [Member(samples=scan, vectors=each, config=config) for each in apart])
         return float(np.abs(found[0] - found[1]).mean())
 
     assert left(AgreeConfig().momentum) < 0.97 * left(0.0)

@@ -147,7 +147,9 @@ def test_a_tilted_reading_is_turned_back(model: TrainedModel, system: NodeSystem
     few = OrientedPoints(scan.points[:200], scan.normals[:200])
     pose = RigidPose.identity()
     network: Any = Follower()
-    predictor = Predictor(network, system, model.template.core, None, np.random.default_rng(0))
+    predictor = Predictor(
+        network=network, system=system, core=model.template.core, mirror=None, rng=np.random.default_rng(0)
+    )
     found = predictor.variants(few, few, pose, 3, 20.0)
     for each in found:
         assert np.abs(each.vectors).max() < 1e-3

@@ -93,7 +93,7 @@ def test_what_all_fits_have_in_common_hardly_drifts(system: NodeSystem, model: T
     start = 0.1 * nodes * [1.0, -1.0, 1.0]
 
     def drifted(drift: float) -> float:
-        members = [Member(scan, start, AgreeConfig(steps=8, prior=0.01, drift=drift))] * 2
+        members = [Member(samples=scan, vectors=start, config=AgreeConfig(steps=8, prior=0.01, drift=drift))] * 2
         found = agree(system, members)[0]
         return float(np.abs(system.deformation_gradient(found) - system.deformation_gradient(start)).mean())
 

@@ -117,7 +117,7 @@ def _dense(matrix: Any) -> Floats:
     return np.asarray(matrix if isinstance(matrix, np.ndarray) else matrix.toarray())
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Predictor:
     """The network, and what its answers move; draws its points with ``rng``."""
 
@@ -131,7 +131,9 @@ class Predictor:
     def of(cls, model: TrainedModel, rng: np.random.Generator, device: str = "cpu", mirrored: bool = True) -> Predictor:
         """The predictor of a trained model; the mirror takes time to build, and serves `variants` alone."""
         mirror = mirror_of(model) if mirrored else None
-        return cls(model.on(device), node_system(model), model.template.core, mirror, rng)
+        return cls(
+            network=model.on(device), system=node_system(model), core=model.template.core, mirror=mirror, rng=rng
+        )
 
     def fit_all(
         self,

@@ -29,7 +29,7 @@ _CLEAN: WeakKeyDictionary[Shape, Shape | None] = WeakKeyDictionary()
 _SHOWN: WeakKeyDictionary[Shape, Shape | None] = WeakKeyDictionary()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class FitTask:
     """One shape that is to be fitted."""
 
@@ -64,7 +64,18 @@ class FitTask:
         if (shown := without_interior(shape, predictor.system)) is not shape:
             visible = sample_surface(shown, config.samples, np.random.default_rng(config.seed)).in_frame(frame)
         progress = progress or Progress()
-        return cls(model, config, predictor, shape, clean.roughness, frame, samples, visible, landmarks, progress)
+        return cls(
+            model=model,
+            config=config,
+            predictor=predictor,
+            shape=shape,
+            roughness=clean.roughness,
+            frame=frame,
+            samples=samples,
+            visible_samples=visible,
+            landmarks=landmarks,
+            progress=progress,
+        )
 
     @property
     def system(self) -> NodeSystem:

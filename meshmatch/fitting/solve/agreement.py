@@ -84,7 +84,7 @@ class AgreeConfig(Pairing):
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Member:
     """One of several fits that agree."""
 

@@ -156,7 +156,7 @@ class NodeSystem:
         return solved
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Equations:
     """What never changes of a linear field's normal equations."""
 
@@ -176,7 +176,8 @@ class Equations:
         order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(np.int64)
         met = gradient.T @ gradient
         summed = (met if isinstance(met, np.ndarray) else met.toarray())[row, column]
-        return cls(gradient, pairs, summed, order, *_band_places(row, column, np.argsort(order)))
+        band, place = _band_places(row, column, np.argsort(order))
+        return cls(gradient=gradient, pairs=pairs, gradient_pairs=summed, order=order, band=band, place=place)
 
 
 @once_per_model
