@@ -16,7 +16,7 @@ from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.features import uncovered_share
 from meshmatch.fitting.judge.reasons import Reason, Verdict
-from meshmatch.fitting.judge.verdict import EVEN_TRUST, FAIR_RESIDUAL, judge_registration
+from meshmatch.fitting.judge.verdict import LIMITS, judge_registration
 from meshmatch.fitting.search.predictor import mirror_of
 from meshmatch.fitting.search.refinement import REFINEMENTS, fit_part, fit_whole
 from meshmatch.fitting.search.task import FitTask, Registration
@@ -69,7 +69,7 @@ class Fitter:
             stretch = progress.between(k / 2, (k + 1) / 2) if both else progress
             task = FitTask.of(self.model, self.config, shape, landmarks, stretch, mirrored)
             wholes.append(fit_whole(task))
-        # A shape that one side explains as a whole is no part in the mirror.
+        # If either handedness fits the whole shape, the other is not tried as a part.
         parts = landmarks is None and _may_be_part(min(wholes, key=_cost))
         sides = [_as_part_if_closer(whole) if parts else (whole, False) for whole in wholes]
         (found, partial), *others = sorted(sides, key=lambda side: _cost(side[0]))
@@ -107,11 +107,13 @@ def _best_part(task: FitTask) -> Registration:
 
 
 def cap_verdict(fit: Fit, doubts: Sequence[Reason]) -> Fit:
-    """A fit that near says nothing for, in some way: it is fair at best, and as likely wrong as right."""
+    """Cap the verdict of a fit whose residual is uninformative: it is fair at best, and as likely wrong as right."""
     if not doubts:
         return fit
     verdict: Verdict = "fair" if fit.verdict == "good" else fit.verdict
-    return replace(fit, verdict=verdict, reasons=(*fit.reasons, *doubts), trust=min(fit.trust, EVEN_TRUST))
+    return replace(
+        fit, verdict=verdict, reasons=(*fit.reasons, *doubts), trust=min(fit.trust, LIMITS.uninformative_trust)
+    )
 
 
 def _may_be_part(whole: Registration) -> bool:
@@ -124,7 +126,7 @@ def _may_be_part(whole: Registration) -> bool:
     if not may_show_part(task.shape, task.config):
         return False
     # the residual of a cloud says how sparse and noisy it is
-    if not task.shape.is_cloud and whole.candidate.residual > FAIR_RESIDUAL:
+    if not task.shape.is_cloud and whole.candidate.residual > LIMITS.search_parts:
         return True
     return uncovered_share(whole.local, whole.surface.points) > _EMPTY
 

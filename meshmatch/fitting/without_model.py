@@ -10,7 +10,7 @@ from meshmatch.fields.shape_functions import build_field
 from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.judge.features import compute_features
 from meshmatch.fitting.judge.reasons import Reason
-from meshmatch.fitting.judge.verdict import EVEN_TRUST, judge
+from meshmatch.fitting.judge.verdict import LIMITS, judge
 from meshmatch.fitting.search.predictor import two_way_residual
 from meshmatch.fitting.search.task import take_samples
 from meshmatch.fitting.solve.system import NodeSystem
@@ -69,7 +69,7 @@ def fit_viscously(template: Template, system: NodeSystem, shape: Shape, config: 
         verts=shape.verts,
         verdict="fair" if judged.verdict == "good" else judged.verdict,
         reasons=(*judged.reasons, unsure),
-        trust=min(judged.trust, EVEN_TRUST),
+        trust=min(judged.trust, LIMITS.uninformative_trust),
         signs=judged.features,
         regularity=system.regularity(vectors),
         up=axis_name(core.rotation[1]),

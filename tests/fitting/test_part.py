@@ -17,7 +17,7 @@ from meshmatch.fitting.fitter import boundary_length
 from meshmatch.fitting.judge.features import FitFeatures, compute_features, uncovered_share
 from meshmatch.fitting.judge.verdict import Judgement, judge
 from meshmatch.fitting.search import candidates
-from meshmatch.fitting.search.candidates import SHARES
+from meshmatch.fitting.search.candidates import SETTINGS
 from meshmatch.fitting.search.frames import frames_of_part, frames_to_try
 from meshmatch.fitting.search.predictor import Candidate, one_way_residual
 from meshmatch.fitting.search.task import FitTask, take_samples
@@ -51,7 +51,7 @@ def test_a_boundary_against_another_part_is_no_cut(gap: float, length: float) ->
 
 
 def test_a_smaller_share_costs_more() -> None:
-    costs = [Candidate(RigidPose.identity(), np.zeros((1, 3)), 0.02, share).cost for share in SHARES]
+    costs = [Candidate(RigidPose.identity(), np.zeros((1, 3)), 0.02, share).cost for share in SETTINGS.shares]
     assert costs[0] == 0.02
     assert all(more > less for less, more in pairwise(costs))
 

@@ -22,7 +22,7 @@ from meshmatch.fitting.judge.features import (
     subtract_in_quadrature,
 )
 from meshmatch.fitting.judge.reasons import Reason
-from meshmatch.fitting.judge.verdict import FAIR_TRUST, GOOD_TRUST, Judgement, judge, judge_with_allowance
+from meshmatch.fitting.judge.verdict import LIMITS, Judgement, judge, judge_with_allowance
 from meshmatch.fitting.search.discontinuities import discontinuous_share, neighbours
 from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose
@@ -78,7 +78,7 @@ def test_where_verdicts_change() -> None:
     found = [judge(replace(SOUND, residual=value)) for value in np.linspace(0.02, 0.12, 200)]
     assert {each.verdict for each in found} == {"good", "fair", "poor"}
     for each in found:
-        expected = "good" if each.trust >= GOOD_TRUST else "fair" if each.trust >= FAIR_TRUST else "poor"
+        expected = "good" if each.trust >= LIMITS.good_trust else "fair" if each.trust >= LIMITS.fair_trust else "poor"
         assert each.verdict == expected
     assert judge(replace(SOUND, partial=True, hidden=0.3)).verdict == "fair"  # a part is fair at best
 

@@ -20,20 +20,46 @@ from meshmatch.fitting.search.predictor import reads_alike
 from meshmatch.fitting.search.task import Registration, without_interior
 from meshmatch.fitting.solve.regularity import Regularity
 
-# Trust from which on a fit is good, and fair: more likely right than wrong; a part is fair at best.
-GOOD_TRUST, FAIR_TRUST = 0.99, 0.5
-EVEN_TRUST = 0.5  # at most, where nearness says nothing: as likely wrong as right
-# Shares without counterpart up to which a fit is good; and of the template, up to which it is fair. Set by hand.
-_GOOD_SHARE, _FAIR_SHARE = 0.02, 0.06
-_HIDDEN = 0.6  # share of the template: of a part that shows less than the rest, such as a leg, too little can be told
-# A stretch of the template from which on no fit is good, and from which on it is poor. Set by hand.
-_CRUSHED, _FLAT = 1.0, 2.0
 _SKIN = 1.9  # square metres of an adult's skin
-# Share of the template's vertices that are folded, up to which a fit is good: right fits of generated animals have up to
-# 0.03, those of people up to 0.01. What folds only when fits agree is no property of the shape: less of it is too much.
-_FOLDED, _FOLDED_SINCE = 0.05, 0.01
-# A residual (units of sqrt(area)) from which on a fit may be one of a part, and the search for parts goes on. Set by hand.
-FAIR_RESIDUAL = 0.031
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerdictLimits:
+    """Between good, fair and poor. Set by hand, apart from the trust, which is a probability.
+
+    Attributes
+    ----------
+    good_trust, fair_trust : trust from which on a fit is good, and fair: more likely right than wrong
+    uninformative_trust : upper bound where the residual is uninformative
+    good_share : share (0..1) of shape or template without counterpart up to which a fit is good
+    fair_share : share of the template up to which it is fair
+    hidden : share of the template: a part that shows less than the rest, such as a leg, is not enough to judge
+    crushed, flat : stretch of the template from which on no fit is good, and from which on it is poor
+    folded : share of the template's vertices that are folded, up to which a fit is good: right fits of generated animals
+        have up to 0.03, those of people up to 0.01
+    folded_by_agreement : the same for vertices that fold only when fits agree, which is no property of the shape
+    search_parts : residual (units of sqrt(area)) from which on a fit may be one of a part
+    residual, discontinuous, flipped, spread : what is above, is given as a reason
+    """
+
+    good_trust: float = 0.99
+    fair_trust: float = 0.5
+    uninformative_trust: float = 0.5
+    good_share: float = 0.02
+    fair_share: float = 0.06
+    hidden: float = 0.6
+    crushed: float = 1.0
+    flat: float = 2.0
+    folded: float = 0.05
+    folded_by_agreement: float = 0.01
+    search_parts: float = 0.031
+    residual: float = 0.0285
+    discontinuous: float = 0.02
+    flipped: float = 0.1
+    spread: float = 0.06
+
+
+LIMITS = VerdictLimits()
 
 
 @dataclass(frozen=True)
@@ -95,24 +121,24 @@ def judge(features: FitFeatures) -> Judgement:
         lost = f"{100 * features.hidden:.0f} % of the template has no counterpart"
         reasons.append(Reason("part", f"taken for a part: {lost}"))
     if (
-        trust < FAIR_TRUST
-        or features.uncovered_template > _FAIR_SHARE
-        or features.hidden > _HIDDEN
-        or features.stretch > _FLAT
+        trust < LIMITS.fair_trust
+        or features.uncovered_template > LIMITS.fair_share
+        or features.hidden > LIMITS.hidden
+        or features.stretch > LIMITS.flat
     ):
         verdict: Verdict = "poor"
     elif (
-        trust < GOOD_TRUST
+        trust < LIMITS.good_trust
         or features.partial
-        or lacking > _GOOD_SHARE
-        or features.stretch > _CRUSHED
-        or features.inverted > _FOLDED
+        or lacking > LIMITS.good_share
+        or features.stretch > LIMITS.crushed
+        or features.inverted > LIMITS.folded
     ):
         verdict = "fair"
     else:
         return Judgement("good", (), features)
-    if trust < GOOD_TRUST and not reasons:
-        likely = f"{int(100 * trust)} % likely to be right, where a good fit needs {100 * GOOD_TRUST:.0f} %"
+    if trust < LIMITS.good_trust and not reasons:
+        likely = f"{int(100 * trust)} % likely to be right, where a good fit needs {100 * LIMITS.good_trust:.0f} %"
         reasons.append(Reason("doubt", likely))
     return Judgement(verdict, tuple(reasons), features)
 
@@ -127,18 +153,18 @@ def _reasons(features: FitFeatures) -> list[Reason]:
         f"what the network predicts for tilted and mirrored copies is {100 * features.spread:.0f} % of sqrt(area) off"
     )
     told: list[tuple[bool, ReasonCode, str]] = [
-        (features.residual > 0.0285, "residual", _gap(features.residual)),
-        (features.uncovered_shape > _GOOD_SHARE, "unreached", unreached),
-        (features.uncovered_template > _GOOD_SHARE, "empty", empty),
+        (features.residual > LIMITS.residual, "residual", _gap(features.residual)),
+        (features.uncovered_shape > LIMITS.good_share, "unreached", unreached),
+        (features.uncovered_template > LIMITS.good_share, "empty", empty),
         (
-            features.discontinuous > 0.02,
+            features.discontinuous > LIMITS.discontinuous,
             "torn",
             f"{100 * features.discontinuous:.0f} % of neighbours on the shape belong far apart",
         ),
-        (features.stretch > _CRUSHED, "crushed", crushed),
-        (features.inverted > _FOLDED, "folded", _folds(features.inverted)),
-        (features.flipped > 0.1, "facing", facing),
-        (features.spread > 0.06, "unsure", unsure),
+        (features.stretch > LIMITS.crushed, "crushed", crushed),
+        (features.inverted > LIMITS.folded, "folded", _folds(features.inverted)),
+        (features.flipped > LIMITS.flipped, "facing", facing),
+        (features.spread > LIMITS.spread, "unsure", unsure),
     ]
     return [Reason(code, words) for speaks, code, words in told if speaks]
 
@@ -155,6 +181,6 @@ def _folds(inverted: float) -> str:
 def folded_by_agreement(before: Regularity | None, after: Regularity) -> Reason | None:
     """Why a fit is no longer good whose deformation folds more than right ones do, or clearly more than before."""
     folded = 0.0 if before is None else before.inverted
-    if after.inverted <= min(_FOLDED, folded + _FOLDED_SINCE):
+    if after.inverted <= min(LIMITS.folded, folded + LIMITS.folded_by_agreement):
         return None
     return Reason("folded", _folds(after.inverted))

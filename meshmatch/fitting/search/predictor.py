@@ -32,8 +32,8 @@ _PREDICT_POINTS = 2048  # it sees of other samples
 _SPREAD_READINGS, _SPREAD_SEED = 6, 5  # tilts by which it is found out how sure the network is
 _SPREAD_TILT = 15.0  # degrees, see `Predictor.variants`
 USUAL_SPREAD = 0.03  # of fits that no network predicts (units of sqrt(area)), see `Predictor.spread`
-# Further (units of sqrt(area)) its readings of the resting template lie from it only if it has not learned to read tilted
-# shapes; models that ship have 0.008 at most.
+# If predictions for tilted copies of the resting template deviate more than this (units of sqrt(area)), the network was not
+# trained on tilted input, and `spread` is ignored; models that ship have 0.008 at most.
 _READS_ALIKE = 0.02
 _BATCH = 24  # clouds that it is asked about together: more save nothing, and take memory
 # Residual that a share of 0 has to be better by than one of 1: rather the whole than a part. Set by hand.
