@@ -30,6 +30,10 @@ ROOMS = (
     *("maps", "implicit", "transfer", "render", "api", "collections", "cli", "__main__", "experiments"),
 )
 
+# The floors of `fitting`, from the ground up: settings and progress of a fit, what is solved, what is searched, what is
+# judged, and the result. What is not named here composes them, and stands above.
+FITTING = ("fit_config", "solve", "search", "judge", "fit")
+
 # Which rooms know which third-party library.
 OWNERS = {
     "PIL": {"shapes", "maps", "transfer", "render", "experiments"},
@@ -146,6 +150,18 @@ def downward(room: str, tree: ast.Module) -> list[str]:
     return bad
 
 
+def floor_of(module: str) -> int:
+    """Of a module of `fitting`."""
+    name = module.split(".")[2] if module.count(".") > 1 else ""
+    return FITTING.index(name) if name in FITTING else len(FITTING)
+
+
+def down_the_stairs(module: str, tree: ast.Module) -> list[str]:
+    """Imports of a module of `fitting` from a floor above its own."""
+    names = [name for name, _ in imports(tree) if name.startswith("meshmatch.fitting.")]
+    return [name for name in names if floor_of(name) > floor_of(module)]
+
+
 def third_party(tree: ast.Module) -> set[str]:
     names = {name.split(".")[0] for name, _ in imports(tree)}
     return names - set(sys.stdlib_module_names) - {"meshmatch", "numpy"}
@@ -246,6 +262,18 @@ def test_the_rule_sees_an_import_that_points_down() -> None:
     assert asked("fitting", "def f():\n    import meshmatch.maps.build") == ["meshmatch.maps.build"]
     assert asked("maps", "from meshmatch import api") == ["meshmatch.api"]
     assert asked("maps", "from meshmatch.fitting.fit import Fit") == []
+
+
+def test_a_fit_is_searched_solved_and_judged_in_one_direction() -> None:
+    rooms = {module: tree for module, tree in trees().items() if module.startswith("meshmatch.fitting.")}
+    assert {module.split(".")[2] for module in rooms} >= set(FITTING)
+    none(f"{module}: {bad}" for module, tree in rooms.items() for bad in down_the_stairs(module, tree))
+
+
+def test_the_rule_sees_a_search_that_judges() -> None:
+    tree = ast.parse("from meshmatch.fitting.judge.verdict import judge\nfrom meshmatch.fitting.solve.system import x")
+    assert down_the_stairs("meshmatch.fitting.search.task", tree) == ["meshmatch.fitting.judge.verdict.judge"]
+    assert down_the_stairs("meshmatch.fitting.fitter", tree) == []
 
 
 def test_no_module_imports_in_a_circle() -> None:

@@ -15,9 +15,10 @@ import numpy as np
 from meshmatch.api.inputs import usable
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.fitting.classify import classify
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.kind import BELONGS, FAMILIAR, STRANGE, SURE, kind_samples, read_kind, told
+from meshmatch.fitting.judge.category import BELONGS, FAMILIAR, STRANGE, SURE, category_residual, category_samples
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.parts import Parts, apart, tries, without_parts
@@ -86,7 +87,7 @@ def find_alone(
     else:
         for chosen in [int(k) for k in value.argsort(kind="stable")[:_MOST_FITS] if value[k] <= STRANGE]:
             model = models[int(found[:, chosen].argmin())]()
-            of_kind, fit = told(model, clean[chosen].shape, value[chosen], config, progress)
+            of_kind, fit = classify(model, clean[chosen].shape, value[chosen], config, progress)
             if of_kind and fit is not None and fit.trust >= BELONGS and not fit.partial:
                 break
         else:
@@ -111,12 +112,12 @@ def _listed(numbers: Sequence[int]) -> str:
 def _readings(
     models: Sequence[Loader], shapes: Sequence[Shape], config: FitConfig, order: Iterable[Sequence[int]]
 ) -> Float[Floats, "M S"]:
-    samples = beside(kind_samples, shapes, [config.seed] * len(shapes))
+    samples = beside(category_samples, shapes, [config.seed] * len(shapes))
     found = np.full((len(models), len(shapes)), np.inf)
 
     def reading(row: int, number: int) -> float:
         try:
-            return read_kind(models[row](), shapes[number], samples[number], config)
+            return category_residual(models[row](), shapes[number], samples[number], config)
         except OptionError:
             raise
         except MeshmatchError:  # a damaged model, or a shape that it cannot see

@@ -14,10 +14,11 @@ from meshmatch.api.apart import find_alone
 from meshmatch.api.inputs import as_model, refuse_far_parts
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, MeshmatchError, ModelError, OptionError
+from meshmatch.fitting.classify import classify
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import may_show_part
-from meshmatch.fitting.kind import FAMILIAR, KNOWN, SURE, kind_samples, read_kind, told
+from meshmatch.fitting.judge.category import FAMILIAR, KNOWN, SURE, category_residual, category_samples
 from meshmatch.models.card import ModelCard
 from meshmatch.models.registry import list_models
 from meshmatch.models.trained import TrainedModel
@@ -64,20 +65,20 @@ def _no_model() -> ModelError:
     return ModelError("no model is installed", "see `meshmatch models list`")
 
 
-def read_kinds(
+def category_residuals(
     models: Sequence[Installed], shapes: Sequence[Shape], configs: Sequence[FitConfig], sure: float = SURE
 ) -> Float[Floats, "M S"]:
-    """`read_kind` of repaired shapes by models; infinite where a model cannot see a shape, or was not asked.
+    """`category_residual` of repaired shapes by models; infinite where a model cannot see a shape, or was not asked.
 
     One shape decides first, if possible a whole one. The model of people, and the user's own, are asked about it, and the
     others where none of these is ``sure``: two at a time, animals first, until one is. Models of its kind are then asked
     about the other shapes, and the rest where they do not know them: but not about a part of something whose kind is known.
     """
-    samples = beside(kind_samples, shapes, [config.seed for config in configs])
+    samples = beside(category_samples, shapes, [config.seed for config in configs])
 
     def reading(model: Installed, number: int) -> float:
         try:
-            return read_kind(model.load(), shapes[number], samples[number], configs[number])
+            return category_residual(model.load(), shapes[number], samples[number], configs[number])
         except OptionError:  # a device that is not there: true of all models
             raise
         except MeshmatchError:  # also of a damaged model: `meshmatch models list` tells what is wrong with it
@@ -118,7 +119,7 @@ def _is_part(shape: Shape, config: FitConfig) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class Classification:
     """What is known of one shape: its kind, None where that cannot be told; the card of the model that reads it best; and
     the fit by it, with refined nodes, that had to tell, if any.
     """
@@ -157,19 +158,19 @@ def choose_model(
     if settled is not None and settled.card not in [model.card for model in models]:
         models.append(Installed.loaded(settled))
     shapes = [each.shape for each in clean]
-    readings = read_kinds(models, shapes, configs)
+    readings = category_residuals(models, shapes, configs)
     if np.isinf(readings).all():
         raise _no_model()
-    found = _told(models, readings, shapes, configs, progress)
+    found = _classified(models, readings, shapes, configs, progress)
     clean = list(clean)
-    tried = [told.kind is None or each.far_parts > 0 for told, each in zip(found, clean, strict=True)]
+    tried = [known.kind is None or each.far_parts > 0 for known, each in zip(found, clean, strict=True)]
     for number in np.flatnonzero(tried).tolist():
         config = configs[number]
         loaders, whole = [model.load for model in models], clean[number].original
         if (alone := find_alone(loaders, whole, config, _order(models), progress)) is not None:
             card = models[alone.row].card
             clean[number], readings[:, number] = alone.clean, alone.readings
-            found[number] = Told(card.category, card, alone.fit)
+            found[number] = Classification(card.category, card, alone.fit)
         refuse_far_parts(clean[number])
     shapes = [each.shape for each in clean]
     _refuse_unknown(models, found, shapes, configs)
@@ -202,44 +203,44 @@ def _unsure(shape: Shape, taken: str) -> str:
     return f"{why}: taken for {taken}; {hint}"
 
 
-def tell_kinds(
+def classify_shapes(
     models: Sequence[Installed],
     readings: Float[Floats, "M S"],
     shapes: Sequence[Shape],
     configs: Sequence[FitConfig],
     progress: ProgressCallback | None = None,
-) -> list[Told]:
-    """What the readings, and fits of those that read strangely, tell of each shape (`meshmatch.fitting.kind.told`).
+) -> list[Classification]:
+    """What the readings, and fits of those that read strangely, tell of each shape (`meshmatch.fitting.classify`).
 
     `InputError` for a complete mesh that is not of the kind that reads it best.
     """
-    found = _told(models, readings, shapes, configs, progress)
+    found = _classified(models, readings, shapes, configs, progress)
     _refuse_unknown(models, found, shapes, configs)
     return found
 
 
-def _told(
+def _classified(
     models: Sequence[Installed],
     readings: Float[Floats, "M S"],
     shapes: Sequence[Shape],
     configs: Sequence[FitConfig],
     progress: ProgressCallback | None,
-) -> list[Told]:
-    def tell(shape: Shape, config: FitConfig, column: Float[Floats, " M"]) -> Told:
+) -> list[Classification]:
+    def tell(shape: Shape, config: FitConfig, column: Float[Floats, " M"]) -> Classification:
         best = models[row := int(column.argmin())]
         kind = best.card.category
         if np.isinf(column[row]):
-            return Told(None, best.card)
+            return Classification(None, best.card)
         if _is_part(shape, config):  # whose fit would tell nothing that the reading does not
-            return Told(kind if column[row] <= KNOWN else None, best.card)
-        known, fit = told(best.load(), shape, column[row], config, progress)
-        return Told(kind if known else None, best.card, fit)
+            return Classification(kind if column[row] <= KNOWN else None, best.card)
+        known, fit = classify(best.load(), shape, column[row], config, progress)
+        return Classification(kind if known else None, best.card, fit)
 
     return beside(tell, shapes, configs, readings.T)
 
 
 def _refuse_unknown(
-    models: Sequence[Installed], found: Sequence[Told], shapes: Sequence[Shape], configs: Sequence[FitConfig]
+    models: Sequence[Installed], found: Sequence[Classification], shapes: Sequence[Shape], configs: Sequence[FitConfig]
 ) -> None:
     for shape, config, each in zip(shapes, configs, found, strict=True):
         if each.kind is None and not shape.is_cloud and not may_show_part(shape, config):
@@ -252,10 +253,10 @@ def other_kind(model: TrainedModel, shape: Shape, config: FitConfig) -> str | No
     """The kind that a repaired shape is of by the installed models, if that is another one than the model's."""
     try:
         models = installed_models()
-        readings = read_kinds(models, [shape], [config])
+        readings = category_residuals(models, [shape], [config])
         if models[int(readings.argmin())].card.category == model.card.category:
             return None
-        return tell_kinds(models, readings, [shape], [config])[0].kind
+        return classify_shapes(models, readings, [shape], [config])[0].kind
     except (InputError, ModelError):
         return None
 
@@ -275,7 +276,7 @@ def kinds_of(
     found: dict[str, str | None] = {}
     for number, name in enumerate(read):
         try:
-            readings = read_kinds(models, [repair(load_shape(files[name])).shape], [config])[:, 0]
+            readings = category_residuals(models, [repair(load_shape(files[name])).shape], [config])[:, 0]
         except InputError:  # of no use to any model
             readings = np.full(len(models), np.inf)
         best = int(readings.argmin())

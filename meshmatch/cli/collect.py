@@ -58,7 +58,7 @@ def fit(
     shape.
     """
     from meshmatch.collections.setting import FAILED
-    from meshmatch.fitting.viscous import NO_MODEL
+    from meshmatch.fitting.without_model import NO_MODEL
 
     how.check()
     if how.model != NO_MODEL:

@@ -28,7 +28,7 @@ from meshmatch.collections.workers import hired
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.viscous import NO_MODEL
+from meshmatch.fitting.without_model import NO_MODEL
 from meshmatch.maps.build import build_map
 from meshmatch.maps.files import check_suffix
 from meshmatch.maps.places import Places

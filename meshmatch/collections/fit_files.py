@@ -17,8 +17,9 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from meshmatch.errors import InputError, ModelError
-from meshmatch.fitting.fit import Fit, Reason
-from meshmatch.fitting.regularity import Regularity
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.judge.reasons import Reason
+from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.places import Places

@@ -17,7 +17,8 @@ from meshmatch.collections.setting import FIRST, TEMPLATE, Setting, Source
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.viscous import NO_MODEL, ViscousConfig, template_of
+from meshmatch.fitting.solve.viscous import ViscousConfig
+from meshmatch.fitting.without_model import NO_MODEL, template_of
 from meshmatch.geometry.frames import kabsch
 from meshmatch.models.registry import AUTO
 from meshmatch.outputs import replace_on_success

@@ -21,11 +21,11 @@ from meshmatch.collections.fit_files import StoredFit, load_words, regularity_of
 from meshmatch.collections.setting import AGREEING, ALONE, FITS, SUFFIX, Record, Setting, Source, digest_of
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError
-from meshmatch.fitting.agree import AgreeConfig, Member, agree_step, log_stretch, member_of
-from meshmatch.fitting.regularity import Regularity
-from meshmatch.fitting.system import node_system
-from meshmatch.fitting.verdict import with_vectors
-from meshmatch.fitting.viscous import NO_MODEL
+from meshmatch.fitting.agree import member_of, with_vectors
+from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree_step, log_stretch
+from meshmatch.fitting.solve.regularity import Regularity
+from meshmatch.fitting.solve.system import node_system
+from meshmatch.fitting.without_model import NO_MODEL
 from meshmatch.maps.places import Places
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.input_files import read_npy
@@ -156,11 +156,10 @@ def agree_a_little(task: AgreeTask) -> Float[Floats, "G 3 3"]:
         now = after(task.step)
     elif task.step > 0:
         common = load_array(store, common_file(group.agreement, task.step))
-        nodes = setting.config.for_model(setting.trained).nodes
         starts = _starts(members, before, after(max(task.step - 2, 0)))
         gradients = [system.deformation_gradient(start) for start in starts]
         steps = zip(members, starts, gradients, strict=True)
-        now = np.array([agree_step(system, nodes, *each, common) for each in steps])
+        now = np.array([agree_step(system, *each, common) for each in steps])
         save_array(store, group.file(task.step), now)
     gradients = [system.deformation_gradient(start) for start in _starts(members, now, before)]
     return np.sum([log_stretch(F) for F in gradients], axis=0)
@@ -170,7 +169,13 @@ def _member(read: StoredFit, how: AgreeConfig) -> Member:
     roughness = read.words.get("roughness")
     if read.samples is None or type(roughness) is not float:
         raise InputError("a fit that should agree has no samples", "remove the folder of fits, and make it again")
-    return Member(read.samples, read.fit.vectors, how.for_noise(roughness), None, read.fit.partial)
+    return Member(
+        samples=read.samples,
+        vectors=read.fit.vectors,
+        config=how.for_noise(roughness),
+        landmarks=None,
+        partial=read.fit.partial,
+    )
 
 
 def _starts(members: Sequence[Member], now: Floats, before: Floats) -> list[Floats]:

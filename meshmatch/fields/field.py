@@ -59,10 +59,10 @@ class Field:
         kind = torch.promote_types(rows.dtype, torch.float32)
         return columns.transpose(-1, -2) + torch.eye(3, dtype=kind, device=rows.device)
 
-    def for_training(self, strained: int | None = None) -> Field:
-        """The same arranged for large batches; the gradient on the first ``strained`` points alone."""
+    def for_training(self, gradients: int | None = None) -> Field:
+        """The same arranged for large batches; the gradient at the first ``gradients`` points alone."""
         # Dense, for a large batch is one product: a sparse one would be slower.
-        rows = None if strained is None else 3 * strained
+        rows = None if gradients is None else 3 * gradients
         return Field(self.phi.to_dense(), self.gradient.to_dense()[:rows])
 
     def for_descent(self) -> Field:
@@ -180,10 +180,10 @@ def turned_rows(rows: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float
 
 @dataclass(frozen=True, eq=False)
 class PointwiseField:
-    """A network's motion on fixed points, with gradients on ``strained``; codes have D numbers."""
+    """A network's motion on fixed points, with gradients at ``gradient_points``; codes have D numbers."""
 
     points: Float[torch.Tensor, "P 3"]
-    strained: Float[torch.Tensor, "G 3"]
+    gradient_points: Float[torch.Tensor, "G 3"]
     motion: Motion
     D: int
 
@@ -194,7 +194,7 @@ class PointwiseField:
 
     def deformation_gradient(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B G 3 3"]:
         code, turn = unpack(rows, self.D)
-        F = value_and_jacobian(self.motion, self.strained.expand(len(code), -1, -1), code)[1]
+        F = value_and_jacobian(self.motion, self.gradient_points.expand(len(code), -1, -1), code)[1]
         F = F + torch.eye(3, dtype=F.dtype, device=F.device)
         return F + turn.transpose(1, 2)[:, None] @ F
 
@@ -202,7 +202,9 @@ class PointwiseField:
         with torch.no_grad():
             return self.displacement(torch.from_numpy(np.array(rows)).float()[None])[0].double().numpy()
 
-    def strain(self, rows: Float[Floats, "R 3"], at: Int[Ints, " N"] | slice = slice(None)) -> Float[Floats, "N 3 3"]:
+    def deformation_gradient_at(
+        self, rows: Float[Floats, "R 3"], at: Int[Ints, " N"] | slice = slice(None)
+    ) -> Float[Floats, "N 3 3"]:
         """F of one answer at some of the points, in float64."""
         index = at if isinstance(at, slice) else torch.from_numpy(at)
         part = PointwiseField(self.points, self.points[index], self.motion, self.D)
@@ -210,8 +212,8 @@ class PointwiseField:
             given = torch.from_numpy(np.array(rows)).float()[None]
             return part.deformation_gradient(given)[0].double().numpy()
 
-    def for_training(self, strained: int | None = None) -> PointwiseField:
-        return PointwiseField(self.points, self.points[:strained], self.motion, self.D)
+    def for_training(self, gradients: int | None = None) -> PointwiseField:
+        return PointwiseField(self.points, self.points[:gradients], self.motion, self.D)
 
     def for_descent(self) -> PointwiseField:
         return self
@@ -222,8 +224,8 @@ class PointwiseField:
 
     def to(self, *args, **kwargs) -> PointwiseField:
         """Where the points are; the network is moved by whoever owns it."""
-        points, strained = (each.to(*args, **kwargs) for each in (self.points, self.strained))
-        return PointwiseField(points, strained, self.motion, self.D)
+        points, gradient_points = (each.to(*args, **kwargs) for each in (self.points, self.gradient_points))
+        return PointwiseField(points, gradient_points, self.motion, self.D)
 
 
 def value_and_jacobian(

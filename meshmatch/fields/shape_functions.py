@@ -59,17 +59,17 @@ class ShapeFunctions:
     """
 
     phi: Any
-    slopes: Any  # the gradient, or a function that gives its rows at some points
+    gradient_rows: Any  # the gradient, or a function that gives its rows at some points
 
     @cached_property
     def gradient(self) -> Any:
-        return self.slopes(np.arange(self.phi.shape[0])) if callable(self.slopes) else self.slopes
+        return self.gradient_rows(np.arange(self.phi.shape[0])) if callable(self.gradient_rows) else self.gradient_rows
 
     def gradient_at(self, at: Int[Ints, " N"]) -> Any:
         """The rows (3 N, K) of ``gradient`` at some of the points: of moving least squares, no others are computed."""
-        if callable(self.slopes):
-            return self.slopes(at)
-        return self.slopes[(3 * at[:, None] + np.arange(3)).reshape(-1)]
+        if callable(self.gradient_rows):
+            return self.gradient_rows(at)
+        return self.gradient_rows[(3 * at[:, None] + np.arange(3)).reshape(-1)]
 
     @property
     def K(self) -> int:
@@ -79,10 +79,12 @@ class ShapeFunctions:
         """Displacement of the points by node vectors, in float64."""
         return np.asarray(self.phi.astype(np.float64) @ rows)
 
-    def strain(self, rows: Float[Floats, "K 3"], at: Int[Ints, " N"] | slice = slice(None)) -> Float[Floats, "N 3 3"]:
+    def deformation_gradient_at(
+        self, rows: Float[Floats, "K 3"], at: Int[Ints, " N"] | slice = slice(None)
+    ) -> Float[Floats, "N 3 3"]:
         """F = I + sum_i u_i (grad Phi_i)^T at some of the points, F[..., a, k] = dx'_a / dx_k, in float64."""
-        slopes = np.asarray(self.gradient.astype(np.float64) @ rows).reshape(-1, 3, 3)
-        return slopes.transpose(0, 2, 1)[at] + np.eye(3)
+        rates = np.asarray(self.gradient.astype(np.float64) @ rows).reshape(-1, 3, 3)
+        return rates.transpose(0, 2, 1)[at] + np.eye(3)
 
 
 def shape_functions(
@@ -122,7 +124,7 @@ def build_field(points: ArrayLike, nodes: ArrayLike, radius: ArrayLike, kernel: 
     phi = (fit.weight * fit.along).astype(np.float32)
     _tell_amplification(np.bincount(fit.at, np.abs(phi), len(points)).astype(np.float64))
     values = csr_matrix((phi, (fit.at, fit.of_node)), (len(points), len(nodes)))
-    return ShapeFunctions(values, lambda some: _slopes(points[some], nodes, radii, kernel))
+    return ShapeFunctions(values, lambda some: _gradient(points[some], nodes, radii, kernel))
 
 
 def _positions(values: ArrayLike, what: str) -> Float[Floats, "N 3"]:
@@ -174,7 +176,7 @@ def _outer(basis: Float[Floats, "N 4"]) -> Float[Floats, "N 16"]:
     return (basis[:, :, None] * basis[:, None, :]).reshape(-1, 16)
 
 
-def _slopes(
+def _gradient(
     points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radii: Float[Floats, " K"], kernel: Kernel
 ) -> Any:
     """The gradient of moving least squares (3 P, K)."""

@@ -1,12 +1,6 @@
 """A curve through several fits of one template and beyond them, and how far its poses are from what they should be.
 
-What the field does at every point is blended, limbs turn and keep their size. Blending node vectors would move every point
-along a straight line, and a turning arm would shrink on its way. Here the deformation gradient of each fit is split into
-a rotation and a stretch (polar decomposition). Stretches are blended by their logarithms. Rotations are taken from
-neighbour to neighbour, along a spanning tree of the surface that prefers neighbours which turn alike: a forearm turns
-about its elbow and the elbow goes where the upper arm takes it. Then follow the node vectors that fit the blended
-gradients best (least squares), and a few rounds in which every point may choose its own rotation anew (local and global
-steps of Sorkine and Alexa, 2007).
+What the field does at every point is blended (`meshmatch.fitting.solve.blend`), or the codes that the network has.
 """
 
 from __future__ import annotations
@@ -17,17 +11,14 @@ from typing import Literal, get_args
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.sparse import coo_matrix, csr_matrix
-from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.nodes import nearest_rotations
-from meshmatch.fitting.system import NodeSystem, node_system
-from meshmatch.fitting.task import take_samples
+from meshmatch.fitting.search.task import take_samples
+from meshmatch.fitting.solve.blend import FieldPath, RotationBlend, StretchBlend, polar
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
@@ -38,12 +29,6 @@ WAYS: tuple[Way, ...] = get_args(Way)
 _SAMPLES = 2048  # of which a shape's code is read
 # From the weights of the n key shapes to node vectors.
 Path = Callable[[Float[Floats, " n"]], Float[Floats, "K 3"]]
-
-_MIN_STRETCH = 1e-3  # smaller ones count as this: a logarithm must stay finite
-_MAX_LOG = 5.0  # a stretch of 150, which only a far extrapolation reaches
-_ROUNDS = 3  # of local and global steps; their damping, and before it that of the first solve. Set by hand.
-_DAMPING_FIRST, _DAMPING = 1e-7, 1e-4
-_MIN_COST = 1e-6  # of an edge over which rotations do not change: a graph drops edges of cost 0
 
 
 @dataclass(frozen=True)
@@ -119,7 +104,7 @@ class Blend:
         beside = verts[cKDTree(verts).query(model.template.nodes)[1]]
         self._node_field = model.field(beside) if way == "codes" and model.has_nodes else None
         if self._node_field is not None:
-            turns = np.stack([polar(self._node_field.strain(vectors))[0] for vectors in met])
+            turns = np.stack([polar(self._node_field.deformation_gradient_at(vectors))[0] for vectors in met])
             self._correction = np.einsum("nkij,nki->nkj", turns, self._correction)
         self._turns = RotationBlend([fit.frame.turn[None] for fit in fits])
         self._scales = np.array([fit.frame.scale for fit in fits])
@@ -141,7 +126,7 @@ class Blend:
             return self._keys[weights.argmax()]
         there, correction = self._path(weights), np.tensordot(weights, self._correction, 1)
         if self._node_field is not None:
-            correction = np.einsum("kij,kj->ki", polar(self._node_field.strain(there))[0], correction)
+            correction = np.einsum("kij,kj->ki", polar(self._node_field.deformation_gradient_at(there))[0], correction)
         return there + correction
 
     def points(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3"]:
@@ -150,7 +135,7 @@ class Blend:
 
     def turns(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3 3"]:
         """Rotations by which the field of a pose turns each template vertex."""
-        return polar(self._system.field.strain(vectors))[0]
+        return polar(self._system.field.deformation_gradient_at(vectors))[0]
 
     def frame(self, time: float) -> Frame:
         """Between the frames of the fits: it turns, moves and grows from one to the next."""
@@ -180,140 +165,3 @@ def _code_path(model: TrainedModel, shapes: Sequence[Shape], fits: Sequence[Fit]
         frame, samples = take_samples(shape, _SAMPLES, np.random.default_rng(fit.seed))
         codes.append(network.encode(fit.frame.apply(frame.undo(samples.points))))
     return lambda weights: network.decode(weights @ np.stack(codes))
-
-
-class RotationBlend:
-    """Weighted means of N rotations in each of several keys; exact at the keys.
-
-    In the tangent space at the mean of the keys: for two keys that is the shortest turn from one to the other at
-    constant speed. The order of the keys, each (N, 3, 3), does not matter.
-    """
-
-    def __init__(self, keys: Sequence[Floats]) -> None:
-        quaternions = np.stack([Rotation.from_matrix(key).as_quat() for key in keys])  # n N 4
-        # A quaternion and its negative are one rotation; their outer products are the same.
-        outer = np.einsum("kni,knj->nij", quaternions, quaternions)
-        self._mean = Rotation.from_quat(np.linalg.eigh(outer)[1][:, :, -1])
-        back = self._mean.inv()
-        self._logs = np.stack([(back * Rotation.from_matrix(key)).as_rotvec() for key in keys])
-
-    def at(self, weights: Float[Floats, " n"]) -> Float[Floats, "N 3 3"]:
-        """Rotations for weights that sum to one."""
-        return (self._mean * Rotation.from_rotvec(np.tensordot(weights, self._logs, 1))).as_matrix()
-
-
-class StretchBlend:
-    """Weighted means of symmetric stretches, given by their logarithms (N, 3, 3)."""
-
-    def __init__(self, keys: Sequence[Floats]) -> None:
-        self._logs = np.stack(keys)
-
-    def at(self, weights: Float[Floats, " n"]) -> Float[Floats, "N 3 3"]:
-        """Stretches for weights that sum to one."""
-        values, axes = np.linalg.eigh(np.tensordot(weights, self._logs, 1))
-        return (axes * np.exp(np.clip(values, -_MAX_LOG, _MAX_LOG))[:, None, :]) @ axes.transpose(0, 2, 1)
-
-
-def polar(F: Float[Floats, "N 3 3"]) -> tuple[Float[Floats, "N 3 3"], Float[Floats, "N 3 3"]]:
-    """Polar decomposition F = R S: the rotations R nearest to F, and the logarithms of the stretches S.
-
-    Where F turns space inside out the smallest stretch would be negative; it counts as a very small one.
-    """
-    U, sizes, Vh = np.linalg.svd(F)
-    flip = np.where(np.linalg.det(U @ Vh) < 0, -1.0, 1.0)
-    U[:, :, 2] *= flip[:, None]
-    sizes[:, 2] *= flip
-    logs = np.log(np.maximum(sizes, _MIN_STRETCH))
-    return U @ Vh, (Vh.transpose(0, 2, 1) * logs[:, None, :]) @ Vh
-
-
-class FieldPath:
-    """The poses between several fits of one template, by what the field does at its strain points.
-
-    Keys are node vectors (K, 3) of the fits, each in its core frame; vertices of the core stay in the middle.
-    """
-
-    def __init__(self, system: NodeSystem, keys: Sequence[Floats], core: Int[Ints, " C"]) -> None:
-        self._system, self._keys = system, np.stack(keys)
-        parts = [polar(system.deformation_gradient(key)) for key in keys]
-        rotations = [rotation for rotation, _ in parts]
-        self.stretches = StretchBlend([logs for _, logs in parts])
-        self._parent, self._levels = _spanning_order(system, rotations, core)
-        child = np.flatnonzero(self._parent >= 0)
-        relative = [rotation.copy() for rotation in rotations]  # to that of each point's parent; of roots as they are
-        for own, whole in zip(relative, rotations, strict=True):
-            own[child] = whole[self._parent[child]].transpose(0, 2, 1) @ whole[child]
-        self._joints = RotationBlend(relative)
-        self._core = np.asarray(system.phi[core].mean(0)).ravel()  # of the node vectors: how the core moves
-        V = len(system.verts)
-        self._free = np.zeros((V, 6)), np.zeros((V, 3))
-
-    def __call__(self, weights: Float[Floats, " n"]) -> Float[Floats, "K 3"]:
-        """Node vectors for weights of the keys that sum to one."""
-        stretch = self.stretches.at(weights)
-        straight = np.tensordot(weights, self._keys, 1)
-        turned = self._joints.at(weights)
-        for level in self._levels:
-            turned[level] = turned[self._parent[level]] @ turned[level]
-        vectors = self._solve(turned @ stretch, _DAMPING_FIRST, straight, straight)
-        for _ in range(_ROUNDS):
-            own = nearest_rotations(self._system.deformation_gradient(vectors), stretch)
-            vectors = self._solve(own @ stretch, _DAMPING, vectors, straight)
-        return vectors
-
-    def _solve(
-        self,
-        targets: Float[Floats, "G 3 3"],
-        damping: float,
-        near: Float[Floats, "K 3"],
-        straight: Float[Floats, "K 3"],
-    ) -> Float[Floats, "K 3"]:
-        """Node vectors with the gradients asked for; the core goes where it goes on the straight way."""
-        system = self._system
-        vectors = system.solve(*self._free, 1.0 / len(targets), targets, damping / system.K, near)
-        return vectors + self._core @ (straight - vectors)
-
-
-def _spanning_order(
-    system: NodeSystem, rotations: Sequence[Floats], core: Int[Ints, " C"]
-) -> tuple[Int[Ints, " G"], list[Ints]]:
-    """Parents (G,) of the strain points, -1 for roots, and the other points level by level below their roots.
-
-    One tree for each connected part, along the edges over which the rotations change least. Its root is the point
-    nearest to the middle of the core.
-    """
-    at = system.verts[system.strain_points]
-    G = len(at)
-    a, b = _neighbours(system)
-    jump = np.full(len(a), _MIN_COST)
-    for R in rotations:
-        jump += np.linalg.norm(R[a] - R[b], axis=(1, 2))
-    tree = minimum_spanning_tree(coo_matrix((jump, (a, b)), (G, G)).tocsr())
-    part = connected_components(tree, directed=False)[1]
-    away = np.linalg.norm(at - system.verts[core].mean(0), axis=1)
-    parent, depth = np.full(G, -1), np.zeros(G, int)
-    for number in range(part.max() + 1):
-        members = np.flatnonzero(part == number)
-        order, before = breadth_first_order(tree, members[away[members].argmin()], directed=False)
-        for point in order[1:]:
-            parent[point] = before[point]
-            depth[point] = depth[before[point]] + 1
-    by_depth = np.argsort(depth, kind="stable")
-    levels = np.split(by_depth, np.cumsum(np.bincount(depth))[:-1])
-    return parent, levels[1:]
-
-
-def _neighbours(system: NodeSystem) -> tuple[Ints, Ints]:
-    """Pairs (a < b) of strain points whose regions of the surface touch."""
-    V, G = len(system.verts), len(system.strain_points)
-    edges = np.concatenate([system.faces[:, [0, 1]], system.faces[:, [1, 2]], system.faces[:, [2, 0]]])
-    length = np.linalg.norm(system.verts[edges[:, 0]] - system.verts[edges[:, 1]], axis=1)
-    graph = csr_matrix((np.maximum(length, 1e-12), (edges[:, 0], edges[:, 1])), (V, V))
-    found = dijkstra(graph, directed=False, indices=system.strain_points, min_only=True, return_predecessors=True)
-    number = np.full(V + 1, -1)
-    number[system.strain_points] = np.arange(G)
-    region = number[np.where(found[2] < 0, V, found[2])]  # the nearest strain point along the surface, -1 out of reach
-    pairs = region[edges]
-    pairs = np.sort(pairs[(pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])], axis=1)
-    code = np.unique(pairs[:, 0] * G + pairs[:, 1])
-    return code // G, code % G

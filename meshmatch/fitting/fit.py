@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints, Pickled
 from meshmatch.errors import OptionError
-from meshmatch.fitting.regularity import Regularity
+from meshmatch.fitting.judge.reasons import Reason, Verdict
+from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.quick_scipy import cKDTree
 from meshmatch.shapes.repair import Repaired
@@ -19,49 +20,11 @@ from meshmatch.shapes.shape import Shape
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
-    from meshmatch.fitting.signs import Signs
+    from meshmatch.fitting.judge.features import FitFeatures
     from meshmatch.models.trained import TrainedModel
 
-Verdict = Literal["good", "fair", "poor"]
-ReasonCode = Literal[
-    "residual",
-    "unreached",
-    "empty",
-    "torn",
-    "crushed",
-    "folded",
-    "pieces",
-    "uncut",
-    "bent",
-    "facing",
-    "unsure",
-    "doubt",
-    "part",
-    "side",
-    "unsupervised",
-]
-"""Template and shape stay apart; some of the shape is not reached; template lies where the shape has no surface;
-neighbours belong far apart; the template is stretched or compressed; it is folded, or inside out, in places; pieces of a
-part lie beside it; a part ends where the shape has no edge; a knee bends forward; the shape faces the other way; the network
-predicts other points for tilted and mirrored copies of the shape; no sign alone, but all together; it was taken for a part;
-its mirror image fits as well; the model was learned without correspondence."""
 
-
-class Reason(str):
-    """Why a verdict is not good: a sentence to print, with a ``code`` to branch on."""
-
-    code: ReasonCode
-
-    def __new__(cls, code: ReasonCode, sentence: str) -> Reason:
-        reason = super().__new__(cls, sentence)
-        reason.code = code
-        return reason
-
-    def __reduce__(self) -> tuple[type[Reason], tuple[str, str]]:
-        return Reason, (self.code, str(self))
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Fit(Pickled):
     """A template fitted to one shape.
 
@@ -139,7 +102,7 @@ class Fit(Pickled):
     notes: tuple[str, ...] = ()
     model: str = ""
     trust: float = 1.0
-    signs: Signs | None = None
+    signs: FitFeatures | None = None
     left_out: tuple[int, ...] = ()
     regularity: Regularity | None = None
 

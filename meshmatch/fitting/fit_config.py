@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from meshmatch.shapes.normalise import Mirroring
 
 Refine = Literal["none", "latent", "nodes"]
-"""How a fit is refined, see `meshmatch.fitting.refinement.REFINEMENTS`."""
+"""How a fit is refined, see `meshmatch.fitting.search.refinement.REFINEMENTS`."""
 Partial = Literal["auto", "yes", "no"]
 """Whether a shape may be a part of a whole, such as a scan from one side."""
 ON_NODES: tuple[Refine, ...] = ("nodes",)
@@ -30,26 +30,73 @@ _LEAST = {"seed": 0, "variants": 0, "screening": 0} | dict.fromkeys(
 )
 
 
-@dataclass(frozen=True)
-class NodeRefineConfig:
-    """Schedule and weights of the node refinement; lengths in units of sqrt(area). Set by hand."""
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """How the weights of a least-squares fit change from its first step to its last; lengths in units of sqrt(area).
 
-    steps: int = 10
-    strain_first: float = 0.003  # weight of the prior in the first step
-    strain_last: float = 0.0001  # and in the last; it falls geometrically between them
-    scale_first: float = 0.1  # the same of the scale of the robust weight
-    scale_last: float = 0.03
+    Attributes
+    ----------
+    steps : how many linear systems are solved
+    prior : weight of the prior in the first step and in the last, geometric in between
+    scale : the same for the scale of the robust weight
+    damping : weight of the present node vectors, for those that nothing else holds
+    momentum : how far each step continues along the last one
+    """
+
+    steps: int
+    prior: tuple[float, float]
+    scale: tuple[float, float] = (1.0, 1.0)
+    damping: float = 1e-4
+    momentum: float = 0.0
+
+    def prior_at(self, step: int) -> float:
+        """Weight of the prior in a step, counted from 0."""
+        return geometric_between(*self.prior, self._share(step))
+
+    def scale_at(self, step: int) -> float:
+        """Scale of the robust weight in a step, counted from 0."""
+        return geometric_between(*self.scale, self._share(step))
+
+    def _share(self, step: int) -> float:
+        return step / max(self.steps - 1, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pairing:
+    """How template vertices and samples are paired; lengths in units of sqrt(area). Set by hand."""
+
     point_share: float = 0.3  # how much a pair pulls along the surface, against 1 across it
     # How far a normal that points the other way (2 units) pushes a neighbour away: little, for sheets are apart by then, and
     # a normal that bends a little more must not drag its point along the surface.
     pair_normals: float = 0.06
     normal_cosine: float = 0.2  # pairs whose normals differ more do not count
     back_points: int = 4000  # about how many samples look for their template vertex
-    damping: float = 1e-4  # weight of the present node vectors, for those that nothing else holds
-    landmark_weight: float = 0.05  # of each landmark; all other pairs together have about 1
     # How much (0..1) samples pull at all of the template within about ``spread`` instead of at the nearest of it.
     shared: float = 0.0
     spread: float = 0.016
+    landmark_weight: float = 0.05  # of each landmark; all other pairs together have about 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class NodeRefineConfig(Pairing):
+    """Schedule and pairing of the node refinement; lengths in units of sqrt(area). Set by hand."""
+
+    steps: int = 10
+    strain_first: float = 0.003  # weight of the prior in the first step
+    strain_last: float = 0.0001  # and in the last; it falls geometrically between them
+    scale_first: float = 0.1  # the same of the scale of the robust weight
+    scale_last: float = 0.03
+    damping: float = 1e-4  # weight of the present node vectors, for those that nothing else holds
+
+    @property
+    def schedule(self) -> Schedule:
+        """The same as the driver of the least squares takes it."""
+        return Schedule(
+            steps=self.steps,
+            prior=(self.strain_first, self.strain_last),
+            scale=(self.scale_first, self.scale_last),
+            damping=self.damping,
+        )
 
     def for_noise(self, roughness: float) -> NodeRefineConfig:
         """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`).
@@ -70,10 +117,10 @@ class NodeRefineConfig:
 
 def geometric_between(low: float, high: float, share: float) -> float:
     """The number at a ``share`` (0..1) of the way from one to another, by ratio."""
-    return low if low <= 0 else low * (high / low) ** share
+    return low if low <= 0 or low == high else low ** (1 - share) * high**share
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LatentRefineConfig:
     """The paper's test-time weights L1..L3, steps and rate."""
 
@@ -85,7 +132,7 @@ class LatentRefineConfig:
     points: int = 3000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FitConfig:
     """How hard a fit searches, and how it is refined.
 

@@ -12,15 +12,15 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, off_torch
 from meshmatch.errors import OptionError
-from meshmatch.fitting.candidates import fit_part, fit_whole
-from meshmatch.fitting.fit import Fit, Reason, Verdict, axis_name
+from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.network_fit import mirror_of
-from meshmatch.fitting.nodes import Landmarks
-from meshmatch.fitting.refinement import REFINEMENTS
-from meshmatch.fitting.signs import empty_share
-from meshmatch.fitting.task import FitTask, Registration
-from meshmatch.fitting.verdict import EVEN_TRUST, FAIR_RESIDUAL, judge_registration
+from meshmatch.fitting.judge.features import uncovered_share
+from meshmatch.fitting.judge.reasons import Reason, Verdict
+from meshmatch.fitting.judge.verdict import LIMITS, judge_registration
+from meshmatch.fitting.search.predictor import mirror_of
+from meshmatch.fitting.search.refinement import REFINEMENTS, fit_part, fit_whole
+from meshmatch.fitting.search.task import FitTask, Registration
+from meshmatch.fitting.solve.terms import Landmarks
 from meshmatch.geometry.oriented import quick_tree
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
@@ -68,8 +68,8 @@ class Fitter:
         for k, mirrored in enumerate((False, True) if both else (False,)):
             stretch = progress.between(k / 2, (k + 1) / 2) if both else progress
             task = FitTask.of(self.model, self.config, shape, landmarks, stretch, mirrored)
-            wholes.append(fit_whole(task, REFINEMENTS[task.config.refine].whole))
-        # A shape that one side explains as a whole is no part in the mirror.
+            wholes.append(fit_whole(task))
+        # If either handedness fits the whole shape, the other is not tried as a part.
         parts = landmarks is None and _may_be_part(min(wholes, key=_cost))
         sides = [_as_part_if_closer(whole) if parts else (whole, False) for whole in wholes]
         (found, partial), *others = sorted(sides, key=lambda side: _cost(side[0]))
@@ -80,7 +80,7 @@ class Fitter:
         if not card.correspondence:
             doubts.append(Reason("unsupervised", f"{card.name} was learned without correspondence: near may be wrong"))
         fit = replace(as_fit(found, partial, began), notes=notes)
-        return doubted(fit, doubts)
+        return cap_verdict(fit, doubts)
 
 
 def _cost(found: Registration) -> float:
@@ -91,20 +91,29 @@ def _as_part_if_closer(whole: Registration) -> tuple[Registration, bool]:
     """A fit of the whole, or one as a part if that may be and is better; and which it is."""
     if not _may_be_part(whole):
         return whole, False
-    task = whole.task
-    part = fit_part(task.bare, REFINEMENTS[task.config.refine].part)
+    part = _best_part(whole.task.on_visible_samples)
     # A part explains the shape better than the whole, and lacks some of it.
     closer = part.candidate.cost < _CLOSER * whole.candidate.residual
     partial = closer and part.candidate.share < 1 - _MISSING
     return (part, True) if partial else (whole, False)
 
 
-def doubted(fit: Fit, doubts: Sequence[Reason]) -> Fit:
-    """A fit that near says nothing for, in some way: it is fair at best, and as likely wrong as right."""
+def _best_part(task: FitTask) -> Registration:
+    """The best fit of a part; where that is poor, also from more orientations."""
+    found = fit_part(task)
+    if judge_registration(found, partial=True).verdict != "poor":
+        return found
+    return min(found, fit_part(task, wide=True), key=_cost)
+
+
+def cap_verdict(fit: Fit, doubts: Sequence[Reason]) -> Fit:
+    """Cap the verdict of a fit whose residual is uninformative: it is fair at best, and as likely wrong as right."""
     if not doubts:
         return fit
     verdict: Verdict = "fair" if fit.verdict == "good" else fit.verdict
-    return replace(fit, verdict=verdict, reasons=(*fit.reasons, *doubts), trust=min(fit.trust, EVEN_TRUST))
+    return replace(
+        fit, verdict=verdict, reasons=(*fit.reasons, *doubts), trust=min(fit.trust, LIMITS.uninformative_trust)
+    )
 
 
 def _may_be_part(whole: Registration) -> bool:
@@ -117,9 +126,9 @@ def _may_be_part(whole: Registration) -> bool:
     if not may_show_part(task.shape, task.config):
         return False
     # the residual of a cloud says how sparse and noisy it is
-    if not task.shape.is_cloud and whole.candidate.residual > FAIR_RESIDUAL:
+    if not task.shape.is_cloud and whole.candidate.residual > LIMITS.search_parts:
         return True
-    return empty_share(whole.local, whole.surface.points) > _EMPTY
+    return uncovered_share(whole.local, whole.surface.points) > _EMPTY
 
 
 def may_show_part(shape: Shape, config: FitConfig) -> bool:
@@ -144,7 +153,7 @@ def as_fit(found: Registration, partial: bool, began: float) -> Fit:
         verdict=judged.verdict,
         reasons=judged.reasons,
         trust=judged.trust,
-        signs=judged.signs,
+        signs=judged.features,
         regularity=task.system.regularity(found.candidate.vectors),
         up=axis_name(frame.rotation[1]),
         front=axis_name(frame.rotation[2]),

@@ -33,7 +33,7 @@ _NOISE_RANGE = 0.006, 0.03  # units of sqrt(area)
 _CHUNK = 8192  # points at a time
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Places:
     """Where the vertices of one shape belong on the template. Two of them, of one template, make a map.
 
@@ -95,20 +95,20 @@ class Places:
         fitted = np.zeros(original.F, bool)
         fitted[part.kept_face] = True
         return cls(
-            original.name,
-            original.hash,
-            fit.template_hash,
-            of_file(resting),
-            of_file(height),
-            of_file(distance) + away.astype(np.float32),
-            None if shift is None else of_file(shift),
-            None if spread is None else of_file(spread),
-            stands.astype(np.int32),
-            original.faces.astype(np.int32),
-            fitted,
-            fit.verdict,
-            fit.reasons,
-            fit.trust,
+            name=original.name,
+            hash=original.hash,
+            template_hash=fit.template_hash,
+            resting=of_file(resting),
+            height=of_file(height),
+            distance=of_file(distance) + away.astype(np.float32),
+            shift=None if shift is None else of_file(shift),
+            spread=None if spread is None else of_file(spread),
+            stands=stands.astype(np.int32),
+            faces=original.faces.astype(np.int32),
+            fitted=fitted,
+            verdict=fit.verdict,
+            reasons=fit.reasons,
+            trust=fit.trust,
         )
 
     def nearest(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -79,6 +79,7 @@ class VertexMap(Pickled):
     source: str
     target: str
     index: Int[Ints, " V_source"]
+    _: KW_ONLY
     face: Int[Ints, " V_source"] = None  # type: ignore[assignment]  # an array once built
     barycentric: Float[Floats, "V_source 3"] = None  # type: ignore[assignment]
     confidence: Float[Floats32, " V_source"] = None  # type: ignore[assignment]

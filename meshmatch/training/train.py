@@ -311,11 +311,11 @@ def build_dataset(
     return BatchDataset(source, faces, verts[core], core, supervised, encoder, aligner, *settings)
 
 
-def build_loss_points(template: Template, kernel: Kernel, model: Deformer, strained: int = 400) -> LossPoints:
-    """The model's field at the supervised vertices; its gradient at the first ``strained`` of them."""
+def build_loss_points(template: Template, kernel: Kernel, model: Deformer, gradients: int = 400) -> LossPoints:
+    """The model's field at the supervised vertices; its gradient at the first ``gradients`` of them."""
     verts = template.shape.verts[loss_vertices(template)]
     field = model.field(verts, template.nodes, template.radius, kernel)
-    return LossPoints(torch.from_numpy(verts).float(), field.for_training(strained))
+    return LossPoints(torch.from_numpy(verts).float(), field.for_training(gradients))
 
 
 def build_cloud_dataset(samples: ShapeSamples, config: TrainConfig, scan: ScanConfig) -> CloudDataset:

@@ -34,7 +34,7 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[int, float]], list[
             asked.append(shape.V)
             return known.get(shape.V, 8.0) / 100
 
-        monkeypatch.setattr(apart, "read_kind", read)
+        monkeypatch.setattr(apart, "category_residual", read)
         return asked
 
     return install
@@ -103,7 +103,7 @@ def test_nothing_is_made_of_what_nobody_knows(reads: Reads, monkeypatch: pytest.
     reads({table.V: 5.5})
     for fit, found in (("fair", 0.6, False), False), (("fair", 0.8, True), False), (("fair", 0.8, False), True):
         made = SimpleNamespace(verdict=fit[0], trust=fit[1], partial=fit[2])
-        monkeypatch.setattr(apart, "told", lambda *_, made=made: (made.verdict != "poor", made))
+        monkeypatch.setattr(apart, "classify", lambda *_, made=made: (made.verdict != "poor", made))
         alone = find_alone(loaders(), together("room.ply", table, floor(BODY)), CONFIG)
         assert (alone is not None) is found
 

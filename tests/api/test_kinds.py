@@ -15,8 +15,9 @@ from meshmatch.api.inputs import as_model, validated
 from meshmatch.api.kinds import Installed
 from meshmatch.api.matching import Matcher
 from meshmatch.errors import InputError, ModelError, OptionError
-from meshmatch.fitting import kind
+from meshmatch.fitting import classify
 from meshmatch.fitting.fit_config import FitConfig, Partial
+from meshmatch.fitting.judge.category import has_limbs
 from meshmatch.models import registry
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
@@ -48,7 +49,7 @@ def models(monkeypatch: pytest.MonkeyPatch) -> list[TrainedModel]:
         return np.array([[float(word) / 100 for word in shape.name.split()[1:]] for shape in shapes]).T[: len(models)]
 
     monkeypatch.setattr(kinds, "installed_models", lambda: [Installed.loaded(model) for model in known])
-    monkeypatch.setattr(kinds, "read_kinds", read)
+    monkeypatch.setattr(kinds, "category_residuals", read)
     return known
 
 
@@ -101,26 +102,26 @@ def test_a_fair_fit_tells_a_strange_mesh_if_the_template_has_limbs(
     monkeypatch: pytest.MonkeyPatch, name: str, verdict: str, trust: float, mesh: bool, points: bool
 ) -> None:
     fit = SimpleNamespace(verdict=verdict, trust=trust, partial=False)
-    monkeypatch.setattr(kind.Fitter, "fit", lambda *_: fit)
+    monkeypatch.setattr(classify.Fitter, "fit", lambda *_: fit)
     for shape, of_kind in ((ball("man"), mesh), (cloud("man"), points)):
-        assert kind.told(as_model(name), shape, 0.055, CONFIG, None) == (of_kind, fit)
+        assert classify.classify(as_model(name), shape, 0.055, CONFIG, None) == (of_kind, fit)
 
 
 def test_models_know_whether_they_have_limbs() -> None:
-    found = {name: kind.has_limbs(as_model(name)) for name in ("human", "quadruped", "hand", "head")}
+    found = {name: has_limbs(as_model(name)) for name in ("human", "quadruped", "hand", "head")}
     assert found == {"human": True, "quadruped": True, "hand": True, "head": False}
 
 
 def test_a_fit_as_a_part_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     fit = SimpleNamespace(verdict="good", trust=1.0, partial=True)
-    monkeypatch.setattr(kind.Fitter, "fit", lambda *_: fit)
+    monkeypatch.setattr(classify.Fitter, "fit", lambda *_: fit)
     for reading, known in ((0.048, True), (0.055, False)):
-        assert kind.told(as_model("human"), ball("half"), reading, CONFIG, None) == (known, fit)
+        assert classify.classify(as_model("human"), ball("half"), reading, CONFIG, None) == (known, fit)
 
 
 @pytest.mark.usefixtures("models")
 def test_a_shape_that_is_said_to_be_a_part_is_not_fitted_to_tell_its_kind(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kind, "Fitter", None)
+    monkeypatch.setattr(classify, "Fitter", None)
     part, config = validated(ball("half 7 7 5.5", opened=True)), FitConfig(partial="yes")
     choice = kinds.choose_model([part, validated(ball("man 3 4 6"))], [config] * 2)
     assert choice.model.card.name == "human" and "may be a part" in choice.words[0]
@@ -173,11 +174,11 @@ def asked(monkeypatch: pytest.MonkeyPatch, shapes: list[Shape], partial: Partial
         calls.append(f"{model} {name}")
         return float(words[["human", "quadruped", "own"].index(model)]) / 100
 
-    monkeypatch.setattr(kinds, "read_kind", read)
+    monkeypatch.setattr(kinds, "category_residual", read)
     cards = {name: as_model(name).card for name in ("human", "quadruped")}
     cards["own"] = replace(cards["quadruped"], name="own", category="ape")
     models = [Installed(card, lambda name=name: name, name != "own") for name, card in cards.items()]
-    kinds.read_kinds(models, shapes, [FitConfig(partial=partial)] * len(shapes))
+    kinds.category_residuals(models, shapes, [FitConfig(partial=partial)] * len(shapes))
     return sorted(calls)
 
 
@@ -200,15 +201,15 @@ def test_samples_are_told_apart() -> None:
     names = "climber", "dancer", "calf", "fox"
     shapes = [validated(meshmatch.load_shape(SAMPLES / f"{name}.ply")).shape for name in names]
     models = [Installed.loaded(as_model(name)) for name in ("human", "quadruped")]
-    found = kinds.read_kinds(models, shapes, [CONFIG] * 4)
+    found = kinds.category_residuals(models, shapes, [CONFIG] * 4)
     assert (found[0, :2] < 0.042).all() and found[1, 0] > 0.05
     assert found[1, 1] == np.inf  # the dancer is what the climber is: nobody else was asked
     assert (found[1, 2:] < 0.046).all() and (found[0, 2:] > 0.05).all()
-    told = kinds.tell_kinds(models, found, shapes, [CONFIG] * 4)
+    told = kinds.classify_shapes(models, found, shapes, [CONFIG] * 4)
     assert [each.kind for each in told] == ["human", "human", "quadruped", "quadruped"]
     # the same turned and scaled: a reading knows no up
     turned = Shape(7 * shapes[2].verts[:, [2, 0, 1]], shapes[2].faces, "turned")
-    (again,) = kinds.read_kinds(models[1:], [turned], [CONFIG])
+    (again,) = kinds.category_residuals(models[1:], [turned], [CONFIG])
     assert abs(again[0] - found[1, 2]) < 0.004
 
 
@@ -216,8 +217,8 @@ def test_hands_and_heads_are_told_apart() -> None:
     models = kinds.installed_models()
     for name, category in (("waving", "hand"), ("pointing", "hand"), ("laughing", "head"), ("child", "head")):
         shape = validated(meshmatch.load_shape(SAMPLES / f"{name}.ply")).shape
-        readings = kinds.read_kinds(models, [shape], [CONFIG])
-        assert kinds.tell_kinds(models, readings, [shape], [CONFIG])[0].kind == category, name
+        readings = kinds.category_residuals(models, [shape], [CONFIG])
+        assert kinds.classify_shapes(models, readings, [shape], [CONFIG])[0].kind == category, name
         own = [model.card.category for model in models].index(category)
         assert np.delete(readings[:, 0], own).min() > readings[own, 0] + 0.005, name
 
@@ -284,9 +285,9 @@ def test_animals_are_told_before_the_rarer_kinds_are_asked(monkeypatch: pytest.M
     def asked(name: str, known: str) -> list[str]:
         calls.clear()
         monkeypatch.setattr(
-            kinds, "read_kind", lambda model, *_: calls.append(model) or (0.03 if model == known else 0.07)
+            kinds, "category_residual", lambda model, *_: calls.append(model) or (0.03 if model == known else 0.07)
         )
-        found = kinds.read_kinds(models, [ball(name)], [CONFIG])
+        found = kinds.category_residuals(models, [ball(name)], [CONFIG])
         assert [*cards][int(found.argmin())] == known
         return calls
 
@@ -306,7 +307,7 @@ def test_a_folder_of_two_kinds_is_told(tmp_path: Path) -> None:
 
 
 def test_of_many_files_some_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kinds, "read_kinds", lambda models, *_: np.full((len(models), 1), 0.03))
+    monkeypatch.setattr(kinds, "category_residuals", lambda models, *_: np.full((len(models), 1), 0.03))
     for count, read in ((3, 3), (40, 40), (79, 40), (119, 40)):
         found = list(kinds.kinds_of({f"{k}.ply": SAMPLES / "calf.ply" for k in range(count)}))
         assert len(found) == read

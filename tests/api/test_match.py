@@ -60,7 +60,7 @@ def test_a_turned_and_scaled_copy_maps_to_itself(dancer: Shape) -> None:
 
 
 def test_a_wrong_axis_is_obeyed_and_judged(dancer: Shape) -> None:
-    upside_down, right = (register(dancer, config=FitConfig("none", up=up)) for up in ("-y", "y"))
+    upside_down, right = (register(dancer, config=FitConfig(refine="none", up=up)) for up in ("-y", "y"))
     assert right.up == "+y"
     assert upside_down.residual > right.residual
 

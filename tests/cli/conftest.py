@@ -13,7 +13,7 @@ from meshmatch.api.inputs import as_model
 from meshmatch.api.results import MatchResult
 from meshmatch.cli import main
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.regularity import Regularity
+from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import save_shape

@@ -18,9 +18,9 @@ from meshmatch.collections.fit_files import load_fit, load_words, save_fit
 from meshmatch.collections.setting import Record
 from meshmatch.errors import InputError, MeshmatchError, OptionError, OutputError
 from meshmatch.experiments.hostile.learned import write_eggs
-from meshmatch.fitting.agree import agree_step
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.system import node_system
+from meshmatch.fitting.solve.agreement import agree_step
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.locks import locked
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape

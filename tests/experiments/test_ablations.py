@@ -27,10 +27,8 @@ from meshmatch.experiments.paper.ablation_setting import SCANS, Setting, pool_of
 from meshmatch.experiments.paper.ablation_training import fewer, new_network, timed, train_run
 from meshmatch.experiments.paper.ablation_views import BASE, CODED, CONSTRAINTS, VIEWS, Run, all_runs
 from meshmatch.fields.shape_functions import FIELDS
-from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.latent import LatentRefineConfig
-from meshmatch.fitting.nodes import NodeRefineConfig
-from meshmatch.fitting.system import node_system
+from meshmatch.fitting.fit_config import FitConfig, LatentRefineConfig, NodeRefineConfig
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.models.registry import load_model
 from meshmatch.shapes.normalise import sqrt_area_frame

@@ -13,7 +13,7 @@ from meshmatch.experiments.bench import campaign
 from meshmatch.experiments.bench.campaign import POSES, Body, People, band_of, counted
 from meshmatch.experiments.makers.human_bodies import unseen_bodies
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.signs import Signs
+from meshmatch.fitting.judge.features import FitFeatures
 from meshmatch.generators.bodies import template_rig
 from meshmatch.generators.figure import Figure
 from meshmatch.shapes.shape import Shape
@@ -87,7 +87,7 @@ def test_a_run_goes_on_where_it_was_stopped(
         if shape.name == "body 5-1":
             raise InputError("no body")
         body = people.draw(int(shape.name.rsplit("-")[-1]))
-        return some_fit(body.places, people.template.shape.faces, signs=Signs(0.02))
+        return some_fit(body.places, people.template.shape.faces, signs=FitFeatures(residual=0.02))
 
     monkeypatch.setattr(campaign, "People", lambda *_: people)
     monkeypatch.setattr(campaign, "save_fit", lambda *_: None)

@@ -20,7 +20,7 @@ def readings(monkeypatch: pytest.MonkeyPatch) -> None:
     def read(models: list[Any], shapes: list[Shape], configs: Any, sure: float) -> np.ndarray:
         return np.array([[float(word) / 100] for word in shapes[0].name.split()[1:]])
 
-    monkeypatch.setattr(chosen_models, "read_kinds", read)
+    monkeypatch.setattr(chosen_models, "category_residuals", read)
     monkeypatch.setattr(
         chosen_models, "installed_models", lambda: [Installed.loaded(as_model(name)) for name in ("human", "quadruped")]
     )

@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from meshmatch.experiments.paper.refinement import FEWER, measured, refined, started
-from meshmatch.fitting.latent import LatentRefineConfig
-from meshmatch.fitting.nodes import NodeRefineConfig
-from meshmatch.fitting.system import node_system
+from meshmatch.fitting.fit_config import LatentRefineConfig, NodeRefineConfig
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape

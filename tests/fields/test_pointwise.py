@@ -97,7 +97,7 @@ def test_arrays_are_answered_as_tensors_are(points: torch.Tensor) -> None:
     assert np.allclose(field.displaced(given), field.displacement(rows)[0].detach(), atol=1e-7)
     some = np.array([3, 0])
     F = field.deformation_gradient(rows)[0].detach()
-    assert np.allclose(field.strain(given, some), F[some], atol=1e-6)
+    assert np.allclose(field.deformation_gradient_at(given, some), F[some], atol=1e-6)
     part = field.for_training(2)
     assert torch.allclose(part.deformation_gradient(rows)[0], F[:2], atol=1e-6)
     assert part.displacement(rows).shape == (1, 5, 3)

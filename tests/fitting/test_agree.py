@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from meshmatch.fitting.agree import AgreeConfig, Member, agree, agreed_fits, likeness, log_stretch, mean_log, stretch_of
+from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.nodes import NodeRefineConfig
-from meshmatch.fitting.system import NodeSystem, node_system
-from meshmatch.fitting.task import Landmarks
+from meshmatch.fitting.search.task import Landmarks
+from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree, likeness, log_stretch, mean_log, stretch_of
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
@@ -76,21 +76,21 @@ def slid(system: NodeSystem, nodes: np.ndarray, turn: float) -> np.ndarray:
 
 
 def test_two_that_slid_apart_come_closer(system: NodeSystem, model: TrainedModel) -> None:
-    scan, nodes, config = scan_of(system), model.template.nodes, AgreeConfig(steps=6, strain=0.01)
+    scan, nodes, config = scan_of(system), model.template.nodes, AgreeConfig(steps=6, prior=0.01)
     apart = [slid(system, nodes, 0.15), slid(system, nodes, -0.15)]
-    nearer = agree(system, [Member(scan, each, config) for each in apart], NodeRefineConfig())
+    nearer = agree(system, [Member(samples=scan, vectors=each, config=config) for each in apart])
 
     def gap(pair: list[np.ndarray]) -> float:
         return float(np.linalg.norm(system.moved(pair[0]) - system.moved(pair[1]), axis=1).mean())
 
     assert gap(nearer) < 0.75 * gap(apart)
-    alone = agree(system, [Member(scan, apart[0], config)], NodeRefineConfig())
+    alone = agree(system, [Member(samples=scan, vectors=apart[0], config=config)])
     assert gap([alone[0], apart[1]]) > gap(nearer)
 
 
 def test_two_that_are_equal_stay_so_and_the_same_twice(system: NodeSystem, model: TrainedModel) -> None:
-    member = Member(scan_of(system), slid(system, model.template.nodes, 0.1), AgreeConfig())
-    first, again = (agree(system, [member, member], NodeRefineConfig()) for _ in range(2))
+    member = Member(samples=scan_of(system), vectors=slid(system, model.template.nodes, 0.1), config=AgreeConfig())
+    first, again = (agree(system, [member, member]) for _ in range(2))
     assert np.array_equal(first[0], first[1])
     assert np.array_equal(first[0], again[0])
 
@@ -110,11 +110,12 @@ def test_a_thick_and_a_thin_one_keep_their_stretch(system: NodeSystem, model: Tr
     vectors = [np.zeros_like(nodes), nodes * [0.5, 0, 0.5]]
 
     def apart(alike: float) -> float:
-        config = AgreeConfig(steps=6, strain=1.0, alike=alike)
-        members = [Member(each, start, config) for each, start in zip((scan, thick), vectors, strict=True)]
-        one, other = (
-            log_stretch(system.deformation_gradient(each)) for each in agree(system, members, NodeRefineConfig())
-        )
+        config = AgreeConfig(steps=6, prior=1.0, alike=alike)
+        members = [
+            Member(samples=each, vectors=start, config=config)
+            for each, start in zip((scan, thick), vectors, strict=True)
+        ]
+        one, other = (log_stretch(system.deformation_gradient(each)) for each in agree(system, members))
         return float(np.linalg.norm((one - other).reshape(len(one), -1), axis=1).mean())
 
     assert AgreeConfig().alike < 0.5
@@ -128,7 +129,7 @@ def test_landmarks_hold(system: NodeSystem, model: TrainedModel) -> None:
     config = AgreeConfig(steps=3)
 
     def missed(known: Landmarks | None) -> float:
-        moved = system.moved(agree(system, [Member(scan, start, config, known)], NodeRefineConfig())[0])
+        moved = system.moved(agree(system, [Member(samples=scan, vectors=start, config=config, landmarks=known)])[0])
         return float(np.linalg.norm(moved[at] - places, axis=1).max())
 
     assert missed((at, places)) < 0.25 * missed(None)
@@ -144,7 +145,7 @@ def test_fits_agree_in_their_own_frames(system: NodeSystem, model: TrainedModel)
     vectors = [slid(system, model.template.nodes, turn) for turn in (0.15, -0.15)]
     fits = [fit_of(system, each) for each in vectors]
     shape = Shape(fits[0].frame.undo(system.verts), system.faces)
-    how = AgreeConfig(steps=6, strain=0.01)
+    how = AgreeConfig(steps=6, prior=0.01)
     agreed = agreed_fits(model, [shape, shape], fits, FitConfig(samples=1500), how=how)
     before, after = (np.linalg.norm(a.points - b.points, axis=1).mean() for a, b in (fits, agreed))
     assert after < before
@@ -173,7 +174,7 @@ def test_the_card_says_how_stiff(system: NodeSystem, model: TrainedModel) -> Non
         return agreed_fits(which, [shape, shape], fits, FitConfig(samples=1500), how=how)[0].points
 
     plain = AgreeConfig()
-    assert np.array_equal(points(soft), points(model, replace(plain, strain=0.25 * plain.strain)))
+    assert np.array_equal(points(soft), points(model, replace(plain, prior=0.25 * plain.prior)))
     assert np.array_equal(points(model), points(model, plain))
     assert not np.array_equal(points(soft), points(model))
 
@@ -183,8 +184,8 @@ def test_momentum_goes_further_in_as_many_steps(model: TrainedModel, system: Nod
     apart = [slid(system, nodes, amount) for amount in (0.1, -0.1)]
 
     def left(momentum: float) -> float:
-        config = AgreeConfig(steps=3, strain=0.01, momentum=momentum)
-        found = agree(system, [Member(scan, each, config) for each in apart], NodeRefineConfig())
+        config = AgreeConfig(steps=3, prior=0.01, momentum=momentum)
+        found = agree(system, [Member(samples=scan, vectors=each, config=config) for each in apart])
         return float(np.abs(found[0] - found[1]).mean())
 
     assert left(AgreeConfig().momentum) < 0.97 * left(0.0)

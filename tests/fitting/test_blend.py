@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import OptionError
 from meshmatch.fitting import blend as blend_module
-from meshmatch.fitting.blend import Blend, RotationBlend, StretchBlend, _spanning_order, polar
+from meshmatch.fitting.blend import Blend
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.system import node_system
+from meshmatch.fitting.solve.blend import RotationBlend, StretchBlend, _spanning_order, polar
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
@@ -92,7 +93,7 @@ def test_polar_of_a_reflection_is_a_rotation_with_a_very_small_stretch() -> None
 
 
 def fake_system(verts: np.ndarray, faces: np.ndarray) -> Any:
-    return SimpleNamespace(verts=verts, faces=faces, strain_points=np.arange(len(verts)))
+    return SimpleNamespace(verts=verts, faces=faces, gradient_points=np.arange(len(verts)))
 
 
 def test_the_tree_goes_round_a_tear() -> None:

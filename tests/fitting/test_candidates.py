@@ -5,22 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from meshmatch.fitting import candidates, refinement
-from meshmatch.fitting.candidates import fit_whole
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.network_fit import Candidate, Predictor
-from meshmatch.fitting.refinement import (
+from meshmatch.fitting.search import candidates, refinement
+from meshmatch.fitting.search.candidates import candidates_of_whole
+from meshmatch.fitting.search.discontinuities import discontinuous_share, neighbours
+from meshmatch.fitting.search.predictor import Candidate, Predictor
+from meshmatch.fitting.search.refinement import (
     CandidateScorer,
     PartComparison,
     WholeComparison,
     averaged,
     choose,
     differ,
-    stands_as_usual,
+    has_common_axes,
 )
-from meshmatch.fitting.system import NodeSystem, node_system
-from meshmatch.fitting.task import FitTask
-from meshmatch.fitting.tears import neighbours, torn_share
+from meshmatch.fitting.search.task import FitTask
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
@@ -59,7 +59,7 @@ def test_a_shape_that_the_network_misses_is_tried_with_its_core_further_down(
         return [Candidate(pose, np.zeros((task.system.K, 3)), residual) for _, pose in starts]
 
     monkeypatch.setattr(Predictor, "fit_all", fit_all)
-    fit_whole(task, lambda task, found: found[0])
+    candidates_of_whole(task)
     assert sum(map(len, asked[:-1])) == tried * len(frames)
     assert len(asked[-1]) == careful
     if tried > 1:
@@ -95,9 +95,9 @@ def folded(system: NodeSystem, residual: float = 0.03) -> Candidate:
 
 def test_a_right_fit_is_continuous_and_a_folded_one_is_not(system: NodeSystem, scan: OrientedPoints) -> None:
     scorer = CandidateScorer(system, scan)
-    whole = torn_share(system, neighbours(scan), scan, still(system).vectors)
+    whole = discontinuous_share(system, neighbours(scan), scan, still(system).vectors)
     assert whole < 0.02  # a template is coarse: neighbours may have vertices apart
-    cut = torn_share(system, neighbours(scan), scan, folded(system).vectors)
+    cut = discontinuous_share(system, neighbours(scan), scan, folded(system).vectors)
     assert 2 * whole < cut <= 1.0
     assert scorer.score(scan, folded(system)) == pytest.approx(0.03 + 0.1 * cut)
 
@@ -159,7 +159,7 @@ def test_of_a_rough_cloud_positions_alone_are_scorerd_and_squares(system: NodeSy
     wanted = np.sqrt(0.5 * np.square(apart.min(1)).mean() + 0.5 * np.square(apart.min(0)).mean())
     rough, smooth, half = (CandidateScorer(system, scan, share) for share in (1.0, 0.0, 0.5))
     assert rough.scatter(scan, shifted.vectors) == pytest.approx(wanted)
-    cut = 0.1 * torn_share(system, neighbours(scan), scan, shifted.vectors)
+    cut = 0.1 * discontinuous_share(system, neighbours(scan), scan, shifted.vectors)
     assert rough.score(scan, shifted) == pytest.approx(wanted + cut)
     assert smooth.score(scan, shifted) == pytest.approx(0.03 + cut)
     assert half.score(scan, shifted) == pytest.approx(0.5 * (0.03 + wanted) + cut)
@@ -177,7 +177,7 @@ def test_how_most_files_stand(up: str, front: str, usual: bool) -> None:
         return np.eye(3)["xyz".index(name[-1])] * (-1 if name.startswith("-") else 1)
 
     rotation = np.stack([np.cross(axis(up), axis(front)), axis(up), axis(front)], 1)
-    assert stands_as_usual(RigidPose(rotation, np.zeros(3))) is usual
+    assert has_common_axes(RigidPose(rotation, np.zeros(3))) is usual
 
 
 @pytest.mark.parametrize(("reads", "spread", "told"), [(True, 0.02, True), (True, 0.09, True), (False, 0.02, False)])

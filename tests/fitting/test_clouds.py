@@ -6,14 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from meshmatch.fitting.agree import AgreeConfig, agreed_fits
-from meshmatch.fitting.candidates import estimate_scale, isolated_points
+from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.network_fit import Candidate, two_way_residual
-from meshmatch.fitting.nodes import pair_terms, refine_nodes
-from meshmatch.fitting.signs import cloud_allowance, unexplained
-from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.judge.features import cloud_allowance, subtract_in_quadrature
+from meshmatch.fitting.search.candidates import estimate_scale, isolated_points
+from meshmatch.fitting.search.predictor import Candidate, two_way_residual
+from meshmatch.fitting.solve.agreement import AgreeConfig
+from meshmatch.fitting.solve.nodes import refine_nodes
+from meshmatch.fitting.solve.system import NodeSystem, node_system
+from meshmatch.fitting.solve.terms import PairTerm
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.sampling import sample_surface
@@ -150,8 +152,8 @@ def test_noise_has_a_limit(system: NodeSystem) -> None:
 
 
 def test_squares_add_up_in_what_is_explained() -> None:
-    assert unexplained(0.05, 0.03) == pytest.approx(0.04)
-    assert unexplained(0.02, 0.03) == 0.0
+    assert subtract_in_quadrature(0.05, 0.03) == pytest.approx(0.04)
+    assert subtract_in_quadrature(0.02, 0.03) == 0.0
 
 
 def test_a_repeated_point_is_no_company(system: NodeSystem) -> None:
@@ -177,7 +179,7 @@ def test_noise_makes_a_cloud_rough_and_its_fit_stiff(system: NodeSystem) -> None
     assert stiff.nodes.scale_last > config.nodes.scale_last and stiff.samples > config.samples
     assert config.for_noise(0.0) is config
     agree = AgreeConfig()
-    assert agree.for_noise(1.0).strain == pytest.approx(80 * agree.strain)
+    assert agree.for_noise(1.0).prior == pytest.approx(80 * agree.prior)
     assert (stiff.nodes.shared, agree.for_noise(1.0).shared, agree.for_noise(0.25).shared) == (1.0, 1.0, 0.25)
     assert agree.for_noise(0.0) == agree
 
@@ -196,11 +198,13 @@ def test_fits_of_rough_clouds_are_suited_to_them(system: NodeSystem, monkeypatch
         asked.append(config.strain_last)
         return refine_nodes(system, scan, vectors, config, fixed)
 
-    def pairs(system, scan, vectors, scale, config, one_sided):
-        paired.append(config.back_points)
-        return pair_terms(system, scan, vectors, scale, config, one_sided)
+    quadratic = PairTerm.quadratic
 
-    monkeypatch.setattr("meshmatch.fitting.refinement.refine_nodes", refined)
+    def paired_again(term, system, vectors, scale):
+        paired.append(term.config.back_points)
+        return quadratic(term, system, vectors, scale)
+
+    monkeypatch.setattr("meshmatch.fitting.search.refinement.refine_nodes", refined)
     config = FitConfig(partial="no", variants=2, finalists=1, careful=1)
     fits = []
     for cloud in clouds:
@@ -209,7 +213,7 @@ def test_fits_of_rough_clouds_are_suited_to_them(system: NodeSystem, monkeypatch
         expected = config.nodes.strain_last * 10**cloud.roughness
         assert asked and asked == pytest.approx([expected] * len(asked))
     assert clouds[1].roughness > clouds[0].roughness + 0.3
-    monkeypatch.setattr("meshmatch.fitting.agree.pair_terms", pairs)
+    monkeypatch.setattr(PairTerm, "quadratic", paired_again)
     how = AgreeConfig(steps=1, back_points=100)
     agreed_fits(egg_model(), clouds, fits, config, how=how)
     assert paired == [round(100 * (1 + cloud.roughness)) for cloud in clouds]

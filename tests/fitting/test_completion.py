@@ -9,11 +9,11 @@ from scipy.spatial import cKDTree
 
 from meshmatch.api.inputs import as_model
 from meshmatch.experiments.bench.partial import part_of
-from meshmatch.fitting.candidates import completed
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.network_fit import Candidate
-from meshmatch.fitting.signs import area_share, visible_vertices
-from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.judge.features import area_share, visible_vertices
+from meshmatch.fitting.search.candidates import completed
+from meshmatch.fitting.search.predictor import Candidate
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.files import load_shape

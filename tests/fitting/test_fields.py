@@ -19,9 +19,9 @@ from meshmatch.fitting.blend import Blend
 from meshmatch.fitting.fit import dense_shape
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.latent import LatentRefineConfig
-from meshmatch.fitting.nodes import refine_nodes
-from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.search.latent import LatentRefineConfig
+from meshmatch.fitting.solve.nodes import refine_nodes
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.models.network import NetworkConfig
 from meshmatch.models.registry import load_model
 from meshmatch.models.trained import TrainedModel
@@ -147,7 +147,7 @@ def test_the_dense_system_is_the_sparse_one(rbf: TrainedModel) -> None:
     assert np.allclose(*found, rtol=1e-6, atol=1e-8)
 
 
-def test_gauss_newton_works_on_radial_basis_functions(rbf: TrainedModel) -> None:
+def test_least_squares_work_on_radial_basis_functions(rbf: TrainedModel) -> None:
     system = node_system(rbf)
     bent = system.moved(gentle_vectors(rbf))
     scan = scan_of(replace(rbf.template.shape, verts=bent), 2000)

@@ -14,12 +14,12 @@ from meshmatch.fields.field import PointField
 from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fit_config import REFINE_NAMES, FitConfig, Refine
 from meshmatch.fitting.fitter import Fitter, template_vertices
-from meshmatch.fitting.initial_frames import axis_vector
-from meshmatch.fitting.latent import LatentRefineConfig
-from meshmatch.fitting.network_fit import Candidate, Mirror, Predictor
-from meshmatch.fitting.refinement import REFINEMENTS
-from meshmatch.fitting.system import NodeSystem
-from meshmatch.fitting.task import take_samples
+from meshmatch.fitting.search.frames import axis_vector
+from meshmatch.fitting.search.latent import LatentRefineConfig
+from meshmatch.fitting.search.predictor import Candidate, Mirror, Predictor
+from meshmatch.fitting.search.refinement import REFINEMENTS
+from meshmatch.fitting.search.task import take_samples
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.frames import Frame, RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.initial_frames import aligned_frames, scan_frame
+from meshmatch.fitting.search.frames import aligned_frames, scan_frame
 from meshmatch.models.network import NetworkConfig
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape

@@ -15,9 +15,9 @@ from meshmatch.fields.shape_functions import build_field
 from meshmatch.fitting.fit import dense_shape
 from meshmatch.fitting.fit_config import FitConfig, Refine
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy
-from meshmatch.fitting.refinement import REFINEMENTS
-from meshmatch.fitting.system import node_system
+from meshmatch.fitting.search.latent import LatentRefineConfig, PaperEnergy
+from meshmatch.fitting.search.refinement import REFINEMENTS
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.kernels import KERNELS, Kernel
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.registry import built_in_folder, load_model
@@ -54,8 +54,8 @@ def test_the_least_squares_system_has_the_models_kernel(model: TrainedModel) -> 
     phi, gradient = shape_functions(model, model.card.field["kernel"])
     system = node_system(model)
     assert np.allclose(system.phi.toarray(), phi, atol=1e-6)
-    rows = (3 * system.strain_points[:, None] + np.arange(3)).ravel()
-    assert np.allclose(system.equations.slopes.toarray(), gradient[rows], atol=1e-5)
+    rows = (3 * system.gradient_points[:, None] + np.arange(3)).ravel()
+    assert np.allclose(system.equations.gradient.toarray(), gradient[rows], atol=1e-5)
 
 
 def test_the_papers_energy_has_the_models_kernel(model: TrainedModel) -> None:

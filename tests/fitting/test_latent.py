@@ -7,7 +7,7 @@ import pytest
 
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy, refine_code
+from meshmatch.fitting.search.latent import LatentRefineConfig, PaperEnergy, refine_code
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress

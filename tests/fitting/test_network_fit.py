@@ -9,9 +9,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from meshmatch.fitting import network_fit
-from meshmatch.fitting.network_fit import Predictor, one_way_residual, two_way_residual
-from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.search import predictor
+from meshmatch.fitting.search.predictor import Predictor, one_way_residual, two_way_residual
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints, with_normals
 from meshmatch.models.trained import TrainedModel
@@ -49,7 +49,7 @@ def test_the_residual_is_that_of_a_plain_loop(system: NodeSystem, scan: Oriented
 def test_predictions_are_means_of_seeded_draws(
     model: TrainedModel, scan: OrientedPoints, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(network_fit, "_PREDICT_POINTS", 100)
+    monkeypatch.setattr(predictor, "_PREDICT_POINTS", 100)
     still = RigidPose.identity()
     one, again, other = (
         Predictor.of(model, np.random.default_rng(k)).fit(scan, still, rounds=1, draws=3).vectors for k in (0, 0, 1)
@@ -63,14 +63,14 @@ def test_predictions_are_means_of_seeded_draws(
             for _ in range(3)
         ]
     assert np.allclose(one, torch.stack(draws).mean(0), atol=1e-5)
-    monkeypatch.setattr(network_fit, "_PREDICT_POINTS", 10**6)  # more than there are
+    monkeypatch.setattr(predictor, "_PREDICT_POINTS", 10**6)  # more than there are
     assert Predictor.of(model, np.random.default_rng(5)).fit(scan, still).vectors.shape == (model.template.K, 3)
 
 
 def test_starts_asked_together_are_fitted_as_each_alone(
     model: TrainedModel, scan: OrientedPoints, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(network_fit, "_BATCH", 2)  # three starts are asked in two batches
+    monkeypatch.setattr(predictor, "_BATCH", 2)  # three starts are asked in two batches
     few = scan.first(200)  # so few that every draw is all of them
     poses = [RigidPose(Rotation.from_rotvec([0, angle, 0]).as_matrix(), np.zeros(3)) for angle in (0.0, 0.4, -0.7)]
     starts = [(few, pose) for pose in poses]
@@ -147,7 +147,9 @@ def test_a_tilted_reading_is_turned_back(model: TrainedModel, system: NodeSystem
     few = OrientedPoints(scan.points[:200], scan.normals[:200])
     pose = RigidPose.identity()
     network: Any = Follower()
-    predictor = Predictor(network, system, model.template.core, None, np.random.default_rng(0))
+    predictor = Predictor(
+        network=network, system=system, core=model.template.core, mirror=None, rng=np.random.default_rng(0)
+    )
     found = predictor.variants(few, few, pose, 3, 20.0)
     for each in found:
         assert np.abs(each.vectors).max() < 1e-3

@@ -1,4 +1,4 @@
-"""Gauss-Newton on the nodes: its parts by hand, and laws of the whole."""
+"""Least squares on the nodes: its parts by hand, and laws of the whole."""
 
 from dataclasses import replace
 
@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from meshmatch.fitting.network_fit import two_way_residual
-from meshmatch.fitting.nodes import NodeRefineConfig, nearest_rotations, pair_terms, refine_nodes, robust_weight
-from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.fit_config import NodeRefineConfig
+from meshmatch.fitting.search.predictor import two_way_residual
+from meshmatch.fitting.solve.nodes import refine_nodes
+from meshmatch.fitting.solve.priors import nearest_rotations
+from meshmatch.fitting.solve.system import NodeSystem, node_system
+from meshmatch.fitting.solve.terms import PairTerm, robust_weight
 from meshmatch.geometry.oriented import OrientedPoints, with_normals
 from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.models.trained import TrainedModel
@@ -77,7 +80,7 @@ def test_pairs_are_those_of_a_plain_loop(system: NodeSystem, weight: float) -> N
     scan = scan_of(Shape(1.1 * system.verts + 0.02, system.faces), 60)
     config = replace(CONFIG, back_points=20, pair_normals=weight)
     vectors = np.zeros((system.K, 3))
-    weights, pulls = pair_terms(system, scan, vectors, 0.08, config)
+    weights, pulls = PairTerm(scan, config).quadratic(system, vectors, 0.08)
 
     normals = system.normals(system.verts)
     seen = with_normals(system.verts, normals, weight)
@@ -119,12 +122,12 @@ def test_shared_pairs_are_those_of_a_plain_loop(system: NodeSystem) -> None:
             term = weight * (np.outer(normals[v], normals[v]) + config.point_share * np.eye(3))
             H[v] += term
             s[v] += term @ scan.points[p]
-    weights, pulls = pair_terms(system, scan, vectors, 0.08, config)
+    weights, pulls = PairTerm(scan, config).quadratic(system, vectors, 0.08)
     assert np.allclose(weights, H.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
     assert np.allclose(pulls, s)
     # in between both kinds have their share
-    nearest = pair_terms(system, scan, vectors, 0.08, replace(config, shared=0.0))
-    mixed = pair_terms(system, scan, vectors, 0.08, replace(config, shared=0.25))
+    nearest = PairTerm(scan, replace(config, shared=0.0)).quadratic(system, vectors, 0.08)
+    mixed = PairTerm(scan, replace(config, shared=0.25)).quadratic(system, vectors, 0.08)
     for found, alone, together in zip(mixed, nearest, (weights, pulls), strict=True):
         assert np.allclose(found, 0.75 * alone + 0.25 * together)
 
@@ -145,9 +148,9 @@ def test_noise_that_shares_its_pairs_leaves_the_template_where_it_belongs(system
 
 def test_a_surface_that_faces_the_other_way_is_no_partner(system: NodeSystem, scan: OrientedPoints) -> None:
     inside_out = OrientedPoints(scan.points, -scan.normals)
-    weights, _ = pair_terms(system, inside_out, np.zeros((system.K, 3)), 0.1, CONFIG)
+    weights, _ = PairTerm(inside_out, CONFIG).quadratic(system, np.zeros((system.K, 3)), 0.1)
     # a few pairs reach the far side of the egg, where normals agree and the robust weight is nearly nothing
-    right = pair_terms(system, scan, np.zeros((system.K, 3)), 0.1, CONFIG)[0]
+    right = PairTerm(scan, CONFIG).quadratic(system, np.zeros((system.K, 3)), 0.1)[0]
     assert weights.sum() < 0.05 * right.sum()
 
 
@@ -236,7 +239,7 @@ def test_of_a_part_only_what_is_near_it_is_pulled(system: NodeSystem, scan: Orie
     never = far & (moved[:, 1] < -0.2)  # nor do points of the half ask for these
     assert never.sum() > 20
     config = replace(CONFIG, normal_cosine=-1.0)
-    whole, part = (pair_terms(system, half, truth, scale, config, one_sided)[0] for one_sided in (False, True))
+    whole, part = (PairTerm(half, config, one_sided).quadratic(system, truth, scale)[0] for one_sided in (False, True))
     assert (whole[never] != 0).any(1).all()
     assert (part[never] == 0).all()
     assert np.array_equal(part[~far], whole[~far])
@@ -268,8 +271,8 @@ def test_weights_of_samples_scale_their_pairs(
     system: NodeSystem, scan: OrientedPoints, truth: np.ndarray, shared: float
 ) -> None:
     config = replace(CONFIG, shared=shared)
-    plain = pair_terms(system, scan, truth, 0.1, config)
+    plain = PairTerm(scan, config).quadratic(system, truth, 0.1)
     for weight in (0.0, 0.5, 1.0):
         weighted = replace(scan, weights=np.full(len(scan.points), weight))
-        for terms, expected in zip(pair_terms(system, weighted, truth, 0.1, config), plain, strict=True):
+        for terms, expected in zip(PairTerm(weighted, config).quadratic(system, truth, 0.1), plain, strict=True):
             assert np.allclose(terms, weight * expected)

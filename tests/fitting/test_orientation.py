@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import OptionError
-from meshmatch.fitting.initial_frames import (
+from meshmatch.fitting.search.frames import (
     ask_aligner,
     axis_vector,
     forced_frames,

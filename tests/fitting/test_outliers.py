@@ -10,10 +10,10 @@ from meshmatch.api.matching import register
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.network_fit import one_way_residual, two_way_residual
-from meshmatch.fitting.system import NodeSystem, node_system
-from meshmatch.fitting.task import take_samples, without_inside, without_outliers
-from meshmatch.fitting.tears import neighbours, torn_share
+from meshmatch.fitting.search.discontinuities import discontinuous_share, neighbours
+from meshmatch.fitting.search.predictor import one_way_residual, two_way_residual
+from meshmatch.fitting.search.task import take_samples, without_interior, without_outliers
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.files import load_shape
@@ -105,7 +105,9 @@ def test_residuals_and_tears_ignore_a_side_that_is_not_known(system: NodeSystem)
         assert residual(system, flipped, still) > 2 * right
         assert residual(system, OrientedPoints(scan.points, -scan.normals, signed=False), still) == pytest.approx(right)
     unsure = OrientedPoints(scan.points, -scan.normals, signed=False)
-    right, wrong, turned = (torn_share(system, neighbours(each), each, still) for each in (scan, flipped, unsure))
+    right, wrong, turned = (
+        discontinuous_share(system, neighbours(each), each, still) for each in (scan, flipped, unsure)
+    )
     assert wrong != right == turned
 
 
@@ -115,7 +117,7 @@ def test_a_cloud_is_tried_as_a_part_only_where_it_leaves_the_template_bare(
     """A residual says that a cloud is sparse and noisy, not that something is missing."""
     tried = []
 
-    def part(task, refine):
+    def part(task):
         tried.append(task)
         raise KeyboardInterrupt
 
@@ -178,7 +180,7 @@ def nested(outer: Shape, size: float) -> Shape:
 
 def test_what_lies_inside_neither_pulls_nor_counts(system: NodeSystem) -> None:
     egg = Shape(system.verts, system.faces, "egg")
-    assert without_inside(nested(egg, 0.7), system).F == egg.F
+    assert without_interior(nested(egg, 0.7), system).F == egg.F
     alone, with_it = (Fitter(egg_model(), FEW).fit(shape) for shape in (egg, nested(egg, 0.7)))
     assert with_it.residual < 1.2 * alone.residual
 
@@ -187,4 +189,4 @@ def test_a_template_with_chambers_keeps_those_of_shapes(system: NodeSystem) -> N
     hollow = nested(Shape(system.verts, system.faces), 0.7)
     assert system.shows_all and not NodeSystem(hollow, system.field).shows_all
     shape = nested(Shape(system.verts, system.faces), 0.6)
-    assert without_inside(shape, NodeSystem(hollow, system.field)) is shape
+    assert without_interior(shape, NodeSystem(hollow, system.field)) is shape

@@ -10,18 +10,18 @@ import pytest
 from meshmatch.api.inputs import as_model
 from meshmatch.api.matching import Matcher
 from meshmatch.errors import OptionError
-from meshmatch.fitting import candidates
-from meshmatch.fitting.candidates import SHARES
+from meshmatch.fitting import fitter
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import boundary_length
-from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try
-from meshmatch.fitting.network_fit import Candidate, one_way_residual
-from meshmatch.fitting.refinement import REFINEMENTS
-from meshmatch.fitting.signs import Signs, empty_share, signs_of
-from meshmatch.fitting.system import node_system
-from meshmatch.fitting.task import FitTask, take_samples
-from meshmatch.fitting.verdict import Judgement, judge
+from meshmatch.fitting.judge.features import FitFeatures, compute_features, uncovered_share
+from meshmatch.fitting.judge.verdict import Judgement, judge
+from meshmatch.fitting.search import candidates
+from meshmatch.fitting.search.candidates import SETTINGS
+from meshmatch.fitting.search.frames import frames_of_part, frames_to_try
+from meshmatch.fitting.search.predictor import Candidate, one_way_residual
+from meshmatch.fitting.search.task import FitTask, take_samples
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import unit
@@ -51,7 +51,7 @@ def test_a_boundary_against_another_part_is_no_cut(gap: float, length: float) ->
 
 
 def test_a_smaller_share_costs_more() -> None:
-    costs = [Candidate(RigidPose.identity(), np.zeros((1, 3)), 0.02, share).cost for share in SHARES]
+    costs = [Candidate(RigidPose.identity(), np.zeros((1, 3)), 0.02, share).cost for share in SETTINGS.shares]
     assert costs[0] == 0.02
     assert all(more > less for less, more in pairwise(costs))
 
@@ -66,12 +66,15 @@ def test_what_is_not_visible_is_not_held_against_a_part() -> None:
     samples = sample_surface(Shape(system.verts, system.faces), 3000, np.random.default_rng(0))
     half = samples.points[:, 1] > 0
     scan, still = OrientedPoints(samples.points[half], samples.normals[half]), np.zeros((system.K, 3))
-    assert 0.3 < empty_share(scan, system.verts) < 0.6
-    assert judge(signs_of(system, still, scan, 0.02, egg_model().template.labels)).verdict == "poor"
-    judged = judge(replace(signs_of(system, still, scan, 0.02, egg_model().template.labels, partial=True), hidden=0.5))
+    assert 0.3 < uncovered_share(scan, system.verts) < 0.6
+    assert judge(compute_features(system, still, scan, 0.02, egg_model().template.labels)).verdict == "poor"
+    features = compute_features(system, still, scan, 0.02, egg_model().template.labels, partial=True)
+    judged = judge(replace(features, hidden=0.5))
     assert judged.verdict == "fair"
     assert judged.reasons == ("taken for a part: 50 % of the template has no counterpart",)
-    assert judge(signs_of(system, still, scan, 0.05, egg_model().template.labels, partial=True)).verdict == "poor"
+    assert (
+        judge(compute_features(system, still, scan, 0.05, egg_model().template.labels, partial=True)).verdict == "poor"
+    )
     whole = OrientedPoints(samples.points, samples.normals)
     assert one_way_residual(system, scan, still) == pytest.approx(one_way_residual(system, whole, still), rel=0.1)
 
@@ -136,12 +139,12 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
     for verdict in ("fair", "poor"):
         monkeypatch.setattr(candidates, "frames_of_part", frames)
         monkeypatch.setattr(
-            candidates,
+            fitter,
             "judge_registration",
-            lambda found, partial, verdict=verdict: Judgement(verdict, (), Signs(0.02)),
+            lambda found, partial, verdict=verdict: Judgement(verdict, (), FitFeatures(residual=0.02)),
         )
         asked.clear()
-        best = candidates.fit_part(task, REFINEMENTS["none"].part)
+        best = fitter._best_part(task)
         found[verdict] = best.candidate.cost
         assert asked == ({(48, 2, False)} if verdict == "fair" else {(48, 2, False), (96, 4, True)})
     assert found["poor"] <= found["fair"]

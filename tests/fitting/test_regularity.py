@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 import meshmatch
-from meshmatch.fitting.agree import AgreeConfig, Member, agree, agreed_fits
+from meshmatch.fitting.agree import agreed_fits, with_vectors
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_config import NodeRefineConfig
-from meshmatch.fitting.regularity import Regularity, opened
-from meshmatch.fitting.system import NodeSystem, node_system
-from meshmatch.fitting.verdict import with_vectors
+from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree
+from meshmatch.fitting.solve.regularity import Regularity, opened
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
 from meshmatch.templates.location import bundled_folder
@@ -94,8 +93,8 @@ def test_what_all_fits_have_in_common_hardly_drifts(system: NodeSystem, model: T
     start = 0.1 * nodes * [1.0, -1.0, 1.0]
 
     def drifted(drift: float) -> float:
-        members = [Member(scan, start, AgreeConfig(steps=8, strain=0.01, drift=drift))] * 2
-        found = agree(system, members, NodeRefineConfig())[0]
+        members = [Member(samples=scan, vectors=start, config=AgreeConfig(steps=8, prior=0.01, drift=drift))] * 2
+        found = agree(system, members)[0]
         return float(np.abs(system.deformation_gradient(found) - system.deformation_gradient(start)).mean())
 
     assert drifted(0.0) < drifted(AgreeConfig().drift) < drifted(1.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from meshmatch.fitting.system import NodeSystem, _EveryPair, node_system
+from meshmatch.fitting.solve.system import NodeSystem, _EveryPair, node_system
 from meshmatch.geometry.kernels import KERNELS
 from meshmatch.models.trained import TrainedModel
 from tests.fitting.eggs import egg_model, gentle_vectors
@@ -19,7 +19,7 @@ def model(request: pytest.FixtureRequest) -> TrainedModel:
 @pytest.fixture(scope="module")
 def system(model: TrainedModel) -> NodeSystem:
     shape = model.template.shape
-    return NodeSystem(shape, model.field(shape.verts), strain_points=40)
+    return NodeSystem(shape, model.field(shape.verts), gradient_points=40)
 
 
 class Problem:
@@ -27,7 +27,7 @@ class Problem:
 
     def __init__(self, system: NodeSystem, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
-        V, G = len(system.verts), len(system.strain_points)
+        V, G = len(system.verts), len(system.gradient_points)
         self.roots = rng.normal(size=(V, 3, 3)) * (rng.random((V, 1, 1)) < 2 / 3)
         self.places = rng.normal(size=(V, 3))
         self.targets = rng.normal(size=(G, 3, 3))
@@ -42,7 +42,7 @@ class Problem:
 
     def rows(self, system: NodeSystem) -> tuple[np.ndarray, np.ndarray]:
         """Matrix and right-hand side, a row for each residual; unknown 3 k + a is component a of node k."""
-        phi, slopes = system.phi.toarray(), system.equations.slopes.toarray().reshape(-1, 3, system.K)
+        phi, slopes = system.phi.toarray(), system.equations.gradient.toarray().reshape(-1, 3, system.K)
         eye = np.eye(3)
         data = np.einsum("vab,vk->vakb", self.roots, phi).reshape(-1, 3 * system.K)
         offset = np.einsum("vab,vb->va", self.roots, self.places - system.verts).ravel()
@@ -74,8 +74,8 @@ def test_products_too_many_to_be_kept_are_formed_anew(
     kept = int((np.diff(system.phi.indptr) ** 2).sum())
     shape, problem = model.template.shape, Problem(system)
     for most, formed in ((kept, False), (kept - 1, True)):
-        monkeypatch.setattr("meshmatch.fitting.system._MAX_PRODUCTS", most)
-        other = NodeSystem(shape, model.field(shape.verts), strain_points=40)
+        monkeypatch.setattr("meshmatch.fitting.solve.system._MAX_PRODUCTS", most)
+        other = NodeSystem(shape, model.field(shape.verts), gradient_points=40)
         assert isinstance(other.equations.pairs, _EveryPair) == formed
         assert np.allclose(problem.solve(other), problem.solve(system), atol=1e-8)
 
@@ -120,7 +120,7 @@ def test_an_affine_motion_of_the_nodes_moves_the_template_by_it(system: NodeSyst
 
 def test_the_gradient_is_the_slope_of_the_motion(system: NodeSystem, model: TrainedModel) -> None:
     """F of a smooth bend against differences of the bend itself, which the field nearly reproduces."""
-    vectors, at, step = gentle_vectors(model), system.strain_points, 1e-4
+    vectors, at, step = gentle_vectors(model), system.gradient_points, 1e-4
     F = system.deformation_gradient(vectors)
     for axis in range(3):
         aside = np.zeros(3)
@@ -144,5 +144,5 @@ def test_normals_are_unit_and_outward_and_turn_along(system: NodeSystem, model: 
 
 def test_the_system_of_a_model_is_built_once(model: TrainedModel) -> None:
     assert node_system(model) is node_system(model)
-    assert len(node_system(model).strain_points) == model.template.shape.V  # fewer than the most there may be
-    assert len(np.unique(node_system(model).strain_points)) == model.template.shape.V
+    assert len(node_system(model).gradient_points) == model.template.shape.V  # fewer than the most there may be
+    assert len(np.unique(node_system(model).gradient_points)) == model.template.shape.V

@@ -10,24 +10,24 @@ import trimesh
 
 from meshmatch.api.matching import Matcher
 from meshmatch.arrays import Floats, Ints
-from meshmatch.fitting.fit import Reason
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fitter import Fitter, doubted
-from meshmatch.fitting.joints import knees_forward, nearest_rotation
-from meshmatch.fitting.signs import (
-    Signs,
+from meshmatch.fitting.fitter import Fitter, cap_verdict
+from meshmatch.fitting.judge.features import (
+    FitFeatures,
     astray_share,
-    built_allowance,
+    compute_features,
     connected_parts,
-    shortened_to,
-    signs_of,
+    multipart_allowance,
+    shortening,
+    stretch_spread_of,
+    subtract_in_quadrature,
     uncut_share,
-    unevenness,
-    unexplained,
 )
-from meshmatch.fitting.system import NodeSystem, node_system
-from meshmatch.fitting.tears import neighbours, torn_share
-from meshmatch.fitting.verdict import FAIR_TRUST, GOOD_TRUST, Judgement, judge, judge_excused
+from meshmatch.fitting.judge.joints import knees_forward, nearest_rotation
+from meshmatch.fitting.judge.reasons import Reason
+from meshmatch.fitting.judge.verdict import LIMITS, Judgement, judge, judge_with_allowance
+from meshmatch.fitting.search.discontinuities import discontinuous_share, neighbours
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.files import load_shape
@@ -38,15 +38,15 @@ from tests.conftest import some_fit
 from tests.fitting.eggs import egg_model, scan_of
 
 RANK = {"good": 0, "fair": 1, "poor": 2}
-SOUND = Signs(0.023, torn=0.001, stretch=0.5, uneven=0.22, against=0.015, spread=0.02)
+SOUND = FitFeatures(residual=0.023, discontinuous=0.001, stretch=0.5, stretch_spread=0.22, flipped=0.015, spread=0.02)
 RISING = {
     "residual": np.linspace(0.02, 0.1, 30),
-    "missed": np.linspace(0, 1, 30),
-    "empty": np.linspace(0, 1, 30),
-    "torn": np.linspace(0, 1, 30),
+    "uncovered_shape": np.linspace(0, 1, 30),
+    "uncovered_template": np.linspace(0, 1, 30),
+    "discontinuous": np.linspace(0, 1, 30),
     "stretch": np.linspace(0.1, 4, 30),
-    "uneven": np.linspace(0.05, 2, 30),
-    "against": np.linspace(0, 1, 30),
+    "stretch_spread": np.linspace(0.05, 2, 30),
+    "flipped": np.linspace(0, 1, 30),
     "partial": [False, True],
     "hidden": np.linspace(0, 1, 30),
     "astray": np.linspace(0, 1, 30),
@@ -57,38 +57,38 @@ RISING = {
 }
 
 
-APART = {"empty", "stretch", "against", "partial", "inverted"}  # bound the verdict by themselves, or are reasons alone
-ALONE = {"astray", "uncut", "forward"}  # tell by themselves
+APART = {"uncovered_template", "stretch", "flipped", "partial", "inverted"}  # bound the verdict, or are reasons alone
+ALONE = {"astray", "uncut", "forward"}  # decide alone
 
 
-def test_all_signs_are_tried() -> None:
-    assert list(RISING) == [each.name for each in fields(Signs)]
+def test_all_features_are_tried() -> None:
+    assert list(RISING) == [each.name for each in fields(FitFeatures)]
     assert len(SOUND.values()) == len(RISING) - len(APART | ALONE)
 
 
 @pytest.mark.parametrize("sign", RISING)
 def test_trust_falls_as_a_sign_rises_and_verdicts_never_improve(sign: str) -> None:
     found = [replace(SOUND, **{sign: value}) for value in RISING[sign]]
-    trust = [each.trust for each in found]
+    trust = [each.p_correct for each in found]
     assert trust == sorted(trust, reverse=True) and (trust[-1] < trust[0] or sign in APART)
     judged = [judge(each) for each in found]
     ranks = [RANK[each.verdict] for each in judged]
     assert ranks == sorted(ranks) and ranks[0] == 0
-    assert ranks[-1] > 0 or sign == "against"
+    assert ranks[-1] > 0 or sign == "flipped"
     for each in judged:
         assert bool(each.reasons) == (each.verdict != "good")
-        assert each.trust == each.signs.trust
+        assert each.trust == each.features.p_correct
 
 
 @pytest.mark.parametrize(("sign", "code"), [("astray", "pieces"), ("uncut", "uncut"), ("forward", "bent")])
 def test_some_signs_tell_by_themselves(sign: str, code: str) -> None:
     """A fit that is fair otherwise is poor, and says by which sign; below its limit a sign does not count."""
     fair = replace(SOUND, residual=0.03, partial=True)
-    assert fair.trust > 0.9 and judge(fair).verdict == "fair"
+    assert fair.p_correct > 0.9 and judge(fair).verdict == "fair"
     limits = {"astray": 0.03, "uncut": 0.5, "forward": 27.0}
     below, above = (replace(fair, **{sign: factor * limits[sign]}) for factor in (0.99, 1.01))
-    assert below.trust == fair.trust and judge(below).verdict == "fair"
-    assert above.trust < 0.3 and judge(above).verdict == "poor"
+    assert below.p_correct == fair.p_correct and judge(below).verdict == "fair"
+    assert above.p_correct < 0.3 and judge(above).verdict == "poor"
     told = {reason.code for reason in judge(above).reasons}
     assert code in told and code not in {reason.code for reason in judge(below).reasons}
 
@@ -97,7 +97,7 @@ def test_where_verdicts_change() -> None:
     found = [judge(replace(SOUND, residual=value)) for value in np.linspace(0.02, 0.12, 200)]
     assert {each.verdict for each in found} == {"good", "fair", "poor"}
     for each in found:
-        expected = "good" if each.trust >= GOOD_TRUST else "fair" if each.trust >= FAIR_TRUST else "poor"
+        expected = "good" if each.trust >= LIMITS.good_trust else "fair" if each.trust >= LIMITS.fair_trust else "poor"
         assert each.verdict == expected
     assert judge(replace(SOUND, partial=True, hidden=0.3)).verdict == "fair"  # a part is fair at best
 
@@ -105,9 +105,9 @@ def test_where_verdicts_change() -> None:
 def test_where_nearness_says_nothing_a_fit_is_as_likely_wrong_as_right() -> None:
     doubt = Reason("side", "its mirror image fits as well")
     sound = some_fit(np.eye(3), np.array([[0, 1, 2]]))
-    assert doubted(sound, []) is sound
+    assert cap_verdict(sound, []) is sound
     for verdict, trust in (("good", 0.99), ("fair", 0.7), ("poor", 0.2)):
-        found = doubted(replace(sound, verdict=verdict, trust=trust), [doubt])
+        found = cap_verdict(replace(sound, verdict=verdict, trust=trust), [doubt])
         assert found.verdict == ("fair" if verdict == "good" else verdict)
         assert (found.trust, found.reasons) == (min(trust, 0.5), (doubt,))
 
@@ -138,18 +138,19 @@ def labels() -> Ints:
 
 def test_signs_of_a_template_on_itself() -> None:
     still = np.zeros((system().K, 3))
-    signs = signs_of(system(), still, scan_of(egg_model().template.shape, 2000), 0.02, labels())
-    assert (signs.residual, signs.missed, signs.empty, signs.partial) == (0.02, 0.0, 0.0, False)
-    assert signs.stretch < 0.01 and signs.against < 0.02 and signs.torn < 0.02
+    features = compute_features(system(), still, scan_of(egg_model().template.shape, 2000), 0.02, labels())
+    assert (features.residual, features.partial) == (0.02, False)
+    assert (features.uncovered_shape, features.uncovered_template) == (0.0, 0.0)
+    assert features.stretch < 0.01 and features.flipped < 0.02 and features.discontinuous < 0.02
 
 
 def test_signs_of_a_template_on_a_part_and_on_more() -> None:
     still, scan = np.zeros((system().K, 3)), scan_of(egg_model().template.shape, 2000)
     half = replace(scan.rows(scan.points[:, 1] > 0))
-    assert 0.3 < signs_of(system(), still, half, 0.02, labels()).empty < 0.6
-    assert signs_of(system(), still, half, 0.02, labels(), partial=True).empty == 0.0
+    assert 0.3 < compute_features(system(), still, half, 0.02, labels()).uncovered_template < 0.6
+    assert compute_features(system(), still, half, 0.02, labels(), partial=True).uncovered_template == 0.0
     more = replace(scan, points=scan.points + np.where(scan.points[:, 1:2] > 0, [0.0, 1.0, 0.0], 0.0))
-    assert 0.3 < signs_of(system(), still, more, 0.02, labels()).missed < 0.6
+    assert 0.3 < compute_features(system(), still, more, 0.02, labels()).uncovered_shape < 0.6
 
 
 def pressed_egg(axis: int, left: float) -> tuple[Floats, OrientedPoints]:
@@ -162,45 +163,48 @@ def pressed_egg(axis: int, left: float) -> tuple[Floats, OrientedPoints]:
 def test_signs_of_a_template_pressed_flat() -> None:
     scan = scan_of(egg_model().template.shape, 2000)
     flat, pressed = pressed_egg(2, 0.02)
-    signs = signs_of(system(), flat, pressed, 0.025, labels())
-    assert signs.stretch > 2 and judge(signs).verdict == "poor"
-    assert "crushed" in {reason.code for reason in judge(signs).reasons}
+    features = compute_features(system(), flat, pressed, 0.025, labels())
+    assert features.stretch > 2 and judge(features).verdict == "poor"
+    assert "crushed" in {reason.code for reason in judge(features).reasons}
     turned = replace(scan, normals=-scan.normals)
-    assert signs_of(system(), np.zeros_like(flat), turned, 0.025, labels()).against > 0.9
+    assert compute_features(system(), np.zeros_like(flat), turned, 0.025, labels()).flipped > 0.9
 
 
 def test_how_much_a_surface_is_shortened_is_its_least_stretch() -> None:
-    rng, points = np.random.default_rng(0), system().strain_points
+    rng, points = np.random.default_rng(0), system().gradient_points
     gradient = np.eye(3) + 0.4 * rng.normal(size=(len(points), 3, 3))
     normals = system().normals(system().verts)[points]
     inside = np.linalg.svd(normals[:, None])[2][:, 1:]  # two directions of each surface
     least = np.linalg.svd(gradient @ inside.transpose(0, 2, 1), compute_uv=False)[:, 1]
-    assert shortened_to(system(), gradient)[points] == pytest.approx(np.clip(least, 0.2, 1), abs=1e-6)
-    assert np.allclose(shortened_to(system(), np.broadcast_to(2 * np.eye(3), gradient.shape)), 1)
+    assert shortening(system(), gradient)[points] == pytest.approx(np.clip(least, 0.2, 1), abs=1e-6)
+    assert np.allclose(shortening(system(), np.broadcast_to(2 * np.eye(3), gradient.shape)), 1)
 
 
 def test_stretch_is_uneven_about_the_mean_of_its_part() -> None:
     rng, parts = np.random.default_rng(0), np.repeat([0, 2, 3], 40)
     own = rng.normal(size=(4, 3, 3))[parts]
-    assert unevenness(own, parts) == pytest.approx(0, abs=1e-12)
+    assert stretch_spread_of(own, parts) == pytest.approx(0, abs=1e-12)
     away = rng.normal(size=(60, 3, 3)).repeat(2, 0) * np.tile([1, -1], 60)[:, None, None]
-    assert unevenness(own + away, parts) == pytest.approx(np.median(np.linalg.norm(away, axis=(1, 2))))
+    assert stretch_spread_of(own + away, parts) == pytest.approx(np.median(np.linalg.norm(away, axis=(1, 2))))
 
 
 def test_parts_of_other_proportions_are_even() -> None:
     upper, nodes = system().verts[:, 1] > 0, egg_model().template.nodes
     short = -0.7 * np.maximum(nodes, 0) * [0, 1, 0]
     scan = scan_of(egg_model().template.shape, 2000)
-    one, two = (signs_of(system(), short, scan, 0.02, parts).uneven for parts in (0 * labels(), upper.astype(int)))
+    one, two = (
+        compute_features(system(), short, scan, 0.02, parts).stretch_spread
+        for parts in (0 * labels(), upper.astype(int))
+    )
     assert 0.2 < one and two < 0.5 * one
-    even, level = (replace(SOUND, uneven=value).trust for value in (0.05, 0.2))
-    assert even == level > replace(SOUND, uneven=0.3).trust
+    even, level = (replace(SOUND, stretch_spread=value).p_correct for value in (0.05, 0.2))
+    assert even == level > replace(SOUND, stretch_spread=0.3).p_correct
 
 
 def test_a_shortened_template_is_not_torn() -> None:
     short, pressed = pressed_egg(1, 0.3)
-    assert torn_share(system(), neighbours(pressed), pressed, short) > 0.03
-    assert signs_of(system(), short, pressed, 0.02, labels()).torn < 0.005
+    assert discontinuous_share(system(), neighbours(pressed), pressed, short) > 0.03
+    assert compute_features(system(), short, pressed, 0.02, labels()).discontinuous < 0.005
 
 
 def test_the_network_reads_what_it_knows_alike_and_a_box_in_many_ways() -> None:
@@ -234,22 +238,26 @@ def test_the_residual_of_many_solids_is_allowed_for() -> None:
         verts = np.concatenate([egg.verts + 3.0 * k for k in range(count)])
         return Shape(verts, np.concatenate([egg.faces + len(egg.verts) * k for k in range(count)]))
 
-    allowed = [built_allowance(each, each) for each in map(solids, (1, 2, 5, 8, 12))]
+    allowed = [multipart_allowance(each, each) for each in map(solids, (1, 2, 5, 8, 12))]
     assert allowed == pytest.approx([0.0, 0.0, 0.033 * np.sqrt(0.5), 0.033, 0.033], abs=1e-6)
     many = solids(12)
     shown = Shape(many.verts, many.faces[: 5 * len(egg.faces)])  # the others are inside
-    assert built_allowance(many, shown) == pytest.approx(allowed[2])
+    assert multipart_allowance(many, shown) == pytest.approx(allowed[2])
 
 
 def test_what_is_excused_lets_a_fit_be_fair_but_not_good() -> None:
     fair, poor = replace(SOUND, residual=0.06), replace(SOUND, residual=0.1)
     assert [judge(each).verdict for each in (SOUND, fair, poor)] == ["good", "fair", "poor"]
-    assert judge_excused(SOUND, 0.024) == judge(SOUND)
-    judged = judge_excused(SOUND, 0.055)
-    assert (judged.verdict, judged.signs, [reason.code for reason in judged.reasons]) == ("fair", SOUND, ["residual"])
+    assert judge_with_allowance(SOUND, 0.024) == judge(SOUND)
+    judged = judge_with_allowance(SOUND, 0.055)
+    assert (judged.verdict, judged.features, [reason.code for reason in judged.reasons]) == (
+        "fair",
+        SOUND,
+        ["residual"],
+    )
     assert "5.5 %" in judged.reasons[0]
-    assert judge_excused(fair, 0.1) == judge(fair)
-    assert judge_excused(poor, 0.11) == judge(poor)
+    assert judge_with_allowance(fair, 0.1) == judge(fair)
+    assert judge_with_allowance(poor, 0.11) == judge(poor)
 
 
 def _two_sheets() -> tuple[Shape, OrientedPoints]:
@@ -296,30 +304,30 @@ def test_a_registration_is_judged_by_the_parts_of_its_shape(monkeypatch: pytest.
     shape = Shape(np.concatenate(verts), np.concatenate(faces))
     assert shape.face_parts.max() == 11
     shown = Shape(shape.verts, shape.faces[shape.face_parts < 3])
-    monkeypatch.setattr("meshmatch.fitting.verdict.without_inside", lambda *_: shown)
+    monkeypatch.setattr("meshmatch.fitting.judge.verdict.without_interior", lambda *_: shown)
     asked = []
 
     def watched(*args, **kwargs):
-        asked.append(args)
-        return signs_of(*args, **kwargs)
+        asked.append((*args[:3], kwargs["connected"]))
+        return compute_features(*args, **kwargs)
 
-    def excused(signs: Signs, residual: float) -> Judgement:
+    def excused(features: FitFeatures, residual: float) -> Judgement:
         asked.append(residual)
-        return judge_excused(signs, residual)
+        return judge_with_allowance(features, residual)
 
-    monkeypatch.setattr("meshmatch.fitting.verdict.signs_of", watched)
-    monkeypatch.setattr("meshmatch.fitting.verdict.judge_excused", excused)
+    monkeypatch.setattr("meshmatch.fitting.judge.verdict.compute_features", watched)
+    monkeypatch.setattr("meshmatch.fitting.judge.verdict.judge_with_allowance", excused)
     fit = Fitter(egg_model(), FitConfig(samples=900, variants=0, finalists=1, careful=1, partial="no")).fit(shape)
     assert fit.signs is not None
-    assert fit.signs.residual == pytest.approx(unexplained(fit.residual, built_allowance(shape, shown)))
+    assert fit.signs.residual == pytest.approx(subtract_in_quadrature(fit.residual, multipart_allowance(shape, shown)))
     assert 0 < fit.signs.residual < fit.residual
-    (system, vectors, local, *_, connected), residual = asked[-2:]
+    (system, vectors, local, connected), residual = asked[-2:]
     assert residual == fit.residual
     assert np.array_equal(connected, shape.vertex_parts[local.vertex])
     pairs, strict = neighbours(local), neighbours(local, connected)
     assert 0 < len(strict[0]) < len(pairs[0])
-    shortened = shortened_to(system, system.deformation_gradient(vectors))
-    assert fit.signs.torn == torn_share(system, strict, local, vectors, shortened)
+    shortened = shortening(system, system.deformation_gradient(vectors))
+    assert fit.signs.discontinuous == discontinuous_share(system, strict, local, vectors, shortened)
 
 
 @pytest.mark.parametrize("bend", [-120.0, -30.0, 0.0, 20.0, 60.0])
@@ -332,7 +340,7 @@ def test_a_knee_bends_forward_by_so_many_degrees(bend: float) -> None:
     angle, nodes = np.radians(bend), template.nodes
     swing = np.array([[1, 0, 0], [0, np.cos(angle), np.sin(angle)], [0, -np.sin(angle), np.cos(angle)]])  # front is +z
     low = nodes[:, 1] < -0.15 * np.ptp(nodes[:, 1])
-    low_points = system().verts[system().strain_points][:, 1]
+    low_points = system().verts[system().gradient_points][:, 1]
     vectors = np.where(low[:, None], nodes @ swing.T - nodes, 0.0)
     found = knees_forward(system(), vectors, legs)
     assert (low_points < 0).any()

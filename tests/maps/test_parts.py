@@ -26,7 +26,20 @@ def beads(*lengths: float, shift: float = 0.0, dropped: int = 0, name: str = "be
     V, F = len(resting), len(faces)
     zeros, fitted = np.zeros(V, np.float32), np.arange(F) < F - dropped
     stands = np.arange(V, dtype=np.int32)
-    places = Places(name, name, "t", resting, zeros, zeros, None, None, stands, faces, fitted, "good")
+    places = Places(
+        name=name,
+        hash=name,
+        template_hash="t",
+        resting=resting,
+        height=zeros,
+        distance=zeros,
+        shift=None,
+        spread=None,
+        stands=stands,
+        faces=faces,
+        fitted=fitted,
+        verdict="good",
+    )
     return places, np.repeat(np.arange(len(lengths)), BALL.V)
 
 
@@ -72,7 +85,17 @@ def test_a_cloud_has_no_parts() -> None:
     built, own = beads(1, 1, 1, 1, 1)
     none = np.zeros((0, 3), np.int32)
     cloud = Places(
-        "cloud", "cloud", "t", built.resting, built.height, built.distance, None, None, built.stands, none,
-        np.zeros(0, bool), "good",
-    )  # fmt: skip
+        name="cloud",
+        hash="cloud",
+        template_hash="t",
+        resting=built.resting,
+        height=built.height,
+        distance=built.distance,
+        shift=None,
+        spread=None,
+        stands=built.stands,
+        faces=none,
+        fitted=np.zeros(0, bool),
+        verdict="good",
+    )
     assert len(build_map(cloud, built).index) == len(build_map(built, cloud).index) == len(own)

@@ -32,7 +32,7 @@ from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
 from meshmatch.collections.fit_files import save_fit
 from meshmatch.errors import MeshmatchError
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.verdict_shapes import LIMBS, direction, faces_kept
+from meshmatch.experiments.bench.verdict_cases import LIMBS, direction, faces_kept
 from meshmatch.experiments.bench.verdicts import REFUSED, VERDICTS
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig

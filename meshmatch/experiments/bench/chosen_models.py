@@ -22,7 +22,7 @@ from rich.table import Table
 from typer import Option
 
 from meshmatch.api.inputs import validated
-from meshmatch.api.kinds import installed_models, read_kinds, tell_kinds
+from meshmatch.api.kinds import category_residuals, classify_shapes, installed_models
 from meshmatch.errors import InputError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.characters import characters_of
@@ -31,7 +31,7 @@ from meshmatch.experiments.makers.character_designs import Designer
 from meshmatch.experiments.makers.cut_scans import make_scans
 from meshmatch.experiments.makers.furniture import KINDS, furniture
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.kind import KNOWN
+from meshmatch.fitting.judge.category import KNOWN
 from meshmatch.shapes.files import as_shape
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
@@ -109,14 +109,14 @@ def row_of(name: str, shapes: list[Shape]) -> dict[str, Any]:
     for shape in runner.track(shapes, name):
         clean = [validated(shape).shape]
         with thread_limit(1):
-            readings = read_kinds(models, clean, config, sure=0.0)  # all are asked
+            readings = category_residuals(models, clean, config, sure=0.0)  # all are asked
         for model, reading in zip(models, readings[:, 0], strict=True):
             if model.card.category == wanted:
                 own = max(own, float(reading))
             else:
                 others = min(others, float(reading))
         try:
-            kind = tell_kinds(models, readings, clean, config)[0].kind
+            kind = classify_shapes(models, readings, clean, config)[0].kind
         except InputError:
             kind = ""
         right += kind == wanted

@@ -32,7 +32,7 @@ from meshmatch.experiments.bench.hearts import TRUTH, heart_errors
 from meshmatch.experiments.bench.scores import evaluate_set
 from meshmatch.experiments.bench.sets import load_folder, load_set
 from meshmatch.experiments.makers.human_bodies import write_bodies
-from meshmatch.fitting.viscous import NO_MODEL
+from meshmatch.fitting.without_model import NO_MODEL
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape

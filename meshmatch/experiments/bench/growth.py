@@ -97,7 +97,18 @@ def parts_to_parts(n: int, _: Path) -> Step:
     def places(name: str, moved: float) -> Places:
         at = points + np.float32(moved)
         return Places(
-            name, name, "", at, zeros, zeros, None, None, stands, corners, np.ones(len(corners), bool), "good"
+            name=name,
+            hash=name,
+            template_hash="",
+            resting=at,
+            height=zeros,
+            distance=zeros,
+            shift=None,
+            spread=None,
+            stands=stands,
+            faces=corners,
+            fitted=np.ones(len(corners), bool),
+            verdict="good",
         )
 
     source, target = places("a", 0.0), places("b", 0.01)

@@ -25,8 +25,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.fit_files import load_fit, save_fit
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_config import ON_NODES, FitConfig, Partial, Refine
-from meshmatch.fitting.latent import LatentRefineConfig
+from meshmatch.fitting.fit_config import ON_NODES, FitConfig, LatentRefineConfig, Partial, Refine
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import interpolate

@@ -7,10 +7,8 @@ vertices that have a partner, and that of a shape of another kind is infinite. A
 above 8. Confidence is compared, at every vertex, with how often the error is within 5 cm; a vertex without a partner
 never is. All maps weigh the same, however many vertices they have. The longest fit is in CPU seconds.
 
-``--fit`` prints the weights that tell right from wrong best, of the cases of this run: those in
-`meshmatch.fitting.signs` are of nine cases of seeds 0 and 1 and the families that may tune, of as many limbs, cuts and holes
-of seed 2, of twelve stylised and pulled ones of seeds 2, 3 and 4, and of 32 people of `experiments.bench.characters`,
-seed 5. Measure with another seed.
+``--fit`` prints the weights that tell right from wrong best, of the cases of this run, in the form in which
+`meshmatch.fitting.judge.calibration` keeps them. Measure with other seeds than those that it names.
 """
 
 from __future__ import annotations
@@ -20,6 +18,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
+from datetime import date
 from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -37,6 +36,7 @@ from meshmatch.experiments.bench.charts import Chart, Line, draw_lines
 from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, Case, Cases, between, direction
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.judge.calibration import Calibration
 from meshmatch.generators.kinds import GENERATORS
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.outputs import make_folder
@@ -270,7 +270,14 @@ def main(
     if fit:
         weights, offset = fitted_weights([each for each in found if each["family"] not in KEPT])
         record["weights"] = [round(float(value), 3) for value in weights] + [round(offset, 3)]
-        notes.append(f"weights {record['weights'][:-1]}, offset {record['weights'][-1]}")
+        fitted = Calibration(
+            weights=tuple(record["weights"][:-1]),
+            offset=record["weights"][-1],
+            data=f"{count} cases of each family of {kind}: {families}",
+            seeds=tuple(range(seed, seed + seeds)),
+            date=f"{date.today()}",
+        )
+        notes.append(str(fitted))
     return runner.Report(record, tables, notes)
 
 

@@ -25,12 +25,12 @@ from meshmatch.experiments.paper.ablation_setting import Setting
 from meshmatch.experiments.paper.ablation_views import BASE, CODED, Run
 from meshmatch.experiments.paper.learned_baselines import TransModel, load_transmatch
 from meshmatch.experiments.runner import spread
-from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit_config import FitConfig, NodeRefineConfig
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.latent import LatentRefineConfig, refine_code
-from meshmatch.fitting.network_fit import Candidate, Predictor
-from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
-from meshmatch.fitting.system import node_system
+from meshmatch.fitting.search.latent import LatentRefineConfig, refine_code
+from meshmatch.fitting.search.predictor import Candidate, Predictor
+from meshmatch.fitting.solve.nodes import refine_nodes
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame, RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.evaluate import CM_PER_UNIT, LOST_CM
@@ -41,7 +41,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 
 METHODS = ("none", "code", "chamfer", "nodes")
-"""Refinements: none; of the code with the run's regularisers, or without; Gauss-Newton on the nodes."""
+"""Refinements: none; of the code with the run's regularisers, or without; least squares on the nodes."""
 TRANS_POINTS, TRANS_ROUNDS = 1024, 2  # each network is asked twice, the second time in the frame of its first answer
 Refinement = LatentRefineConfig | NodeRefineConfig | None
 
@@ -243,7 +243,7 @@ def pair_errors(subjects: Sequence[Subject], fitted: Sequence[Float[Floats, "V 3
 
 CODE_STEPS, NODE_STEPS = (0, 10, 30, 100, 300), (0, 1, 2, 4, 7, 10)
 LINES = {
-    "ours, nodes (Gauss-Newton)": (BASE, "nodes", NODE_STEPS),
+    "ours, nodes (least squares)": (BASE, "nodes", NODE_STEPS),
     "ours, code (Adam)": (BASE, "code", CODE_STEPS),
     "3D-CODED, code (Adam)": (CODED, "chamfer", CODE_STEPS),
 }

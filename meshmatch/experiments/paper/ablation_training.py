@@ -54,7 +54,7 @@ def train_run(run: Run, setting: Setting, folder: Path, *, minutes: float = 0.0,
     template, recipe = setting.template(run), setting.recipe(run)
     pool = pool_of(setting, run.pose)
     model = new_network(run, setting, pool)
-    points = build_loss_points(template, recipe.kernel, model, strained=setting.strained)
+    points = build_loss_points(template, recipe.kernel, model, gradients=setting.strained)
     trainer = Trainer(model, fewer(points, run.supervised), recipe.train)
     on_cpu = trainer.device.type == "cpu"
     clock = time.process_time if on_cpu else time.monotonic
@@ -133,7 +133,7 @@ def built(setting: Setting, run: Run) -> tuple[Trainer, list[Any]]:
     chosen, template, source = setting.recipe(run), setting.template(run), setting.sources(run.pose)[0]
     train = chosen.train
     model = build_deformer(template, source, chosen.network, chosen.scan, chosen.kernel, train.seed)
-    points = build_loss_points(template, chosen.kernel, model, strained=setting.strained)
+    points = build_loss_points(template, chosen.kernel, model, gradients=setting.strained)
     trainer = Trainer(model, fewer(points, run.supervised), train)
     data = build_dataset(
         template, source, model, chosen.scan, train.shapes, train.scans_per_shape, train.seed, _BATCHES

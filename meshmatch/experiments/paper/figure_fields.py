@@ -24,7 +24,7 @@ from meshmatch.experiments.paper.ablation_errors import Measure, begin_body, ref
 from meshmatch.experiments.paper.ablation_views import BASE
 from meshmatch.fields.field import Field, PointField, PointwiseField, pack
 from meshmatch.fields.shape_functions import FIELDS, FieldName, has_nodes, shape_functions
-from meshmatch.fitting.system import node_system
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.maps.evaluate import CM_PER_UNIT

@@ -31,7 +31,7 @@ from meshmatch.arrays import Float, Floats, Int
 from meshmatch.errors import ModelError
 from meshmatch.experiments import runner
 from meshmatch.experiments.paper.transformer import TransConfig, Transformer
-from meshmatch.fitting.initial_frames import standing_grid
+from meshmatch.fitting.search.frames import standing_grid
 from meshmatch.generators.bodies import human_source
 from meshmatch.generators.generator import Source
 from meshmatch.geometry.triangles import interpolate

@@ -44,7 +44,7 @@ from meshmatch.experiments.makers.furniture_models import (
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.latent import LatentRefineConfig
+from meshmatch.fitting.search.latent import LatentRefineConfig
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.build import build_map
 from meshmatch.maps.places import Places

@@ -5,7 +5,7 @@ samples of generated bodies of people that no training drew, in one process with
 
 - code: 2,000 Adam steps on the shape code, Chamfer distance (3,000 points each way) plus volume and rigidity with the
   paper's weights; the best step of all is returned.
-- nodes: the steps that `meshmatch match` ends with, on all samples; also fewer of them.
+- nodes: the steps of least squares that `meshmatch match` ends with, on all samples; also fewer of them.
 
 Measured is the refinement alone, in CPU seconds, after one warm-up of each; what is computed once per template is counted
 for neither. The error is the mean distance of the fitted template's vertices from where they belong, in centimeters at
@@ -30,10 +30,10 @@ from meshmatch.arrays import Floats
 from meshmatch.experiments import runner
 from meshmatch.experiments.makers.human_bodies import unseen_bodies
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.latent import LatentRefineConfig, refine_code
-from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
-from meshmatch.fitting.system import node_system
+from meshmatch.fitting.fit_config import FitConfig, NodeRefineConfig
+from meshmatch.fitting.search.latent import LatentRefineConfig, refine_code
+from meshmatch.fitting.solve.nodes import refine_nodes
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.trained import TrainedModel

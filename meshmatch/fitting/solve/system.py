@@ -23,7 +23,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fields.shape_functions import ShapeFunctions
-from meshmatch.fitting.regularity import Regularity, Unfolding
+from meshmatch.fitting.solve.regularity import Regularity, Unfolding
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import triangle_vectors
 from meshmatch.models.trained import TrainedModel, once_per_model
@@ -44,15 +44,15 @@ _MAX_PRODUCTS = 20_000_000
 class NodeSystem:
     """A field on a template's vertices, arranged for repeated least squares on its node vectors.
 
-    With a field that is not linear it moves the template all the same, but there is nothing to `solve` for. Strain is
-    measured at ``strain_points`` of the vertices, at most.
+    With a field that is not linear it moves the template all the same, but there is nothing to `solve` for. The deformation
+    gradient F is asked at ``gradient_points`` of the vertices, at most.
 
-    ``verts`` (V, 3) and ``faces`` (F, 3) are the template's, in its frame; ``strain_points`` (G,) numbers of vertices.
+    ``verts`` (V, 3) and ``faces`` (F, 3) are the template's, in its frame; ``gradient_points`` (G,) numbers of vertices.
     """
 
     phi: Any  # (V, K), sparse or dense, where the field is linear
 
-    def __init__(self, shape: Shape, field: ShapeFunctions | PointwiseField, strain_points: int = 1500) -> None:
+    def __init__(self, shape: Shape, field: ShapeFunctions | PointwiseField, gradient_points: int = 1500) -> None:
         self.verts = np.asarray(shape.verts)
         self.faces = np.asarray(shape.faces)
         self.linear = isinstance(field, ShapeFunctions)
@@ -63,7 +63,7 @@ class NodeSystem:
         if isinstance(field, ShapeFunctions):
             self.K = field.K
             self.phi = field.phi.astype(np.float64)
-        self._strained = min(strain_points, len(self.verts))
+        self._gradient_count = min(gradient_points, len(self.verts))
         self._made: dict[str, Any] = {}
         self._making = RLock()
 
@@ -75,14 +75,14 @@ class NodeSystem:
             return self._made[name]
 
     @property
-    def strain_points(self) -> Int[Ints, " G"]:
-        return self._once("strain points", lambda: farthest_points(self.verts, self._strained))
+    def gradient_points(self) -> Int[Ints, " G"]:
+        return self._once("gradient points", lambda: farthest_points(self.verts, self._gradient_count))
 
     @property
     def equations(self) -> Equations:
         field = self.field
         assert isinstance(field, ShapeFunctions)
-        return self._once("equations", lambda: Equations.of(self.phi, field.gradient_at(self.strain_points)))
+        return self._once("equations", lambda: Equations.of(self.phi, field.gradient_at(self.gradient_points)))
 
     @property
     def shows_all(self) -> bool:
@@ -99,14 +99,14 @@ class NodeSystem:
         return self.verts + (self.phi @ vectors if self.linear else self.field.displaced(vectors))
 
     def deformation_gradient(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "G 3 3"]:
-        """F at the strain points, F[g, a, k] = d x'_a / d x_k."""
+        """F at the gradient points, F[g, a, k] = d x'_a / d x_k."""
         if not self.linear:
-            return self.field.strain(vectors, self.strain_points)
-        return (self.equations.slopes @ vectors).reshape(-1, 3, 3).transpose(0, 2, 1) + np.eye(3)
+            return self.field.deformation_gradient_at(vectors, self.gradient_points)
+        return (self.equations.gradient @ vectors).reshape(-1, 3, 3).transpose(0, 2, 1) + np.eye(3)
 
     def regularity(self, vectors: Float[Floats, "K 3"]) -> Regularity:
         """How regular the deformation is, at all vertices."""
-        return Regularity.of(self.field.strain(vectors))
+        return Regularity.of(self.field.deformation_gradient_at(vectors))
 
     def unfolded(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "K 3"]:
         """Node vectors near the given ones under which no vertex is folded, or fewer; see `Unfolding`."""
@@ -128,19 +128,19 @@ class NodeSystem:
         self,
         weights: Float[Floats, "V 6"],
         pulls: Float[Floats, "V 3"],
-        strain: float,
+        prior_weight: float,
         targets: Float[Floats, "G 3 3"],
         damping: float,
         current: Float[Floats, "K 3"],
     ) -> Float[Floats, "K 3"]:
-        """Minimise sum_p |y_p - s_p|^2_{H_p} + strain sum_g |F_g - T_g|^2 + damping |u - current|^2 over node vectors u.
+        """Minimise sum_p |y_p - s_p|^2_{H_p} + w sum_g |F_g - T_g|^2 + damping |u - current|^2 over node vectors u.
 
-        ``weights`` are upper triangles of H_p in the order xx xy xz yy yz zz, ``pulls`` right-hand sides H_p s_p, and
-        ``targets`` the T_g.
+        ``weights`` are upper triangles of H_p in the order xx xy xz yy yz zz, ``pulls`` right-hand sides H_p s_p,
+        ``prior_weight`` is w, and ``targets`` are the T_g.
         """
         fixed = self.equations
         blocks = fixed.pairs @ weights  # pairs 6
-        blocks[:, _DIAGONAL] += strain * fixed.strain_pairs[:, None]
+        blocks[:, _DIAGONAL] += prior_weight * fixed.gradient_pairs[:, None]
         normal = np.zeros((3 * self.K, fixed.band + 1))
         normal.reshape(-1)[fixed.place] = blocks[:, _BLOCK]
         normal[:, 0] += damping
@@ -148,7 +148,7 @@ class NodeSystem:
         full = np.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z], 1)
         right = self.phi.T @ (pulls - full)
         wanted = (targets - np.eye(3)).transpose(0, 2, 1).reshape(-1, 3)
-        right += strain * (fixed.slopes.T @ wanted) + damping * current
+        right += prior_weight * (fixed.gradient.T @ wanted) + damping * current
         solved = np.empty((self.K, 3))
         solved[fixed.order] = solveh_banded(
             normal.T, right[fixed.order].reshape(-1), overwrite_ab=True, lower=True, check_finite=False
@@ -156,27 +156,28 @@ class NodeSystem:
         return solved
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Equations:
-    """What never changes of a linear field's normal equations; strain points come to the ``slopes`` (3 G, K)."""
+    """What never changes of a linear field's normal equations."""
 
-    slopes: Any  # gradient of the shape functions at the strain points
+    gradient: Any  # (3 G, K), of the shape functions at the gradient points
     pairs: Any  # (pairs, V), products Phi_pi Phi_pj of the nodes that meet somewhere
-    strain_pairs: Float[Floats, " pairs"]  # the same of slopes, summed
+    gradient_pairs: Float[Floats, " pairs"]  # the same of the gradient, summed
     order: Int[Ints, " K"]  # of the nodes, in which those that meet are near one another
     band: int  # half width, see `_band_places`
     place: Int[Ints, "pairs 9"]
 
     @classmethod
     def of(cls, phi: Any, gradient: Any) -> Equations:
-        """For shape functions at the vertices, and their gradient at the strain points."""
-        K, slopes = phi.shape[1], gradient.astype(np.float64)
+        """For shape functions at the vertices, and their gradient at the gradient points."""
+        K, gradient = phi.shape[1], gradient.astype(np.float64)
         row, column, pairs = _pair_products(phi)
         graph = coo_matrix((np.ones(len(row), np.int8), (row, column)), (K, K))
         order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(np.int64)
-        met = slopes.T @ slopes
+        met = gradient.T @ gradient
         summed = (met if isinstance(met, np.ndarray) else met.toarray())[row, column]
-        return cls(slopes, pairs, summed, order, *_band_places(row, column, np.argsort(order)))
+        band, place = _band_places(row, column, np.argsort(order))
+        return cls(gradient=gradient, pairs=pairs, gradient_pairs=summed, order=order, band=band, place=place)
 
 
 @once_per_model

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.fitting.network_fit import weighted_mean
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.search.predictor import weighted_mean
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import is_discontinuous
 
@@ -28,7 +28,7 @@ def neighbours(samples: OrientedPoints, part: Int[Ints, " P"] | None = None) -> 
     return start, end
 
 
-def torn_share(
+def discontinuous_share(
     system: NodeSystem,
     pairs: Pairs,
     local: OrientedPoints,

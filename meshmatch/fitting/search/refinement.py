@@ -10,7 +10,7 @@ as front and back of a robot do, by what the network reads in copies of the shap
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -21,43 +21,87 @@ from scipy.spatial import cKDTree
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import needs
 from meshmatch.fitting import fit_config
-from meshmatch.fitting.candidates import STAGE, completed
-from meshmatch.fitting.network_fit import (
+from meshmatch.fitting.search.candidates import STAGE, candidates_of_part, candidates_of_whole, completed
+from meshmatch.fitting.search.discontinuities import Pairs, discontinuous_share, neighbours
+from meshmatch.fitting.search.predictor import (
+    USUAL_SPREAD,
     Candidate,
     best_first,
     one_way_residual,
     reads_alike,
+    scaled_to_area,
     two_way_residual,
     weighted_mean,
 )
-from meshmatch.fitting.nodes import refine_nodes
-from meshmatch.fitting.signs import USUAL_SPREAD
-from meshmatch.fitting.system import NodeSystem
-from meshmatch.fitting.task import FitTask, Refine
-from meshmatch.fitting.tears import Pairs, neighbours, torn_share
+from meshmatch.fitting.search.task import FitTask, Registration
+from meshmatch.fitting.solve.nodes import refine_nodes
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
 from meshmatch.threads import beside
 
-# All of these were set by hand. Lengths and residuals are in units of sqrt(area).
-_DISCONTINUITY_COST = 0.1  # residual that a map discontinuous everywhere is worse by
-_CAP = 0.1  # beyond it a distance says no more
-# Interpretations differ where this share of the template's vertices lies that far apart.
-_SHARE, _FAR = 0.02, 0.1
-# Interpretations closer than that are the same, and of these so many at most are averaged.
-_NEAR, _MAX_AVERAGED = 0.05, 8
-_POOL = 24  # among how many of the best those that are unlike each other are looked for
-# One whose score is so many times the best one's after a few steps is left: on 78 bodies of SCAPE, FAUST and SHREC'19 the
-# best after a few steps was the best at the end.
-_BEHIND = 1.05
-# Residual by which another way to stand must be better than that of most files, and the cosine from which on it is that one.
-_UNUSUAL, _UPRIGHT = 0.001, 0.85
-# Residual of an interpretation, for each unit that the network's readings of tilted copies lie from it, up to a usual
-# distance: beyond it they tell no more. On robots of seeds 0 and 1 they tell front from back in 15 of 15 ties.
-_UNSURE = 0.3
-_PART_FINALISTS = 4  # interpretations of a part that get a few steps each
-_SCREENED_SAMPLES = 4096  # enough to tell interpretations apart
+
+@dataclass(frozen=True, kw_only=True)
+class RefinementSettings:
+    """How interpretations are compared and refined. All set by hand; lengths and residuals are in units of sqrt(area).
+
+    Attributes
+    ----------
+    discontinuity_cost : residual that a map discontinuous everywhere is worse by
+    cap : a distance beyond this says no more
+    different_share, different_distance : interpretations differ where this share of the template's vertices lies that far
+        apart
+    same_distance, max_averaged : interpretations closer than that are the same, and so many of these at most are averaged
+    pool : among how many of the best those that are unlike each other are looked for
+    screening_margin : an interpretation whose score is more than this times the best one's after a few steps is left: on 78
+        bodies of SCAPE, FAUST and SHREC'19 the best after a few steps was the best at the end
+    unusual_axes_cost : margin by which an orientation that is rare in files must win
+    usual_cosine : cosine above which an orientation is a usual one
+    spread_cost : residual for each unit that the network's predictions for tilted copies lie from an interpretation, up to
+        the usual spread, beyond which they tell no more: on robots of seeds 0 and 1 they tell front from back in 15 of 15
+        ties
+    part_finalists : interpretations of a part that get a few steps each
+    screening_samples : samples that are enough to tell interpretations apart
+    """
+
+    discontinuity_cost: float = 0.1
+    cap: float = 0.1
+    different_share: float = 0.02
+    different_distance: float = 0.1
+    same_distance: float = 0.05
+    max_averaged: int = 8
+    pool: int = 24
+    screening_margin: float = 1.05
+    unusual_axes_cost: float = 0.001
+    usual_cosine: float = 0.85
+    spread_cost: float = 0.3
+    part_finalists: int = 4
+    screening_samples: int = 4096
+
+
+SETTINGS = RefinementSettings()
+
+
+Refine = Callable[[FitTask, list[Candidate]], Candidate]
+"""From a task's candidates, best first, to the fit."""
+
+
+def fit_whole(task: FitTask) -> Registration:
+    """Fit the template to a shape that is taken for complete."""
+    task, candidates = candidates_of_whole(task)
+    return Registration(task.on_visible_samples, REFINEMENTS[task.config.refine].whole(task, candidates))
+
+
+def fit_part(task: FitTask, wide: bool = False) -> Registration:
+    """Fit the template to a shape that may show only a part, from more orientations if the search is to be ``wide``.
+
+    The residual is from the samples to the template only.
+    """
+    task, candidates = candidates_of_part(task, wide)
+    best = REFINEMENTS[task.config.refine].part(task, candidates)
+    root = float(np.sqrt(best.share))
+    return Registration(task.rescaled(1 / root, scaled_to_area(task.samples, best.share)), best)
 
 
 @dataclass(frozen=True)
@@ -79,7 +123,7 @@ def _first(task: FitTask, candidates: list[Candidate]) -> Candidate:
 def _search_code(task: FitTask, candidates: list[Candidate]) -> Candidate:
     """The best candidate, refined by the paper's search over codes."""
     with needs("torch", "train"):
-        from meshmatch.fitting.latent import refine_code
+        from meshmatch.fitting.search.latent import refine_code
 
     best = candidates[0]
     local = task.samples.to_local(best.pose)
@@ -91,7 +135,7 @@ def _search_code(task: FitTask, candidates: list[Candidate]) -> Candidate:
 
 
 def _fit_nodes(task: FitTask, candidates: list[Candidate]) -> Candidate:
-    """The best of the candidates and of variants of the best one, refined by Gauss-Newton on the nodes."""
+    """The best of the candidates and of variants of the best one, refined by least squares on the nodes."""
     config, coarse, pose = task.config, task.coarse, candidates[0].pose
     local = task.samples.to_local(pose)
     pool = task.predictor.variants(local, coarse.to_local(pose), pose, config.variants, config.tilt)
@@ -99,12 +143,14 @@ def _fit_nodes(task: FitTask, candidates: list[Candidate]) -> Candidate:
         residual = two_way_residual(task.system, coarse.to_local(each.pose), each.vectors)
         pool.append(replace(each, residual=residual))
     found = best_first(pool)
-    return choose(found, config.finalists, WholeComparison(task.bare, found), task.progress.stage("refinement"))
+    return choose(
+        found, config.finalists, WholeComparison(task.on_visible_samples, found), task.progress.stage("refinement")
+    )
 
 
 def _fit_nodes_to_part(task: FitTask, candidates: list[Candidate]) -> Candidate:
-    """The best of several interpretations of a part, refined by Gauss-Newton on the nodes."""
-    return choose(candidates, _PART_FINALISTS, PartComparison(task), task.progress.stage(STAGE, 0.6, 1.0))
+    """The best of several interpretations of a part, refined by least squares on the nodes."""
+    return choose(candidates, SETTINGS.part_finalists, PartComparison(task), task.progress.stage(STAGE, 0.6, 1.0))
 
 
 REFINEMENTS: dict[fit_config.Refine, Refinement] = {
@@ -131,7 +177,7 @@ def choose(candidates: Sequence[Candidate], count: int, comparison: Comparison, 
     """The best of several interpretations (best first), refined; at most ``count`` that are unlike each other are tried."""
     finalists: list[Candidate] = []
     known: list[Floats] = []
-    for candidate in candidates[:_POOL]:
+    for candidate in candidates[: SETTINGS.pool]:
         verts = comparison.vertices(candidate)
         if len(finalists) < count and all(differ(verts, each) for each in known):
             finalists.append(candidate)
@@ -155,7 +201,7 @@ def _screened(candidates: list[Candidate], comparison: Comparison, progress: Pro
     rough = sorted(beside(tried, candidates), key=lambda entry: entry[0])
     kept: list[tuple[Candidate, Floats]] = []
     for score, candidate, verts in rough:
-        if score <= _BEHIND * rough[0][0] and all(differ(verts, other) for _, other in kept):
+        if score <= SETTINGS.screening_margin * rough[0][0] and all(differ(verts, other) for _, other in kept):
             kept.append((candidate, verts))
     return [candidate for candidate, _ in kept]
 
@@ -166,7 +212,7 @@ class WholeComparison:
     def __init__(self, task: FitTask, candidates: list[Candidate], roughness: float | None = None) -> None:
         self.task, self._candidates = task, candidates
         roughness = task.roughness if roughness is None else roughness
-        few = task.samples.first(_SCREENED_SAMPLES)
+        few = task.samples.first(SETTINGS.screening_samples)
         # by whether an interpretation is refined in full
         self.scorers = {
             in_full: CandidateScorer(task.system, samples, roughness)
@@ -199,7 +245,7 @@ class WholeComparison:
         cost = replace(candidate, residual=residual).cost
         if not in_full:
             return cost
-        return cost + (0.0 if stands_as_usual(candidate.pose) else _UNUSUAL) + self.doubt(candidate)
+        return cost + (0.0 if has_common_axes(candidate.pose) else SETTINGS.unusual_axes_cost) + self.doubt(candidate)
 
     def doubt(self, candidate: Candidate) -> float:
         """What is added to the residual of an interpretation that the network reads less surely."""
@@ -208,7 +254,7 @@ class WholeComparison:
             return 0.0
         everywhere = np.ones(len(task.system.verts), bool)
         spread = task.predictor.spread(candidate.local(task.samples), candidate.vectors, everywhere)
-        return _UNSURE * min(spread, USUAL_SPREAD)
+        return SETTINGS.spread_cost * min(spread, USUAL_SPREAD)
 
     def vertices(self, candidate: Candidate) -> Float[Floats, "V 3"]:
         moved = self.task.system.moved(candidate.vectors)
@@ -252,28 +298,30 @@ class CandidateScorer:
         residual, rough = candidate.residual, self._roughness
         if rough > 0:
             residual += rough * (self.scatter(local, candidate.vectors) - residual)
-        return residual + _DISCONTINUITY_COST * torn_share(self._system, self._pairs, local, candidate.vectors)
+        return residual + SETTINGS.discontinuity_cost * discontinuous_share(
+            self._system, self._pairs, local, candidate.vectors
+        )
 
     def scatter(self, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> float:
         """Root of the mean squared distance of nearest points, both ways, normals left out (units of sqrt(area))."""
         moved = self._system.moved(vectors)
-        forward = cKDTree(local.points).query(moved, distance_upper_bound=_CAP)[0]
-        back = cKDTree(moved).query(local.points, distance_upper_bound=_CAP)[0]
-        squares = [np.square(np.minimum(distance, _CAP)) for distance in (forward, back)]
+        forward = cKDTree(local.points).query(moved, distance_upper_bound=SETTINGS.cap)[0]
+        back = cKDTree(moved).query(local.points, distance_upper_bound=SETTINGS.cap)[0]
+        squares = [np.square(np.minimum(distance, SETTINGS.cap)) for distance in (forward, back)]
         return float(np.sqrt(0.5 * (squares[0].mean() + weighted_mean(squares[1], local.weights))))
 
 
-def stands_as_usual(pose: RigidPose) -> bool:
+def has_common_axes(pose: RigidPose) -> bool:
     """Whether a core frame stands as shapes do in most files: up along y and front along z, or up along z and front
     along -y.
     """
     up, front = pose.rotation[:, 1], pose.rotation[:, 2]
-    return bool(min(up[1], front[2]) > _UPRIGHT or min(up[2], -front[1]) > _UPRIGHT)
+    return bool(min(up[1], front[2]) > SETTINGS.usual_cosine or min(up[2], -front[1]) > SETTINGS.usual_cosine)
 
 
-def differ(here: Float[Floats, "V 3"], there: Float[Floats, "V 3"], far: float = _FAR) -> bool:
+def differ(here: Float[Floats, "V 3"], there: Float[Floats, "V 3"], far: float = SETTINGS.different_distance) -> bool:
     """Whether two interpretations have parts of the template in different places."""
-    return bool((np.linalg.norm(here - there, axis=1) > far).mean() > _SHARE)
+    return bool((np.linalg.norm(here - there, axis=1) > far).mean() > SETTINGS.different_share)
 
 
 def averaged(system: NodeSystem, chosen: Candidate, candidates: Sequence[Candidate]) -> Candidate:
@@ -285,6 +333,6 @@ def averaged(system: NodeSystem, chosen: Candidate, candidates: Sequence[Candida
     alike = [
         other.vectors
         for other in candidates
-        if other.pose is chosen.pose and not differ(here, system.moved(other.vectors), _NEAR)
+        if other.pose is chosen.pose and not differ(here, system.moved(other.vectors), SETTINGS.same_distance)
     ]
-    return replace(chosen, vectors=np.mean(alike[:_MAX_AVERAGED], axis=0)) if alike else chosen
+    return replace(chosen, vectors=np.mean(alike[: SETTINGS.max_averaged], axis=0)) if alike else chosen

@@ -1,4 +1,4 @@
-"""Signs that tell right fits from wrong ones, and how far they let a fit be trusted.
+"""Features that tell right fits from wrong ones, and the probability of a right fit that they give.
 
 What a fit says of itself is not only how near template and shape come: a template can be crushed onto a plane, or its legs
 both onto one. Each sign alone errs; together they give the probability that a fit is right, that is to say that its
@@ -15,9 +15,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
-from meshmatch.fitting.network_fit import two_way_residual, weighted_mean
-from meshmatch.fitting.system import NodeSystem
-from meshmatch.fitting.tears import neighbours, torn_share
+from meshmatch.fitting.judge.calibration import CALIBRATION
+from meshmatch.fitting.search.discontinuities import discontinuous_share, neighbours
+from meshmatch.fitting.search.predictor import USUAL_SPREAD, two_way_residual, weighted_mean
+from meshmatch.fitting.search.visibility import area_share, visible_vertices
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.symmetric import entries_of, logarithm, matrices_of
 from meshmatch.shapes.sampling import Samples, sample_surface
@@ -25,25 +27,20 @@ from meshmatch.shapes.shape import Shape
 
 # Further from the other surface than this (units of sqrt(area)), a point of shape or template is without counterpart.
 _REACH = 0.06
-# A template vertex is visible if a sample is this near, and if the nearest sample belongs this near to the vertex on the
-# resting template (units of sqrt(area)). Set by hand.
-_NEAR, _HOME = 0.06, 0.06
 # More noise than this (units of sqrt(area), 3.4 cm on a person) is a wrong fit rather than noise.
 _MAX_NOISE = 0.025
 _TEAR_SAMPLES = 4096  # enough to see tears
 _SHORTEST = 0.2  # what is shortened more is torn
 _EVEN = 0.2  # a stretch that varies less says no more
-USUAL_SPREAD = 0.03  # of fits that no network read
 _LEAST_SPREAD = 0.01  # less of it says no more
 _MIN_SQUARE = 1e-6  # of a stretch: a logarithm must stay finite
-# Of the logit of a wrong fit, in the order of `Signs.trust`.
-_WEIGHTS, _OFFSET = (0.909, 3.628, 1.163, 2.653, 5.308, 2.133), 9.935
+_WEIGHTS, _OFFSET = CALIBRATION.weights, CALIBRATION.offset
 # Residual (units of sqrt(area)) of even a right fit of a figure built of many solids, which no skin follows: the likeliest
 # one, given right fits and upside-down ones of robots, and fits of solids and of furniture in pieces, that are not those of
 # docs/results.md. Between so many parts of equal area and so many, set by hand, it grows to that.
 _BUILT, _FEW, _MANY = 0.033, 2.0, 8.0
-_AGAINST_IF_UNSIGNED = 0.015  # normals of a cloud have no side: taken for a usual share
-# Signs that tell by themselves, and how much each adds to the logit of a wrong fit. Set by hand, between what right and
+_FLIPPED_IF_UNSIGNED = 0.015  # normals of a cloud have no side: taken for a usual share
+# Features that decide alone, and how much each adds to the logit of a wrong fit. Set by hand, between what right and
 # wrong fits of `experiments.bench.campaign` have: knees that bend forward by so many degrees (16 at most where right, 31
 # to 74 of bodies taken back to front), pieces of a part beside the template (2 and 4 % of its surface), and a border of
 # what a part shows that is not cut (7 % where right and fair, 57 to 91 % of limbs taken for more).
@@ -53,21 +50,22 @@ _ASIDE = 0.022  # mean distance from the template (units of sqrt(area), 3 cm on 
 _CUT = 0.12  # a border further from an edge of the shape than this (units of sqrt(area)) is not that of a cut
 
 
-@dataclass(frozen=True)
-class Signs:
+@dataclass(frozen=True, kw_only=True)
+class FitFeatures:
     """What tells right fits from wrong ones.
 
     Attributes
     ----------
     residual : mean distance of template and shape, normals included, without what a cloud, or a figure of many solids,
         explains (units of sqrt(area))
-    missed : share (0..1) of the shape that the template does not reach
-    empty : share (0..1) of the template where the shape has no surface; a part has none of it
-    torn : share (0..1) of neighbours on the shape that belong far apart on the template, further than it is shortened there
+    uncovered_shape : share (0..1) of the shape that the template does not reach
+    uncovered_template : share (0..1) of the template where the shape has no surface; a part has none of it
+    discontinuous : share (0..1) of neighbouring samples whose template points are farther apart than local shortening
+        explains
     stretch : root mean square of the logarithms of the template's stretches
-    uneven : median over the template of how far the logarithm of the stretch there is from its mean over the body part,
-        which proportions explain: short legs are no worse a sign than long ones
-    against : share (0..1) of the shape that faces the other way than the template
+    stretch_spread : median over the template of how far the logarithm of the stretch there is from its mean over the body
+        part, which proportions explain: short legs are no worse a sign than long ones
+    flipped : share (0..1) of the shape that faces the other way than the template
     partial : whether the shape was taken for a part
     hidden : share (0..1) of the template that a part does not show
     astray : share (0..1) of a part's surface in separate pieces that lie beside the template
@@ -79,12 +77,12 @@ class Signs:
     """
 
     residual: float
-    missed: float = 0.0
-    empty: float = 0.0
-    torn: float = 0.0
+    uncovered_shape: float = 0.0
+    uncovered_template: float = 0.0
+    discontinuous: float = 0.0
     stretch: float = 0.0
-    uneven: float = 0.0
-    against: float = 0.0
+    stretch_spread: float = 0.0
+    flipped: float = 0.0
     partial: bool = False
     hidden: float = 0.0
     astray: float = 0.0
@@ -94,29 +92,29 @@ class Signs:
     inverted: float = 0.0
 
     def values(self) -> tuple[float, ...]:
-        """Numbers that grow about as the doubt does; ``empty``, ``stretch``, ``against`` and ``partial`` told nothing beside
-        them; ``inverted`` was not tried."""
+        """Numbers that grow about as the doubt does; ``uncovered_template``, ``stretch``, ``flipped`` and ``partial`` added
+        nothing to them; ``inverted`` was not tried."""
         return (
             100 * self.residual,
-            float(np.sqrt(10 * min(self.missed, 0.2))),
-            float(np.log(self.torn + 0.003)),
-            float(np.log(max(self.uneven, _EVEN))),
+            float(np.sqrt(10 * min(self.uncovered_shape, 0.2))),
+            float(np.log(self.discontinuous + 0.003)),
+            float(np.log(max(self.stretch_spread, _EVEN))),
             self.hidden,
             float(np.log(max(self.spread, _LEAST_SPREAD))),
         )
 
     @property
     def alone(self) -> tuple[bool, bool, bool]:
-        """Whether each sign speaks that tells by itself: ``astray``, ``uncut``, ``forward``."""
+        """Whether each feature speaks that decides alone: ``astray``, ``uncut``, ``forward``."""
         return self.astray > _ASTRAY, self.uncut > _UNCUT, self.forward > _FORWARD
 
     @property
-    def trust(self) -> float:
+    def p_correct(self) -> float:
         """Probability (0..1) that the fit is right."""
         return float(1 / (1 + np.exp(_OFFSET + np.dot(_WEIGHTS, self.values()) + _ALONE * sum(self.alone))))
 
 
-def signs_of(
+def compute_features(
     system: NodeSystem,
     vectors: Float[Floats, "K 3"],
     local: OrientedPoints,
@@ -125,10 +123,10 @@ def signs_of(
     partial: bool = False,
     spread_at: Callable[[Bool[Bools, " V"]], float] | None = None,
     connected: Int[Ints, " P"] | None = None,
-) -> Signs:
-    """The signs of a fit; ``local`` are samples of the shape in the core frame, ``parts`` the body parts of the template's
-    vertices, ``spread_at`` gives the spread over those that the shape shows (a usual one if there is no network), and
-    ``connected`` numbers the connected part of the shape that each sample is on, where there are several.
+) -> FitFeatures:
+    """The features of a fit; ``local`` are samples of the shape in the core frame, ``parts`` the body parts of the
+    template's vertices, ``spread_at`` gives the spread over those that the shape shows (a usual one if there is no network),
+    and ``connected`` numbers the connected part of the shape that each sample is on, where there are several.
     """
     shown = visible_vertices(system, local, vectors)
     surface = system.surface(vectors)
@@ -136,35 +134,37 @@ def signs_of(
     some = local.first(_TEAR_SAMPLES)
     gradient = system.deformation_gradient(vectors)
     stretches = matrices_of(0.5 * logarithm(entries_of(gradient.transpose(0, 2, 1) @ gradient), _MIN_SQUARE))
-    against = (surface.normals[nearest] * local.normals).sum(1) < 0
-    return Signs(
-        residual,
-        float(weighted_mean(gap > _REACH, local.weights)),
-        0.0 if partial else empty_share(local, surface.points),
-        torn_share(system, neighbours(some, connected), some, vectors, shortened_to(system, gradient)),
-        float(np.sqrt(np.square(stretches).sum((1, 2)).mean())),
-        unevenness(stretches, parts[system.strain_points]),
-        float(weighted_mean(against, local.weights)) if local.signed else _AGAINST_IF_UNSIGNED,
-        partial,
-        1 - area_share(system, shown) if partial else 0.0,
-        astray_share(connected, gap, local.weights) if partial and connected is not None else 0.0,
+    flipped = (surface.normals[nearest] * local.normals).sum(1) < 0
+    return FitFeatures(
+        residual=residual,
+        uncovered_shape=float(weighted_mean(gap > _REACH, local.weights)),
+        uncovered_template=0.0 if partial else uncovered_share(local, surface.points),
+        discontinuous=discontinuous_share(
+            system, neighbours(some, connected), some, vectors, shortening(system, gradient)
+        ),
+        stretch=float(np.sqrt(np.square(stretches).sum((1, 2)).mean())),
+        stretch_spread=stretch_spread_of(stretches, parts[system.gradient_points]),
+        flipped=float(weighted_mean(flipped, local.weights)) if local.signed else _FLIPPED_IF_UNSIGNED,
+        partial=partial,
+        hidden=1 - area_share(system, shown) if partial else 0.0,
+        astray=astray_share(connected, gap, local.weights) if partial and connected is not None else 0.0,
         spread=USUAL_SPREAD if spread_at is None or not shown.any() else spread_at(shown),
         inverted=system.regularity(vectors).inverted,
     )
 
 
-def unevenness(stretches: Float[Floats, "G 3 3"], parts: Int[Ints, " G"]) -> float:
+def stretch_spread_of(stretches: Float[Floats, "G 3 3"], parts: Int[Ints, " G"]) -> float:
     """Median norm of the logarithms of stretches about the mean of their part."""
     member = np.eye(int(parts.max()) + 1)[parts]
     means = np.einsum("gp,gij->pij", member, stretches) / np.maximum(member.sum(0), 1)[:, None, None]
     return float(np.median(np.linalg.norm(stretches - means[parts], axis=(1, 2))))
 
 
-def shortened_to(system: NodeSystem, gradient: Float[Floats, "G 3 3"]) -> Float[Floats, " V"]:
-    """By the deformation gradient at the strain points: the share of its length that a line on the template's surface keeps
-    around each vertex, in the direction in which it keeps least; from `_SHORTEST` to 1.
+def shortening(system: NodeSystem, gradient: Float[Floats, "G 3 3"]) -> Float[Floats, " V"]:
+    """The share of its length that a line on the template's surface keeps around each vertex, in the direction in which it
+    keeps least; from `_SHORTEST` to 1. By the deformation ``gradient`` at the gradient points.
     """
-    points = system.strain_points
+    points = system.gradient_points
     normals = system.normals(system.verts)[points]
     along = gradient - (gradient @ normals[:, :, None]) @ normals[:, None]  # of what lies in the surface
     a, b, c = gradient.transpose(2, 0, 1)
@@ -201,12 +201,12 @@ def uncut_share(
     return float(length[cKDTree(edges).query(middles)[0] > _CUT].sum() / length.sum())
 
 
-def unexplained(residual: float, allowance: float) -> float:
+def subtract_in_quadrature(residual: float, allowance: float) -> float:
     """What is left of a residual where squares add up."""
     return float(np.sqrt(max(residual**2 - allowance**2, 0.0)))
 
 
-def empty_share(local: OrientedPoints, points: Float[Floats, "V 3"]) -> float:
+def uncovered_share(local: OrientedPoints, points: Float[Floats, "V 3"]) -> float:
     """Share (0..1) of the fitted template's vertices without any of the shape near."""
     return float((cKDTree(local.points).query(points)[0] > _REACH).mean())
 
@@ -233,10 +233,10 @@ def cloud_allowance(
     cloud = Shape(drawn + noise * rng.standard_normal(drawn.shape), np.empty((0, 3), np.int64))
     expected = two_way_residual(system, OrientedPoints(cloud.verts, cloud.vertex_normals, signed=False), vectors)
     clear = two_way_residual(system, clean, vectors)
-    return unexplained(expected, clear)
+    return subtract_in_quadrature(expected, clear)
 
 
-def built_allowance(shape: Shape, shown: Shape) -> float:
+def multipart_allowance(shape: Shape, shown: Shape) -> float:
     """The part of the residual that even a right fit has on a mesh of several connected parts; squares add up.
 
     Only those count that are ``shown``, the same mesh without the faces that are hidden.
@@ -249,22 +249,3 @@ def built_allowance(shape: Shape, shown: Shape) -> float:
 def connected_parts(shape: Shape, samples: OrientedPoints) -> Int[Ints, " P"] | None:
     """Number of the connected part that each sample of a mesh is on; None where there is but one, and for a cloud."""
     return shape.vertex_parts[samples.vertex] if isinstance(samples, Samples) and shape.face_parts.any() else None
-
-
-def visible_vertices(system: NodeSystem, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> Bool[Bools, " V"]:
-    """Whether samples (core frame) show each vertex of the template as fitted.
-
-    Vertices beyond a cut have the edge of the samples near by, but the edge belongs elsewhere on the template.
-    """
-    surface = system.surface(vectors)
-    local = local.facing(surface)
-    distance, nearest = local.tree.query(surface.features)
-    home = surface.tree.query(local.features)[1]
-    away = np.linalg.norm(system.verts[home[nearest]] - system.verts, axis=1)
-    return np.asarray((distance < _NEAR) & (away < _HOME))
-
-
-def area_share(system: NodeSystem, vertices: Bool[Bools, " V"]) -> float:
-    """Share (0..1) of the resting template's area around some vertices."""
-    area = Shape(system.verts, system.faces).vertex_areas
-    return float(area[vertices].sum() / area.sum())

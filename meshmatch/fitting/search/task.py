@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from weakref import WeakKeyDictionary
@@ -10,10 +9,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.initial_frames import scan_frame
-from meshmatch.fitting.network_fit import Candidate, Predictor
-from meshmatch.fitting.nodes import Landmarks
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.search.frames import scan_frame
+from meshmatch.fitting.search.predictor import Candidate, Predictor
+from meshmatch.fitting.solve.system import NodeSystem
+from meshmatch.fitting.solve.terms import Landmarks
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
@@ -30,7 +29,7 @@ _CLEAN: WeakKeyDictionary[Shape, Shape | None] = WeakKeyDictionary()
 _SHOWN: WeakKeyDictionary[Shape, Shape | None] = WeakKeyDictionary()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class FitTask:
     """One shape that is to be fitted."""
 
@@ -41,7 +40,7 @@ class FitTask:
     roughness: float  # of the shape without outliers (0..1, see `Shape.roughness`)
     frame: Frame  # from the file to the frame of the samples: area about 1, centroid 0
     samples: OrientedPoints  # of the shape without outliers, for the network, which knows what may be hidden in shapes
-    shown: OrientedPoints  # the same, or of what can be seen from outside, for all else
+    visible_samples: OrientedPoints  # the same, or of what can be seen from outside, for all else
     landmarks: Landmarks | None  # template vertices (N,), positions (N, 3) in the file
     progress: Progress
 
@@ -61,11 +60,22 @@ class FitTask:
         clean = without_outliers(shape)
         frame, samples = take_samples(clean, config.samples, rng, scan_frame(model, clean, mirrored))
         predictor = Predictor.of(model, rng, config.device)
-        shown = samples
-        if (bare := without_inside(shape, predictor.system)) is not shape:
-            shown = sample_surface(bare, config.samples, np.random.default_rng(config.seed)).in_frame(frame)
+        visible = samples
+        if (shown := without_interior(shape, predictor.system)) is not shape:
+            visible = sample_surface(shown, config.samples, np.random.default_rng(config.seed)).in_frame(frame)
         progress = progress or Progress()
-        return cls(model, config, predictor, shape, clean.roughness, frame, samples, shown, landmarks, progress)
+        return cls(
+            model=model,
+            config=config,
+            predictor=predictor,
+            shape=shape,
+            roughness=clean.roughness,
+            frame=frame,
+            samples=samples,
+            visible_samples=visible,
+            landmarks=landmarks,
+            progress=progress,
+        )
 
     @property
     def system(self) -> NodeSystem:
@@ -78,21 +88,19 @@ class FitTask:
         return self.samples.first(self.config.coarse_samples)
 
     @property
-    def bare(self) -> FitTask:
+    def on_visible_samples(self) -> FitTask:
         """The same task with samples of what can be seen alone."""
-        return replace(self, samples=self.shown)
+        return replace(self, samples=self.visible_samples)
 
     def rescaled(self, scale: float, samples: OrientedPoints | None = None) -> FitTask:
         """The same task with lengths divided by ``scale``; where samples were left out, with those that are left."""
         frame = self.frame.compose(Frame(scale, np.eye(3), np.zeros(3)))
         if samples is not None:
-            return replace(self, frame=frame, samples=samples, shown=samples)
-        all_samples, shown = (replace(each, points=each.points / scale) for each in (self.samples, self.shown))
-        return replace(self, frame=frame, samples=all_samples, shown=shown)
-
-
-# Of a task's candidates, best first, to the fit.
-Refine = Callable[[FitTask, list[Candidate]], Candidate]
+            return replace(self, frame=frame, samples=samples, visible_samples=samples)
+        all_samples, visible = (
+            replace(each, points=each.points / scale) for each in (self.samples, self.visible_samples)
+        )
+        return replace(self, frame=frame, samples=all_samples, visible_samples=visible)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +141,7 @@ def without_outliers(shape: Shape) -> Shape:
     return _CLEAN[shape] or shape
 
 
-def without_inside(shape: Shape, system: NodeSystem) -> Shape:
+def without_interior(shape: Shape, system: NodeSystem) -> Shape:
     """A mesh without what cannot be seen from outside (found once), where the template has nothing of the kind."""
     if not system.shows_all:
         return shape

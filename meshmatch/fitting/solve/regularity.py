@@ -53,8 +53,8 @@ class Unfolding:
     def __init__(self, phi: Any, gradient: Any) -> None:
         """By shape functions (V, K) at the template's vertices, and their gradient (3 V, K)."""
         self._gradient = gradient.astype(np.float64)
-        moved, strained = (each.T @ each for each in (phi.astype(np.float64), self._gradient))
-        normal = moved + _LENGTH**2 * strained
+        moved, squared_gradient = (each.T @ each for each in (phi.astype(np.float64), self._gradient))
+        normal = moved + _LENGTH**2 * squared_gradient
         normal = normal if isinstance(normal, np.ndarray) else normal.toarray()
         normal[np.diag_indices_from(normal)] += _DAMPING * np.trace(normal) / len(normal)
         self._factor = cho_factor(normal, overwrite_a=True)
@@ -63,7 +63,7 @@ class Unfolding:
         """Node vectors near the given ones, with fewer folds or none; the same ones where nothing is folded."""
         best, fewest = vectors, np.inf
         for _ in range(_ROUNDS):
-            F = self._strain(vectors)
+            F = self._deformation_gradient(vectors)
             determinants = np.linalg.det(F)
             folds = int((determinants <= 0).sum())
             if folds < fewest:
@@ -77,7 +77,7 @@ class Unfolding:
             vectors = vectors + _AHEAD * _LENGTH**2 * cho_solve(self._factor, pull)
         return best
 
-    def _strain(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3 3"]:
+    def _deformation_gradient(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3 3"]:
         return (self._gradient @ vectors).reshape(-1, 3, 3).transpose(0, 2, 1) + np.eye(3)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.templates.template import Template
 
 # Labels of the parts above and below a knee. In the axes of a human template (y up, z to the front) a shin points down.
@@ -15,7 +15,7 @@ _DOWN, _FRONT = np.array([0.0, -1.0, 0.0]), 2
 
 def knees_forward(system: NodeSystem, vectors: Float[Floats, "K 3"], template: Template) -> float:
     """How far (degrees) the knee bends forward that does so most; 0 where none does, or the template has no knees."""
-    names, labels = template.label_names or (), np.asarray(template.labels)[system.strain_points]
+    names, labels = template.label_names or (), np.asarray(template.labels)[system.gradient_points]
     gradient, most = system.deformation_gradient(vectors), 0.0
     for above, below in _KNEES:
         if above not in names or below not in names:

@@ -1,4 +1,4 @@
-"""The network's candidates for a shape that is taken for complete, or for a part, and the fit that refinement makes of them.
+"""The network's candidates for a shape that is taken for complete, or for a part.
 
 The area of a cloud is only estimated, too small where points are few and noisy, and outliers look like surface. The
 network's own fit knows better: its template has the area of a body, and a point far from it, with few others around, is
@@ -15,18 +15,24 @@ the network wants it, and nothing beyond a cut is pulled onto its edge.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats
-from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try
-from meshmatch.fitting.network_fit import Candidate, Predictor, best_first, one_way_residual, sized, two_way_residual
-from meshmatch.fitting.signs import area_share, visible_vertices
-from meshmatch.fitting.system import NodeSystem
-from meshmatch.fitting.task import FitTask, Refine, Registration
-from meshmatch.fitting.verdict import judge_registration
+from meshmatch.fitting.search.frames import frames_of_part, frames_to_try
+from meshmatch.fitting.search.predictor import (
+    Candidate,
+    Predictor,
+    best_first,
+    one_way_residual,
+    scaled_to_area,
+    two_way_residual,
+)
+from meshmatch.fitting.search.task import FitTask
+from meshmatch.fitting.search.visibility import area_share, visible_vertices
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import vertex_areas
@@ -35,37 +41,64 @@ from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import beside
 
-# How the scale and the outliers of a cloud are found. Set by hand.
-_ROUNDS = 3
-_MAX_CHANGE = 1.3  # of the scale, in all: more is a wrong fit, not a wrong area
-_FAR = 0.06  # from the template, units of sqrt(area)
-_ISOLATED = 1.5  # reach of the nearest points, against the median of the cloud
-_NEIGHBOURS = 8
-_SETTLED = 0.005  # a relative change of the scale that ends the search
-_BEHIND = 1.1  # times the best residual: candidates further behind say nothing about a cloud's scale
-
-# A shape that the network's own fits of it miss by more than this (units of sqrt(area)) may be built like nobody that the
-# aligner knows: with a large head the core lies further down its own up axis than that by so much. Set by hand.
-_STRANGE = 0.05
-_LOWER = (0.1, 0.2)
-
 STAGE = "fitting as a part"
-# Shares of the surface that a part may show, and all that follows, were set by hand.
-SHARES = (1.0, 0.8, 0.62, 0.48, 0.36)
-_MIN_SHARE = 0.2  # that a shape is taken to show
-_WIDE_SHARES = (0.62,)  # for which a wide search tries all frames
-_ROUGH = 768  # samples by which frames are ranked
-# Candidates of each share that are fitted with care, in a narrow and in a wide search.
-_CAREFUL, _CAREFUL_IF_WIDE = 5, 5
-# Candidates that are completed and fitted again: so many once, of these so many twice, and so many three times.
-_COMPLETED = (10, 5, 3)
-_VARIED = 1  # candidates of which variants are sought
-_COARSE = 2048
-_MAX_ADDED = 3  # points that complete the samples, for each of them, at most
 
 
-def fit_whole(task: FitTask, refine: Refine) -> Registration:
-    """Fit the template to a shape that is taken for complete; ``refine`` turns the network's candidates into one fit."""
+@dataclass(frozen=True, kw_only=True)
+class CandidateSettings:
+    """How the network's candidates are found. All set by hand; lengths and residuals are in units of sqrt(area).
+
+    Attributes
+    ----------
+    scale_rounds : how often the scale and the outliers of a cloud are estimated anew
+    max_scale_change : factor by which the scale may change in all: more is a wrong fit, not a wrong area
+    outlier_distance : isolated points further than this from the fitted template are outliers
+    isolation : a point is isolated whose neighbours reach so many times as far as the median of the cloud
+    neighbours : how many neighbours those are
+    scale_tolerance : relative change of the scale that ends the search
+    scale_margin : candidates whose residual is more than this times the best one say nothing about a cloud's scale
+    unusual_residual : a shape that the network's own fits miss by more may be built like nobody that the aligner knows: with
+        a large head the core lies further down its own up axis
+    lower_cores : by how much the core is then tried further down
+    shares : shares of the surface that a part may show
+    min_share : the smallest share that a shape is taken to show
+    wide_shares : shares for which a wide search tries all frames
+    ranking_samples : samples by which frames are ranked
+    careful, careful_if_wide : candidates of each share that are fitted with care, in a narrow and in a wide search
+    completed : candidates that are completed and fitted again: so many once, of these so many twice, and so many three times
+    varied : candidates of which variants are sought
+    coarse_samples : samples by which variants are compared, and visible vertices found
+    max_added : points that complete the samples, for each of them, at most
+    """
+
+    scale_rounds: int = 3
+    max_scale_change: float = 1.3
+    outlier_distance: float = 0.06
+    isolation: float = 1.5
+    neighbours: int = 8
+    scale_tolerance: float = 0.005
+    scale_margin: float = 1.1
+    unusual_residual: float = 0.05
+    lower_cores: tuple[float, ...] = (0.1, 0.2)
+    shares: tuple[float, ...] = (1.0, 0.8, 0.62, 0.48, 0.36)
+    min_share: float = 0.2
+    wide_shares: tuple[float, ...] = (0.62,)
+    ranking_samples: int = 768
+    careful: int = 5
+    careful_if_wide: int = 5
+    completed: tuple[int, ...] = (10, 5, 3)
+    varied: int = 1
+    coarse_samples: int = 2048
+    max_added: int = 3
+
+
+SETTINGS = CandidateSettings()
+
+
+def candidates_of_whole(task: FitTask) -> tuple[FitTask, list[Candidate]]:
+    """The network's fits of a shape that is taken for complete, best first; and the task, a cloud's in the scale, and
+    without the outliers, that the best fit tells.
+    """
     orientation = task.progress.stage("orientation")
     orientation(0.0)
     # A cloud's residual says little before its core frame is found; a second round finds it.
@@ -74,11 +107,11 @@ def fit_whole(task: FitTask, refine: Refine) -> Registration:
     candidates = best_first(task.predictor.fit_all(starts, rounds=care, draws=care))
     careful = task.config.careful
     part = task.config.partial == "yes"  # which is no strange body
-    if candidates[0].residual > _STRANGE and not (task.shape.is_cloud or part):
+    if candidates[0].residual > SETTINGS.unusual_residual and not (task.shape.is_cloud or part):
         lower = [
             (samples, RigidPose(pose.rotation, pose.center - down * pose.rotation[:, 1]))
             for samples, pose in starts
-            for down in _LOWER
+            for down in SETTINGS.lower_cores
         ]
         candidates = best_first([*candidates, *task.predictor.fit_all(lower, rounds=care, draws=care)])
         careful *= 4
@@ -87,7 +120,7 @@ def fit_whole(task: FitTask, refine: Refine) -> Registration:
         task, candidates = _rescaled(task, candidates)
     best = task.predictor.fit_all([(task.samples, each.pose) for each in candidates[:careful]])
     orientation(1.0)
-    return Registration(task.bare, refine(task, best_first(best)))
+    return task, best_first(best)
 
 
 def _rescaled(task: FitTask, candidates: list[Candidate]) -> tuple[FitTask, list[Candidate]]:
@@ -96,7 +129,7 @@ def _rescaled(task: FitTask, candidates: list[Candidate]) -> tuple[FitTask, list
     def fit_again(samples: OrientedPoints, pose: RigidPose) -> Candidate:
         return task.predictor.fit(samples, pose, draws=1, measure=lambda *_: 0.0)
 
-    near = _BEHIND * candidates[0].residual
+    near = SETTINGS.scale_margin * candidates[0].residual
     best = [each for each in candidates[: task.config.careful] if each.residual <= near]
     isolated = isolated_points(task.samples.points)
     found = [estimate_scale(task.system, task.samples, isolated, candidate, fit_again) for candidate in best]
@@ -126,17 +159,17 @@ def estimate_scale(
     """
     resting = vertex_areas(system.verts, system.faces).sum()
     total = 1.0
-    for _ in range(_ROUNDS):
+    for _ in range(SETTINGS.scale_rounds):
         moved, pose = system.moved(candidate.vectors), candidate.pose
         step = np.sqrt(vertex_areas(moved, system.faces).sum() / resting)
-        step = np.clip(step, 1 / _MAX_CHANGE / total, _MAX_CHANGE / total)
+        step = np.clip(step, 1 / SETTINGS.max_scale_change / total, SETTINGS.max_scale_change / total)
         keep = ~isolated
-        keep[isolated] = cKDTree(pose.to_world(moved)).query(samples.points[isolated])[0] <= _FAR
+        keep[isolated] = cKDTree(pose.to_world(moved)).query(samples.points[isolated])[0] <= SETTINGS.outlier_distance
         total *= step
         samples, isolated = samples.rows(keep), isolated[keep]
         samples = replace(samples, points=samples.points / step)
         candidate = fit_again(samples, RigidPose(pose.rotation, pose.center / step))
-        if keep.all() and abs(step - 1) < _SETTLED:
+        if keep.all() and abs(step - 1) < SETTINGS.scale_tolerance:
             break
     return float(total), samples, candidate
 
@@ -147,45 +180,36 @@ def isolated_points(points: Float[Floats, "P 3"]) -> Bool[Bools, " P"]:
     Samples of a small cloud repeat its points; copies of a point do not count as its neighbours.
     """
     own, which = np.unique(points, axis=0, return_inverse=True)
-    reach = cKDTree(own).query(own, min(_NEIGHBOURS + 1, len(own)))[0][:, -1]
-    return np.asarray((reach > _ISOLATED * np.median(reach))[which.reshape(-1)])
+    reach = cKDTree(own).query(own, min(SETTINGS.neighbours + 1, len(own)))[0][:, -1]
+    return np.asarray((reach > SETTINGS.isolation * np.median(reach))[which.reshape(-1)])
 
 
-def fit_part(task: FitTask, refine: Refine) -> Registration:
-    """Fit the template to a shape that may show only a part; where that is poor, from more orientations.
+def candidates_of_part(task: FitTask, wide: bool = False) -> tuple[FitTask, list[Candidate]]:
+    """The network's fits of a shape that may show only a part, best first, each with the share that it shows; and the task,
+    whose predictor draws from its seed anew: each search draws the same random numbers.
 
-    ``refine`` turns the network's candidates into one fit, whose residual is from the samples to the template only.
+    A ``wide`` search starts from more orientations. Residuals are from the samples to the template only.
     """
-    found = _search(task, refine, wide=False)
-    if judge_registration(found, partial=True).verdict != "poor":
-        return found
-    config = replace(task.config, copies=2 * task.config.copies, hypotheses=2 * task.config.hypotheses)
-    again = _search(replace(task, config=config), refine, wide=True)
-    return min(found, again, key=lambda each: each.candidate.cost)
-
-
-def _search(task: FitTask, refine: Refine, wide: bool) -> Registration:
-    """The best fit of a part from some orientations; each search draws the same random numbers."""
-    task = replace(
-        task, predictor=Predictor.of(task.model, np.random.default_rng(task.config.seed), task.config.device)
-    )
+    config = task.config
+    if wide:
+        config = replace(config, copies=2 * config.copies, hypotheses=2 * config.hypotheses)
+    predictor = Predictor.of(task.model, np.random.default_rng(config.seed), config.device)
+    task = replace(task, config=config, predictor=predictor)
     progress = task.progress.stage(STAGE)
     candidates = _careful(task, wide, progress.between(0.0, 0.4))
-    for number, count in enumerate(_COMPLETED):
+    for number, count in enumerate(SETTINGS.completed):
         candidates = _fitted_again(task, best_first(candidates)[:count])
-        progress(0.4 + 0.2 * (number + 1) / len(_COMPLETED))
+        progress(0.4 + 0.2 * (number + 1) / len(SETTINGS.completed))
     candidates = best_first(candidates)
-    for candidate in candidates[:_VARIED]:
+    for candidate in candidates[: SETTINGS.varied]:
         # other interpretations of the completed samples
         local, config = candidate.local(task.samples), task.config
         whole = completed(task.system, local, candidate.vectors, candidate.share, task.predictor.rng)
-        near = local.first(_COARSE)
+        near = local.first(SETTINGS.coarse_samples)
         for each in task.predictor.variants(whole, near, candidate.pose, config.variants, config.tilt):
             residual = one_way_residual(task.system, local, each.vectors)
             candidates.append(replace(each, residual=residual, share=candidate.share))
-    best = refine(task, best_first(candidates))
-    root = float(np.sqrt(best.share))
-    return Registration(task.rescaled(1 / root, sized(task.samples, best.share)), best)
+    return task, best_first(candidates)
 
 
 def _careful(task: FitTask, wide: bool, progress: Progress) -> list[Candidate]:
@@ -195,20 +219,20 @@ def _careful(task: FitTask, wide: bool, progress: Progress) -> list[Candidate]:
     """
     found: list[Candidate] = []
     best: dict[int, float] = {}  # residuals of the frames that all shares have in common
-    order = sorted(SHARES, key=lambda share: wide and share not in _WIDE_SHARES)
+    order = sorted(SETTINGS.shares, key=lambda share: wide and share not in SETTINGS.wide_shares)
     for number, share in enumerate(order):
-        samples = sized(task.samples, share)
+        samples = scaled_to_area(task.samples, share)
         frames, others = frames_of_part(task.model, samples, task.config, wide)
         tried = list(range(len(others)))
-        if wide and number >= len(_WIDE_SHARES):
+        if wide and number >= len(SETTINGS.wide_shares):
             tried = sorted(best, key=lambda frame: best[frame])[: len(others) // 4]
-        thin = samples.first(_ROUGH)
+        thin = samples.first(SETTINGS.ranking_samples)
         starts = [(thin, pose) for pose in [*(others[k] for k in tried), *frames]]
         rough = task.predictor.fit_all(starts, 1, 1, one_way_residual)
         for k, candidate in zip(tried, rough, strict=False):
             best[k] = min(candidate.residual, best.get(k, np.inf))
         rough.sort(key=lambda candidate: candidate.residual)
-        count = _CAREFUL_IF_WIDE if wide else _CAREFUL
+        count = SETTINGS.careful_if_wide if wide else SETTINGS.careful
         careful = [(samples, each.pose) for each in rough[:count]]
         found += [replace(fit, share=share) for fit in task.predictor.fit_all(careful, measure=one_way_residual)]
         progress((number + 1) / len(order))
@@ -219,10 +243,14 @@ def _fitted_again(task: FitTask, candidates: Sequence[Candidate]) -> list[Candid
     """New fits of the samples, completed by the last fits; how much of these was visible is the new share."""
     system, starts, shares = task.system, [], []
     placed = [candidate.local(task.samples) for candidate in candidates]
-    shown = beside(lambda local, each: visible_vertices(system, local.first(_COARSE), each.vectors), placed, candidates)
+    shown = beside(
+        lambda local, each: visible_vertices(system, local.first(SETTINGS.coarse_samples), each.vectors),
+        placed,
+        candidates,
+    )
     for candidate, local, visible in zip(candidates, placed, shown, strict=True):
         vectors = candidate.vectors
-        shares.append(float(np.clip(area_share(system, visible), _MIN_SHARE, 1.0)))
+        shares.append(float(np.clip(area_share(system, visible), SETTINGS.min_share, 1.0)))
         whole = completed(system, local, vectors, candidate.share, task.predictor.rng, visible)
         growth = np.sqrt(shares[-1] / candidate.share)
         starts.append((replace(whole, points=whole.points * growth), RigidPose.identity()))
@@ -260,7 +288,7 @@ def completed(
     if not missing.area > 0:
         return local
     P = len(local.points)
-    count = min(round(P * missing.area / share), _MAX_ADDED * P)
+    count = min(round(P * missing.area / share), SETTINGS.max_added * P)
     added = sample_surface(missing, count, rng)
     local = local.facing(surface)
     order = rng.permutation(P + count)

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
 from meshmatch.errors import TemplateError
 from meshmatch.fields.shape_functions import ShapeFunctions
-from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints, nearest_unsigned, with_normals
 from meshmatch.models.network import Network
@@ -31,8 +31,9 @@ _VARIANT_POINTS = (700, 1400)
 _PREDICT_POINTS = 2048  # it sees of other samples
 _SPREAD_READINGS, _SPREAD_SEED = 6, 5  # tilts by which it is found out how sure the network is
 _SPREAD_TILT = 15.0  # degrees, see `Predictor.variants`
-# Further (units of sqrt(area)) its readings of the resting template lie from it only if it has not learned to read tilted
-# shapes; models that ship have 0.008 at most.
+USUAL_SPREAD = 0.03  # of fits that no network predicts (units of sqrt(area)), see `Predictor.spread`
+# If predictions for tilted copies of the resting template deviate more than this (units of sqrt(area)), the network was not
+# trained on tilted input, and `spread` is ignored; models that ship have 0.008 at most.
 _READS_ALIKE = 0.02
 _BATCH = 24  # clouds that it is asked about together: more save nothing, and take memory
 # Residual that a share of 0 has to be better by than one of 1: rather the whole than a part. Set by hand.
@@ -58,7 +59,7 @@ class Candidate:
 
     def local(self, samples: OrientedPoints) -> OrientedPoints:
         """Samples of area 1 as large as their share, in the core frame."""
-        return sized(samples, self.share).to_local(self.pose)
+        return scaled_to_area(samples, self.share).to_local(self.pose)
 
     @property
     def cost(self) -> float:
@@ -71,7 +72,7 @@ def best_first(candidates: Sequence[Candidate]) -> list[Candidate]:
     return sorted(candidates, key=lambda candidate: candidate.cost)
 
 
-def sized(samples: OrientedPoints, share: float) -> OrientedPoints:
+def scaled_to_area(samples: OrientedPoints, share: float) -> OrientedPoints:
     """Samples of area 1, scaled to area ``share``."""
     return replace(samples, points=samples.points * np.sqrt(share))
 
@@ -116,7 +117,7 @@ def _dense(matrix: Any) -> Floats:
     return np.asarray(matrix if isinstance(matrix, np.ndarray) else matrix.toarray())
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Predictor:
     """The network, and what its answers move; draws its points with ``rng``."""
 
@@ -130,7 +131,9 @@ class Predictor:
     def of(cls, model: TrainedModel, rng: np.random.Generator, device: str = "cpu", mirrored: bool = True) -> Predictor:
         """The predictor of a trained model; the mirror takes time to build, and serves `variants` alone."""
         mirror = mirror_of(model) if mirrored else None
-        return cls(model.on(device), node_system(model), model.template.core, mirror, rng)
+        return cls(
+            network=model.on(device), system=node_system(model), core=model.template.core, mirror=mirror, rng=rng
+        )
 
     def fit_all(
         self,

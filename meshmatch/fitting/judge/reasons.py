@@ -1,0 +1,43 @@
+"""The words of a verdict: good, fair or poor, and the reasons why it is not good."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+Verdict = Literal["good", "fair", "poor"]
+ReasonCode = Literal[
+    "residual",
+    "unreached",
+    "empty",
+    "torn",
+    "crushed",
+    "folded",
+    "pieces",
+    "uncut",
+    "bent",
+    "facing",
+    "unsure",
+    "doubt",
+    "part",
+    "side",
+    "unsupervised",
+]
+"""Template and shape stay apart; some of the shape is not reached; template lies where the shape has no surface;
+neighbours belong far apart; the template is stretched or compressed; it is folded, or inside out, in places; pieces of a
+part lie beside it; a part ends where the shape has no edge; a knee bends forward; the shape faces the other way; the network
+predicts other points for tilted and mirrored copies of the shape; no feature alone, but all together; it was taken for a
+part; its mirror image fits as well; the model was learned without correspondence."""
+
+
+class Reason(str):
+    """Why a verdict is not good: a sentence to print, with a ``code`` to branch on."""
+
+    code: ReasonCode
+
+    def __new__(cls, code: ReasonCode, sentence: str) -> Reason:
+        reason = super().__new__(cls, sentence)
+        reason.code = code
+        return reason
+
+    def __reduce__(self) -> tuple[type[Reason], tuple[str, str]]:
+        return Reason, (self.code, str(self))

@@ -1,0 +1,199 @@
+"""Good, fair or poor: how a fit is judged, by its features, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from meshmatch.arrays import Bool, Bools
+from meshmatch.fitting.judge.features import (
+    FitFeatures,
+    cloud_allowance,
+    compute_features,
+    connected_parts,
+    multipart_allowance,
+    subtract_in_quadrature,
+    uncut_share,
+)
+from meshmatch.fitting.judge.joints import knees_forward
+from meshmatch.fitting.judge.reasons import Reason, ReasonCode, Verdict
+from meshmatch.fitting.search.predictor import reads_alike
+from meshmatch.fitting.search.task import Registration, without_interior
+from meshmatch.fitting.solve.regularity import Regularity
+
+_SKIN = 1.9  # square metres of an adult's skin
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerdictLimits:
+    """Between good, fair and poor. Set by hand, apart from the trust, which is a probability.
+
+    Attributes
+    ----------
+    good_trust, fair_trust : trust from which on a fit is good, and fair: more likely right than wrong
+    uninformative_trust : upper bound where the residual is uninformative
+    good_share : share (0..1) of shape or template without counterpart up to which a fit is good
+    fair_share : share of the template up to which it is fair
+    hidden : share of the template: a part that shows less than the rest, such as a leg, is not enough to judge
+    crushed, flat : stretch of the template from which on no fit is good, and from which on it is poor
+    folded : share of the template's vertices that are folded, up to which a fit is good: right fits of generated animals
+        have up to 0.03, those of people up to 0.01
+    folded_by_agreement : the same for vertices that fold only when fits agree, which is no property of the shape
+    search_parts : residual (units of sqrt(area)) from which on a fit may be one of a part
+    residual, discontinuous, flipped, spread : what is above, is given as a reason
+    """
+
+    good_trust: float = 0.99
+    fair_trust: float = 0.5
+    uninformative_trust: float = 0.5
+    good_share: float = 0.02
+    fair_share: float = 0.06
+    hidden: float = 0.6
+    crushed: float = 1.0
+    flat: float = 2.0
+    folded: float = 0.05
+    folded_by_agreement: float = 0.01
+    search_parts: float = 0.031
+    residual: float = 0.0285
+    discontinuous: float = 0.02
+    flipped: float = 0.1
+    spread: float = 0.06
+
+
+LIMITS = VerdictLimits()
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A verdict, why it is not good, and by what features."""
+
+    verdict: Verdict
+    reasons: tuple[Reason, ...]
+    features: FitFeatures
+
+    @property
+    def trust(self) -> float:
+        """How far (0..1) the fit can be trusted."""
+        return self.features.p_correct
+
+
+def judge_registration(found: Registration, partial: bool) -> Judgement:
+    """What is thought of a registration."""
+    task, vectors = found.task, found.candidate.vectors
+    if task.shape.is_cloud:
+        allowance = cloud_allowance(task.system, found.local, task.shape.V, vectors, task.config.seed)
+    else:
+        allowance = multipart_allowance(task.shape, without_interior(task.shape, task.system))
+    residual = subtract_in_quadrature(found.candidate.residual, allowance)
+
+    def spread_at(vertices: Bool[Bools, " V"]) -> float:
+        return task.predictor.spread(found.local, vectors, vertices)
+
+    predicted = task.model.has_nodes and reads_alike(task.model)
+    features = compute_features(
+        task.system,
+        vectors,
+        found.local,
+        residual,
+        task.model.template.labels,
+        partial=partial,
+        spread_at=spread_at if predicted else None,
+        connected=connected_parts(task.shape, found.local),
+    )
+    features = replace(features, forward=knees_forward(task.system, vectors, task.model.template))
+    if partial and not task.shape.is_cloud:
+        edges = found.core_frame.apply(task.shape.verts[task.shape.edges.open].mean(1))
+        features = replace(features, uncut=uncut_share(task.system, found.local, vectors, edges))
+    return judge(features) if task.shape.is_cloud else judge_with_allowance(features, found.candidate.residual)
+
+
+def judge_with_allowance(features: FitFeatures, residual: float) -> Judgement:
+    """Verdict, reasons and trust of a fit of a mesh that has that ``residual``, some of it excused in ``features``.
+
+    What is excused makes no fit good: front and back of a figure of solids differ by no more than that.
+    """
+    judged = judge(features)
+    if judged.verdict != "good" or judge(replace(features, residual=residual)).verdict == "good":
+        return judged
+    return replace(judged, verdict="fair", reasons=(Reason("residual", _gap(residual)),))
+
+
+def judge(features: FitFeatures) -> Judgement:
+    """Verdict, reasons and trust."""
+    trust, reasons = features.p_correct, _reasons(features)
+    lacking = max(features.uncovered_shape, features.uncovered_template)
+    if features.partial:
+        lost = f"{100 * features.hidden:.0f} % of the template has no counterpart"
+        reasons.append(Reason("part", f"taken for a part: {lost}"))
+    if (
+        trust < LIMITS.fair_trust
+        or features.uncovered_template > LIMITS.fair_share
+        or features.hidden > LIMITS.hidden
+        or features.stretch > LIMITS.flat
+    ):
+        verdict: Verdict = "poor"
+    elif (
+        trust < LIMITS.good_trust
+        or features.partial
+        or lacking > LIMITS.good_share
+        or features.stretch > LIMITS.crushed
+        or features.inverted > LIMITS.folded
+    ):
+        verdict = "fair"
+    else:
+        return Judgement("good", (), features)
+    if trust < LIMITS.good_trust and not reasons:
+        likely = f"{int(100 * trust)} % likely to be right, where a good fit needs {100 * LIMITS.good_trust:.0f} %"
+        reasons.append(Reason("doubt", likely))
+    return Judgement(verdict, tuple(reasons), features)
+
+
+def _reasons(features: FitFeatures) -> list[Reason]:
+    """Features that speak against the fit."""
+    unreached = f"{100 * features.uncovered_shape:.0f} % of the shape is not reached by the template"
+    empty = f"{100 * features.uncovered_template:.0f} % of the template lies where the shape has no surface"
+    crushed = f"the template had to be stretched or compressed {np.exp(features.stretch):.1f}-fold on average"
+    facing = f"{100 * features.flipped:.0f} % of the shape faces the other way than the template"
+    unsure = (
+        f"what the network predicts for tilted and mirrored copies is {100 * features.spread:.0f} % of sqrt(area) off"
+    )
+    pieces = f"{100 * features.astray:.0f} % of the shape are separate pieces that lie beside the template"
+    uncut = f"{100 * features.uncut:.0f} % of the border of what the part shows is no edge of the shape"
+    bent = f"a knee bends forward by {features.forward:.0f} degrees, as if front and back were exchanged"
+    astray, open_border, forward = features.alone
+    told: list[tuple[bool, ReasonCode, str]] = [
+        (features.residual > LIMITS.residual, "residual", _gap(features.residual)),
+        (features.uncovered_shape > LIMITS.good_share, "unreached", unreached),
+        (features.uncovered_template > LIMITS.good_share, "empty", empty),
+        (
+            features.discontinuous > LIMITS.discontinuous,
+            "torn",
+            f"{100 * features.discontinuous:.0f} % of neighbours on the shape belong far apart",
+        ),
+        (features.stretch > LIMITS.crushed, "crushed", crushed),
+        (features.inverted > LIMITS.folded, "folded", _folds(features.inverted)),
+        (astray, "pieces", pieces),
+        (open_border, "uncut", uncut),
+        (forward, "bent", bent),
+        (features.flipped > LIMITS.flipped, "facing", facing),
+        (features.spread > LIMITS.spread, "unsure", unsure),
+    ]
+    return [Reason(code, words) for speaks, code, words in told if speaks]
+
+
+def _gap(residual: float) -> str:
+    on_a_person = 100 * np.sqrt(_SKIN) * residual
+    return f"template and shape are {100 * residual:.1f} % of sqrt(area) apart on average ({on_a_person:.1f} cm on a person)"
+
+
+def _folds(inverted: float) -> str:
+    return f"the template is folded or inside out at {100 * inverted:.1f} % of its vertices"
+
+
+def folded_by_agreement(before: Regularity | None, after: Regularity) -> Reason | None:
+    """Why a fit is no longer good whose deformation folds more than right ones do, or clearly more than before."""
+    folded = 0.0 if before is None else before.inverted
+    if after.inverted <= min(LIMITS.folded, folded + LIMITS.folded_by_agreement):
+        return None
+    return Reason("folded", _folds(after.inverted))

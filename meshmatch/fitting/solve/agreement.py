@@ -1,0 +1,180 @@
+"""Log-Euclidean co-registration: several fits of one template that agree on how it stretches.
+
+A fit sees its own surface alone, so it is free to slide along it. Shapes of one kind, or one shape in two poses,
+stretch the template alike: a few more steps of least squares on each fit pull its stretch at every gradient point to the
+mean of all. The mean is taken of logarithms, so that doubling and halving cancel (the log-Euclidean mean of Arsigny,
+Fillard, Pennec and Ayache, *Log-Euclidean metrics for fast and simple calculus on diffusion tensors*, 2006).
+Pairs of points hold tighter across the surface than along it, where the stretch decides.
+
+Shapes that are not alike, such as people in different clothes, do not stretch the template alike: the more the fits
+differ, the more each keeps the stretch that it had alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.fitting.fit_config import Pairing, Schedule, geometric_between
+from meshmatch.fitting.solve.driver import Problem, minimise_together
+from meshmatch.fitting.solve.priors import Prior, RotatedReference
+from meshmatch.fitting.solve.system import NodeSystem
+from meshmatch.fitting.solve.terms import Landmarks, LandmarkTerm, PairTerm, Term
+from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.symmetric import entries_of, exponential, logarithm, matrices_of
+from meshmatch.models.trained import TrainedModel
+
+_MIN_STRETCH = 1e-3  # smaller ones count as this: a logarithm must stay finite
+_STEEP = 8  # how suddenly shapes cease to be alike; set by hand
+_SAME = 0.99  # shapes so much alike share the stretch
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgreeConfig(Pairing):
+    """How fits are refined together. Set by hand, on 24 pairs each of SCAPE and FAUST, ``alike`` on generated people in
+    clothes.
+    """
+
+    steps: int = 8
+    prior: float = 0.0001  # weight of the common stretch
+    scale: float = 0.05  # of the robust weight (units of sqrt(area))
+    momentum: float = 0.6  # how far each step goes on along the last: what slides along the surface has far to go
+    drift: float = 0.4  # how far the common stretch follows the fits as they move, against where they began
+    alike: float = 0.4  # two whose logarithms of stretch lie so far apart (median) follow their mean half way
+    point_share: float = 0.01
+    pair_normals: float = 0.012
+    back_points: int = 8000
+    damping: float = 1e-4
+
+    @property
+    def schedule(self) -> Schedule:
+        """The same as the driver of the least squares takes it."""
+        return Schedule(
+            steps=self.steps,
+            prior=(self.prior, self.prior),
+            scale=(self.scale, self.scale),
+            damping=self.damping,
+            momentum=self.momentum,
+        )
+
+    @classmethod
+    def for_model(cls, model: TrainedModel) -> AgreeConfig:
+        """As stiff as the model's card says."""
+        return cls(prior=cls.prior * model.card.stiffness)
+
+    @classmethod
+    def for_collection(cls, model: TrainedModel) -> AgreeConfig:
+        """The same for many shapes, whose mean hardly moves: they come to it later than a pair meets half way."""
+        return replace(cls.for_model(model), steps=12)
+
+    def for_noise(self, roughness: float) -> AgreeConfig:
+        """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): all samples, shared, a stiffer template."""
+        return replace(
+            self,
+            prior=geometric_between(self.prior, 80 * self.prior, roughness),
+            momentum=self.momentum * (1 - roughness),
+            alike=self.alike / max(1 - roughness, 1e-9),  # noise stretches too
+            point_share=geometric_between(self.point_share, max(self.point_share, 3.0), roughness),
+            pair_normals=geometric_between(self.pair_normals, 5 * self.pair_normals, roughness),
+            back_points=round(self.back_points * (1 + roughness)),
+            shared=max(self.shared, roughness),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Member:
+    """One of several fits that agree."""
+
+    samples: OrientedPoints  # of the shape, in the fit's core frame
+    vectors: Float[Floats, "K 3"]  # node vectors of the fit
+    config: AgreeConfig  # all members take as many steps as the first
+    landmarks: Landmarks | None = None  # template vertices (N,), positions (N, 3) in the core frame
+    partial: bool = False  # the shape shows a part only
+
+    def problem(self, system: NodeSystem) -> Problem:
+        """The least squares of this fit."""
+        terms: list[Term] = [PairTerm(self.samples, self.config, self.partial)]
+        if self.landmarks is not None:
+            terms.append(LandmarkTerm(self.landmarks, self.config.landmark_weight))
+        return Problem(system=system, terms=terms, schedule=self.config.schedule)
+
+
+def agree(system: NodeSystem, members: Sequence[Member], threads: int = 1) -> list[Float[Floats, "K 3"]]:
+    """Refine the fits of several shapes together, so many beside each other: better node vectors for each."""
+    vectors = [member.vectors for member in members]
+    logs = [log_stretch(system.deformation_gradient(each)) for each in vectors]
+    prior = CommonStretch(logs, [member.config for member in members])
+    found = minimise_together([member.problem(system) for member in members], prior, vectors, threads)
+    return [system.unfolded(each) for each in found]
+
+
+class CommonStretch:
+    """The joint prior of fits that agree: each keeps to the mean stretch of all, as far as it is like them.
+
+    ``logs`` are the logarithms of the fits' stretches before they agree.
+    """
+
+    def __init__(self, logs: Sequence[Float[Floats, "G 3 3"]], configs: Sequence[AgreeConfig]) -> None:
+        self._logs, self._config, self._first = logs, configs[0], mean_log(logs)
+        self._follow = [likeness(log, logs, config.alike) for log, config in zip(logs, configs, strict=True)]
+
+    def __call__(self, gradients: Sequence[Float[Floats, "G 3 3"]]) -> list[Prior]:
+        mean = held_mean(self._first, mean_log([log_stretch(F) for F in gradients]), self._config)
+        shared = stretch_of(mean)
+        return [
+            RotatedReference(shared if share > _SAME else stretch_of(log + share * (mean - log)))
+            for log, share in zip(self._logs, self._follow, strict=True)
+        ]
+
+
+def likeness(log: Float[Floats, "G 3 3"], others: Sequence[Float[Floats, "G 3 3"]], half: float) -> float:
+    """How much (0..1) one of several shapes is like all of them, by the logarithms of their stretches.
+
+    It is a half where it differs by ``half``, at the median over the template; of two, their distance from one another.
+    """
+    apart = 2 * (log - mean_log(others))
+    distance = float(np.median(np.linalg.norm(apart.reshape(len(log), -1), axis=1)))
+    return 1 / (1 + (distance / half) ** _STEEP)
+
+
+def agree_step(
+    system: NodeSystem,
+    member: Member,
+    vectors: Float[Floats, "K 3"],
+    F: Float[Floats, "G 3 3"],
+    common: Float[Floats, "G 3 3"],
+) -> Float[Floats, "K 3"]:
+    """One step of one fit, from node vectors with the deformation gradients F towards the common stretch."""
+    return member.problem(system).step(0, vectors, F, RotatedReference(common))
+
+
+def held_mean(
+    first: Float[Floats, "G 3 3"], now: Float[Floats, "G 3 3"], config: AgreeConfig
+) -> Float[Floats, "G 3 3"]:
+    """Logarithm of the common stretch: between the mean of the fits before they agreed and their mean now.
+
+    Pairs hold fits across the surface alone. If nothing held the mean, all fits could slide together until a nose or a
+    finger is flat.
+    """
+    return first + config.drift * (now - first)
+
+
+def mean_log(logs: Sequence[Float[Floats, "G 3 3"]]) -> Float[Floats, "G 3 3"]:
+    """Mean of logarithms of stretches; its exponential is the log-Euclidean mean of the stretches."""
+    total = np.zeros_like(logs[0])
+    for log in logs:
+        total += log
+    return total / len(logs)
+
+
+def log_stretch(F: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
+    """Logarithm of the right stretch sqrt(F^T F)."""
+    return matrices_of(0.5 * logarithm(entries_of(F.transpose(0, 2, 1) @ F), _MIN_STRETCH**2))
+
+
+def stretch_of(logs: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
+    """The stretch of a logarithm."""
+    return matrices_of(exponential(entries_of(logs)))

@@ -1,0 +1,82 @@
+"""The one driver of least squares on node vectors: a schedule, terms and a prior, step by step.
+
+Each step freezes the pairs and the robust weights of the terms, and the targets of the prior (rotations, say), and solves
+one linear system. That is iteratively reweighted least squares with local/global rotations: iterative closest points with
+an as-rigid-as-possible prior (Sorkine and Alexa, 2007). Refinement of one fit, agreement of several, the fit without a
+model and interpolation differ only in what they hand over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.fitting.fit_config import Schedule
+from meshmatch.fitting.solve.priors import Prior
+from meshmatch.fitting.solve.system import NodeSystem
+from meshmatch.fitting.solve.terms import Quadratic, Term
+
+JointPrior = Callable[[Sequence[Float[Floats, "G 3 3"]]], Sequence[Prior]]
+"""From the current deformation gradients of several fits to the prior of each in the next step."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Problem:
+    """What is minimised for one fit, apart from its prior.
+
+    ``anchor`` moves the node vectors after each step, such as to where no term holds them.
+    """
+
+    system: NodeSystem
+    terms: Sequence[Term]
+    schedule: Schedule
+    anchor: Callable[[Float[Floats, "K 3"]], Float[Floats, "K 3"]] | None = None
+
+    def step(
+        self, number: int, start: Float[Floats, "K 3"], F: Float[Floats, "G 3 3"], prior: Prior
+    ) -> Float[Floats, "K 3"]:
+        """Node vectors after a step of the schedule from ``start``, where the deformation gradients are F."""
+        system, schedule = self.system, self.schedule
+        weights, pulls = self._sum(start, schedule.scale_at(number))
+        targets = prior.targets(F)
+        held = schedule.prior_at(number) * (1.0 / len(targets))
+        found = system.solve(weights, pulls, held, targets, schedule.damping / system.K, start)
+        return found if self.anchor is None else self.anchor(found)
+
+    def _sum(self, vectors: Float[Floats, "K 3"], scale: float) -> Quadratic:
+        """The sum of all terms."""
+        V = len(self.system.verts)
+        weights, pulls = np.zeros((V, 6)), np.zeros((V, 3))
+        for term in self.terms:
+            more_weights, more_pulls = term.quadratic(self.system, vectors, scale)
+            weights += more_weights
+            pulls += more_pulls
+        return weights, pulls
+
+    def start(self, now: Float[Floats, "K 3"], before: Float[Floats, "K 3"]) -> Float[Floats, "K 3"]:
+        """Where a step begins: further on along the last one, which led from ``before`` to ``now``."""
+        return now + self.schedule.momentum * (now - before) if self.schedule.momentum else now
+
+
+def minimise(problem: Problem, prior: Prior, vectors: Float[Floats, "K 3"]) -> Float[Floats, "K 3"]:
+    """Node vectors of one fit after all steps."""
+    return minimise_together([problem], lambda _: [prior], [vectors])[0]
+
+
+def minimise_together(
+    problems: Sequence[Problem], joint_prior: JointPrior, vectors: Sequence[Float[Floats, "K 3"]], threads: int = 1
+) -> list[Float[Floats, "K 3"]]:
+    """Node vectors of several fits after as many steps as the first has, so many fits beside each other."""
+    now = before = list(vectors)
+    with ThreadPoolExecutor(threads) as pool:
+        run = pool.map if threads > 1 else map
+        for number in range(problems[0].schedule.steps):
+            starts = [each.start(*path) for each, *path in zip(problems, now, before, strict=True)]
+            gradients = [each.system.deformation_gradient(start) for each, start in zip(problems, starts, strict=True)]
+            steps = [number] * len(problems)
+            before, now = now, list(run(Problem.step, problems, steps, starts, gradients, joint_prior(gradients)))
+    return now

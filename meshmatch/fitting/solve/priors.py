@@ -1,0 +1,103 @@
+"""Priors of the least squares of a fit: which deformation gradients it should have where the shape does not say.
+
+A prior gives a target T_g for the deformation gradient F_g at every gradient point, from the current F. This is the local
+step of local/global optimisation (Sorkine and Alexa, *As-rigid-as-possible surface modeling*, 2007); the linear system that
+holds F_g near T_g is the global one. A new prior is a class with `Prior`'s one method.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+
+from meshmatch.arrays import Float, Floats
+
+_MAX_ITERATIONS = 20  # of Newton's: five are the rule, and convergence is quadratic
+
+
+class Prior(Protocol):
+    """Which deformation gradients are sought."""
+
+    def targets(self, F: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
+        """Targets for the gradients of the next step, given the current ones."""
+
+
+@dataclass(frozen=True, eq=False)
+class RotatedReference:
+    """As rigid as possible about a reference: R_g S_g, with R_g the rotation that brings S_g closest to F_g.
+
+    The surface may bend, but it keeps the stretch of the reference.
+    """
+
+    reference: Float[Floats, "G 3 3"]
+
+    def targets(self, F: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
+        return nearest_rotations(F, self.reference) @ self.reference
+
+
+@dataclass(frozen=True, eq=False)
+class FixedGradient:
+    """Gradients that are known."""
+
+    wanted: Float[Floats, "G 3 3"]
+
+    def targets(self, F: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
+        return self.wanted
+
+
+@dataclass(frozen=True, eq=False)
+class ViscousGradient:
+    """The mean of the current gradients over the nearest gradient points.
+
+    The stretch may be any, but changes slowly from place to place, and what a step has gained is kept, as in a viscous
+    fluid.
+    """
+
+    mean: Any  # sparse (G, G)
+
+    @classmethod
+    def over(cls, points: Float[Floats, "G 3"], count: int) -> ViscousGradient:
+        """For gradient points on the resting template: each mean is over ``count`` of them, itself included."""
+        near = cKDTree(points).query(points, count)[1]
+        rows = np.repeat(np.arange(len(points)), count)
+        return cls(csr_matrix((np.full(near.size, 1 / count), (rows, near.reshape(-1))), (len(points),) * 2))
+
+    def targets(self, F: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
+        return np.asarray(self.mean @ F.reshape(-1, 9)).reshape(-1, 3, 3)
+
+
+def nearest_rotations(F: Float[Floats, "G 3 3"], start: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
+    """Rotations R_g that bring start_g closest to F_g (orthogonal Procrustes).
+
+    The orthogonal factor of F start^T by Newton's iteration with scaling (Higham, 1986), all matrices side by side: a
+    sixth of the time of singular values, which remain for those that are nearly singular or turned inside out.
+    """
+    M = F @ start.transpose(0, 2, 1)
+    X = np.ascontiguousarray(M.reshape(-1, 9).T)
+    size = np.sqrt((X * X).sum(0))
+    C = _cofactors(X)
+    hard = (X[:3] * C[:3]).sum(0) <= 1e-4 * size**3
+    X[:, hard] = np.eye(3).reshape(9, 1)
+    for _ in range(_MAX_ITERATIONS):
+        C = _cofactors(X)
+        det = (X[:3] * C[:3]).sum(0)
+        scale = np.sqrt(np.sqrt((C * C).sum(0) / (X * X).sum(0)) / det)
+        last, X = X, 0.5 * (scale * X + C / (scale * det))
+        if not (np.abs(X - last) > 1e-8).any():
+            break
+    R = np.ascontiguousarray(X.T).reshape(-1, 3, 3)
+    if hard.any():
+        U, _, Vh = np.linalg.svd(M[hard])
+        U[:, :, 2] *= np.linalg.det(U @ Vh)[:, None]
+        R[hard] = U @ Vh
+    return R
+
+
+def _cofactors(X: Float[Floats, "9 G"]) -> Float[Floats, "9 G"]:
+    a, b, c, d, e, f, g, h, i = X
+    rows = (e * i - f * h, f * g - d * i, d * h - e * g, c * h - b * i, a * i - c * g, b * g - a * h)
+    return np.stack([*rows, b * f - c * e, c * d - a * f, a * e - b * d])

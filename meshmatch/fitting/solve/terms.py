@@ -1,0 +1,162 @@
+"""Terms of the least squares of a fit: what pulls template vertices to where they belong.
+
+Every term is quadratic once its pairs and robust weights are frozen for a step: iteratively reweighted least squares, with
+the weight function of Geman and McClure for pairs of nearest points, as in robust variants of iterative closest points.
+A new term is a class with `Term`'s one method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.sparse import csc_matrix
+from scipy.spatial import cKDTree
+
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.fitting.fit_config import Pairing
+from meshmatch.fitting.solve.system import NodeSystem
+from meshmatch.geometry.oriented import OrientedPoints, feature_tree, with_normals
+from meshmatch.geometry.triangles import vertex_areas
+
+_SHARERS = 16  # vertices of the template that share a point, at most
+
+Landmarks = tuple[Int[Ints, " N"], Float[Floats, "N 3"]]
+"""Template vertices and where they belong."""
+Quadratic = tuple[Float[Floats, "V 6"], Float[Floats, "V 3"]]
+"""Upper triangles (V, 6) of H_p and right-hand sides H_p s_p (V, 3) of template vertices p, see `NodeSystem.solve`."""
+
+
+class Term(Protocol):
+    """Something that pulls at template vertices."""
+
+    def quadratic(self, system: NodeSystem, vectors: Float[Floats, "K 3"], scale: float) -> Quadratic:
+        """The term about the current node vectors; ``scale`` is that of robust weights (units of sqrt(area))."""
+
+
+@dataclass(frozen=True, eq=False)
+class PairTerm:
+    """Pairs of template vertices and samples, whose weights sum to about one and follow those of the samples.
+
+    Where pairs are ``one_sided``, the samples show a part of the shape: template vertices without a partner are left to
+    the prior.
+    """
+
+    samples: OrientedPoints  # core frame
+    config: Pairing
+    one_sided: bool = False
+
+    def quadratic(self, system: NodeSystem, vectors: Float[Floats, "K 3"], scale: float) -> Quadratic:
+        surface, shared = system.surface(vectors), self.config.shared
+        if shared <= 0:
+            return _nearest_pairs(system, self.samples, surface, scale, self.config, self.one_sided)
+        far_weights, far_pulls = _shared_pairs(system, self.samples, surface, scale, self.config)
+        if shared >= 1:
+            return far_weights, far_pulls
+        weights, pulls = _nearest_pairs(system, self.samples, surface, scale, self.config, self.one_sided)
+        return (1 - shared) * weights + shared * far_weights, (1 - shared) * pulls + shared * far_pulls
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkTerm:
+    """Template vertices (N,) that are pulled to positions (N, 3) in the core frame, each with the same weight."""
+
+    landmarks: Landmarks
+    weight: float
+
+    def quadratic(self, system: NodeSystem, vectors: Float[Floats, "K 3"], scale: float) -> Quadratic:
+        (at, position), V = self.landmarks, len(system.verts)
+        weights, pulls = np.zeros((V, 6)), np.zeros((V, 3))
+        np.add.at(weights, (at[:, None], np.array([0, 3, 5])), self.weight)
+        np.add.at(pulls, at, self.weight * position)
+        return weights, pulls
+
+
+def _nearest_pairs(
+    system: NodeSystem, samples: OrientedPoints, surface: OrientedPoints, scale: float, config: Pairing, one_sided: bool
+) -> Quadratic:
+    """Pairs of what is nearest and faces the same way, in both directions, each with half of the weight."""
+    moved, normals = surface.points, surface.normals
+    features = with_normals(moved, normals, config.pair_normals)
+    to_samples = samples.pair_tree(config.pair_normals).query(features)[1]
+    partner, partner_normal = samples.points.take(to_samples, 0), samples.normals.take(to_samples, 0)
+    area = vertex_areas(moved, system.faces)
+    forward = area / area.sum() * robust_weight(moved - partner, scale)
+    forward *= _row_sums(normals * partner_normal) > config.normal_cosine
+    if one_sided:
+        forward *= np.linalg.norm(moved - partner, axis=1) < 3 * scale
+
+    some = samples.thinned(config.back_points)
+    to_template = feature_tree(features).query(with_normals(some.points, some.normals, config.pair_normals))[1]
+    back = robust_weight(moved.take(to_template, 0) - some.points, scale) / len(some.points)
+    back *= _row_sums(normals.take(to_template, 0) * some.normals) > config.normal_cosine
+    if samples.weights is not None and some.weights is not None:
+        forward *= samples.weights[to_samples]
+        back *= some.weights
+
+    at = np.concatenate([np.arange(len(moved)), to_template])
+    point = np.concatenate([partner, some.points])
+    normal = np.concatenate([partner_normal, some.normals])
+    weight = 0.5 * np.concatenate([forward, back])
+    return _summed(at, point, normal, weight, config.point_share, len(moved))
+
+
+def _shared_pairs(
+    system: NodeSystem, samples: OrientedPoints, surface: OrientedPoints, scale: float, config: Pairing
+) -> Quadratic:
+    """Every sample pairs with all of the template from where noise may have brought it.
+
+    The expectation step of a mixture of Gaussians at the template's vertices, as in Coherent Point Drift (Myronenko and
+    Song, TPAMI 2010). A template among noisy points always has one close by, so it does not ask which; and directions
+    across are its own.
+    """
+    some, moved = samples.thinned(config.back_points), surface.points
+    V = len(moved)
+    distance, at = cKDTree(moved).query(some.points, min(_SHARERS, V))
+    distance, at = distance.reshape(len(some.points), -1), at.reshape(len(some.points), -1)
+    further = np.square(distance) - np.square(distance[:, :1])  # the nearest one always has its share
+    share = vertex_areas(moved, system.faces)[at] * np.exp(-0.5 * further / config.spread**2)
+    share /= np.maximum(share.sum(1, keepdims=True), 1e-300)
+    share *= 1.0 / np.square(1.0 + np.square(distance[:, :1] / scale)) / len(some.points)
+    if some.weights is not None:
+        share *= some.weights[:, None]
+    # Directions are the template's, so all that pulls at a vertex is summed before they are asked.
+    begins = np.arange(0, share.size + 1, share.shape[1])
+    shares = csc_matrix((share.reshape(-1), at.reshape(-1), begins), (V, len(share)))
+    total, pull = shares @ np.ones(len(share)), shares @ some.points
+    mean = pull / np.maximum(total, 1e-300)[:, None]
+    return _summed(np.arange(V), mean, surface.normals, total, config.point_share, V)
+
+
+def _summed(
+    at: Int[Ints, " N"],
+    point: Float[Floats, "N 3"],
+    normal: Float[Floats, "N 3"],
+    weight: Float[Floats, " N"],
+    share: float,
+    V: int,
+) -> Quadratic:
+    """Sum w (n n^T + share I) and its product with the point, per template vertex."""
+    axes, places = np.ascontiguousarray(normal.T), np.ascontiguousarray(point.T)
+    x, y, z = axes
+    entries = x * x + share, x * y, x * z, y * y + share, y * z, z * z + share
+    along = _row_sums(normal * point)
+    pulls = (axis * along + share * place for axis, place in zip(axes, places, strict=True))
+    return _sums(at, (entry * weight for entry in entries), V), _sums(at, (weight * pull for pull in pulls), V)
+
+
+def _sums(at: Int[Ints, " N"], columns: Iterable[Float[Floats, " N"]], V: int) -> Float[Floats, "V D"]:
+    """Sums at each vertex of D columns."""
+    return np.stack([np.bincount(at, column, V) for column in columns], 1).astype(np.float64, copy=False)
+
+
+def robust_weight(offset: Float[Floats, "N 3"], scale: float) -> Float[Floats, " N"]:
+    """Geman and McClure's weight of offsets."""
+    return 1.0 / np.square(1.0 + _row_sums(np.square(offset)) / scale**2)
+
+
+def _row_sums(rows: Float[Floats, "N 3"]) -> Float[Floats, " N"]:
+    """A quarter of the time of ``rows.sum(1)``, and the same bits."""
+    return rows[:, 0] + rows[:, 1] + rows[:, 2]
