@@ -73,7 +73,7 @@ def is_numbered(numbers: ArrayLike | Sequence[str]) -> bool:
 def check_numbered(numbers: ArrayLike | Sequence[str]) -> None:
     """`InputError` if the rows are not numbered 0, 1, 2, ..."""
     if not is_numbered(numbers):
-        from_one = is_numbered(["0", *numbers] if len(numbers) and isinstance(numbers[0], str) else [0, *numbers])
+        from_one = is_numbered(["0", *map(str, np.asarray(numbers).tolist())])
         hint = "it counts from 1: subtract 1" if from_one else "sort it, one row for each"
         raise InputError("its rows are not 0, 1, 2, ... in order", hint)
 

@@ -263,7 +263,7 @@ def _read_fcsv(path: Path) -> tuple[list[Record], Space]:
     head = [name.strip() for name in names.split(mark)]
     if not {"x", "y", "z"} <= set(head):
         raise InputError("its columns have no x, y and z")
-    records = []
+    records: list[dict[str, Any]] = []
     lines = (line for line in text.splitlines() if line.strip(" \t;,") and not line.startswith("#"))
     for row in csv.reader(lines, delimiter=mark):
         cell = dict(zip(head, row, strict=False))  # later columns may be left out
