@@ -41,7 +41,13 @@ class MeshmatchError(Exception):
 
 
 class MeshmatchWarning(UserWarning):
-    """Something about a file that the user should know: what was left out, or taken in another way than it is written."""
+    """Something about a file that the user should know: what was left out, or taken in another way than it is written.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> warnings.simplefilter("error", meshmatch.MeshmatchWarning)
+    """
 
 
 def warn(text: str) -> None:

@@ -31,7 +31,7 @@ FUNCTIONS = {name: thing for name, thing in PUBLIC.items() if not inspect.isclas
     if inspect.isclass(thing)
     for method, function in methods(thing)
 }
-CLASSES = {name: thing for name, thing in PUBLIC.items() if inspect.isclass(thing)}
+CLASSES = {name: thing for name, thing in PUBLIC.items() if inspect.isclass(thing) and not issubclass(thing, Warning)}
 
 
 def section(thing: Any, title: str) -> list[str]:
