@@ -16,10 +16,3 @@ def test_public_names_are_there_and_nothing_else_is() -> None:
     assert (ROOT / "meshmatch" / "py.typed").is_file()
     with pytest.raises(AttributeError, match="no attribute 'mach'"):
         _ = meshmatch.mach  # type: ignore[attr-defined]
-
-
-def test_the_reference_names_everything_public() -> None:
-    from meshmatch.experiments import reference
-
-    described = {name for names in reference.API.values() for name in names}
-    assert described == set(meshmatch.__all__) - {"__version__"}
