@@ -179,7 +179,7 @@ def test_strict_wants_fits_that_are_not_poor(run: Run, eggs: Path, tmp_path: Pat
     strict = run(*call, "--model", eggs / "model", "--strict")
     assert strict.status == 1
     assert strict.err.startswith("error: the fit is poor, nothing was written: ")
-    assert ".ply: template and shape stay" in strict.err
+    assert ".ply: template and shape are" in strict.err
     assert not out.exists()
     lax = run(*call, "--model", eggs / "model", "--quiet")
     assert lax.status == 0
