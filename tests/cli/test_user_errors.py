@@ -52,18 +52,6 @@ def few_points(path: Path) -> None:
     np.save(path, np.random.default_rng(0).normal(size=(20, 3)))
 
 
-def far_apart(path: Path) -> None:
-    n = 30
-    u, v = np.meshgrid(np.linspace(0.1, 3.0, n), np.arange(n) * 2 * np.pi / n, indexing="ij")
-    ball = np.stack([np.sin(u) * np.cos(v), np.sin(u) * np.sin(v), np.cos(u)], -1).reshape(-1, 3)
-    grid = np.arange(n * n).reshape(n, n)
-    a, b = grid[:-1], grid[1:]
-    c, d = np.roll(b, -1, 1), np.roll(a, -1, 1)
-    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-    both = np.concatenate([ball, ball + np.array([50.0, 0, 0])])
-    save_shape(path, Shape(both, np.concatenate([faces, faces + n * n]), "both"))
-
-
 # name of the file, how it is made (None: not at all), a word of the message that names the trouble
 BAD_FILES = {
     "missing": ("bad.ply", None, "there is no file"),
@@ -85,7 +73,6 @@ BAD_FILES = {
     "one triangle": ("bad.ply", one_triangle, "only 1 usable triangle"),
     "no face with area": ("bad.ply", flat_faces, "no face with any area"),
     "few points": ("bad.npy", few_points, "only 20 distinct point positions"),
-    "two components far apart": ("bad.ply", far_apart, "2 large parts far apart"),
     "a folder": ("bad.ply", lambda path: path.mkdir(), "is a folder"),
     "a map for a cloud": ("bad.npy", lambda path: np.save(path, np.arange(9)), "bad.npy"),
 }
