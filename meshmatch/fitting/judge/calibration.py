@@ -1,6 +1,6 @@
 """Weights of the verdict that a command fitted: replace them by what it prints, and do not edit them by hand.
 
-``python -m meshmatch.experiments.bench.verdicts --fit`` fits them to right and wrong fits whose truth is known (logistic
+`experiments.bench.verdicts` with ``--fit`` fits them to right and wrong fits whose truth is known (logistic
 regression), and prints a `Calibration` to put here, with its data, seeds and date inside.
 """
 
