@@ -25,18 +25,18 @@ _ODD = 3.0  # sizes further apart than this are probably units
 class AtlasOptions:
     """What an atlas is, and what is found out about it."""
 
-    modes: int = Option(100, min=1, metavar="N", help="Largest number of modes to keep.")
+    modes: int = Option(100, min=1, metavar="N", help="Maximum number of modes to keep.")
     scale: Literal["keep", "remove"] = Option("keep", help="Keep the shapes' sizes, or scale all shapes to one size.")
-    robust: bool = Option(False, "--robust", help="Let a few shapes that are nothing like the others hardly matter.")
-    poor: bool = Option(False, "--poor", help="Do not leave out shapes whose fit is poor.")
+    robust: bool = Option(False, "--robust", help="Reduce the influence of outliers among the shapes.")
+    poor: bool = Option(False, "--poor", help="Include shapes whose fit is poor.")
     groups: tuple[Path, Path] | None = Option(
-        None, metavar="A.txt B.txt", help="Compare two groups: files with the names of their shapes, one a line."
+        None, metavar="A.txt B.txt", help="Compare two groups: files with the names of their shapes, one per line."
     )
     statistic: Literal["normal", "hotelling"] = Option(
         "normal",
         help="Compare displacements along the normal of the mean, or in all directions (Hotelling's T squared).",
     )
-    permutations: int = Option(10_000, min=1, metavar="N", help="Number of permutations of the group labels, at most.")
+    permutations: int = Option(10_000, min=1, metavar="N", help="Maximum number of permutations of the group labels.")
     samples: int = Option(0, min=0, max=10_000, metavar="N", help="Number of random shapes to write.")
     measures: bool = Option(
         True,
@@ -67,8 +67,8 @@ def atlas(
 ) -> None:
     """Learn the mean shape of a collection and the modes in which its shapes vary.
 
-    Writes the arrays, tables, pictures, the modes as morph targets, and page.html, on which sliders vary the shape.
-    With --groups also where two groups differ, by a permutation test with correction for the number of vertices.
+    Writes arrays, tables, pictures, the modes as morph targets, and page.html with a slider for each mode. With
+    --groups, also tests where two groups differ (permutation test, corrected for multiple comparisons).
     """
     from meshmatch.collections.atlas_files import record, write_folder
 

@@ -17,12 +17,12 @@ from meshmatch.models.registry import AUTO, check_model
 if TYPE_CHECKING:
     from meshmatch.collections.setting import Record
 
-Jobs = Annotated[int | None, Option(min=1, metavar="N", help="Number of processes. Default: one a core.")]
+Jobs = Annotated[int | None, Option(min=1, metavar="N", help="Number of processes. Default: one per core.")]
 Scheduler = Annotated[
     str | None,
     Option(
         metavar="ADDRESS",
-        help="Let the workers of a Dask scheduler do the work, such as tcp://127.0.0.1:8786. They must see the same "
+        help="Run on the workers of a Dask scheduler, such as tcp://127.0.0.1:8786. They must see the same "
         "files (needs meshmatch[cluster]).",
     ),
 ]
@@ -36,13 +36,17 @@ _ROW = "{:<28} {:<7} {:>6} {:>9} {:>4} {:>6} {:>11} {:>8}"
 def fit(
     *,
     shapes: list[str] = Argument(..., metavar="SHAPES", help="Files, folders, or patterns in quotes; URLs of folders."),
-    output: str = output_option("FITS", "The folder of the fits, or its URL; if it is there, the work goes on."),
+    output: str = output_option("FITS", "The folder of the fits, or its URL; an existing one is continued."),
     how: FitOptions,
     agree: bool = Option(
-        True, "--agree/--alone", help="Refine all fits together, towards the mean stretch of the template, or not."
+        True,
+        "--agree/--alone",
+        help="Refine all fits jointly, towards their mean stretch of the template (--agree), or each alone.",
     ),
     sequence: bool = Option(
-        False, "--sequence", help="The shapes of a folder are frames: each fit starts where the last one ended."
+        False,
+        "--sequence",
+        help="The shapes of the folder are frames of a sequence: each fit starts from the previous one.",
     ),
     jobs: Jobs = None,
     scheduler: Scheduler = None,
@@ -52,10 +56,9 @@ def fit(
 ) -> None:
     """Fit every shape of a collection once, for maps between any two of them and for atlases.
 
-    Each shape is a row of a table as it comes in; one that cannot be fitted is reported, and the others go on. What a run
-    that was stopped had finished is kept, and shapes that were added since are fitted when it is run again. With --model
-    none the template is made of the shapes themselves, which must be complete. FITS/fits.csv says what became of each
-    shape.
+    Each shape is reported when it is finished; one that cannot be fitted does not stop the others. Run the command
+    again to continue after an interruption or to add shapes. With --model none the template is built from the shapes
+    themselves, which must be complete. FITS/fits.csv lists the result of every shape.
     """
     from meshmatch.collections.setting import FAILED
     from meshmatch.fitting.without_model import NO_MODEL
@@ -105,7 +108,7 @@ def _table(console: Console) -> Callable[["Record"], None]:
 def map(
     fits: Annotated[str, Argument(metavar="FITS", help="A folder that `meshmatch fit` made, or its URL.")],
     output: str = output_option("MAPS", "The folder of the maps: the one from A to B is MAPS/A/B with a suffix."),
-    pairs: Path | None = optional("FILE", "Map these: the names of a source and a target a line."),
+    pairs: Path | None = optional("FILE", "Pairs to map: the names of a source and a target per line."),
     to: str | None = optional("NAME", "Or map every shape to this one."),
     all_pairs: bool = Option(False, "--all", help="Or map every shape to every other."),
     suffix: str = Option(
@@ -118,7 +121,7 @@ def map(
 ) -> None:
     """Map shapes of a collection to each other; nothing is fitted again.
 
-    Maps that are there are kept if they are as new as the fits.
+    Existing maps are kept unless the fits are newer.
     """
     from meshmatch.collections.map_all import load_pairs
 

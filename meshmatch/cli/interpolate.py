@@ -21,7 +21,7 @@ class SequenceOptions:
     """What the shapes between two shapes are."""
 
     frames: int = Option(9, "--frames", "-n", min=2, max=1000, help="Number of shapes.")
-    through: list[Path] | None = optional("C", "A shape to pass on the way; may be repeated.")
+    through: list[Path] | None = optional("C", "A shape to pass through on the way. May be repeated.")
     start: float = Option(0.0, "--from", metavar="T", help="Time of the first shape; below 0 is before A.")
     stop: float = Option(1.0, "--to", metavar="T", help="Time of the last shape; above 1 is beyond B.")
     mesh: Literal["source", "template"] = Option(
@@ -36,7 +36,10 @@ class SequenceOptions:
         "source: all as A; auto: files, unless the files seem to have different units.",
     )
     resolution: int = Option(
-        64, min=8, max=512, help="Cells along each side of the cube, of an implicit model's surfaces; an even number."
+        64,
+        min=8,
+        max=512,
+        help="Grid cells per side when the surfaces of an implicit model are extracted; an even number.",
     )
     format: Literal["ply", "obj", "off", "glb"] = Option("ply", help="Format of the files in a folder.")
     plot: Path | None = optional("FILE", "Plot how well each shape keeps volume and distances: .png, .svg or .pdf.")
@@ -55,11 +58,11 @@ def interpolate(
     how: FitOptions,
     run: RunOptions,
 ) -> None:
-    """Blend one shape into another: a sequence of the shapes in between.
+    """Blend one shape into another, as a sequence of the shapes in between.
 
-    The model's template is fitted to each, and its poses are blended; A's own mesh moves along. Time 0 is A as it is in
-    its file, and at time 1 A's mesh lies on B. Shapes given with --through are passed at even times in between.
-    An implicit model blends codes instead, and each shape is a surface of its own.
+    The model's template is fitted to both, the fits are blended, and A's own mesh follows. Time 0 is A as in its
+    file; at time 1 A's mesh lies on B. Shapes given with --through are reached at even times in between. An implicit
+    model blends latent codes instead, and each shape has a mesh of its own.
     """
     from meshmatch.api import interpolation
 

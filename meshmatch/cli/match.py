@@ -37,7 +37,7 @@ def match(
     ),
     how: PairOptions,
     run: RunOptions,
-    picture: Path | None = optional("PNG", "Draw both shapes, corresponding points in one color."),
+    picture: Path | None = optional("PNG", "Draw both shapes, corresponding points in the same color."),
 ) -> None:
     """Match every vertex of one shape to another.
 
@@ -136,7 +136,8 @@ def register(
     """Fit the model's template to one shape.
 
     This is a non-rigid registration: the template is deformed, and the shape stays where it is. Results for all
-    shapes have the same vertices and triangles in the same order. More than one of --threads may change the last bits.
+    shapes have the same vertices and triangles in the same order. With more than one thread, results may differ in
+    the last bits.
     """
     from meshmatch.shapes.files import check_suffix
 
@@ -208,15 +209,15 @@ def _register_implicit(
 def evaluate(
     *,
     map_file: Path = Argument(..., metavar="MAP", help="A map that `meshmatch match` wrote, or a folder of fits."),
-    source: Path = Argument(..., metavar="SOURCE", help="The shape that it maps."),
+    source: Path = Argument(..., metavar="SOURCE", help="The shape that it maps from."),
     target: Path = Argument(..., metavar="TARGET", help="The shape that it maps to."),
     truth: options.Truth = None,
     points: options.Points = None,
-    threshold: float = Option(15.0, min=0.0, metavar="CM", help="Give the share of errors over this many cm."),
-    curve: Path | None = optional("FILE", "Draw the cumulative error curve, .png, .svg or .pdf (needs the truth)."),
-    picture: Path | None = optional("PNG", "Draw both shapes, the errors as a color map (needs the truth)."),
+    threshold: float = Option(15.0, min=0.0, metavar="CM", help="Report the share of errors above this many cm."),
+    curve: Path | None = optional("FILE", "Plot the cumulative error curve: .png, .svg or .pdf (needs ground truth)."),
+    picture: Path | None = optional("PNG", "Draw both shapes, errors as a color map (needs ground truth)."),
     unit: options.ErrorUnit = Option(
-        "cm", help="Of curve and picture: cm on a person (1.9 m2 of skin), or 1/100 of sqrt(area) of the target."
+        "cm", help="Unit of curve and picture: cm on a person (1.9 m2 of skin), or percent of the target's sqrt(area)."
     ),
     seed: options.Seed = 0,
     json: options.Json = False,
@@ -230,7 +231,7 @@ def evaluate(
     told = options.check_truth(truth, points)
     for what, file in (("curve", curve), ("picture", picture)):
         if file is not None and not told:
-            raise OptionError(f"a {what} of errors needs the truth", "give it with --truth or --points")
+            raise OptionError(f"a {what} of errors needs ground truth", "give it with --truth or --points")
     check_outputs([map_file, source, target, truth, *(points or ())], chart=curve, picture=picture)
     shapes = meshmatch.load_shape(source), meshmatch.load_shape(target)
     if map_file.is_dir():

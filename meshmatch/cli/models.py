@@ -95,7 +95,7 @@ def verify(
     ] = None,
     json: options.Json = False,
 ) -> None:
-    """Check that models are whole and unchanged."""
+    """Check that models are complete and unchanged."""
     checked: list[dict[str, str | None]] = []
     for name in names or [entry.name for entry in registry.list_models()]:
         try:

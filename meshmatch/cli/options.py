@@ -34,24 +34,27 @@ Target = Annotated[Path, Argument(metavar="TARGET", help="The shape it is matche
 Seed = Annotated[int, Option(min=0, help="Random seed. The same seed gives the same result.")]
 Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout.")]
 Threads = Annotated[int, Option(min=1, help="Number of threads.")]
-Quiet = Annotated[bool, Option("--quiet", "-q", help="No progress and no summary; warnings stay.")]
+Quiet = Annotated[bool, Option("--quiet", "-q", help="Print only warnings and errors.")]
 ErrorUnit = Literal["cm", "x100"]
 Truth = Annotated[
     Path | None,
     Option(
         metavar="FILE",
-        help="True pairs, a source vertex and a target vertex a line (.txt, .csv or .npy); or one column: the "
-        "target vertex of every source vertex.",
+        help="Ground truth: a source vertex and a target vertex per line (.txt, .csv or .npy), or one column with "
+        "the target vertex of every source vertex.",
     ),
 ]
 Points = Annotated[
     tuple[Path, Path] | None,
     Option(
         metavar="FILE FILE",
-        help="The truth as two lists: vertices of SOURCE, and the same points as vertices of TARGET.",
+        help="Ground truth as two lists: vertices of SOURCE, and the corresponding vertices of TARGET.",
     ),
 ]
-PAIRS_HELP = "Known pairs that pull both fits, source and target vertex a line, from 0; the map says which it misses."
+PAIRS_HELP = (
+    "Known correspondences that guide both fits: a source vertex and a target vertex per line, counted from "
+    "0. The map reports those that it misses."
+)
 
 
 def output_option(metavar: str, help: str) -> Any:
@@ -82,7 +85,7 @@ def refuse_given(group: Any, allowed: Container[str], what: str) -> None:
 def check_truth(truth: Path | None, points: tuple[Path, Path] | None) -> bool:
     """Whether the truth is known; refuse to be told it twice (`OptionError`)."""
     if truth is not None and points is not None:
-        raise OptionError("--truth and --points both give the truth", "choose one of them")
+        raise OptionError("--truth and --points both give the ground truth", "choose one of them")
     return truth is not None or points is not None
 
 
@@ -140,7 +143,7 @@ def load_truth(
     except InputError:
         column = load_points(truth)  # its error is the one to tell: a column is the simpler form
     if len(column) != source.V:
-        hint = "a truth of one column has an entry for every vertex of the source"
+        hint = "ground truth in one column needs an entry for every vertex of the source"
         raise InputError(f"{truth.name} has {len(column)} entries, but {source.name} has {source.V} vertices", hint)
     return np.arange(source.V), column
 
@@ -152,42 +155,43 @@ class FitOptions:
     model: str = Option(
         AUTO,
         metavar="NAME",
-        help="Model: a name (see `meshmatch models list`), a model folder, or auto: the installed model for this kind "
-        "of shape.",
+        help="A model's name (see `meshmatch models list`), a model folder, or auto: the installed model that knows "
+        "the shapes.",
     )
     only: list[str] | None = Option(
         None,
         metavar="NAME",
-        help="Fit only this part, by number, or of a glb or gltf file the meshes of this name, which may hold * and ?; more "
-        "than once. `meshmatch info FILE` lists names and numbers.",
+        help="Fit only this part: its number or, in a glb or gltf file, the name of its meshes, with * and ? as "
+        "wildcards. May be repeated. `meshmatch info FILE` lists names and numbers.",
     )
     without: list[str] | None = Option(
         None,
         metavar="NAME",
-        help="Exclude these from the fit: weapons, capes, the floor. Their vertices follow the nearest fitted ones.",
+        help="Exclude this part from the fit, such as weapons, a cape or the floor. Its vertices follow the nearest "
+        "fitted ones. May be repeated.",
     )
     refine: Refine = Option(
         "nodes",
-        help="Refinement of the fit. nodes: least squares on the nodes; latent: search over the network's codes; "
-        "none: the network alone.",
+        help="Refinement of the fit. nodes: least squares on the nodes; latent: search over the network's latent "
+        "codes; none: the network's prediction alone.",
     )
     up: Axis | None = Option(
-        None, help="Axis of the file that points up. Default: detect. With two shapes, of both.", case_sensitive=False
+        None, help="Axis of the file that points up; with two shapes, of both. Default: detected.", case_sensitive=False
     )
     front: Axis | None = Option(
         None,
-        help="Axis of the file that the shape faces. Default: detect. With two shapes, of both.",
+        help="Axis of the file that the shape faces; with two shapes, of both. Default: detected.",
         case_sensitive=False,
     )
     partial: bool | None = Option(
         None,
         "--partial/--whole",
-        help="Treat shapes as partial scans (--partial) or as complete (--whole). Default: detect.",
+        help="Treat shapes as partial scans (--partial) or as complete (--whole). Default: detected.",
     )
     mirror: Literal["auto", "no"] | None = Option(
         None,
-        help="Whether a shape may be the mirror image of what the model knows, a left hand for one of right ones. "
-        "Default: as the model's card says.",
+        help="Whether to try the mirror image of each shape too, as for left hands with a model of right hands. "
+        "Default: as the model card says.",
     )
     seed: Seed = 0
     device: str = Option(
@@ -269,7 +273,7 @@ class PairOptions(FitOptions):
 class RunOptions:
     """How a verb that takes long behaves."""
 
-    strict: bool = Option(False, "--strict", help="Write nothing and exit with 1 if a fit or map is poor.")
+    strict: bool = Option(False, "--strict", help="Write nothing and exit with status 1 if a fit or map is poor.")
     json: Json = False
     threads: Threads = 2
     quiet: Quiet = False
@@ -280,7 +284,7 @@ class RuleOptions:
     """What is written where the map is not to be trusted."""
 
     fill: bool = Option(False, "--fill", help="Replace values of low confidence by those of their neighbours.")
-    blank: str | None = optional("VALUE", "Or write VALUE there. Default: keep them as they are.")
+    blank: str | None = optional("VALUE", "Write VALUE where confidence is low. Default: keep the transferred value.")
     min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Minimum confidence for a value to be trusted.")
 
     def rule(self, blank: float | str | Sequence[float] | None = None) -> meshmatch.ConfidenceRule:

@@ -28,33 +28,36 @@ Subject: TypeAlias = "tuple[meshmatch.Shape | Template, Appearance | None]"
 class PictureOptions:
     """What is shown."""
 
-    map: Path | None = options.optional("MAP", "Of two shapes, SOURCE TARGET, a map: matched places in one color.")
-    confidence: bool = Option(False, "--confidence", help="With --map: its confidence, as a color map.")
+    map: Path | None = options.optional(
+        "MAP", "Map between two shapes, SOURCE TARGET: corresponding points in the same color."
+    )
+    confidence: bool = Option(False, "--confidence", help="With --map: show its confidence as a color map.")
     truth: options.Truth = None
     points: options.Points = None
     unit: options.ErrorUnit = Option(
-        "cm", help="Of errors: cm on a person (1.9 m2 of skin), or 1/100 of sqrt(area) of the target."
+        "cm", help="Unit of errors: cm on a person (1.9 m2 of skin), or percent of the target's sqrt(area)."
     )
     values: list[Path] | None = options.optional(
-        "FILE", "A number per vertex, as a color map (.npy or .csv); or three, as a color. Once for each shape."
+        "FILE",
+        "A number per vertex, shown as a color map (.npy or .csv), or three, shown as a color. Once for each shape.",
     )
-    title: str | None = options.optional("TEXT", "What the numbers of --values are, with their unit.")
+    title: str | None = options.optional("TEXT", "Title of the color scale: what --values are, with their unit.")
     range: tuple[float, float] | None = options.optional(
-        "LOW HIGH", "Ends of the scale of a heat; chosen if not given."
+        "LOW HIGH", "Ends of the color scale. Default: chosen from the values."
     )
     labels: list[Path] | None = options.optional(
         "FILE", "A label for each vertex or face (.npy, .csv, .txt or .json). Once for each shape."
     )
     on: Literal["vertices", "faces"] | None = Option(
-        None, help="What the labels belong to; told by their count if not given."
+        None, help="Whether the labels are of vertices or faces. Default: decided by their number."
     )
     fit: str | None = options.optional(
         "MESH|MODEL",
-        "Over one shape: the template that `meshmatch register` laid on it, or a model whose template is "
-        "laid on it now. The distance is drawn as a color map.",
+        "For one shape: the output of `meshmatch register`, or a model to fit now. The template is drawn over the "
+        "shape, colored by distance.",
     )
-    image: Path | None = options.optional("FILE", "A texture for a shape whose file names none, or another one.")
-    plain: bool = Option(False, "--plain", help="Without textures, colors and nodes.")
+    image: Path | None = options.optional("FILE", "Texture image for a shape, instead of the one its file names.")
+    plain: bool = Option(False, "--plain", help="Draw no textures, colors or nodes.")
     seed: options.Seed = 0
 
     @property
@@ -99,14 +102,12 @@ class PictureOptions:
 class LookOptions:
     """How it is shown."""
 
-    view: Literal["quarter", "front", "left", "right", "back", "above"] = Option(
-        "quarter", help="The side that is shown."
-    )
-    up: options.Axis | None = Option(None, help="The files' axis that points up. Guessed if not given.")
-    front: options.Axis | None = Option(None, help="The files' axis that the shapes face. Guessed if not given.")
-    size: str | None = options.optional("WxH", "Width and height in pixels, such as 1200x800. Fitted if not given.")
+    view: Literal["quarter", "front", "left", "right", "back", "above"] = Option("quarter", help="Direction of view.")
+    up: options.Axis | None = Option(None, help="Axis of the files that points up. Default: detected.")
+    front: options.Axis | None = Option(None, help="Axis of the files that the shapes face. Default: detected.")
+    size: str | None = options.optional("WxH", "Width and height in pixels, such as 1200x800. Default: chosen to fit.")
     background: str = Option("white", metavar="COLOR", help="white, dark, transparent, or a color such as #e8f0f8.")
-    ground: bool = Option(True, "--ground/--no-ground", help="Whether shadows fall.")
+    ground: bool = Option(True, "--ground/--no-ground", help="Draw shadows.")
 
     def look(self) -> "Look":
         """The same for the library."""
@@ -135,14 +136,14 @@ def picture(
     output: Path = options.output_option("PNG", "The picture."),
     shown: PictureOptions,
     how: LookOptions,
-    name: list[str] | None = options.optional("TEXT", "Text below a shape, once for each. Default: the file's name."),
-    names: bool = Option(True, "--names/--no-names", help="Write the names."),
+    name: list[str] | None = options.optional("TEXT", "Caption of a shape, once for each. Default: the file's name."),
+    names: bool = Option(True, "--names/--no-names", help="Draw the captions."),
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Draw shapes, and what is known about them.
+    """Draw shapes, maps and values on shapes.
 
-    A PNG without a GPU, a display or OpenGL. Textures and colors of the files are shown where there are any.
+    Writes a PNG; no GPU, display or OpenGL is needed. Textures and colors of the files are shown where there are any.
     """
     shown.check(len(shapes))
     if name and len(name) != len(shapes):
@@ -271,10 +272,10 @@ def view(
     maps: ViewMapOptions,
     run: options.RunOptions,
 ) -> None:
-    """Make a page that shows two shapes and the map between them.
+    """Write an interactive page of two shapes and the map between them.
 
-    Corresponding points have one color; point at one shape and see the place on the other. The page is a single file
-    for any recent browser and needs no network. With --map, --up and --front give the orientation of SOURCE.
+    Corresponding points have the same color; point at one shape to see the place on the other. The page is a single
+    file for any recent browser and needs no network. With --map, --up and --front give the orientation of SOURCE.
     """
     from meshmatch.render.viewer.assembly import check_page
 

@@ -20,44 +20,48 @@ class PrepareOptions:
     template: str | None = optional(
         "SHAPE",
         "The shape that becomes the template: a name in the folder, or any mesh or cloud. Default: the folder's "
-        "first where all are registered, else the one nearest to all others.",
+        "first if all are registered, otherwise the one closest to all others.",
     )
     align: Literal["none", "near", "rigid"] | None = Option(
         None,
-        help="How shapes are turned to the template, now and when fitted: as they are given, a little, or from any "
-        "orientation. Default: near where they are registered and stand alike, else rigid.",
+        help="How shapes are aligned with the template, now and whenever the model is used: not at all, by a small "
+        "rotation, or from any orientation. Default: near for registered shapes that share an orientation, "
+        "otherwise rigid.",
     )
     scale: Literal["area", "sphere"] = Option(
-        "area", help="What is made equal to the template's: surface area, or the radius around the centroid."
+        "area", help="What is scaled to the template's: surface area, or the radius around the centroid."
     )
     mirror: Literal["auto", "no"] = Option(
         "auto",
-        help="Whether shapes that are mirror images of the others, such as left hands among right ones, are found and "
-        "mirrored; the model then does the same. Of registered shapes none are.",
+        help="Whether to find and mirror shapes that are mirror images of the others, such as left hands among right "
+        "ones; the model then tries both sides. Registered shapes are never mirrored.",
     )
     landmarks: str | None = optional(
         "WHERE",
-        "Known points of the shapes: a folder of NAME.npy, or a suffix beside them such as .landmarks.npy or .fcsv "
-        "(docs/formats.md).",
+        "Known points of the shapes: a folder of NAME.npy, or the suffix of files beside the shapes, such as "
+        ".landmarks.npy or .fcsv (docs/formats.md).",
     )
     strategy: Literal["parts", "spectral", "geodesic", "uniform"] = Option(
         "geodesic",
-        help="Which nodes are rejected: those between two parts (needs --labels), between two spectral clusters, near "
-        "two points far apart along the surface, or none.",
+        help="Which candidate nodes are rejected. parts: those between two parts (needs --labels); spectral: between "
+        "two spectral clusters; geodesic: near points that are far apart along the surface; uniform: none.",
     )
-    labels: Path | None = optional("FILE", "The part of every vertex of a single shape: one number a line, from 0.")
+    labels: Path | None = optional(
+        "FILE", "The part of every vertex of a single shape: one number per line, counted from 0."
+    )
     nodes: int = Option(320, min=4, max=10_000, help="Number of control nodes.")
     radius: float = Option(0.13, min=1e-6, help="Support radius of a node, in units of sqrt(surface area).")
     grow_radii: bool = Option(
         False,
         "--grow-radii",
-        help="Where vertices have too few nodes in reach, widen the nodes around them, each to a radius of its own. "
-        "Default: add nodes, or take a milder strategy.",
+        help="Where vertices are within reach of too few nodes, enlarge the radii of the nodes around them. Default: "
+        "add nodes, or use a milder strategy.",
     )
-    faces: int = Option(10_000, min=100, help="Triangles of the low resolution.")
+    faces: int = Option(10_000, min=100, help="Number of triangles after decimation.")
     decimate: Literal["fast", "meshlab"] = Option(
         "fast",
-        help="How the low resolution is made: fast, or slowly with better triangles by MeshLab (extra `meshlab`).",
+        help="How shapes are decimated: fast, or by MeshLab, which is slower and gives better triangles (extra "
+        "`meshlab`).",
     )
     seed: Seed = 0
 
@@ -71,12 +75,12 @@ def prepare(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make a template, and shapes to learn from.
+    """Prepare shapes and a template for training.
 
-    A folder's shapes are checked, normalised, decimated and brought to the template's position, size and orientation.
-    `meshmatch train --shapes FOLDER` learns from them: from their correspondence if all share the template's vertices
-    and triangles, else without one. Writes template.safetensors, a picture of the nodes (nodes.png) and, from a
-    folder, shapes.safetensors, points.safetensors, normalised/ and prepared.json.
+    The shapes of a folder are checked, normalised, decimated and aligned with the template. `meshmatch train --shapes
+    FOLDER` then learns from them: from their correspondence if all share the template's vertices and triangles,
+    otherwise without it. Writes template.safetensors, a picture of the nodes (nodes.png) and, from a folder,
+    shapes.safetensors, points.safetensors, normalised/ and prepared.json.
     """
     from meshmatch.maps.table_files import load_points
     from meshmatch.render.compose import compose_shapes

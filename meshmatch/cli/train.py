@@ -29,13 +29,14 @@ class TrainOptions:
 
     template: str | None = optional(
         "NAME",
-        "A bundled template (human-T, human-A, human-I, human-T-300), or a bundle's file. Default: human-T; of the "
-        "preset paper human-T-300, which has its 300 nodes.",
+        "A bundled template (human-T, human-A, human-I, human-T-300), or a template file. Default: human-T; with the "
+        "preset paper human-T-300, which has the paper's 300 nodes.",
     )
     shapes: Path | None = optional(
         "FOLDER",
-        "Learn from a folder that `meshmatch prepare` made, with its template; or go on with the model of a folder that "
-        "`meshmatch fit` made, from its fits that are not poor. Default: generated shapes of a --kind.",
+        "Learn from a folder that `meshmatch prepare` wrote, with its template; or, given a folder that `meshmatch "
+        "fit` wrote, continue training its model on the fits that are not poor. Default: generated shapes of a "
+        "--kind.",
     )
     kind: Literal["human", "quadruped", "hand", "head"] | None = Option(
         None,
@@ -45,65 +46,78 @@ class TrainOptions:
     implicit: bool = Option(
         False,
         "--implicit",
-        help="Learn the signed distances of a folder of watertight meshes, clouds or .npz samples that stand alike, such as "
-        "chairs: a model for `match` and `interpolate` (needs the extra `implicit`). --field: mls or pointwise.",
+        help="Learn the signed distances of a folder of watertight meshes, clouds or .npz samples that share an "
+        "orientation, such as chairs, for `match` and `interpolate` (needs the extra `implicit`). --field: mls or "
+        "pointwise.",
     )
-    unsupervised: bool = Option(
-        False,
-        "--unsupervised",
-        help="Learn without correspondence even if the shapes are registered; others always are.",
-    )
+    unsupervised: bool = Option(False, "--unsupervised", help="Ignore the correspondence of registered shapes.")
     preset: Literal["default", "paper"] = Option(
-        "default", help="The recipe: what measured best, or the paper's; with --implicit DIF-Net's, of either --field."
+        "default",
+        help="Training settings: the ones that measured best, or the paper's (with --implicit DIF-Net's, "
+        "for either --field).",
     )
     field: Literal["mls", "rbf", "pointwise"] | None = Option(
         None,
-        help="How a deformation is represented: by moving least squares (mls, the default) or radial basis functions of "
-        "nodes, or by a network at every point, which is slow (--refine nodes then refines its code).",
+        help="Representation of the deformation: moving least squares (mls, the default) or radial basis functions "
+        "(rbf) on nodes, or a network evaluated at every point (pointwise), which is slow and is refined by its "
+        "latent code.",
     )
-    start: str | None = optional("MODEL", "Begin with the weights of a trained model of the same template and preset.")
+    start: str | None = optional(
+        "MODEL", "Start from the weights of a trained model with the same template and preset."
+    )
     rate: float | None = Option(None, min=0.0, help="Learning rate; default: the preset's.")
-    volume: float | None = Option(None, min=0.0, metavar="WEIGHT", help="Weight of volume: the paper's l2.")
-    arap: float | None = Option(None, min=0.0, metavar="WEIGHT", help="Weight of rigidity: the paper's l3.")
+    volume: float | None = Option(
+        None, min=0.0, metavar="WEIGHT", help="Weight of the volume loss (lambda_2 in the paper)."
+    )
+    arap: float | None = Option(
+        None, min=0.0, metavar="WEIGHT", help="Weight of the rigidity loss (lambda_3 in the paper)."
+    )
     blend: float | None = Option(
         None,
         metavar="WEIGHT",
         min=0.0,
-        help="Weight of volume and rigidity between two codes: the paper's l4, 1 for models that interpolate by codes. "
-        "Default: the preset's.",
+        help="Weight of both losses at blends of two latent codes (lambda_4 in the paper); 1 for models that "
+        "interpolate by codes. Default: the preset's.",
     )
     stiffness: float = Option(
         1.0,
         min=1e-6,
-        help="How firmly two fits hold a common stretch of the template; written on the card. 1 suits bodies; 0.05 "
-        "what differs more from shape to shape, such as organs.",
+        help="How firmly jointly refined fits keep a common stretch of the template; stored on the card. 1 suits "
+        "bodies; 0.05 suits shapes that differ more, such as organs.",
     )
     name: str | None = optional("NAME", "The model's name; default: the folder's.")
-    category: str | None = optional("NAME", "What it matches; default: the kind, or of a folder the model's name.")
-    licence: str = Option("unstated", help="Terms of use of the weights; written on the card.")
+    category: str | None = optional(
+        "NAME", "The category it matches; default: the kind, or for a folder the model's name."
+    )
+    licence: str = Option("unstated", help="Terms of use of the weights; stored on the card.")
     steps: int | None = Option(None, min=1, help="Training steps; default: the preset's.")
-    minutes: float | None = Option(None, min=0.0, help="Stop after so many minutes; the same command goes on later.")
+    minutes: float | None = Option(
+        None, min=0.0, help="Stop after this many minutes; the same command continues later."
+    )
     points: int | None = Option(None, min=64, help="Points sampled per training scan. Default: the preset's.")
-    identities: int | None = Option(None, min=1, help="How many people (default: 4096) or animals (1024) are made.")
+    identities: int | None = Option(None, min=1, help="Number of generated people (default: 4096) or animals (1024).")
     bodies: int | None = Option(
-        None, min=0, help="Learn from so many bodies, drawn once; 0 (default): ever new ones. Preset paper: 1,000."
+        None,
+        min=0,
+        help="Number of bodies that are drawn once and reused; 0 (default) draws new ones throughout. "
+        "Preset paper: 1,000.",
     )
     characters: float | None = Option(
         None,
         min=0.0,
         max=1.0,
         metavar="SHARE",
-        help="Share of the bodies that wear clothes, are children, stylised or built of parts; the others are naked adults, "
-        "for the most part. Default: 0.5; of the preset paper 0.",
+        help="Share of bodies that wear clothes, are children, stylised or built of parts; most others are naked "
+        "adults. Default: 0.5; with the preset paper 0.",
     )
     poses: Path | None = optional("FILE", "Poses to mix with the sampled ones: .npz, .json or .csv (docs/formats.md).")
     pose_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies that stand in a pose of --poses.")
     bf16: bool | None = Option(None, "--bf16/--no-bf16", help="bfloat16 arithmetic; default: the preset's choice.")
-    workers: int | None = Option(None, min=0, help="Processes that draw batches; default: the preset's.")
+    workers: int | None = Option(None, min=0, help="Processes that generate batches; default: the preset's.")
     threads: Threads = 1
     seed: Seed = 0
-    picture: Path | None = optional("FILE", "Draw the losses of this run over its steps: .png, .svg or .pdf.")
-    fresh: bool = Option(False, "--fresh", help="Start anew instead of going on from the folder's checkpoint.")
+    picture: Path | None = optional("FILE", "Plot the losses of this run: .png, .svg or .pdf.")
+    fresh: bool = Option(False, "--fresh", help="Start again instead of continuing from the folder's checkpoint.")
 
 
 @grouped
@@ -116,9 +130,8 @@ def train(
 ) -> None:
     """Train a model.
 
-    The result is a folder that --model and `meshmatch models add` accept. After a stop or a kill the same
-    command goes on from the checkpoint, exactly. On several GPUs:
-    `torchrun --nproc-per-node N -m meshmatch train ...`.
+    The result is a folder that --model and `meshmatch models add` accept. After an interruption the same command
+    continues exactly from the checkpoint. On several GPUs: `torchrun --nproc-per-node N -m meshmatch train ...`.
     """
     with needs("torch", "train"):
         from meshmatch.training import train as training

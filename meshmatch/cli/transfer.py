@@ -89,14 +89,16 @@ def transfer_labels(
     maps: MapOptions,
     rules: RuleOptions,
     run: RunOptions,
-    on: On | None = Option(None, help="What the labels of FILE belong to. Default: told by their number."),
-    to: On | None = Option(None, help="What of TGT gets labels. Default: the same."),
+    on: On | None = Option(
+        None, help="Whether FILE labels vertices or faces. Default: decided by the number of labels."
+    ),
+    to: On | None = Option(None, help="Whether to label vertices or faces of TGT. Default: as in FILE."),
     picture: Picture = None,
 ) -> None:
     """Transfer labels of vertices or faces.
 
-    Labels are voted on and never averaged. The VALUE of --blank is a label, such as -1 or unknown; TGT also gets it
-    where SRC has no label.
+    Labels are chosen by vote and never averaged. The VALUE of --blank is a label, such as -1 or unknown; TGT also
+    gets it where SRC has no label.
     """
     import numpy as np
 
@@ -191,13 +193,13 @@ def transfer_landmarks(
     ),
     maps: MapOptionsWithPairs,
     run: RunOptions,
-    min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Landmarks of less confidence are named."),
+    min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Landmarks below this confidence are listed."),
     picture: Picture = None,
 ) -> None:
     """Transfer landmarks to exact points on the surface of another shape.
 
-    The output has for each: its vertex, its position, its face with barycentric weights, and its confidence (.csv,
-    .json); or name and position (.pp, .fcsv, .mrk.json). A position in FILE stands for the nearest point of SRC.
+    For each landmark, .csv and .json files have its vertex, position, face with barycentric weights, and confidence;
+    .pp, .fcsv and .mrk.json files its name and position. A position in FILE stands for the nearest point of SRC.
     """
     import numpy as np
 

@@ -36,8 +36,8 @@ class MapOptions(PairOptions):
         None,
         "--map",
         metavar="MAP",
-        help="Map from SRC to TGT (as in `meshmatch match SRC TGT`), or the folder of their fits that `meshmatch fit` made. "
-        "Default: match them.",
+        help="Map from the first shape to the second, as `meshmatch match` writes it, or a folder with the fits of "
+        "both that `meshmatch fit` wrote. Default: match them now.",
     )
 
 
@@ -81,7 +81,7 @@ class Transfer:
         files = files or [self.output]
         self.options.check()
         if self.options.map is not None and self.options.given:
-            problem = f"{self.options.given[0]} is for matching, and --map gives the match"
+            problem = f"{self.options.given[0]} controls matching, but --map supplies the map"
             raise OptionError(problem, "leave one of them out")
         check_outputs([self.source, self.target, self.options.map, read], *files, picture=self.picture)
         with ExitStack() as claims:  # the first is renamed last: it names the others

@@ -29,7 +29,7 @@ class TextureOptions:
     padding: int = Option(
         8,
         metavar="TEXELS",
-        help="Distance between new charts. Colors are continued past their edges; with 0 they are not, and seams show.",
+        help="Distance between new charts, filled with the colors at their edges. With 0, seams are visible.",
     )
 
 
@@ -51,10 +51,10 @@ def transfer_texture(
 ) -> None:
     """Transfer the texture of one shape to another.
 
-    Every texel takes the color of its place on SRC: from its materials and their images, or from its vertex colors.
-    The VALUE of --blank is a color such as #808080, or 0 for a hole. The first vertices of a written glb are those of
-    TGT in their order, and copies at texture seams follow; an obj has exactly the vertices and triangles of TGT, whose
-    polygons are split.
+    Each texel takes the color of the corresponding point of SRC, from its materials and images or from its vertex
+    colors. The VALUE of --blank is a color such as #808080, or 0 for transparent. A glb begins with the vertices of
+    TGT in their order, followed by copies at texture seams; an obj has exactly the vertices of TGT, and its polygons
+    as triangles.
     """
     from meshmatch.shapes import textured_files
     from meshmatch.transfer.vertex_files import parse_color, save_colors
@@ -105,7 +105,9 @@ def _tell_baked(
     if atlas.note:
         console.say(f"note: {atlas.note}")
     if baked.low:
-        became = "filled in from around" if rule.fill else "kept as it is" if rule.blank is None else "left blank"
+        became = (
+            "filled in from its surroundings" if rule.fill else "kept as it is" if rule.blank is None else "left blank"
+        )
         console.say(f"{100 * baked.low:.1f} % of the surface has less confidence than {rule.minimum:g}: {became}")
     if baked.torn > _WORTH_SAYING:
         console.say(f"note: the map is discontinuous on {100 * baked.torn:.1f} % of the surface; colors are cut there")

@@ -113,7 +113,7 @@ def test_units_draw_different_curves(run: Run, files: tuple[Path, ...], tmp_path
         (["--truth", "none.txt"], "none.txt"),
         (["--truth", "wide.txt"], "not 1 a line"),
         (["--truth", "outside.txt"], "outside"),
-        (["--curve", "c.png"], "needs the truth"),
+        (["--curve", "c.png"], "needs ground truth"),
         (["--truth", "short.txt", "--points", "short.txt", "short.txt"], "choose one"),
     ],
 )
@@ -180,7 +180,7 @@ def test_a_picture_of_errors_needs_the_truth_and_a_place(run: Run, files: tuple[
     truth = write_truth(tmp_path, "column")
     before = sorted(path.name for path in tmp_path.iterdir())
     for words, told in (
-        (["--picture", tmp_path / "e.png"], "needs the truth"),
+        (["--picture", tmp_path / "e.png"], "needs ground truth"),
         ([*truth, "--picture", tmp_path / "e.jpg"], "is a PNG"),
         ([*truth, "--picture", tmp_path / "no" / "e.png"], "no folder"),
         ([*truth, "--picture", tmp_path / "e.png", "--curve", tmp_path / "e.png"], "an output of this command"),

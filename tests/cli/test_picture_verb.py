@@ -361,7 +361,7 @@ BAD: list[tuple[str, str]] = [
     ("a.ply c.ply -o o.png --confidence", "needs a map"),
     ("a.ply c.ply -o o.png --truth truth.npy", "need a map"),
     ("a.ply c.ply -o o.png --map map.npz --confidence --truth truth.npy", "both color"),
-    ("a.ply c.ply -o o.png --map map.npz --truth truth.npy --points truth.npy truth.npy", "both give the truth"),
+    ("a.ply c.ply -o o.png --map map.npz --truth truth.npy --points truth.npy truth.npy", "both give the ground truth"),
     ("a.ply c.ply -o o.png --map map.npz --truth seven.npy", "seven.npy"),
     ("a.ply c.ply -o o.png --map map.npz --values v.npy", "do not go together"),
     ("a.ply c.ply -o o.png --map map.npz --plain", "do not go together"),

@@ -84,7 +84,7 @@ def test_a_map_leaves_nothing_to_match(run: Run, files: Path, stub: FakeMatching
     for words in (("--partial",), ("--source-up", "y"), ("--target-front", "x")):
         answer = run(verb, "a.ply", "b.ply", "-o", output, *rest, "--map", "ab.npz", *words)
         assert answer.status == 1
-        assert f"{words[0]} is for matching, and --map gives the match" in answer.err
+        assert f"{words[0]} controls matching" in answer.err
     assert stub.called == {}
 
 
