@@ -63,11 +63,11 @@ def transfer_color(
     what = "colors" if given is None else f"{columns} number{'s' if columns > 1 else ''} each"
     transfer.console.say(f"wrote {output}: {what} for the {b.V} vertices of {transfer.names[1]}")
     if picture is not None:
-        from meshmatch.render.compose import compose_light, compose_values
-        from meshmatch.shapes.colors import light
+        from meshmatch.render.compose import compose_values
+        from meshmatch.shapes.colors import light, seen
 
         if given is None:
-            shown = compose_light((a, b), (here, light(result.data)))
+            shown = compose_values((a, b), (seen(here), seen(light(result.data))))
         else:
             title = given.names[0] if given.names else str(values and values.stem)
             title += "" if columns == 1 else f" (the first of {columns} numbers)"

@@ -14,12 +14,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from meshmatch.arrays import Floats
 from meshmatch.errors import OptionError
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
 from meshmatch.outputs import replace_on_success
 from meshmatch.render.scales import readable
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # Okabe and Ito's colors, which color-blind readers can tell apart.
@@ -80,18 +82,9 @@ def draw_lines(
     """Draw lines by name: places, and values of 0 or more there. ``marks`` are places with a name: vertical lines."""
     with saved(path, 6.4, 3.6) as figure:
         axes = figure.subplots()
-        for number, (name, (x, y)) in enumerate(lines.items()):
-            axes.plot(x, y, marker="o", clip_on=False, label=short(name, 40), **pen(number))
-        places = np.concatenate([x for x, _ in lines.values()])
-        for place, name in marks.items():
-            axes.axvline(place, color=_GREY, linewidth=0.9, zorder=1)
-            # Names at the sides stay inside the chart.
-            share = (place - places.min()) / max(float(np.ptp(places)), 1e-9)
-            side = "left" if share < 0.2 else "right" if share > 0.8 else "center"
-            at: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
-            axes.annotate(short(name, 30), (place, 1), (0, 4), ha=side, color=_GREY, **at)
+        _plot(axes, lines, 40)
+        _mark(axes, marks, np.concatenate([x for x, _ in lines.values()]))
         axes.set(xlabel=short(xlabel), ylabel=short(ylabel))
-        axes.set_ylim(bottom=0)
         figure.legend(loc="outside upper left", ncols=max(1, min(len(lines), 88 // (6 + max(map(len, lines))))))
 
 
@@ -104,15 +97,11 @@ def draw_beside(
     0 or more there.
     """
     with saved(path, 3.4 * len(charts), 3.2) as figure:
-        from matplotlib.ticker import MaxNLocator
-
         row = figure.subplots(1, len(charts), squeeze=False)[0]
         for axes, (title, (ylabel, lines)) in zip(row, charts.items(), strict=True):
-            for number, (name, (x, y)) in enumerate(lines.items()):
-                axes.plot(x, y, marker="o", clip_on=False, label=short(name, 30), **pen(number))
+            _plot(axes, lines, 30)
             axes.set(xlabel=short(xlabel), ylabel=short(ylabel), title=short(title, 40))
-            axes.set_ylim(bottom=0)
-            axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+            axes.locator_params(axis="x", nbins=6, integer=True)
             if len(lines) > 1:
                 axes.legend(loc="best")
 
@@ -122,17 +111,12 @@ def draw_histogram(
 ) -> None:
     """Draw how often numbers of 0 or more occur, with a stroke for each. ``marks`` are numbers with a name."""
     with saved(path, 6.4, 3.2) as figure:
-        from matplotlib.ticker import MaxNLocator
-
         axes = figure.subplots()
         axes.hist(values, bins="auto", range=(0, max(values)), color=COLORS[0], alpha=0.75, edgecolor="white")
         axes.plot(values, [0] * len(values), "|", color=COLORS[-1], markersize=9, alpha=0.5, clip_on=False)
-        for place, name in marks.items():
-            at: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
-            axes.annotate(short(name, 30), (place, 1), (0, 2), ha="right", color=_GREY, **at)
-            axes.axvline(place, color=_GREY, linewidth=0.9, zorder=1)
+        _mark(axes, marks, np.asarray(values))
         axes.set(xlabel=short(xlabel), ylabel=short(ylabel), xlim=(0, None))
-        axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
+        axes.locator_params(axis="y", nbins=6, integer=True)
 
 
 def draw_losses(
@@ -175,6 +159,23 @@ def draw_losses(
             column[1].set_ylabel("terms of the loss")
         column[-1].set_xlabel("step")
         column[-1].xaxis.set_major_formatter("{x:,.0f}")
+
+
+def _plot(axes: Axes, lines: Mapping[str, tuple[Sequence[float], Sequence[float]]], longest: int) -> None:
+    """Lines with a dot at each place; the vertical axis begins at 0."""
+    for number, (name, (x, y)) in enumerate(lines.items()):
+        axes.plot(x, y, marker="o", clip_on=False, label=short(name, longest), **pen(number))
+    axes.set_ylim(bottom=0)
+
+
+def _mark(axes: Axes, marks: Mapping[float, str], places: Floats) -> None:
+    """Vertical lines with names, which stay inside the chart of these places."""
+    for place, name in marks.items():
+        axes.axvline(place, color=_GREY, linewidth=0.9, zorder=1)
+        share = (place - places.min()) / max(float(np.ptp(places)), 1e-9)
+        side = "left" if share < 0.2 else "right" if share > 0.8 else "center"
+        at: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+        axes.annotate(short(name, 30), (place, 1), (0, 4), ha=side, color=_GREY, **at)
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes
 from meshmatch.render.scales import CLAY, Legend, Scale, label_swatches, position_colors
 from meshmatch.shapes.appearance import Appearance
-from meshmatch.shapes.colors import UNKNOWN, label_colors, to_srgb
+from meshmatch.shapes.colors import UNKNOWN, label_colors
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 from meshmatch.transfer.attributes import pull_values
@@ -201,11 +201,6 @@ def compose_values(
     if title or limits is not None:
         raise OptionError("colors have no scale", "leave out the title and the range")
     return Composition(_painted(shapes, tables), caption="the colors of a file")
-
-
-def compose_light(shapes: Sequence[Shape], light: Sequence[Float[Floats, "V C"]]) -> Composition:
-    """Shapes in linear colors of their vertices, three or four columns; alpha is ignored, nan is black."""
-    return Composition(_painted(shapes, [to_srgb(np.nan_to_num(table[:, :3])) for table in light]))
 
 
 def compose_labels(

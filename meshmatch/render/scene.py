@@ -15,7 +15,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
-from meshmatch.render.surface import Rows, Surface
+from meshmatch.render.surface import Rows, Surface, tangents
 
 # Cosines of the angle between a facet and the smooth normal of a corner: up to here smooth, from there on a crease.
 _SMOOTH, _CREASE = np.cos(np.radians(28.0)), np.cos(np.radians(42.0))
@@ -255,7 +255,7 @@ def _seen(scene: Scene, places: Vectors, flat: Vectors, normal: Vectors, subset:
     asked = places[facing]
     for aim, reach in zip(lamp, _KEY_FAR[subset, few], strict=True):
         hidden[facing] += scene.blocked(asked, np.broadcast_to(aim, asked.shape), reach)
-    side, up = _tangents(normal)
+    side, up = tangents(normal)
     sky = _SKY_SET[subset, few]
     for (x, y, z), reach in zip(sky, _SKY_FAR[subset, few], strict=True):
         aim = x * side + y * up + z * normal
@@ -263,17 +263,6 @@ def _seen(scene: Scene, places: Vectors, flat: Vectors, normal: Vectors, subset:
         aim -= below[:, None] * flat  # a ray into the facet is reflected out
         taken += scene.blocked(places, aim, reach)
     return np.stack([1.0 - grazing * hidden / len(lamp), 1.0 - taken / len(sky)], axis=1).astype(np.float32)
-
-
-def _tangents(normal: Vectors) -> tuple[Vectors, Vectors]:
-    """Two unit tangents of each normal (z > -1) that change smoothly with it (Duff et al. 2017)."""
-    x, y, z = normal[:, 0], normal[:, 1], np.maximum(normal[:, 2], -0.999)
-    a = -1.0 / (1.0 + z)
-    b = x * y * a
-    return (
-        np.stack([1.0 + x * x * a, b, -x], axis=1).astype(np.float32),
-        np.stack([b, 1.0 + y * y * a, -y], axis=1).astype(np.float32),
-    )
 
 
 def shade(hits: Hits, rows: Rows, seen: Shares) -> Vectors:

@@ -161,16 +161,21 @@ def balls(centers: Places, radius: float, colors: Places) -> Surface:
 def discs(centers: Places, normals: Places, radius: Float[AnyFloats, " K"], colors: Places) -> Surface:
     """A flat octagon for every center, perpendicular to its normal, with its radius."""
     turn = 2 * np.pi * np.arange(8) / 8
-    side = np.where(np.abs(normals[:, :1]) < 0.8, [[1.0, 0, 0]], [[0, 1.0, 0]])
-    first = np.cross(normals, side)
-    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-30)
-    second = np.cross(normals, first)
+    first, second = tangents(normals)
     around = np.cos(turn)[:, None] * first[:, None] + np.sin(turn)[:, None] * second[:, None]
     rim = centers[:, None] + radius[:, None, None] * around
     fan = np.array([[0, k, k + 1] for k in range(1, 7)])
     faces = (fan + 8 * np.arange(len(centers))[:, None, None]).reshape(-1, 3)
     paint = face_paint(np.repeat(colors, len(fan), axis=0))
     return Surface(rim.reshape(-1, 3), faces, np.repeat(normals, 8, axis=0), paint, 0.6 * float(np.median(radius)))
+
+
+def tangents(normal: Places) -> tuple[Places, Places]:
+    """Two unit tangents of each normal (z > -1) that change smoothly with it (Duff et al. 2017)."""
+    x, y, z = normal[:, 0], normal[:, 1], np.maximum(normal[:, 2], -0.999)
+    a = -1.0 / (1.0 + z)
+    b = x * y * a
+    return np.stack([1.0 + x * x * a, b, -x], axis=1), np.stack([b, 1.0 + y * y * a, -y], axis=1)
 
 
 def _ball(subdivisions: int) -> tuple[Float[Floats, "V 3"], Int[Ints, "F 3"]]:

@@ -15,7 +15,7 @@ from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import triangle_areas
 from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, known_normals
+from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, known_normals, mean_around
 
 NO_LABEL = -1
 # A face is cut into the square of so many small triangles, whose centers vote.
@@ -134,11 +134,7 @@ def lattice(rows: int) -> Float[Floats, "P 3"]:
 
 def _face_area_around(shape: Shape) -> Float[Floats, " V"]:
     """Mean area of the faces at each vertex; of a cloud, the area of each point."""
-    if shape.is_cloud:
-        return shape.vertex_areas
-    corners = shape.faces.ravel()
-    total = np.bincount(corners, np.repeat(shape.face_areas, 3), shape.V)
-    return np.asarray(total / np.maximum(np.bincount(corners, minlength=shape.V), 1))
+    return shape.vertex_areas if shape.is_cloud else mean_around(shape.faces, shape.face_areas, shape.V)
 
 
 def _vertex_votes(back: VertexMap, source: Shape, labels: Ints, on_faces: bool) -> csr_array:

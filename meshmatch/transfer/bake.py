@@ -77,20 +77,20 @@ class BakeOptions:
     workers: int = 2
 
     def __post_init__(self) -> None:
-        for name in ("size", "samples", "padding", "workers"):
-            if not isinstance(getattr(self, name), Integral):
-                raise OptionError(f"{name} must be an integer, not {getattr(self, name)!r}")
-        if self.workers < 1:
-            raise OptionError(f"workers must be 1 or more, not {self.workers}")
+        for name, low, high, hint in (
+            ("size", 16, _LARGEST, "1024 or 2048 suit most"),
+            ("samples", 1, 8, "2 or 3 suit most"),
+            ("padding", 0, _LARGEST // 4, "8 suits most"),
+            ("workers", 1, 4096, "one for each core is enough"),
+        ):
+            value = getattr(self, name)
+            if not isinstance(value, Integral) or not low <= value <= high:
+                raise OptionError(f"{name} must be an integer from {low} to {high}, not {value!r}", hint)
+        if self.padding > self.size // 4:
+            problem = f"padding of {self.padding} texels does not go with {self.size}"
+            raise OptionError(problem, f"choose 0 to {self.size // 4}")
         if self.fill and self.blank is not None:
             raise OptionError("fill and blank contradict each other", "choose one of them")
-        size, most = self.size, self.size // 4
-        if not 16 <= size <= _LARGEST:
-            raise OptionError(f"a texture has 16 to {_LARGEST} texels a side, not {size}", "1024 or 2048 suit most")
-        if not 1 <= self.samples <= 8:
-            raise OptionError(f"a texel takes 1 to 8 samples each way, not {self.samples}", "2 or 3 suit most")
-        if not 0 <= self.padding <= most:
-            raise OptionError(f"padding of {self.padding} texels does not go with {size}", f"choose 0 to {most}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -174,12 +174,11 @@ def _on_shape(found: LandmarkFile, shape: Shape, space: Space) -> tuple[Landmark
         notes.append(f"the landmarks are in {found.space}, {shape.name} is in {space}: x and y change their signs")
     places = found.in_space(space).places
     missing = [f"landmark {place.name}{place.where}" for place in places if place.kind == "missing"]
-    if len(missing) == len(places):
-        raise InputError(missing[0] + (f", and {len(missing) - 1} more are missing" if len(missing) > 1 else ""))
     if missing:
-        notes.append(
-            missing[0] + (f", and {len(missing) - 1} more are missing" if len(missing) > 1 else "") + ": left out"
-        )
+        told = missing[0] + (f", and {len(missing) - 1} more are missing" if len(missing) > 1 else "")
+        if len(missing) == len(places):
+            raise InputError(told)
+        notes.append(f"{told}: left out")
     parts: list[Landmarks] = []
     rows: list[int] = []
     largest = 0.0

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
@@ -192,10 +193,13 @@ def _edge_lengths(shape: Shape) -> Floats:
     if shape.is_cloud:
         return np.sqrt(shape.vertex_areas)
     edges = shape.edges.vertices
-    length = np.linalg.norm(shape.verts[edges[:, 0]] - shape.verts[edges[:, 1]], axis=1)
-    ends = edges.T.ravel()
-    total = np.bincount(ends, np.tile(length, 2), shape.V)
-    return total / np.maximum(np.bincount(ends, minlength=shape.V), 1)
+    return mean_around(edges, np.linalg.norm(shape.verts[edges[:, 0]] - shape.verts[edges[:, 1]], axis=1), shape.V)
+
+
+def mean_around(corners: Int[NDArray[Any], "N K"], values: Float[Floats, " N"], V: int) -> Float[Floats, " V"]:
+    """Mean of the values of the edges, or faces, at each vertex; 0 where there is none."""
+    total = np.bincount(corners.T.ravel(), np.tile(values, corners.shape[1]), V)
+    return np.asarray(total / np.maximum(np.bincount(corners.ravel(), minlength=V), 1))
 
 
 def known_normals(shape: Shape) -> Float[Floats, "V 3"]:

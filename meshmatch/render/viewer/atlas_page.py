@@ -14,7 +14,7 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.render.scales import CLAY, Scale
 from meshmatch.render.viewer.assembly import check_page, plain_text, scaled, small_integers, write_html
-from meshmatch.render.viewer.drawn import MOST, draw
+from meshmatch.render.viewer.drawn import MOST, draw, span
 from meshmatch.shapes.shape import Shape
 
 MOST_MODES = 12
@@ -53,9 +53,7 @@ def write_atlas_page(
     part = draw(atlas.mean, min(most, MOST_PLACES // count))
     mean = atlas.mean.verts[part.vertex] @ rotation.T
     modes = atlas.modes[:count, part.vertex] @ rotation.T
-    seen = np.concatenate([mean, *(mean + sign * mode for mode in modes for sign in (-2, 2))])
-    low, extent = seen.min(axis=0), np.ptp(seen, axis=0)
-    edge = float(extent.max()) or 1.0
+    low, edge, cube = span(np.concatenate([mean, *(mean + sign * mode for mode in modes for sign in (-2, 2))]))
     reach = np.abs(modes).max(axis=(1, 2))
     # Colors reach as far as two standard deviations of the first mode do.
     scale = Scale.of(2 * np.linalg.norm(atlas.modes[0], axis=1))
@@ -77,7 +75,5 @@ def write_atlas_page(
         "high": f"{scale.high:.4g}",
         "ramp": Scale(0.0, 1.0).colors(np.linspace(0, 1, _RAMP)).round(4).tolist(),
         "clay": list(CLAY),
-        "low": (-extent / edge / 2).round(6).tolist(),
-        "extent": (extent / edge).round(6).tolist(),
     }
-    return write_html(Path(path), "atlas", ("data", "materials", "single", "atlas"), words, arrays, title)
+    return write_html(Path(path), "atlas", ("data", "materials", "single", "atlas"), words | cube, arrays, title)

@@ -96,6 +96,13 @@ def _some_points(shape: Shape, rows: Int[Ints, " N"], most: int) -> Drawn:
     return Drawn(verts, none, normals, rows, _NONE, note)
 
 
+def span(points: Float[Floats, "N 3"]) -> tuple[Float[Floats, " 3"], float, dict[str, list[float]]]:
+    """The lowest corner of the cube around points, its edge, and its words on a page where the edge is 1 long."""
+    low, extent = points.min(axis=0), np.ptp(points, axis=0)
+    edge = float(extent.max()) or 1.0
+    return low, edge, {"low": (-extent / edge / 2).round(6).tolist(), "extent": (extent / edge).round(6).tolist()}
+
+
 @dataclass(frozen=True, eq=False)
 class Box:
     """The cube in which a shape is drawn.

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Floats
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import same_rows
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.viewer.assembly import scaled, small_integers
 from meshmatch.render.viewer.drawn import Drawn
 from meshmatch.shapes.appearance import Appearance, Material, Pixels, png_bytes
-from meshmatch.shapes.colors import LINEAR_OF_BYTE, to_srgb
+from meshmatch.shapes.colors import to_srgb
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.bake import BakeOptions, colors_of_vertices, transfer_texture
 from meshmatch.transfer.unwrap import atlas_of
@@ -104,7 +104,8 @@ def dress(look: Appearance, shape: Shape, part: Drawn) -> tuple[Arrays, dict[str
     """
     if len(part.file_face) and (look.textured or len(look.materials) > 1):
         return _skin(look, part)
-    return {"paint": scaled(vertex_paint(look, shape)[part.vertex], np.uint8)}, None
+    light = colors_of_vertices(shape, look, shape, VertexMap.identity(shape))
+    return {"paint": scaled(to_srgb(light[part.vertex, :3]), np.uint8)}, None
 
 
 def _skin(look: Appearance, part: Drawn) -> tuple[Arrays, dict[str, Any]]:
@@ -167,32 +168,3 @@ def _encoded(pixels: Pixels, shrink: float, opaque: bool) -> tuple[str, bytes]:
     out = BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels[..., :3])).save(out, format="JPEG", quality=90)
     return "image/jpeg", out.getvalue()
-
-
-def vertex_paint(look: Appearance, shape: Shape) -> Float[Floats, "V 3"]:
-    """The color at each vertex as screens show it: of the last of its faces, at the nearest texel."""
-    light = np.ones((shape.V, 3)) if look.colors is None else np.array(look.colors[:, :3])
-    for k, material in enumerate(look.materials):
-        face = np.flatnonzero(look.material == k)
-        if not len(face) and shape.F:
-            continue
-        corner = shape.faces[face].reshape(-1) if shape.F else np.arange(shape.V)
-        seen = np.tile(np.array(material.factor[:3]), (len(corner), 1))
-        if material.image is not None:
-            row, column = (
-                _texel(look.uv[face].reshape(-1, 2)[:, axis], material.wrap[axis], material.image.shape[1 - axis])
-                for axis in (1, 0)
-            )
-            seen *= LINEAR_OF_BYTE[material.image[row, column, :3]]
-        at, last = np.unique(corner[::-1], return_index=True)
-        light[at] *= seen[::-1][last]
-    return to_srgb(light)
-
-
-def _texel(values: Float[Floats, " N"], wrap: str, size: int) -> Int[Ints, " N"]:
-    """Row or column of the texel at coordinates."""
-    if wrap == "repeat":
-        values = values % 1.0
-    elif wrap == "mirror":
-        values = 1.0 - np.abs(values % 2.0 - 1.0)
-    return np.floor(np.clip(values, 0.0, 1.0) * size).astype(np.int64).clip(0, size - 1)

@@ -17,7 +17,7 @@ from meshmatch.render.compose import matched_colors
 from meshmatch.render.facing import Rotations
 from meshmatch.render.scales import CLAY, Scale, position_colors
 from meshmatch.render.viewer.assembly import check_page, plain_text, scaled, small_integers, write_html
-from meshmatch.render.viewer.drawn import MOST, Box, Drawn, boxes, draw, upright
+from meshmatch.render.viewer.drawn import MOST, Box, Drawn, boxes, draw, span, upright
 from meshmatch.render.viewer.looks import Looks, dress
 from meshmatch.shapes.faces import seams
 from meshmatch.shapes.shape import Shape
@@ -143,9 +143,7 @@ def write_motion(
     part = draw(first, min(most, MOST_PLACES // len(frames)))
     rows, faces = part.vertex, part.faces
     turned = [shape.verts[rows] @ rotation.T for shape in frames]
-    used = np.concatenate([verts[part.used] for verts in turned])
-    low, extent = used.min(axis=0), np.ptp(used, axis=0)
-    edge = float(extent.max()) or 1.0
+    low, edge, cube = span(np.concatenate([verts[part.used] for verts in turned]))
     normals = [np.zeros_like(verts) for verts in turned]  # of points, which then face the viewer
     if len(faces):  # the same on both sides of a seam
         joined = seams(turned[0], faces)
@@ -163,8 +161,6 @@ def write_motion(
         "times": [round(float(time), 9) for time in times],
         "met": [[float(time), plain_text(name)] for time, name in (met or {}).items() if times[0] <= time <= times[-1]],
         "cloud": len(faces) == 0,
-        "low": (-extent / edge / 2).round(6).tolist(),
-        "extent": (extent / edge).round(6).tolist(),
         "radius": float(f"{part.radius / edge:.4g}"),
     }
-    return write_html(Path(path), "motion", ("data", "materials", "single", "motion"), words, arrays, title)
+    return write_html(Path(path), "motion", ("data", "materials", "single", "motion"), words | cube, arrays, title)
