@@ -12,19 +12,15 @@ from meshmatch.maps.places import Places, expectation, is_noisy, noise_level
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from tests.conftest import some_fit
+from tests.maps.solids import grid
 
 NO_FACES = np.empty((0, 3), np.int64)
 
 
 def plate(side: int = 21, height: float = 0.0) -> Fit:
     """A square plate of side 1, that rests where it lies."""
-    ticks = np.linspace(0, 1, side)
-    x, y = (each.reshape(-1) for each in np.meshgrid(ticks, ticks, indexing="ij"))
-    points = np.stack([x, y, 0 * x + height], 1)
-    a = np.arange(side * side).reshape(side, side)
-    p, q, r, t = (c.reshape(-1) for c in (a[:-1, :-1], a[1:, :-1], a[1:, 1:], a[:-1, 1:]))
-    faces = np.concatenate([np.stack([p, q, r], 1), np.stack([p, r, t], 1)])
-    return some_fit(points, faces)
+    sheet = grid(side - 1, side - 1, 1 / (side - 1))
+    return some_fit(sheet.verts + np.array([0, 0, height]), sheet.faces)
 
 
 def test_the_noise_is_that_of_the_distances_whatever_a_few_strays_do() -> None:

@@ -1,5 +1,7 @@
 """Parts go to their counterparts: strings of beads, whose fits disagree by a third of a bead."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -24,22 +26,10 @@ def beads(*lengths: float, shift: float = 0.0, dropped: int = 0, name: str = "be
     resting = np.concatenate(verts).astype(np.float32)
     faces = np.concatenate([BALL.faces + k * BALL.V for k in range(len(lengths))]).astype(np.int32)
     V, F = len(resting), len(faces)
-    zeros, fitted = np.zeros(V, np.float32), np.arange(F) < F - dropped
-    stands = np.arange(V, dtype=np.int32)
-    places = Places(
-        name=name,
-        hash=name,
-        template_hash="t",
-        resting=resting,
-        height=zeros,
-        distance=zeros,
-        shift=None,
-        spread=None,
-        stands=stands,
-        faces=faces,
-        fitted=fitted,
-        verdict="good",
-    )
+    own = {"resting": resting, "height": np.zeros(V, np.float32), "distance": np.zeros(V, np.float32)}
+    own |= {"stands": np.arange(V, dtype=np.int32), "faces": faces, "fitted": np.arange(F) < F - dropped}
+    words = {"name": name, "hash": name, "template_hash": "t", "verdict": "good"}
+    places = Places(**words, **own, shift=None, spread=None)
     return places, np.repeat(np.arange(len(lengths)), BALL.V)
 
 
@@ -83,19 +73,5 @@ def test_parts_that_were_not_fitted_are_no_counterparts() -> None:
 
 def test_a_cloud_has_no_parts() -> None:
     built, own = beads(1, 1, 1, 1, 1)
-    none = np.zeros((0, 3), np.int32)
-    cloud = Places(
-        name="cloud",
-        hash="cloud",
-        template_hash="t",
-        resting=built.resting,
-        height=built.height,
-        distance=built.distance,
-        shift=None,
-        spread=None,
-        stands=built.stands,
-        faces=none,
-        fitted=np.zeros(0, bool),
-        verdict="good",
-    )
+    cloud = replace(built, faces=np.zeros((0, 3), np.int32), fitted=np.zeros(0, bool))
     assert len(build_map(cloud, built).index) == len(build_map(built, cloud).index) == len(own)

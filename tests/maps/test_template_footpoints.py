@@ -13,6 +13,7 @@ from meshmatch.maps.footpoints import (
 )
 from meshmatch.shapes.shape import Shape
 from tests.conftest import some_fit
+from tests.maps.solids import grid
 
 # A chain of ten vertices, one apart; where they belong is where they are.
 CHAIN = np.stack([np.arange(9), np.arange(1, 10)], 1)
@@ -60,13 +61,8 @@ def test_noise_asks_more_neighbours(roughness: float, count: int) -> None:
 
 def plates(gap: float) -> Fit:
     """Two square plates, one above the other, that belong far apart on the resting template."""
-    ticks = np.linspace(0, 0.6, 13)
-    x, y = (each.reshape(-1) for each in np.meshgrid(ticks, ticks, indexing="ij"))
-    low = np.stack([x, y, 0 * x], 1)
-    a = np.arange(13 * 13).reshape(13, 13)
-    corners = (a[:-1, :-1], a[1:, :-1], a[1:, 1:], a[:-1, 1:])
-    p, q, r, t = (c.reshape(-1) for c in corners)
-    half = np.concatenate([np.stack([p, q, r], 1), np.stack([p, r, t], 1)])
+    sheet = grid(12, 12, 0.05)
+    low, half = sheet.verts, sheet.faces
     points = np.concatenate([low, low + np.array([0, 0, gap])])
     resting = np.concatenate([low, low + np.array([0, 0, 1.0])])
     faces = np.concatenate([half, half + len(low)])

@@ -21,6 +21,12 @@ class Pair:
     back: VertexMap
 
 
+def itself(shape: Shape) -> Pair:
+    """A shape and the same one."""
+    same = VertexMap.identity(shape)
+    return Pair(shape, shape, same, same)
+
+
 def stirred(
     shape: Shape, name: str = "stirred", verdict: str = "good", reasons: tuple[str, ...] = (), lean: float = 0.0
 ) -> Pair:

@@ -12,7 +12,7 @@ from meshmatch.errors import OptionError
 from meshmatch.render.viewer.atlas_page import MOST_MODES, Varying, write_atlas_page
 from meshmatch.shapes.shape import Shape
 from tests.render.browser import PHONE, browser, opened
-from tests.render.test_motion import read
+from tests.render.pages import read
 
 NAMES = ("a </script>", "b & c", "é")
 SCORES = np.array([[-1.0, 0.5], [2.0, 0.0], [-4.0, 1.0]])
@@ -29,7 +29,7 @@ def test_the_mean_and_every_mode_are_in_the_page(tmp_path: Path, make_sphere: Ca
     turn = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     size = write_atlas_page(path, varying(ball), rotation=turn, title="a & b")
     assert size == path.stat().st_size
-    words, arrays = read(path, {"Int16Array": "<i2", "Float32Array": "<f4"})
+    words, arrays = read(path).words, read(path).arrays
     place = arrays["position"].reshape(-1, 3) / 65535 + words["low"]
     assert np.abs(place * words["unit"] - ball.verts @ turn.T).max() < 1e-4
     assert words["unit"] == pytest.approx(2 * ball.verts[:, 1].max() * 1.4)  # at two standard deviations
@@ -48,7 +48,7 @@ def test_many_modes_and_vertices_are_fewer_on_the_page(tmp_path: Path, make_sphe
     modes = np.random.default_rng(0).standard_normal((20, ball.V, 3))
     many = Varying(ball, modes, np.full(20, 0.05), np.zeros((1, 20)), ("a",))
     write_atlas_page(path, many, rotation=np.eye(3), most=200)
-    words, arrays = read(path, {"Int16Array": "<i2", "Float32Array": "<f4"})
+    words, arrays = read(path).words, read(path).arrays
     assert len(words["shares"]) == MOST_MODES
     assert "12 of 20 modes" in words["kept"]
     assert "of 642 vertices" in words["note"]

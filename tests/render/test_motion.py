@@ -1,12 +1,7 @@
 """A page with a shape in motion: what is in the file, and how it moves in headless Chromium (skipped without)."""
 
-import base64
-import json
-import re
-import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +11,7 @@ from meshmatch.errors import OptionError
 from meshmatch.render.viewer.page import write_motion
 from meshmatch.shapes.shape import Shape
 from tests.render.browser import browser, opened
+from tests.render.pages import read
 
 TIMES = (0.0, 0.5, 2.0)
 
@@ -25,23 +21,13 @@ def grown(shape: Shape, *factors: float, colors: bool = False) -> list[Shape]:
     return [Shape(shape.verts * [1, factor, 1], shape.faces, "grown", tint) for factor in factors]
 
 
-def read(path: Path, more: dict[str, str] | None = None) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    text = path.read_text(encoding="utf-8")
-    words = json.loads(re.findall(r'id="words">(.*?)</script>', text, re.S)[0])
-    data = zlib.decompress(base64.b64decode(re.findall(r'id="packed">(.*?)</script>', text, re.S)[0]))
-    kinds = {"Uint8Array": "u1", "Int8Array": "i1", "Uint16Array": "<u2", "Uint32Array": "<u4"} | (more or {})
-    return words, {
-        row["name"]: np.frombuffer(data, kinds[row["kind"]], row["length"], row["start"]) for row in words["arrays"]
-    }
-
-
 def test_every_frame_is_in_the_page(tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
     ball, path = make_sphere(1), tmp_path / "a.html"
     frames = grown(ball, 1.0, 2.0, 0.5)
     turn = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     size = write_motion(path, frames, TIMES, rotation=turn, met={0.0: "a </script>", 9.0: "never"}, title="a & b")
     assert size == path.stat().st_size
-    words, arrays = read(path)
+    words, arrays = read(path).words, read(path).arrays
     assert (words["times"], words["met"]) == (list(TIMES), [[0.0, "a </script>"]])
     at = arrays["position"].reshape(3, ball.V, 3) / 65535 + words["low"]
     edge = 4.0  # the second frame is the largest, along y
@@ -59,10 +45,10 @@ def test_own_colors_and_a_cloud(tmp_path: Path, make_sphere: Callable[[int], Sha
     ball = make_sphere(1)
     path = tmp_path / "a.html"
     write_motion(path, grown(ball, 1, 2, colors=True), (0, 1), rotation=np.eye(3))
-    assert set(map(tuple, read(path)[1]["color"].reshape(-1, 3).tolist())) == {(230, 26, 26)}
+    assert set(map(tuple, read(path).arrays["color"].reshape(-1, 3).tolist())) == {(230, 26, 26)}
     cloud = Shape(ball.verts, np.empty((0, 3), np.int64))
     write_motion(path, grown(cloud, 1, 2), (0, 1), rotation=np.eye(3))
-    words, arrays = read(path)
+    words, arrays = read(path).words, read(path).arrays
     assert words["cloud"]
     assert words["radius"] > 0
     assert len(arrays["face"]) == 0
@@ -72,7 +58,7 @@ def test_a_large_shape_is_drawn_coarser(tmp_path: Path, make_sphere: Callable[[i
     ball = make_sphere(3)
     path = tmp_path / "a.html"
     write_motion(path, grown(ball, 1, 2), (0, 1), rotation=np.eye(3), most=200)
-    words, arrays = read(path)
+    words, arrays = read(path).words, read(path).arrays
     assert len(arrays["position"]) <= 2 * 3 * 200
     assert "of 642 vertices" in words["note"]
 

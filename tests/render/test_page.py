@@ -2,16 +2,15 @@
 
 import base64
 import hashlib
-import json
 import re
-import zlib
 from collections.abc import Callable
-from html.parser import HTMLParser
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from meshmatch.errors import InputError, OptionError, OutputError
 from meshmatch.maps.vertex_map import VertexMap
@@ -19,64 +18,20 @@ from meshmatch.render.facing import facing_alike
 from meshmatch.render.scales import position_colors
 from meshmatch.render.viewer.assembly import pack, small_integers
 from meshmatch.render.viewer.drawn import draw, relative_size, upright
-from meshmatch.render.viewer.looks import Looks
+from meshmatch.render.viewer.looks import Looks, dress
 from meshmatch.render.viewer.page import write_page
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.colors import UNKNOWN
 from meshmatch.shapes.shape import Shape
-from tests.render.pairs import Pair, bump, stirred
+from tests.render.pages import Page, read, unpacked
+from tests.render.pairs import Pair, bump, itself, stirred
 
-DTYPES = {
-    "Uint8Array": np.uint8,
-    "Int8Array": np.int8,
-    "Uint16Array": np.uint16,
-    "Uint32Array": np.uint32,
-    "Float32Array": np.float32,
-}
 HOSTILE = "</script><script>alert(1)</script ><script /x><!--<script <!--packed--><b a='\"'>&amp;\u2028\u202e.ply"
 
 
 @pytest.fixture(scope="module")
 def pair(make_sphere: Callable[[int], Shape]) -> Pair:
     return stirred(bump(make_sphere(2)))
-
-
-class Page(HTMLParser):
-    """Elements of a page, with the text of scripts and styles."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.text, self.elements, self.open = text, [], False
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.elements.append((tag, dict(attrs), ""))
-        self.open = True
-
-    def handle_endtag(self, tag: str) -> None:
-        self.open = False
-
-    def handle_data(self, data: str) -> None:
-        if self.open:
-            tag, attrs, text = self.elements[-1]
-            self.elements[-1] = (tag, attrs, text + data)
-
-    def all(self, tag: str) -> list[tuple[dict[str, str | None], str]]:
-        return [(attrs, text) for name, attrs, text in self.elements if name == tag]
-
-    @property
-    def words(self) -> dict[str, Any]:
-        (found,) = (text for attrs, text in self.all("script") if attrs.get("id") == "words")
-        return dict(json.loads(found))
-
-    @property
-    def arrays(self) -> dict[str, np.ndarray]:
-        (packed,) = (text for attrs, text in self.all("script") if attrs.get("id") == "packed")
-        data = zlib.decompress(base64.b64decode(packed, validate=True))
-        return {
-            row["name"]: np.frombuffer(data, DTYPES[row["kind"]], row["length"], row["start"])
-            for row in self.words["arrays"]
-        }
 
 
 @pytest.mark.parametrize(
@@ -92,7 +47,7 @@ def test_unknown_confidence_is_not_certainty(
 
 def page_of(path: Path, pair: Pair, **options: Any) -> Page:
     write_page(path, pair.source, pair.target, pair.there, pair.back, **options)
-    return Page(path.read_text(encoding="utf-8"))
+    return read(path)
 
 
 def test_the_page_holds_both_shapes_and_the_map(tmp_path: Path, pair: Pair) -> None:
@@ -249,7 +204,7 @@ def test_a_large_mesh_is_drawn_coarser_and_says_so(
     assert all(200 < drawn <= 900 for drawn in report.drawn)
     assert report.size == path.stat().st_size
     assert report.notes[0] == f"egg.ply: drawn with {report.drawn[0]:,} of 2,562 vertices"
-    page = Page(path.read_text(encoding="utf-8"))
+    page = read(path)
     assert page.words["target"]["note"] == f"drawn with {report.drawn[1]:,} of 2,562 vertices"
     rows = page.arrays["source.vertex"].astype(int)
     assert np.array_equal(page.arrays["source.match"], fine.there.index[rows])
@@ -373,10 +328,14 @@ def look_of(shape: Shape, pixels: np.ndarray | None, **material: Any) -> Appeara
     return Appearance((Material("image", pixels, **material), Material("red", factor=(1.0, 0, 0, 1))), which, uv)
 
 
+def worn_page(folder: Path, shape: Shape, look: Appearance, side: Literal["source", "target"] = "source") -> Page:
+    """Of a shape that is both source and target, with one look."""
+    return page_of(folder / "page.html", itself(shape), looks=Looks(side, (look, look)))
+
+
 def test_a_texture_keeps_its_corners_and_its_image(tmp_path: Path, cube: Shape) -> None:
     look = look_of(cube, image(), wrap=("clamp", "mirror"), nearest=True, alpha="mask", cutoff=0.25)
-    twice = Pair(cube, cube, VertexMap.identity(cube), VertexMap.identity(cube))
-    page = page_of(tmp_path / "page.html", twice, looks=Looks("source", (look, look), look))
+    page = page_of(tmp_path / "page.html", itself(cube), looks=Looks("source", (look, look), look))
     words, arrays = page.words, page.arrays
     assert (words["look"], words["own"]) == ({"kind": "texture", "side": "source"}, True)
     skin = words["source"]["look"]
@@ -395,34 +354,24 @@ def test_a_texture_keeps_its_corners_and_its_image(tmp_path: Path, cube: Shape) 
 
 
 def test_large_images_become_smaller(tmp_path: Path, cube: Shape, monkeypatch: pytest.MonkeyPatch) -> None:
-    from io import BytesIO
-
-    from PIL import Image
-
-    twice = Pair(cube, cube, VertexMap.identity(cube), VertexMap.identity(cube))
     look = look_of(cube, image(2400, 1200))
-    page = page_of(tmp_path / "page.html", twice, looks=Looks("source", (look, look)))
+    page = worn_page(tmp_path, cube, look)
     data = page.arrays["source.look.image0"].tobytes()
     assert page.words["source"]["look"]["images"] == ["image/jpeg"]
     with Image.open(BytesIO(data)) as picture:
         assert (picture.format, picture.size) == ("JPEG", (1024, 2048))
     monkeypatch.setattr("meshmatch.render.viewer.looks.MOST_PIXELS", 512 * 1024)
-    page = page_of(tmp_path / "page.html", twice, looks=Looks("source", (look, look)))
+    page = worn_page(tmp_path, cube, look)
     with Image.open(BytesIO(page.arrays["source.look.image0"].tobytes())) as picture:
         assert picture.size == (512, 1024)
 
 
 def test_alpha_is_kept_where_it_counts(tmp_path: Path, cube: Shape) -> None:
-    from io import BytesIO
-
-    from PIL import Image
-
     pixels = image(300, 300)
     pixels[:150, :, 3] = 0
-    twice = Pair(cube, cube, VertexMap.identity(cube), VertexMap.identity(cube))
     for alpha, kind, mode in (("opaque", "image/jpeg", "RGB"), ("blend", "image/png", "RGBA")):
         look = look_of(cube, pixels, alpha=alpha)
-        page = page_of(tmp_path / "page.html", twice, looks=Looks("target", (look, look)))
+        page = worn_page(tmp_path, cube, look, "target")
         assert page.words["source"]["look"]["images"] == [kind]
         with Image.open(BytesIO(page.arrays["source.look.image0"].tobytes())) as picture:
             assert picture.mode == mode
@@ -433,8 +382,7 @@ def test_alpha_is_kept_where_it_counts(tmp_path: Path, cube: Shape) -> None:
 def test_vertex_colors_are_painted(tmp_path: Path, cube: Shape) -> None:
     light = np.linspace(0, 1, 32).reshape(8, 4)
     look = Appearance((Material(),), np.zeros(12, np.int64), np.zeros((12, 3, 2)), light)
-    twice = Pair(cube, cube, VertexMap.identity(cube), VertexMap.identity(cube))
-    page = page_of(tmp_path / "page.html", twice, looks=Looks("source", (look, look)))
+    page = worn_page(tmp_path, cube, look)
     assert page.words["look"] == {"kind": "colors", "side": "source"}
     assert page.words["source"]["look"] is None
     paint = page.arrays["source.look.paint"].reshape(8, 3) / 255
@@ -450,9 +398,8 @@ def test_a_texture_on_a_coarser_mesh_is_painted(
     ball = bump(make_sphere(4))
     low, extent = ball.bounds[0], np.ptp(ball.verts, axis=0)
     uv = ((ball.verts - low) / extent)[:, [0, 2]][ball.faces]
-    look = Appearance((Material("image", image(64, 64)),), np.zeros(ball.F, np.int64), uv)
-    twice = Pair(ball, ball, VertexMap.identity(ball), VertexMap.identity(ball))
-    page = page_of(tmp_path / "page.html", twice, looks=Looks("source", (look, look)))
+    look = Appearance((Material("image", image(64, 64), wrap=("clamp", "clamp")),), np.zeros(ball.F, np.int64), uv)
+    page = worn_page(tmp_path, ball, look)
     rows = page.arrays["source.vertex"].astype(int)
     expected = ((ball.verts[rows] - low) / extent)[:, 0]
     assert np.abs(page.arrays["source.look.paint"].reshape(-1, 3)[:, 0] / 255 - expected).max() < 0.03
@@ -460,11 +407,11 @@ def test_a_texture_on_a_coarser_mesh_is_painted(
 
 @pytest.mark.parametrize(("wrap", "expected"), [("repeat", 0.25), ("mirror", 0.75), ("clamp", 1.0)])
 def test_coordinates_outside_the_image_are_wrapped(cube: Shape, wrap: str, expected: float) -> None:
-    from meshmatch.render.viewer.looks import vertex_paint
-
     uv = np.full((12, 3, 2), 1.25)
     look = Appearance((Material("i", image(4, 256), wrap=(wrap, wrap)),), np.zeros(12, np.int64), uv)
-    assert np.allclose(vertex_paint(look, cube)[:, 0], expected, atol=0.01)
+    points = draw(Shape(cube.verts, None))  # nothing that could wear the image itself
+    paint, _ = dress(look, cube, points)
+    assert np.allclose(paint["paint"][:, 0] / 255, expected, atol=0.01)
 
 
 def test_packing_is_undone_by_its_table() -> None:
@@ -475,33 +422,22 @@ def test_packing_is_undone_by_its_table() -> None:
         "d": np.array([70000], np.uint32),
         "e": np.array([-128, 127], np.int8),
     }
-    table, text = pack(arrays)
-    data = zlib.decompress(base64.b64decode(text))
-    for row in table:
-        assert row["start"] % 4 == 0
-        found = np.frombuffer(data, DTYPES[row["kind"]], row["length"], row["start"])
-        assert np.array_equal(found, arrays[row["name"]])
-        assert found.dtype == arrays[row["name"]].dtype
+    found = unpacked(*pack(arrays))
+    assert list(found) == list(arrays)
+    for name, array in arrays.items():
+        assert np.array_equal(found[name], array) and found[name].dtype == array.dtype
     assert small_integers(np.array([0, 65534])).dtype == np.uint16
     assert small_integers(np.array([0, 65535])).dtype == np.uint32
 
 
-def test_maps_of_other_shapes_are_refused(tmp_path: Path, pair: Pair, cube: Shape) -> None:
-    with pytest.raises(InputError, match="another target"):
-        write_page(tmp_path / "p.html", pair.source, cube, pair.there, pair.back)
-    with pytest.raises(InputError, match="another source"):
-        write_page(tmp_path / "p.html", cube, pair.target, pair.there, pair.back)
+def test_what_cannot_be_a_page(tmp_path: Path, pair: Pair, cube: Shape) -> None:
+    refused = [
+        ("p.html", pair.source, cube, InputError, "another target"),
+        ("p.html", cube, pair.target, InputError, "another source"),
+        ("no/p.html", pair.source, pair.target, OutputError, "no folder"),
+        *((name, pair.source, pair.target, OptionError, "a page is HTML") for name in ("p.png", "p", "p.xhtml")),
+    ]
+    for name, source, target, error, words in refused:
+        with pytest.raises(error, match=words):
+            write_page(tmp_path / name, source, target, pair.there, pair.back)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["page.png", "page", "page.xhtml"])
-def test_a_page_is_html(tmp_path: Path, pair: Pair, name: str) -> None:
-    with pytest.raises(OptionError, match="a page is HTML") as caught:
-        write_page(tmp_path / name, pair.source, pair.target, pair.there, pair.back)
-    assert ".html" in caught.value.hint
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_is_not_there(tmp_path: Path, pair: Pair) -> None:
-    with pytest.raises(OutputError, match="no folder"):
-        write_page(tmp_path / "no" / "p.html", pair.source, pair.target, pair.there, pair.back)

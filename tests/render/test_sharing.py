@@ -7,8 +7,9 @@ import pytest
 
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.viewer import looks as module
-from meshmatch.render.viewer.looks import share_look, vertex_paint
+from meshmatch.render.viewer.looks import Looks, share_look
 from meshmatch.shapes.appearance import Appearance, Material, vertex_colors_alone
+from meshmatch.shapes.colors import to_srgb
 from meshmatch.shapes.shape import Shape
 from tests.render.pairs import Pair, bump, stirred
 
@@ -42,41 +43,42 @@ def colored(shape: Shape) -> Appearance:
     return vertex_colors_alone(Shape(shape.verts, shape.faces, shape.name, red))
 
 
-def test_a_texture_is_baked_for_the_other_mesh(pair: Pair, textured: Appearance) -> None:
-    looks = share_look((pair.source, pair.target), (textured, None), pair.there, pair.back)
+def check_reds(looks: Looks | None, side: int, shape: Shape, expected: np.ndarray, most: float = 0.06) -> Looks:
+    """The red of each vertex in what a shape wears, at the nearest texel."""
     assert looks is not None
+    worn = looks.worn[side]
+    if worn.colors is not None:
+        seen = to_srgb(worn.colors[:, 0])
+    else:
+        (material,) = worn.materials
+        assert material.image is not None and material.image.shape == (module.TEXELS, module.TEXELS, 4)
+        column, row = (worn.uv.reshape(-1, 2) * module.TEXELS).astype(int).clip(0, module.TEXELS - 1).T
+        seen = np.empty(shape.V)
+        seen[shape.faces.ravel()] = material.image[row, column, 0] / 255
+    assert np.abs(seen - expected).max() < most
+    return looks
+
+
+def test_a_texture_is_baked_for_the_other_mesh(pair: Pair, textured: Appearance) -> None:
+    """With new coordinates, or with the wearer's own where they serve."""
+    there, expected = (pair.source, pair.target), height(pair.source)[pair.back.index]
+    looks = check_reds(share_look(there, (textured, None), pair.there, pair.back), 1, pair.target, expected)
     assert (looks.side, looks.own) == ("source", None)
     assert looks.worn[0] is textured
-    (material,) = looks.worn[1].materials
-    assert material.image is not None
-    assert material.image.shape == (module.TEXELS, module.TEXELS, 4)
-    seen = vertex_paint(looks.worn[1], pair.target)[:, 0]
-    assert np.abs(seen - height(pair.source)[pair.back.index]).max() < 0.06
-
-
-def test_the_wearers_own_coordinates_are_used(pair: Pair, textured: Appearance) -> None:
-    first = share_look((pair.source, pair.target), (textured, None), pair.there, pair.back)
-    assert first is not None
-    own = first.worn[1].uv[:, :, ::-1]  # an atlas, but another one
-    again = share_look(
-        (pair.source, pair.target), (textured, None), pair.there, pair.back, coordinates=(None, own), workers=2
-    )
-    assert again is not None
-    assert np.allclose(again.worn[1].uv, own)
-    seen = vertex_paint(again.worn[1], pair.target)[:, 0]
-    assert np.abs(seen - height(pair.source)[pair.back.index]).max() < 0.06
+    own = looks.worn[1].uv[:, :, ::-1]  # an atlas, but another one
+    again = share_look(there, (textured, None), pair.there, pair.back, coordinates=(None, own), workers=2)
+    assert np.allclose(check_reds(again, 1, pair.target, expected).worn[1].uv, own)
 
 
 def test_a_source_without_a_look_wears_the_targets(pair: Pair, textured: Appearance) -> None:
     looks = share_look((pair.target, pair.source), (None, textured), pair.back, pair.there)
+    check_reds(looks, 0, pair.target, height(pair.source)[pair.back.index])
     assert looks is not None
     assert (looks.side, looks.own) == ("target", None)
     assert looks.worn[1] is textured
-    seen = vertex_paint(looks.worn[0], pair.target)[:, 0]
-    assert np.abs(seen - height(pair.source)[pair.back.index]).max() < 0.06
 
 
-def test_two_looks_are_both_kept(pair: Pair, textured: Appearance) -> None:
+def test_two_looks_are_both_kept_and_none_is_none(pair: Pair, textured: Appearance) -> None:
     other = colored(pair.target)
     looks = share_look((pair.source, pair.target), (textured, other), pair.there, pair.back)
     assert looks is not None
@@ -85,19 +87,17 @@ def test_two_looks_are_both_kept(pair: Pair, textured: Appearance) -> None:
     assert [name for name, _ in looks.of(0)] == ["look", "own"]
     assert looks.of(0)[1][1] is textured
     assert looks.of(1)[1][1] is other
-
-
-def test_nothing_to_wear(pair: Pair) -> None:
     assert share_look((pair.source, pair.target), (None, None), pair.there, pair.back) is None
 
 
-def test_colors_of_vertices_are_carried_as_such(pair: Pair) -> None:
-    looks = share_look((pair.source, pair.target), (colored(pair.source), None), pair.there, pair.back)
-    assert looks is not None
-    assert looks.words["look"] == {"kind": "colors", "side": "source"}
-    assert not looks.worn[1].textured
-    seen = vertex_paint(looks.worn[1], pair.target)[:, 0]
-    assert np.abs(seen - height(pair.source)[pair.back.index]).max() < 0.01
+@pytest.mark.parametrize("cloud", [False, True])
+def test_colors_of_vertices_are_carried_as_such(pair: Pair, cloud: bool) -> None:
+    source = Shape(pair.source.verts, None if cloud else pair.source.faces, "source")
+    there = VertexMap.between(source, pair.target, pair.there.index)
+    back = VertexMap.between(pair.target, source, pair.back.index)
+    looks = share_look((source, pair.target), (colored(source), None), there, back)
+    check_reds(looks, 1, pair.target, height(source)[pair.back.index], 0.01)
+    assert looks is not None and looks.words["look"] == {"kind": "colors", "side": "source"}
 
 
 @pytest.mark.parametrize("why", ["cloud", "fine"])
@@ -105,22 +105,9 @@ def test_where_nothing_can_be_baked_vertices_have_colors(
     pair: Pair, textured: Appearance, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "MOST_FACES", 100 if why == "fine" else 10**6)
-    faces = pair.target.faces if why == "fine" else np.empty((0, 3), np.int64)
-    other = Shape(pair.target.verts, faces, "other")
+    other = Shape(pair.target.verts, pair.target.faces if why == "fine" else None, "other")
     back = VertexMap.between(other, pair.source, pair.back.index)
     there = VertexMap.between(pair.source, other, pair.there.index)
     looks = share_look((pair.source, other), (textured, None), there, back)
-    assert looks is not None
-    assert not looks.worn[1].textured
-    seen = vertex_paint(looks.worn[1], other)[:, 0]
-    assert np.abs(seen - height(pair.source)[pair.back.index]).max() < 0.05
-
-
-def test_the_colors_of_a_cloud_are_carried(pair: Pair) -> None:
-    cloud = Shape(pair.source.verts, np.empty((0, 3), np.int64), "cloud")
-    there = VertexMap.between(cloud, pair.target, pair.there.index)
-    back = VertexMap.between(pair.target, cloud, pair.back.index)
-    looks = share_look((cloud, pair.target), (colored(cloud), None), there, back)
-    assert looks is not None
-    seen = vertex_paint(looks.worn[1], pair.target)[:, 0]
-    assert np.abs(seen - height(pair.source)[pair.back.index]).max() < 0.01
+    check_reds(looks, 1, other, height(pair.source)[pair.back.index], 0.05)
+    assert looks is not None and not looks.worn[1].textured

@@ -17,6 +17,7 @@ from meshmatch.transfer import texel_colors
 from meshmatch.transfer.bake import Baked, BakeOptions, colors_of_vertices, transfer_texture
 from meshmatch.transfer.texels import faces_on
 from meshmatch.transfer.unwrap import Atlas, atlas_of, unwrapped
+from tests.maps.solids import grid
 from tests.shapes.painted import CORNERS, FACES, UV, quarters
 from tests.transfer.known import split
 
@@ -414,20 +415,15 @@ def strips() -> tuple[Shape, Appearance]:
 
 def torn_case() -> tuple[Shape, VertexMap, np.ndarray]:
     """A fine sheet whose left half lies on red and whose right half lies on blue: one column is torn."""
-    n = 12
-    grid = np.stack(np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1)), -1).reshape(-1, 2)
-    number = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
-    a, b, c, d = (number[:-1, :-1].ravel(), number[:-1, 1:].ravel(), number[1:, 1:].ravel(), number[1:, :-1].ravel())
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    target = Shape(np.column_stack([grid, np.zeros(len(grid))]), faces, "sheet")
-    left = grid[:, 0] < 0.5
-    x, y = np.where(left, grid[:, 0], grid[:, 0] - 0.45), grid[:, 1]
+    target = grid(12, 12, 1 / 12, "sheet")
+    left = target.verts[:, 0] < 0.5
+    x, y = np.where(left, target.verts[:, 0], target.verts[:, 0] - 0.45), target.verts[:, 1]
     upper = y > x
     weights = np.where(upper[:, None], np.stack([1 - y, x, y - x], 1), np.stack([1 - x, x - y, y], 1))
     face = np.where(left, 0, 4) + upper
     source = strips()[0]
     back = VertexMap.between(target, source, source.faces[face, 0], face=face, barycentric=weights)
-    return target, back, np.column_stack([grid[:, 0], 1 - grid[:, 1]])[faces]
+    return target, back, (target.verts[:, :2] * [1, -1] + [0, 1])[target.faces]
 
 
 def test_nothing_is_smeared_where_a_map_tears(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import lattice, pull_face_labels
 from meshmatch.transfer.mapped_mesh import invert_map
 from tests.conftest import icosphere
+from tests.maps.solids import grid
 from tests.transfer.known import split
 
 COARSE = icosphere(2)
@@ -24,14 +25,10 @@ def test_the_points_of_a_face_are_spread_evenly(rows: int) -> None:
     assert len(np.unique(points.round(9), axis=0)) == rows * rows
 
 
-def test_the_identity_carries_exactly() -> None:
+def test_the_identity_carries_exactly_and_a_finer_copy_gets_each_face_four_times() -> None:
     labels = np.random.default_rng(0).integers(0, 7, COARSE.F)
     same = pull_face_labels(VertexMap.identity(COARSE), COARSE, COARSE, labels, on_faces=True)
     assert np.array_equal(same, labels)
-
-
-def test_a_finer_copy_gets_each_face_four_times() -> None:
-    labels = np.random.default_rng(1).integers(0, 7, COARSE.F)
     found = pull_face_labels(invert_map(FORWARD, COARSE, FINE), COARSE, FINE, labels, on_faces=True)
     assert np.array_equal(found, np.tile(labels, 4))
 
@@ -47,14 +44,9 @@ def test_a_coarser_copy_takes_the_vote_of_its_four_parts() -> None:
 def test_a_large_face_asks_its_inside() -> None:
     """Its three corners agree, but most of it has another label."""
     n = 12
-    x, y = np.meshgrid(np.arange(n + 1.0), np.arange(n + 1.0), indexing="ij")
-    verts = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-    corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
-    faces = np.concatenate(
-        [np.stack([corner, corner + n + 1, corner + n + 2], 1), np.stack([corner, corner + n + 2, corner + 1], 1)]
-    )
-    sheet = Shape(verts, faces, "sheet")
-    ends = np.array([0, n * (n + 1), (n + 1) ** 2 - 1])
+    sheet = grid(n, n)
+    verts, faces = sheet.verts, sheet.faces
+    ends = np.array([0, n, (n + 1) ** 2 - 1])
     large = Shape(verts[ends], np.array([[0, 1, 2]]), "large")
     labels = np.ones(sheet.V, int)
     near = np.linalg.norm(verts[:, None] - verts[ends], axis=2).min(axis=1) < 2.5
