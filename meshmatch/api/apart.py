@@ -147,5 +147,5 @@ def _refuse_others(whole: Shape, parts: Parts, sets: Sequence[frozenset[int]], b
         return
     firsts = sorted({min(sets[k]) for k in (best, *rivals)})
     shares = " and ".join(f"part {n} ({100 * parts.shares[n - 1]:.0f} % of the area)" for n in firsts[:3])
-    problem = f"{whole.name or 'the shape'} holds more than one shape of a kind: {shares} fit alike"
+    problem = f"{whole.name or 'the shape'} holds several shapes of one kind: {shares} fit about equally well"
     raise InputError(problem, f"choose one with --only {firsts[0]} or --only {firsts[1]} (only= of load_shape)")

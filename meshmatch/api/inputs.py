@@ -31,7 +31,7 @@ def as_model(model: TrainedModel | str | Path) -> TrainedModel:
 
         if not isinstance(model, TrainedModel):
             hint = "give its name, its folder, or what load_model returned"
-            raise ModelError(f"a model cannot be made of {type(model).__name__}", hint)
+            raise ModelError(f"expected a model, not {type(model).__name__}", hint)
         return model
     from meshmatch.models.registry import load_once
 

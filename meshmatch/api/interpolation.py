@@ -218,7 +218,7 @@ def _steps(
         place = "files" if max(sizes) < _ALIKE * min(sizes) and not mirrored else "source"
     elif place == "files" and mirrored:
         hint = "leave out the place: the sequence then stays with the source, and ends as the target's mirror image"
-        raise OptionError("a shape and its mirror image have no way between them in their files", hint)
+        raise OptionError("one of the shapes fits as a mirror image, so no motion leads from file to file", hint)
 
     def seen(moment: float) -> tuple[np.ndarray, np.ndarray]:
         """Node vectors and carried vertices, core frame."""

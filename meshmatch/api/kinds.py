@@ -32,8 +32,8 @@ _PEOPLE = "human"
 _NEXT, _TOGETHER = ("quadruped",), 2  # asked after people, before the others; how many models at a time
 _MOST_READ = 40  # files of a folder whose kind is found out
 _NAME_IT = "name the model (--model NAME, in Python model=NAME) if that is wrong"
-_LEAVE_OUT = "--without leaves out what is no part of it (`meshmatch info` lists parts)"
-_NONE = f"if it is one of these all the same, name the model (--model NAME, in Python model=NAME); {_LEAVE_OUT}"
+_LEAVE_OUT = "exclude what does not belong to it with --without (`meshmatch info` lists parts)"
+_NONE = f"if it is one of these, name the model (--model NAME, in Python model=NAME); {_LEAVE_OUT}"
 
 
 @dataclass(frozen=True)
@@ -198,9 +198,9 @@ def choose_model(
 
 
 def _unsure(shape: Shape, taken: str) -> str:
-    why = "may be a part, or a rough cloud" if shape.is_cloud else "may be a part, or more than one thing"
+    why = "may be a part, or a rough cloud" if shape.is_cloud else "may be a part, or several objects"
     hint = _NAME_IT if shape.is_cloud else f"{_NAME_IT}; {_LEAVE_OUT}"
-    return f"{why}: taken for {taken}; {hint}"
+    return f"{why}: treated as {taken}; {hint}"
 
 
 def classify_shapes(

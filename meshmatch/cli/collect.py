@@ -126,7 +126,7 @@ def map(
     from meshmatch.collections.map_all import load_pairs
 
     if [pairs is not None, to is not None, all_pairs].count(True) != 1:
-        raise OptionError("which maps?", "choose one of --pairs FILE, --to NAME and --all")
+        raise OptionError("no maps are chosen", "choose one of --pairs FILE, --to NAME and --all")
     console = Console(quiet)
     with console.progress() as progress:
         collection = meshmatch.Collection(fits, scheduler or jobs, progress)

@@ -122,7 +122,10 @@ def _interpolate_implicit(
     strip = not output.is_dir() and output.suffix.lower() == ".png"
     if not strip and output.suffix and not output.is_dir():
         hint = "give a name without a suffix for a folder, or one that ends in .png"
-        raise OptionError(f"{output.name}: surfaces of an implicit model share no vertices, as a page needs", hint)
+        raise OptionError(
+            f"{output.name}: a page needs shapes that share vertices, and the surfaces of an implicit model do not",
+            hint,
+        )
     with needs("torch", "implicit"):
         from meshmatch.implicit.sequence import implicit_sequence, save_implicit_sequence
     console = Console(run.quiet)

@@ -186,7 +186,7 @@ def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None
 
     if how.preset != "default" or how.unsupervised:
         name = "--unsupervised" if how.unsupervised else f"--preset {how.preset}"
-        raise OptionError(f"{name} does not go with fits", "fits are learned from by the model that made them")
+        raise OptionError(f"{name} does not go with fits", "training on fits continues the model that made them")
     _refuse(how, ("template", "poses", "characters", "identities", "bodies"), "generated shapes, not with fits")
     collection = Collection(how.shapes)
     found = collection.to_learn()

@@ -44,7 +44,7 @@ def transfer_color(
     from meshmatch.transfer import vertex_files
 
     if directions and values is None:
-        raise OptionError("--directions is for numbers", "give them with --values")
+        raise OptionError("--directions needs --values", "give the vectors with --values")
     transfer = Transfer(source, target, output, maps, run, picture)
     (vertex_files.check_color_suffix if values is None else vertex_files.check_values_suffix)(output)
     with transfer.outputs(values) as (temporary,):

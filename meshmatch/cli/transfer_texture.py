@@ -105,9 +105,7 @@ def _tell_baked(
     if atlas.note:
         console.say(f"note: {atlas.note}")
     if baked.low:
-        became = (
-            "filled in from its surroundings" if rule.fill else "kept as it is" if rule.blank is None else "left blank"
-        )
+        became = "filled in from its surroundings" if rule.fill else "kept" if rule.blank is None else "left blank"
         console.say(f"{100 * baked.low:.1f} % of the surface has less confidence than {rule.minimum:g}: {became}")
     if baked.torn > _WORTH_SAYING:
         console.say(f"note: the map is discontinuous on {100 * baked.torn:.1f} % of the surface; colors are cut there")

@@ -95,7 +95,7 @@ def load_words(path: str | Path) -> tuple[Words, Words]:
         if not odd and not 0 <= about["trust"] <= 1:
             odd = ["trust"]
         if odd or about["verdict"] not in VERDICTS:
-            raise InputError(f"{path.name}: its {odd[0] if odd else 'verdict'} cannot be", _HINT)
+            raise InputError(f"{path.name}: its {odd[0] if odd else 'verdict'} is invalid", _HINT)
         about["reasons"] = [(str(code), str(sentence)) for code, sentence in about["reasons"]]
         regularity_of(about)
         return about, more

@@ -75,7 +75,7 @@ def compare_groups(
     if kind not in STATISTICS:
         raise OptionError(f"invalid statistic {kind!r}", f"choose one of {', '.join(STATISTICS)}")
     if permutations < 1:
-        raise OptionError("a permutation test needs a permutation", "1,000 or more are usual")
+        raise OptionError("a permutation test needs at least one permutation", "1,000 or more are usual")
     S, V = offsets.shape[:2]
     second = int(in_second.sum())
     if min(second, S - second) < 2:

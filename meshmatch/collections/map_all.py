@@ -59,12 +59,12 @@ def load_pairs(path: str | Path) -> list[Pair]:
         mark = next((each for each in "\t;," if each in text), None)
         words = [word.strip() for word in text.split(mark)]
         if text and len(words) != 2:
-            hint = "a source and a target a line; put a comma between names that hold spaces"
+            hint = "each line names a source and a target; put a comma between names that contain spaces"
             raise InputError(f"{path.name}, line {number}: not two names", hint)
         if text:
             found.append((words[0], words[1]))
     if not found:
-        raise InputError(f"{path.name} holds no pair of names", "a source and a target a line")
+        raise InputError(f"{path.name} holds no pair of names", "each line names a source and a target")
     return found
 
 

@@ -88,7 +88,7 @@ class Blend:
             if not model.has_nodes:
                 raise OptionError(
                     f"model {model.card.name} is pointwise: it has no nodes that could blend what the field does",
-                    "blend codes instead (--way codes), or use a model of another field",
+                    "blend codes instead (--blend codes), or use a model of another field",
                 )
             self._path: Path = FieldPath(self._system, list(self._keys), model.template.core)
         elif way == "codes":

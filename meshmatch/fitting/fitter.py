@@ -76,9 +76,14 @@ class Fitter:
         if found.core_frame.mirrored:
             notes = (f"{shape.name}: taken for the mirror image of what {card.name} knows",)
         if others and _cost(found) > _SURE_SIDE * _cost(others[0][0]):
-            doubts.append(Reason("side", "it fits nearly as well in the mirror: left and right may be exchanged"))
+            doubts.append(Reason("side", "its mirror image fits nearly as well: left and right may be exchanged"))
         if not card.correspondence:
-            doubts.append(Reason("unsupervised", f"{card.name} was learned without correspondence: near may be wrong"))
+            doubts.append(
+                Reason(
+                    "unsupervised",
+                    f"{card.name} was trained without correspondence: surfaces that lie close need not correspond",
+                )
+            )
         fit = replace(as_fit(found, partial, began), notes=notes)
         return cap_verdict(fit, doubts)
 

@@ -62,7 +62,7 @@ def fit_implicit(
     >>> chair.verdict, chair.reasons
     """
     if steps < 1:
-        raise OptionError(f"a code is not found in {steps} steps", "200 are usual")
+        raise OptionError(f"a latent code cannot be found in {steps} steps", "200 are usual")
     source = Path(shape) if is_samples(shape) else as_shape(shape)  # type: ignore[arg-type]
     name = Path(source).stem if isinstance(source, str | Path) else source.name or "shape"
     rng = np.random.default_rng(seed)

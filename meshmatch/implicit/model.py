@@ -451,7 +451,7 @@ def load_implicit(folder: str | Path) -> ImplicitModel:
         for number in range(len(card.frames)):
             Frame(card.frames[number][0], np.eye(3), np.array(card.frames[number][1:]))
     except (ValueError, KeyError, TypeError, IndexError, AttributeError, InputError) as error:
-        raise ModelError(f"{folder} holds no implicit model that can be: {error}", "is a file damaged?") from error
+        raise ModelError(f"{folder} holds no valid implicit model: {error}", "is a file damaged?") from error
     check_weights(folder, card)
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     weights = load_weights(folder / WEIGHTS, expected)

@@ -76,7 +76,9 @@ def samples_of(
         shape = source if isinstance(source, Shape) else load_shape(source)
         solid = not shape.is_cloud and shape.invalid is None and is_watertight(shape.faces)
         if closed and not (solid or shape.is_cloud):
-            raise InputError(f"{shape.name} is not watertight: it has no inside", "close its holes, or give its points")
+            raise InputError(
+                f"{shape.name} is not watertight: it has no inside", "close its holes, or give it as a point cloud"
+            )
         count = shape.V if shape.is_cloud else _DENSE
         if solid or shape.invalid is None:
             drawn = sample_surface(shape, count, rng)
@@ -127,7 +129,7 @@ def _arrays(file: Path) -> tuple[Floats, Floats, Floats]:
         raise InputError(what, "see docs/formats.md")
     found = (points, distances, normals)
     if any(each.dtype.kind not in "fiu" or not (np.abs(each.astype(np.float64)) < _HUGE).all() for each in found):
-        raise InputError(f"{file.name} holds what is no finite number, or is huge", "leave these points out")
+        raise InputError(f"{file.name} holds numbers that are not finite, or huge", "leave these points out")
     points, distances, normals = (each.astype(np.float64) for each in found)
     if not len(distances):
         normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)

@@ -46,7 +46,7 @@ def existing(path: Path, hint: str = "", suffixes: tuple[str, ...] = ()) -> Path
             raise InputError(f"{path} is a folder, not a file", hint or "give the name of a file")
         if not path.exists():
             if path.is_symlink():
-                raise InputError(f"{path} is a link to a file that is not there", "mend the link, or name the file")
+                raise InputError(f"{path} is a link to a file that is not there", "repair the link, or name the file")
             raise InputError(f"there is no file {path}", hint or _similar(path, suffixes))
         if not path.is_file():
             odd = f"{path} is not a regular file (it is a pipe or a device)"

@@ -114,8 +114,8 @@ def _place(record: Record, number: int) -> Place:
         absent = any(each != each for each in position)
         return Place(name, "missing", " has no position") if absent else Place(name, "position", position)
     if not {"vertex", "position"} & set(record):
-        raise InputError(f"landmark {name} has no place")
-    return Place(name, "missing", " is vertex -1" if vertex == -1 else " has no place")
+        raise InputError(f"landmark {name} has no vertex and no position")
+    return Place(name, "missing", " is vertex -1" if vertex == -1 else " has no vertex and no position")
 
 
 def _whole(value: Any, name: str) -> int:

@@ -111,7 +111,7 @@ def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     _note(notes, int(flat.sum()), "face", "without area dropped")
     faces, cross, which = _without(flat, faces, cross, which)
     double = duplicate_faces(faces)
-    _note(notes, int(double.sum()), "face", "dropped that occurred twice")
+    _note(notes, int(double.sum()), "duplicate face", "dropped")
     faces, cross, which = _without(double, faces, cross, which)
     if len(faces) == 0:
         raise InputError(f"{shape.name or 'the shape'} has no face with any area", "is it a mesh at all?")
@@ -137,7 +137,7 @@ def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     smooth, passes = without_noise(found.shape, parts)
     if not passes:
         return found
-    return replace(found, shape=smooth, notes=(*found.notes, f"smoothed {passes} times: noise hid the surface"))
+    return replace(found, shape=smooth, notes=(*found.notes, f"smoothed {passes} times, because noise hid the surface"))
 
 
 def _without(bad: Bools, *arrays: NDArray[Any]) -> tuple[NDArray[Any], ...]:

@@ -111,7 +111,7 @@ def prepare(
     """
     shapes, output, config = as_path(shapes), as_path(output), config or PrepareConfig()
     if (config.nodes.strategy == "parts") != (config.labels is not None):
-        raise OptionError("strategy 'parts' and labels go together", "give both, or choose another strategy")
+        raise OptionError("strategy 'parts' and labels need each other", "give both, or choose another strategy")
     if shapes.is_dir():
         if config.labels is not None:
             raise OptionError("labels are of one shape, not of a folder", "name the shape itself")
@@ -120,7 +120,7 @@ def prepare(
         return _prepare_folder(shapes, output, config, Progress(progress, shapes.name).stage("checking and aligning"))
     for name in ("template", "align", "landmarks"):
         if getattr(config, name) is not None:
-            raise OptionError(f"{name} goes with a folder of shapes", "one shape is its own template")
+            raise OptionError(f"{name} applies to a folder of shapes", "one shape is its own template")
     make_folder(output)
     clean = _template_file(shapes)
     labels = config.labels
@@ -163,7 +163,7 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
     if not registered and np.median(residuals) > MAX_RESIDUAL:
         far = f"aligned, they lie {100 * np.median(residuals):.0f} % of sqrt(area) apart"
         hint = "name one of the shapes with --template, or try another --align or --scale"
-        raise InputError(f"most shapes of the folder are nothing like the template {name}: {far}", hint)
+        raise InputError(f"most shapes of the folder do not resemble the template {name}: {far}", hint)
     stems = [Path(clean.original.name).stem for clean in found]
     for clean, stem, frame, residual in zip(found, stems, frames, residuals, strict=True):
         label = stem if stems.count(stem) == 1 else clean.original.name
@@ -172,7 +172,8 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
         normal = Shape(frame.apply(small.verts), small.faces, small.name)
         save_shape(output / "normalised" / f"{label}.ply", normal)
         if residual > MAX_RESIDUAL and not registered:
-            notes.append(f"{clean.original.name} is not much like the template: {100 * residual:.0f} % apart")
+            apart = f"aligned, it lies {100 * residual:.0f} % of sqrt(area) away"
+            notes.append(f"{clean.original.name} differs much from the template: {apart}")
     save_template(made, output / "template.safetensors")
     arrays = {name: getattr(samples, name) for name in prepared_folder.ARRAYS}
     save_arrays(output / "points.safetensors", arrays, {"align": samples.align, "scale": samples.scale})

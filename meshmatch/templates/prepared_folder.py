@@ -70,7 +70,7 @@ class RegisteredShapes:
         V, shape = self.template.shape.V, np.shape(self.verts)
         if len(shape) != 3 or shape[1:] != (V, 3) or not np.isfinite(self.verts).all():
             raise InputError(
-                f"{self.name}: shapes of {V} vertices with finite coordinates are wanted, (N, {V}, 3), not {shape}",
+                f"{self.name}: shapes of {V} vertices with finite coordinates are needed, (N, {V}, 3), not {shape}",
                 "take those of `Collection.to_learn`",
             )
 

@@ -31,7 +31,9 @@ class CardFacts:
 def inherited(facts: CardFacts, card: ModelCard) -> CardFacts:
     """What is not said of a model is said of the one that it goes on from; `OptionError` if that may not teach."""
     if not card.correspondence:
-        raise OptionError(f"{card.name} was learned without correspondence", "fit with a model that knows it")
+        raise OptionError(
+            f"{card.name} was trained without correspondence", "fit with a model that was trained with correspondence"
+        )
     plain = CardFacts()
     names = ("frame", "mirror", "category", "licence", "stiffness")
     unsaid = {name: getattr(card, name) for name in names if getattr(facts, name) == getattr(plain, name)}

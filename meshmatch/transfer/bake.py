@@ -87,7 +87,7 @@ class BakeOptions:
             if not isinstance(value, Integral) or not low <= value <= high:
                 raise OptionError(f"{name} must be an integer from {low} to {high}, not {value!r}", hint)
         if self.padding > self.size // 4:
-            problem = f"padding of {self.padding} texels does not go with {self.size}"
+            problem = f"padding of {self.padding} texels is not possible with {self.size}"
             raise OptionError(problem, f"choose 0 to {self.size // 4}")
         if self.fill and self.blank is not None:
             raise OptionError("fill and blank contradict each other", "choose one of them")

@@ -148,7 +148,10 @@ def test_what_reads_strangely_is_of_the_kind_that_fits_it(monkeypatch: pytest.Mo
 @pytest.mark.usefixtures("models")
 def test_a_cloud_that_reads_strangely_is_of_the_kind_that_fits_it() -> None:
     dancer = load_shape(SAMPLES / "dancer.ply")
-    for points, word in ((dancer.verts, "human"), (ball("").verts, "may be a part, or a rough cloud: taken for human")):
+    for points, word in (
+        (dancer.verts, "human"),
+        (ball("").verts, "may be a part, or a rough cloud: treated as human"),
+    ):
         _, words = choose(Shape(points[::4], np.empty((0, 3), np.int64), "rough 5 5.6 7"))
         assert word in words[0]
 
@@ -159,8 +162,8 @@ def test_what_may_be_a_part_takes_the_other_shapes_kind(unsure: Shape) -> None:
     for shapes in ((unsure, ball("man 3 4 6")), (ball("man 3 4 6"), unsure)):
         name, words = choose(*shapes)
         assert name == "human"
-        why = "may be a part, or a rough cloud" if unsure.is_cloud else "may be a part, or more than one thing"
-        assert words[shapes.index(unsure)].startswith(f"half 7 7 6 {why}: taken for human")
+        why = "may be a part, or a rough cloud" if unsure.is_cloud else "may be a part, or several objects"
+        assert words[shapes.index(unsure)].startswith(f"half 7 7 6 {why}: treated as human")
         assert ("--without" in words[shapes.index(unsure)]) is not unsure.is_cloud
     assert choose(unsure)[0] == "quadruped"  # alone, what reads it best
 

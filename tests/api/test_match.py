@@ -112,7 +112,7 @@ def test_shapes_that_cannot_be_fitted(cube: Shape, dancer: Shape) -> None:
         np.concatenate([dancer.faces, dancer.faces + dancer.V]),
         "two",
     )
-    with pytest.raises(InputError, match="more than one shape of a kind") as caught:
+    with pytest.raises(InputError, match="several shapes of one kind") as caught:
         register(apart)
     assert "--only 1 or --only 2" in caught.value.hint
 

@@ -171,13 +171,13 @@ def test_known_points_and_preset_reach_the_training(
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["prepare", "eggs/egg0.ply", "-o", "out", "--align", "none"], "align goes with a folder"),
-        (["prepare", "eggs/egg0.ply", "-o", "out", "--landmarks", ".x"], "landmarks goes with a folder"),
+        (["prepare", "eggs/egg0.ply", "-o", "out", "--align", "none"], "align applies to a folder"),
+        (["prepare", "eggs/egg0.ply", "-o", "out", "--landmarks", ".x"], "landmarks applies to a folder"),
         (["prepare", "eggs", "-o", "out", "--landmarks", ".nothing"], "has landmarks"),
         (["prepare", "eggs", "-o", "out", "--template", "egg9"], "egg9"),
         (
             ["prepare", "eggs", "-o", "out", "--template", "needle.ply", "--align", "none", *FEW],
-            "nothing like the template",
+            "do not resemble the template",
         ),
         (["prepare", "eggs", "-o", "out", "--template", "bad/three.npy"], "three.npy cannot be a template"),
         (["prepare", "eggs", "-o", "out", "--template", "bad/same.npy"], "it has points in only 1 place"),

@@ -76,8 +76,8 @@ def test_what_cannot_be_mapped(fits: Path, run: Run, tmp_path: Path) -> None:
         assert answer.status == 1 and not (tmp_path / "maps").exists()
         return answer.err
 
-    assert "which maps?" in refused(fits)
-    assert "which maps?" in refused(fits, "--all", "--to", "dancer")
+    assert "no maps are chosen" in refused(fits)
+    assert "no maps are chosen" in refused(fits, "--all", "--to", "dancer")
     assert "is not a folder of fits" in refused(fits.parent / "shapes", "--all")
     assert "did you mean dancer?" in refused(fits, "--to", "dancr")
     pairs = tmp_path / "pairs.txt"

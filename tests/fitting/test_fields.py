@@ -166,7 +166,7 @@ def test_pointwise_fits_are_blended_by_codes_and_agree_as_they_are(pointwise: Tr
     assert agreed_fits(pointwise, shapes, believed) == believed  # the same objects: nothing to solve for
     with pytest.raises(OptionError, match="pointwise") as caught:
         Blend(pointwise, fits)
-    assert "--way codes" in caught.value.hint
+    assert "--blend codes" in caught.value.hint
     blend = Blend(pointwise, fits, shapes=shapes, way="codes")
     for time, fit in enumerate(fits):
         assert np.allclose(blend.points(blend.vectors(time)), fit.points)

@@ -71,7 +71,7 @@ def test_what_is_not_visible_is_not_held_against_a_part() -> None:
     features = compute_features(system, still, scan, 0.02, egg_model().template.labels, partial=True)
     judged = judge(replace(features, hidden=0.5))
     assert judged.verdict == "fair"
-    assert judged.reasons == ("taken for a part: 50 % of the template has no counterpart",)
+    assert judged.reasons == ("fitted as a part: 50 % of the template has no counterpart",)
     assert (
         judge(compute_features(system, still, scan, 0.05, egg_model().template.labels, partial=True)).verdict == "poor"
     )

@@ -69,7 +69,7 @@ def test_repeated_and_degenerate_faces_are_dropped(cube: Shape) -> None:
     flat = [[0, 0, 1], [5, 5, 5]]
     shape = Shape(cube.verts, np.vstack([cube.faces, flat, cube.faces[[3, 7]], cube.faces[[4], [[1, 2, 0]]]]))
     done = repair(shape)
-    assert done.notes == ("2 faces without area dropped", "3 faces dropped that occurred twice")
+    assert done.notes == ("2 faces without area dropped", "3 duplicate faces dropped")
     np.testing.assert_array_equal(done.shape.faces, cube.faces)
     check_answers(shape, done)
 
@@ -121,7 +121,7 @@ def test_flap_is_removed_from_a_closed_surface(sphere: Shape) -> None:
     shape = Shape(verts, np.vstack([sphere.faces, flap]))
     done = repair(shape)
     assert is_watertight(done.shape.faces)
-    assert "2 faces dropped that occurred twice" in done.notes
+    assert "2 duplicate faces dropped" in done.notes
     check_answers(shape, done)
 
 

@@ -170,7 +170,7 @@ def test_labels_are_of_one_shape_and_for_parts(folder: Path, tmp_path: Path) -> 
     parts = NodeConfig(strategy="parts", K=60, radius=0.3)
     with pytest.raises(OptionError, match="labels are of one shape"):
         prepared(folder, tmp_path / "out", parts, labels=np.zeros(5, int))
-    with pytest.raises(OptionError, match="labels go together"):
+    with pytest.raises(OptionError, match="labels need each other"):
         prepared(folder, tmp_path / "out", parts)
 
 

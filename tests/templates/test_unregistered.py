@@ -193,7 +193,7 @@ def test_a_template_of_another_kind_is_refused(pears: Path, tmp_path: Path) -> N
     needle = icosphere(3)
     save_shape(tmp_path / "needle.ply", Shape(needle.verts * [0.05, 1, 0.05], needle.faces))
     wide = NodeConfig(strategy="uniform", K=60, radius=0.6)
-    with pytest.raises(InputError, match="nothing like the template") as caught:
+    with pytest.raises(InputError, match="do not resemble the template") as caught:
         prepared(pears, tmp_path / "out", wide, template=tmp_path / "needle.ply", scale="sphere", align="none")
     assert "--template" in caught.value.hint
     assert not (tmp_path / "out" / "prepared.json").exists()
@@ -209,7 +209,7 @@ def test_few_points_one_point_and_strays_are_left_out_or_told(pears: Path, tmp_p
     notes = "\n".join(made.notes)
     assert "three.npy left out: it has points in only 3 places" in notes
     assert "same.npy left out" in notes
-    assert "fog.npy is not much like the template" in notes
+    assert "fog.npy differs much from the template" in notes
 
 
 def test_a_damaged_or_foreign_folder_is_told(pears: Path, tmp_path: Path) -> None:

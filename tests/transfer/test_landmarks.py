@@ -223,7 +223,7 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "far away": ("a.csv", write("name,x,y,z\nnose,100,0,0\n"), "lies 9.* away from sphere1"),
     "no position": ("a.csv", write("name,x,y,z\nnose,nan,0,0\n"), "nose has no position"),
     "infinite": ("a.csv", write("name,x,y,z\nnose,1e999,0,0\n"), "nose has no position"),
-    "nothing": ("a.json", write('[{"name": "nose"}]'), "nose has no place"),
+    "nothing": ("a.json", write('[{"name": "nose"}]'), "nose has no vertex and no position"),
     "two numbers": ("a.json", write('{"nose": [1, 2]}'), "three numbers"),
     "half a vertex": ("a.json", write('[{"vertex": 1.5}]'), "not the number of a vertex"),
     "true": ("a.json", write('[{"vertex": true}]'), "not the number of a vertex"),

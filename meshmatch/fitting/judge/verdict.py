@@ -125,7 +125,7 @@ def judge(features: FitFeatures) -> Judgement:
     lacking = max(features.uncovered_shape, features.uncovered_template)
     if features.partial:
         lost = f"{100 * features.hidden:.0f} % of the template has no counterpart"
-        reasons.append(Reason("part", f"taken for a part: {lost}"))
+        reasons.append(Reason("part", f"fitted as a part: {lost}"))
     if (
         trust < LIMITS.fair_trust
         or features.uncovered_template > LIMITS.fair_share
@@ -156,10 +156,11 @@ def _reasons(features: FitFeatures) -> list[Reason]:
     crushed = f"the template had to be stretched or compressed {np.exp(features.stretch):.1f}-fold on average"
     facing = f"{100 * features.flipped:.0f} % of the shape faces the other way than the template"
     unsure = (
-        f"what the network predicts for tilted and mirrored copies is {100 * features.spread:.0f} % of sqrt(area) off"
+        f"the network's predictions for tilted and mirrored copies differ by {100 * features.spread:.0f} % of "
+        f"sqrt(area)"
     )
     pieces = f"{100 * features.astray:.0f} % of the shape are separate pieces that lie beside the template"
-    uncut = f"{100 * features.uncut:.0f} % of the border of what the part shows is no edge of the shape"
+    uncut = f"{100 * features.uncut:.0f} % of the border of the fitted part is not an open edge of the shape"
     bent = f"a knee bends forward by {features.forward:.0f} degrees, as if front and back were exchanged"
     astray, open_border, forward = features.alone
     told: list[tuple[bool, ReasonCode, str]] = [
@@ -169,7 +170,8 @@ def _reasons(features: FitFeatures) -> list[Reason]:
         (
             features.discontinuous > LIMITS.discontinuous,
             "torn",
-            f"{100 * features.discontinuous:.0f} % of neighbours on the shape belong far apart",
+            f"{100 * features.discontinuous:.0f} % of neighbouring vertices of the shape belong to distant places of "
+            f"the template",
         ),
         (features.stretch > LIMITS.crushed, "crushed", crushed),
         (features.inverted > LIMITS.folded, "folded", _folds(features.inverted)),

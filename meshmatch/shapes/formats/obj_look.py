@@ -160,7 +160,7 @@ def _materials_meant(file: str, wanted: set[str], known: Collection[str]) -> dic
     if "" in wanted and len(known) == 1:
         [meant[""]] = known
     elif wanted == {""}:
-        warn(f"{file} does not say which of the {len(known)} materials of its mtl it wears: its faces have no image")
+        warn(f"{file} does not say which of the {len(known)} materials of its mtl to use: its faces have no image")
     missing = sorted(name for name in wanted if name and meant[name] not in known)
     if missing:
         some = ", ".join(name[:60] for name in missing[:5]) + (", ..." if len(missing) > 5 else "")
@@ -280,6 +280,6 @@ def _image(path: Path, name: str, entry: _Entry, reader: ImageReader, laid: bool
     other = decode(entry.alpha)
     if other.shape != image.shape:
         what = f"{path.name}: the alpha image {entry.alpha.file} differs in size from the color image"
-        raise InputError(what, "save both in one size, or the alpha within the colors' png")
+        raise InputError(what, "save both at the same size, or the alpha as a channel of the color png")
     channel = other[..., 0] if (other[..., 3] == 255).all() else other[..., 3]
     return np.concatenate([image[..., :3], channel[..., None]], axis=-1)
