@@ -30,6 +30,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 PAGES = ("results.md", "paper.md")
 _BLOCK = re.compile(r"(<!-- (results|summary)([^>]*?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 _COLUMNS = ("mean", "median", "lost", "flips", "pairs")
+_SHOWN_AS = {"not testable at this length": "undecided"}  # cells of the files that a page shows in a word
 
 
 class Row(NamedTuple):
@@ -96,7 +97,7 @@ def table_of(words: str, docs: Path) -> str:
     table = found["tables"][int(number) - 1]
     wanted = [each.strip() for each in names.split(",") if each.strip()] or table["columns"]
     places = [table["columns"].index(each) for each in wanted]
-    rows = [[row[place] for place in places] for row in table["rows"]]
+    rows = [[_SHOWN_AS.get(row[place], row[place]) for place in places] for row in table["rows"]]
     told = f"[{name}.json](results/{name}.json): {found['date']}, commit {found['commit']}, {found['machine']}"
     return f"\n{markdown(wanted, rows)}\n{told}.\n\n"
 
