@@ -18,7 +18,7 @@ from meshmatch.arrays import Floats
 from meshmatch.errors import OptionError
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
 from meshmatch.outputs import replace_on_success
-from meshmatch.render.scales import readable
+from meshmatch.render.scales import short
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -198,9 +198,3 @@ def pen(number: int) -> dict[str, Any]:
     """Color and dashes of a line."""
     rounds, color = divmod(number, len(COLORS))
     return {"color": COLORS[color], "linestyle": _DASHES[rounds % len(_DASHES)]}
-
-
-def short(text: str, most: int = 60) -> str:
-    """The text on one line in letters that a font has, cut in the middle if it is too long."""
-    text = readable(text)
-    return text if len(text) <= most else f"{text[: most // 2]}…{text[-(most // 2 - 1) :]}"

@@ -179,6 +179,12 @@ def readable(text: str) -> str:
     return "".join(out)
 
 
+def short(text: str, most: int = 60) -> str:
+    """The text as `readable`, cut in the middle if it is longer than ``most`` letters."""
+    text = readable(text)
+    return text if len(text) <= most else f"{text[: most // 2]}…{text[-(most // 2 - 1) :]}"
+
+
 @lru_cache(maxsize=4096)
 def _has(letter: str) -> bool:
     if unicodedata.category(letter).startswith("C"):
@@ -189,10 +195,10 @@ def _has(letter: str) -> bool:
 
 def fitting(text: str, size: float, room: float) -> tuple[str, float]:
     """The text and its size so that it fits into ``room`` pixels: smaller first, then cut in the middle."""
-    text = readable(text)
+    text = short(text, 400)
     while size > 9 and width_of(text, size) > room:
         size *= 0.95
-    kept, whole = min(len(text), 400), text
+    kept, whole = len(text), text
     while width_of(text, size) > room and kept > 2:
         kept -= 1
         text = f"{whole[: (kept + 1) // 2]}…{whole[len(whole) - kept // 2 :]}"

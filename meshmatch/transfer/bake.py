@@ -97,7 +97,7 @@ class BakeOptions:
 class Baked:
     """A finished texture."""
 
-    mesh: Textured  # the target that wears it, ready to be written (`meshmatch.shapes.textured_files`)
+    mesh: Textured  # the target with it, ready to be written (`meshmatch.shapes.textured_files`)
     image: Pixels  # (size, size, 4) uint8
     alpha: Alpha  # what its alpha means, with `cutoff`
     cutoff: float

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from meshmatch.errors import OptionError
-from meshmatch.render.charts import COLORS, pen, saved, short
+from meshmatch.render.charts import COLORS, pen, saved
+from meshmatch.render.scales import short
 
 
 @dataclass(frozen=True)

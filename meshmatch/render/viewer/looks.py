@@ -1,4 +1,4 @@
-"""What two shapes wear in a page: the look that one has in its file, and the same carried to the other by the map."""
+"""The looks of two shapes on a page: the one that a file has, and the same transferred to the other shape by the map."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Arrays = dict[str, NDArray[Any]]
 TEXELS = 1024
 """Width and height of a texture that is baked for a page."""
 MOST_FACES = 40_000
-"""A finer mesh wears colors of vertices: they show nearly as much, and it is unwrapped for a minute."""
+"""A finer mesh has vertex colors instead: they show nearly as much, and unwrapping it would take a minute."""
 LARGEST = 2048
 """Pixels along an image's longer side; a larger one is made smaller."""
 MOST_PIXELS = 3 * LARGEST**2
@@ -36,24 +36,24 @@ _DRAWN = 256  # pixels along a side up to which an image is kept without loss: i
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """The look of ``side`` as both shapes have it ``worn``; ``own`` is what the other has in its file, if anything."""
+    """The look of the shape on ``side`` as both are ``shown`` with it; ``own`` is the other's, if its file has one."""
 
     side: Literal["source", "target"]
-    worn: tuple[Appearance, Appearance]
+    shown: tuple[Appearance, Appearance]
     own: Appearance | None = None
 
     @property
     def words(self) -> dict[str, Any]:
         """What the page's buttons and legend say."""
-        textured = self.worn[self.side == "target"].textured
+        textured = self.shown[self.side == "target"].textured
         kind = "texture" if textured else "colors"
         return {"look": {"kind": kind, "side": self.side}, "own": self.own is not None}
 
     def of(self, k: int) -> list[tuple[str, Appearance]]:
         """The looks of one shape (0 the source, 1 the target), each with its name in the page."""
-        found = [("look", self.worn[k])]
+        found = [("look", self.shown[k])]
         if self.own is not None:
-            found.append(("own", self.worn[k] if k == (self.side == "target") else self.own))
+            found.append(("own", self.shown[k] if k == (self.side == "target") else self.own))
         return found
 
 
@@ -73,43 +73,46 @@ def share_look(
     source, target = shapes
     first, second = own
     if first is not None:
-        return Looks("source", (first, _carried(first, source, target, back, coordinates[1], workers)), second)
+        return Looks("source", (first, _transferred(first, source, target, back, coordinates[1], workers)), second)
     if second is not None:
-        return Looks("target", (_carried(second, target, source, there, coordinates[0], workers), second))
+        return Looks("target", (_transferred(second, target, source, there, coordinates[0], workers), second))
     return None
 
 
-def _carried(
-    look: Appearance, owner: Shape, wearer: Shape, back: VertexMap, coordinates: Floats | None, workers: int
+def _transferred(
+    look: Appearance, source: Shape, target: Shape, back: VertexMap, coordinates: Floats | None, workers: int
 ) -> Appearance:
-    """A look of `owner` on `wearer`, by a map from `wearer` to `owner`: baked, or as colors of vertices."""
-    material = np.zeros(wearer.F, np.int64)
-    if look.textured and 0 < wearer.F <= MOST_FACES:
-        choices = BakeOptions(size=TEXELS, padding=4, workers=workers)
+    """The source's look on the target, by a map from target to source: baked, or as colors of vertices."""
+    material = np.zeros(target.F, np.int64)
+    if look.textured and 0 < target.F <= MOST_FACES:
+        options = BakeOptions(size=TEXELS, padding=4, workers=workers)
         try:
-            atlas = atlas_of(wearer, coordinates, choices.size, choices.padding)
-            baked = transfer_texture(owner, look, wearer, back, atlas, choices)
-        except InputError:  # no surface to speak of, or none that can be unwrapped
+            atlas = atlas_of(target, coordinates, options.size, options.padding)
+            baked = transfer_texture(source, look, target, back, atlas, options)
+        except InputError:  # it has no area, or cannot be unwrapped
             pass
         else:
-            cloth = Material("", baked.image, wrap=("clamp", "clamp"), alpha=baked.alpha, cutoff=baked.cutoff)
-            return Appearance((cloth,), material, atlas.uv)
-    colors = colors_of_vertices(owner, look, wearer, back)
-    return Appearance((Material(),), material, np.zeros((wearer.F, 3, 2)), colors)
+            texture = Material("", baked.image, wrap=("clamp", "clamp"), alpha=baked.alpha, cutoff=baked.cutoff)
+            return Appearance((texture,), material, atlas.uv)
+    colors = colors_of_vertices(source, look, target, back)
+    return Appearance((Material(),), material, np.zeros((target.F, 3, 2)), colors)
 
 
-def dress(look: Appearance, shape: Shape, part: Drawn) -> tuple[Arrays, dict[str, Any] | None]:
-    """Arrays and words of a look on what is drawn of a shape: a skin where there is an image and the triangles are the
-    file's own; else ``paint`` (N, 3), a color for each vertex that is drawn, without words.
+def look_arrays(look: Appearance, shape: Shape, part: Drawn) -> tuple[Arrays, dict[str, Any] | None]:
+    """Arrays and words of a look on what is drawn of a shape: a textured mesh where there is an image and the triangles
+    are the file's own; else ``paint`` (N, 3), a color for each vertex that is drawn, without words.
     """
     if len(part.file_face) and (look.textured or len(look.materials) > 1):
-        return _skin(look, part)
-    light = colors_of_vertices(shape, look, shape, VertexMap.identity(shape))
+        return _textured_mesh(look, part)
+    if look.textured or len(look.materials) > 1:
+        light = colors_of_vertices(shape, look, shape, VertexMap.identity(shape))
+    else:
+        light = look.materials[0].factor * (np.ones((shape.V, 4)) if look.colors is None else look.colors)
     return {"paint": scaled(to_srgb(light[part.vertex, :3]), np.uint8)}, None
 
 
-def _skin(look: Appearance, part: Drawn) -> tuple[Arrays, dict[str, Any]]:
-    """A textured surface as the page has it. Arrays: ``vertex`` (S,) the row of the shape that is drawn, ``uv`` (S, 2),
+def _textured_mesh(look: Appearance, part: Drawn) -> tuple[Arrays, dict[str, Any]]:
+    """A textured mesh as the page has it. Arrays: ``vertex`` (S,) the row of the shape that is drawn, ``uv`` (S, 2),
     ``face`` (M, 3) of these S, by material; ``paint`` (S, 3) where vertex colors are to be multiplied; ``image0``,
     ``image1``...: bytes of files. Words: ``groups``, which faces have which material, and ``images``, the kinds of the
     files.

@@ -18,7 +18,7 @@ from meshmatch.render.facing import Rotations
 from meshmatch.render.scales import CLAY, Scale, position_colors
 from meshmatch.render.viewer.assembly import check_page, plain_text, scaled, small_integers, write_html
 from meshmatch.render.viewer.drawn import MOST, Box, Drawn, boxes, draw, span, upright
-from meshmatch.render.viewer.looks import Looks, dress
+from meshmatch.render.viewer.looks import Looks, look_arrays
 from meshmatch.shapes.faces import seams
 from meshmatch.shapes.shape import Shape
 
@@ -82,8 +82,8 @@ def write_page(
             own["vertex"] = small_integers(rows)
         words[side] = _words(shapes[k], shown[k], part, box)
         for name, look in looks.of(k) if looks is not None else []:
-            worn, words[side][name] = dress(look, shapes[k], part)
-            own |= {f"{name}.{key}": array for key, array in worn.items()}
+            shown_arrays, words[side][name] = look_arrays(look, shapes[k], part)
+            own |= {f"{name}.{key}": array for key, array in shown_arrays.items()}
         arrays |= {f"{side}.{name}": array for name, array in own.items()}
     words |= {"look": None, "own": False} if looks is None else looks.words
     # Files of indices alone are read as confident everywhere: that says nothing.
