@@ -30,14 +30,19 @@ def confidence(doubt: NDArray[np.float64] | float, trust: float = 1.0) -> NDArra
     return np.asarray(np.exp(-doubt) * (0.064 + 0.904 * right))
 
 
+def unit_ball(rows: int = 24, columns: int = 40) -> Shape:
+    """Its area is 1."""
+    ball = bumpy_sphere(rows, columns)
+    return Shape(ball.verts / np.sqrt(ball.area), ball.faces, "ball")
+
+
 def lying_on(shape: Shape) -> Fit:
     """A fit that is exactly its shape."""
     return some_fit(shape.verts, shape.faces)
 
 
 def test_where_a_fit_moved_it_is_not_believed() -> None:
-    ball = bumpy_sphere()
-    unit = Shape(ball.verts / np.sqrt(ball.area), ball.faces, "ball")
+    unit = unit_ball()
     part, fit = repair(unit), lying_on(unit)
     sure = mapped(part, fit, part, fit)
     assert np.allclose(sure.confidence, 0.968, atol=2e-3)
@@ -55,8 +60,7 @@ def test_where_a_fit_moved_it_is_not_believed() -> None:
 
 def test_both_fits_count_where_the_source_lies() -> None:
     """The target stands on its head: what moved there is told of the source's vertices that are carried to it."""
-    ball = bumpy_sphere()
-    unit = Shape(ball.verts / np.sqrt(ball.area), ball.faces, "ball")
+    unit = unit_ball()
     turned = Shape(unit.verts * [1, -1, -1], unit.faces, "turned")
     fit, other = lying_on(unit), replace(lying_on(turned), resting=unit.verts)
     high = unit.verts[:, 2] > 0.1
@@ -69,8 +73,7 @@ def test_both_fits_count_where_the_source_lies() -> None:
 
 def test_a_map_is_believed_as_its_fits_are() -> None:
     """Of a wrong fit, one vertex in sixteen is near by chance; of a doubtful one, far ones are doubted more than near."""
-    ball = bumpy_sphere()
-    unit = Shape(ball.verts / np.sqrt(ball.area), ball.faces, "ball")
+    unit = unit_ball()
     part, fit = repair(unit), lying_on(unit)
     half = replace(fit, trust=0.5, verdict="fair")
     for source, target, believed in ((fit, half, 0.5), (half, fit, 0.5), (half, half, 0.25)):
@@ -87,8 +90,7 @@ def test_a_map_is_believed_as_its_fits_are() -> None:
 @pytest.mark.parametrize("side", ["source", "target"])
 def test_distance_from_the_template_costs_confidence_on_both_sides(side: str) -> None:
     """The fit of one side is a little too large all over; the other one is exact."""
-    ball = bumpy_sphere(12, 20)
-    unit = Shape(ball.verts / np.sqrt(ball.area), ball.faces, "ball")
+    unit = unit_ball(12, 20)
     part, fit = repair(unit), lying_on(unit)
     large = replace(fit, points=1.05 * unit.verts)
     distance, _ = brute_force(unit.verts, large.points, unit.faces)
@@ -101,8 +103,7 @@ def test_distance_from_the_template_costs_confidence_on_both_sides(side: str) ->
 
 def test_what_was_left_out_is_as_far_away_as_it_lies() -> None:
     """Vertices of weight 0, which the nearest ones stand for, and one that no face uses."""
-    ball = bumpy_sphere()
-    unit = Shape(ball.verts / np.sqrt(ball.area), ball.faces, "ball")
+    unit = unit_ball()
     verts = np.concatenate([unit.verts, [1.0, 1.0, 1.05] * unit.verts[:1] + [0, 0, 0.05]])
     weights = np.append(np.where(unit.verts[:, 2] > 0.2, 0.0, 1.0), 1.0)
     part, fit = repair(Shape(verts, unit.faces, "part", weights=weights)), lying_on(unit)

@@ -82,3 +82,10 @@ def opened(running: Any, path: Path, **options: Any) -> Iterator[Opened]:
     assert seen.said == []
     assert seen.asked == [path.resolve().as_uri()]
     context.close()
+
+
+def nameless(view: Opened) -> list[str]:
+    """What can be used on a page but has no name that a screen reader could say."""
+    said = "e => e.ariaLabel || e.innerText || [...(e.labels ?? [])].map(l => l.innerText).join() || ''"
+    used = view.page.locator("button, input, select, summary, [role=application]").all()
+    return [element.evaluate("e => e.outerHTML") for element in used if not element.evaluate(said).strip()]

@@ -1,8 +1,8 @@
 """The page of a mean and its modes: what is in the file, and what its sliders do in headless Chromium (skipped without)."""
 
-import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from PIL import Image
 from meshmatch.errors import OptionError
 from meshmatch.render.viewer.atlas_page import MOST_MODES, Varying, write_atlas_page
 from meshmatch.shapes.shape import Shape
-from tests.render.browser import PHONE, browser, opened
+from tests.render.browser import PHONE, nameless, opened
 from tests.render.pages import read
 
 NAMES = ("a </script>", "b & c", "é")
@@ -76,11 +76,11 @@ def height(path: Path) -> int:
     return int((np.abs(column - column[2]).sum(axis=1) > 40).sum())
 
 
-def test_sliders_change_the_shape(tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
+def test_sliders_change_the_shape(running: Any, tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
     ball, path = make_sphere(3), tmp_path / "a.html"
     write_atlas_page(path, varying(ball), rotation=np.eye(3), title="balls")
     top = int(ball.verts[:, 1].argmax())
-    with browser() as running, opened(running, path) as seen:
+    with opened(running, path) as seen:
         mean = height(seen.picture(tmp_path / "0.png"))
         seen.page.evaluate("s = document.getElementById('mode-0'); s.value = 2; s.dispatchEvent(new Event('input'))")
         tall = height(seen.picture(tmp_path / "1.png"))
@@ -101,6 +101,13 @@ def test_sliders_change_the_shape(tmp_path: Path, make_sphere: Callable[[int], S
         for vertex in (0, 7, 300):
             normal = seen.page.evaluate("v => meshmatch.normal(v)", vertex)
             assert normal == pytest.approx(ball.vertex_normals[vertex].tolist(), abs=1e-3)
+
+
+@pytest.mark.slow
+def test_the_page_plays(running: Any, tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
+    path = tmp_path / "a.html"
+    write_atlas_page(path, varying(make_sphere(2)), rotation=np.eye(3), title="balls")
+    with opened(running, path) as seen:
         seen.page.click("#random")
         assert any(seen.settled()["scores"])
         assert seen.page.eval_on_selector("#shape", "e => e.selectedOptions[0].textContent") == "by the sliders"
@@ -119,10 +126,11 @@ def test_sliders_change_the_shape(tmp_path: Path, make_sphere: Callable[[int], S
         assert not seen.settled()["playing"]
 
 
-def test_colors_are_the_distance(tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
+@pytest.mark.slow
+def test_colors_are_the_distance(running: Any, tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
     path = tmp_path / "a.html"
     write_atlas_page(path, varying(make_sphere(3)), rotation=np.eye(3))
-    with browser() as running, opened(running, path) as seen:
+    with opened(running, path) as seen:
 
         def top(name: str) -> np.ndarray:
             """The color near the top of the ball."""
@@ -143,23 +151,19 @@ def test_colors_are_the_distance(tmp_path: Path, make_sphere: Callable[[int], Sh
         assert np.ptp(plain) < 60  # clay
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_words_can_be_read(tmp_path: Path, make_sphere: Callable[[int], Shape], scheme: str) -> None:
+def test_words_can_be_read(
+    running: Any, tmp_path: Path, artefacts: Path, make_sphere: Callable[[int], Shape], scheme: str
+) -> None:
     path = tmp_path / "a.html"
     write_atlas_page(path, varying(make_sphere(3)), rotation=np.eye(3), title="balls of three kinds")
-    folder = Path(os.environ.get("MESHMATCH_ARTEFACTS", tmp_path))
-    with browser() as running:
-        for name, options in {"desktop": {}, "phone": PHONE}.items():
-            with opened(running, path, color_scheme=scheme, **options) as seen:
-                seen.page.evaluate("meshmatch.choose(1)")
-                seen.picture(folder / f"atlas-{scheme}-{name}.png")
-                wide = seen.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-                assert wide
-                for target in ("#title", "#shape", "#mode-0", "#score-1", "#play", "#high"):
-                    box = seen.page.locator(target).bounding_box()
-                    assert box["x"] >= 0 and box["x"] + box["width"] <= seen.page.viewport_size["width"], target
-                for element in seen.page.locator("button, input, select, [role=application]").all():
-                    said = element.evaluate(
-                        "e => e.ariaLabel || e.innerText || [...(e.labels ?? [])].map(l => l.innerText).join() || ''"
-                    )
-                    assert said.strip()
+    for name, options in {"desktop": {}, "phone": PHONE}.items():
+        with opened(running, path, color_scheme=scheme, **options) as seen:
+            seen.page.evaluate("meshmatch.choose(1)")
+            seen.picture(artefacts / f"atlas-{scheme}-{name}.png")
+            assert seen.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+            for target in ("#title", "#shape", "#mode-0", "#score-1", "#play", "#high"):
+                box = seen.page.locator(target).bounding_box()
+                assert box["x"] >= 0 and box["x"] + box["width"] <= seen.page.viewport_size["width"], target
+            assert nameless(seen) == []

@@ -61,7 +61,7 @@ def test_a_block_shows_its_broad_side_with_y_or_its_length_up() -> None:
     assert np.abs(flat[2]).tolist() == [1, 0, 0]
 
 
-@pytest.mark.parametrize("degrees", [0.0, 35.0, 100.0, 180.0, 280.0])
+@pytest.mark.parametrize("degrees", [0.0, 100.0, 215.0])
 @pytest.mark.parametrize("up", ["x", "y", "z"])
 def test_a_body_faces_the_viewer_however_it_stands_in_its_file(up: str, degrees: float) -> None:
     a = np.radians(degrees)

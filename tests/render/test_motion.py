@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from PIL import Image
 from meshmatch.errors import OptionError
 from meshmatch.render.viewer.page import write_motion
 from meshmatch.shapes.shape import Shape
-from tests.render.browser import browser, opened
+from tests.render.browser import opened
 from tests.render.pages import read
 
 TIMES = (0.0, 0.5, 2.0)
@@ -82,10 +83,11 @@ def height(path: Path) -> int:
     return int(((pixels[..., 0] - pixels[..., 1]) > 60).any(axis=1).sum())
 
 
-def test_the_slider_moves_it(tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
+@pytest.mark.slow
+def test_the_slider_moves_it(running: Any, tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
     path = tmp_path / "a.html"
     write_motion(path, grown(make_sphere(3), 1, 2, 1, colors=True), TIMES, rotation=np.eye(3), met={0.5: "tall"})
-    with browser() as running, opened(running, path) as seen:
+    with opened(running, path) as seen:
         small = height(seen.picture(tmp_path / "0.png"))
         assert seen.page.inner_text("#names") == "tall"
         slider = (

@@ -1,10 +1,6 @@
-"""The page as people meet it, in headless Chromium. Skipped, with a reason, where there is none.
+"""The page as people meet it, in headless Chromium. Skipped, with a reason, where there is none."""
 
-Screenshots go to the folder that MESHMATCH_ARTEFACTS names, else to pytest's temporary one.
-"""
-
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,25 +13,11 @@ from meshmatch.render.viewer.looks import Looks
 from meshmatch.render.viewer.page import write_page
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.shape import Shape
-from tests.render.browser import PHONE, Opened, browser, opened
+from tests.render.browser import PHONE, Opened, nameless, opened
 from tests.render.pairs import Pair, bump, stirred
 
 pytestmark = pytest.mark.slow
 MODES = ["matches", "look", "own", "confidence", "plain"]
-
-
-@pytest.fixture(scope="module")
-def running() -> Iterator[Any]:
-    with browser() as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def artefacts(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    named = os.environ.get("MESHMATCH_ARTEFACTS")
-    folder = Path(named) if named else tmp_path_factory.mktemp("artefacts")
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -266,11 +248,7 @@ def test_help_and_verdict_open(running: Any, file: Path) -> None:
 
 def test_everything_that_can_be_used_has_a_name(running: Any, file: Path) -> None:
     with opened(running, file) as view:
-        for element in view.page.locator("button, input, summary, [role=application]").all():
-            name = element.evaluate(
-                "e => e.ariaLabel || e.innerText || [...(e.labels ?? [])].map(l => l.innerText).join() || ''"
-            )
-            assert name.strip(), element.evaluate("e => e.outerHTML")
+        assert nameless(view) == []
 
 
 def test_a_finger_taps_on_a_phone(running: Any, file: Path, pair: Pair, artefacts: Path) -> None:

@@ -84,7 +84,7 @@ def test_what_is_thinner_than_a_pixel_is_drawn_thinly(width: float, degrees: flo
 
 def test_bands_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
-    cloud = balls(rng.uniform(-0.3, 0.3, (60, 3)), 0.04, rng.random((60, 3)))
+    cloud = balls(rng.uniform(-0.3, 0.3, (20, 3)), 0.06, rng.random((20, 3)))
     floor = rotation_about_x(20) @ np.array([0.0, 1, 0])
     scene = Scene([cloud, square(0.5, -0.4)], Ground(floor, -0.35, np.array([[0, -0.2, 0.5, 0.2]])))
     whole = draw(scene, WINDOW)

@@ -46,7 +46,7 @@ def colored(shape: Shape) -> Appearance:
 def check_reds(looks: Looks | None, side: int, shape: Shape, expected: np.ndarray, most: float = 0.06) -> Looks:
     """The red of each vertex in what a shape wears, at the nearest texel."""
     assert looks is not None
-    worn = looks.worn[side]
+    worn = looks.shown[side]
     if worn.colors is not None:
         seen = to_srgb(worn.colors[:, 0])
     else:
@@ -64,10 +64,10 @@ def test_a_texture_is_baked_for_the_other_mesh(pair: Pair, textured: Appearance)
     there, expected = (pair.source, pair.target), height(pair.source)[pair.back.index]
     looks = check_reds(share_look(there, (textured, None), pair.there, pair.back), 1, pair.target, expected)
     assert (looks.side, looks.own) == ("source", None)
-    assert looks.worn[0] is textured
-    own = looks.worn[1].uv[:, :, ::-1]  # an atlas, but another one
+    assert looks.shown[0] is textured
+    own = looks.shown[1].uv[:, :, ::-1]  # an atlas, but another one
     again = share_look(there, (textured, None), pair.there, pair.back, coordinates=(None, own), workers=2)
-    assert np.allclose(check_reds(again, 1, pair.target, expected).worn[1].uv, own)
+    assert np.allclose(check_reds(again, 1, pair.target, expected).shown[1].uv, own)
 
 
 def test_a_source_without_a_look_wears_the_targets(pair: Pair, textured: Appearance) -> None:
@@ -75,7 +75,7 @@ def test_a_source_without_a_look_wears_the_targets(pair: Pair, textured: Appeara
     check_reds(looks, 0, pair.target, height(pair.source)[pair.back.index])
     assert looks is not None
     assert (looks.side, looks.own) == ("target", None)
-    assert looks.worn[1] is textured
+    assert looks.shown[1] is textured
 
 
 def test_two_looks_are_both_kept_and_none_is_none(pair: Pair, textured: Appearance) -> None:
@@ -110,4 +110,4 @@ def test_where_nothing_can_be_baked_vertices_have_colors(
     there = VertexMap.between(pair.source, other, pair.there.index)
     looks = share_look((pair.source, other), (textured, None), there, back)
     check_reds(looks, 1, other, height(pair.source)[pair.back.index], 0.05)
-    assert looks is not None and not looks.worn[1].textured
+    assert looks is not None and not looks.shown[1].textured

@@ -33,12 +33,10 @@ def split(shape: Shape, name: str = "split") -> tuple[Shape, VertexMap, VertexMa
 
 def brute_force(points: np.ndarray, verts: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The closest point on a mesh of each point, by asking every triangle: distances (N,), points (N, 3)."""
-    best, feet = np.full(len(points), np.inf), np.zeros_like(points)
-    for a, b, c in verts[faces]:
-        N = len(points)
-        weights = closest_on_triangles(points, *(np.tile(corner, (N, 1)) for corner in (a, b, c)))
-        found = weights @ np.array([a, b, c])
-        distance = np.linalg.norm(found - points, axis=1)
-        closer = distance < best
-        best[closer], feet[closer] = distance[closer], found[closer]
+    best, feet = np.empty(len(points)), np.empty_like(points)
+    for n, point in enumerate(points):
+        weights = closest_on_triangles(np.tile(point, (len(faces), 1)), *verts[faces].swapaxes(0, 1))
+        found = np.einsum("fk,fkd->fd", weights, verts[faces])
+        distance = np.linalg.norm(found - point, axis=1)
+        best[n], feet[n] = distance.min(), found[distance.argmin()]
     return best, feet

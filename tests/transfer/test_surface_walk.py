@@ -4,9 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from meshmatch.geometry.triangles import closest_on_triangles, interpolate
+from meshmatch.geometry.triangles import interpolate
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.surface_walk import PointWalker, SurfaceWalker, duals
+from tests.transfer.known import brute_force
 
 
 def walked(walker: SurfaceWalker, points: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -15,16 +16,6 @@ def walked(walker: SurfaceWalker, points: np.ndarray, start: np.ndarray) -> tupl
     np.testing.assert_allclose(weights.sum(axis=0), 1, atol=1e-5)
     assert weights.min() >= 0
     return face, interpolate(walker.verts, walker.faces[face], weights.T), distance
-
-
-def closest(walker: SurfaceWalker, points: np.ndarray) -> np.ndarray:
-    """Distances to the surface, the slow way: every triangle is asked."""
-    out = []
-    for point in points:
-        corners = walker.verts[walker.faces]
-        weights = closest_on_triangles(np.tile(point, (len(corners), 1)), *corners.swapaxes(0, 1))
-        out.append(np.linalg.norm(np.einsum("nk,nkd->nd", weights, corners) - point, axis=1).min())
-    return np.array(out)
 
 
 def sheets(gap: float) -> Shape:
@@ -49,14 +40,14 @@ def test_duals_give_the_weights_of_a_point() -> None:
 def test_points_near_a_sphere_find_the_closest_place(sphere: Shape) -> None:
     walker = SurfaceWalker(sphere)
     rng = np.random.default_rng(1)
-    start = rng.integers(0, sphere.F, 300)
-    direction = walker.verts[walker.faces[start]].mean(axis=1) + 0.12 * rng.normal(size=(300, 3))
+    start = rng.integers(0, sphere.F, 100)
+    direction = walker.verts[walker.faces[start]].mean(axis=1) + 0.12 * rng.normal(size=(100, 3))
     points = 0.28 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    points *= 1 + 0.02 * rng.normal(size=(300, 1))
+    points *= 1 + 0.02 * rng.normal(size=(100, 1))
     _, places, distance = walked(walker, points, start)
     found = np.linalg.norm(places - points, axis=1)
     # within a rounding of the best; a face away where two are equally near
-    np.testing.assert_allclose(found, closest(walker, points), atol=2e-4)
+    np.testing.assert_allclose(found, brute_force(points, walker.verts, walker.faces)[0], atol=2e-4)
     assert (distance <= found + 1e-6).all()
 
 
@@ -106,7 +97,8 @@ def test_an_unknown_beginning_and_a_far_one(make_sphere: Callable[[int], Shape])
     points = np.array([[0, 0, -0.29], [0.2, 0.2, 0.03]])
     top = np.array([walker.verts[walker.faces].mean(axis=1)[:, 2].argmax(), -1])
     _, places, _ = walked(walker, points, top)
-    np.testing.assert_allclose(np.linalg.norm(places - points, axis=1), closest(walker, points), atol=1e-4)
+    exact, _ = brute_force(points, walker.verts, walker.faces)
+    np.testing.assert_allclose(np.linalg.norm(places - points, axis=1), exact, atol=1e-4)
 
 
 def test_a_face_without_area_lets_points_pass() -> None:
