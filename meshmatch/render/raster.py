@@ -60,27 +60,15 @@ def draw(scene: Scene, viewport: Viewport) -> Layer:
     """Draw a scene. The same scene gives the same picture, whatever the size of a band."""
     H, W = viewport.height, viewport.width
     whole = Layer(np.zeros((H, W, 3), np.float32), np.zeros((H, W), np.float32), np.full((H, W), -np.inf, np.float32))
-    # Columns and rows in which anything can be, with a margin of one pixel.
-    pixel = viewport.pixel
-    low, high = (scene.bounds - [viewport.left, viewport.top]) / pixel
-    left, right = np.clip([np.floor(low[0]) - 1, np.ceil(high[0]) + 1], 0, W).astype(int).tolist()
-    top, bottom = np.clip([np.floor(-high[1]) - 1, np.ceil(-low[1]) + 1], 0, H).astype(int).tolist()
-    if left >= right or top >= bottom:
-        return whole
-    part = Viewport(right - left, bottom - top, viewport.left + left * pixel, viewport.top - top * pixel, pixel)
-    inner = slice(top, bottom), slice(left, right)
-    drawn = Layer(whole.light[inner], whole.alpha[inner], whole.depth[inner])
-    edges = edge_points(scene, part)
-    rows = max(1, BAND // part.width)
-    for first in range(0, part.height, rows):
-        _band(scene, part, edges, first, min(part.height, first + rows), (left, top), drawn)
+    edges = edge_points(scene, viewport)
+    rows = max(1, BAND // W)
+    for first in range(0, H, rows):
+        _band(scene, viewport, edges, first, min(H, first + rows), whole)
     return whole
 
 
-def _band(
-    scene: Scene, viewport: Viewport, edges: Vectors, first: int, last: int, corner: tuple[int, int], whole: Layer
-) -> None:
-    """Draw rows of a viewport whose corner is at this column and row of the picture, from where blocks are counted."""
+def _band(scene: Scene, viewport: Viewport, edges: Vectors, first: int, last: int, whole: Layer) -> None:
+    """Draw rows of a viewport."""
     low, high = max(0, first - _HALO), min(viewport.height, last + _HALO)
     shape = (high - low, viewport.width)
     row, column = np.divmod(np.arange(shape[0] * shape[1]), viewport.width)
@@ -88,7 +76,7 @@ def _band(
     hits = scene.look(*viewport.at(column + 0.5, row + 0.5), viewport.pixel)
     met = np.flatnonzero(hits.face != -1)
     seen = np.ones((len(hits.face), 2), np.float32)
-    seen[met] = visibility(scene, hits, met, row[met] + corner[1], column[met] + corner[0])
+    seen[met] = visibility(scene, hits, met, row[met], column[met])
     for side, which in ((BLOCK, hits.face >= 0), (GROUND_BLOCK, hits.face == -2)):
         _smooth(seen.reshape(*shape, 2), hits, which.reshape(shape), viewport.pixel, side)
     light, alpha = _shaded(scene, hits, seen)
@@ -101,7 +89,7 @@ def _band(
         chosen[: first - low] = chosen[last - low :] = False
         found = np.flatnonzero(chosen)
         if len(found):
-            fine = _fine(scene, viewport, hits, seen, low, corner, found, places)
+            fine = _fine(scene, viewport, hits, seen, low, found, places)
             light.reshape(-1, 3)[found], alpha.reshape(-1)[found] = fine
     own = slice(first - low, last - low)
     whole.light[first:last], whole.alpha[first:last] = light[own], alpha[own]
@@ -191,7 +179,6 @@ def _fine(
     hits: Hits,
     seen: Float[Floats32, "P 2"],
     low: int,
-    corner: tuple[int, int],
     chosen: Rows,
     places: Float[Floats, "R 2"],
 ) -> tuple[Vectors, Float[Floats32, " N"]]:
@@ -220,8 +207,7 @@ def _fine(
     missing = met[~known]
     # Each ray of a pixel uses other directions, whichever band it is in.
     number = missing % len(places)
-    block_row = (row[missing] + low + corner[1]) * BLOCK + number // BLOCK
-    block_column = (column[missing] + corner[0]) * BLOCK + number % BLOCK
+    block_row, block_column = (row[missing] + low) * BLOCK + number // BLOCK, column[missing] * BLOCK + number % BLOCK
     light_seen[missing] = visibility(scene, finer, missing, block_row, block_column)
     light, alpha = _shaded(scene, finer, light_seen)
     return light.reshape(len(chosen), -1, 3).mean(axis=1), alpha.reshape(len(chosen), -1).mean(axis=1)

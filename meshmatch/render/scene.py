@@ -8,7 +8,6 @@ ground of 8 x 8; a filter over such blocks gives every pixel the mean over the w
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -93,14 +92,6 @@ class Scene:
         self._embree = EmbreeScene()
         # Kept: embree reads the vertices and triangles of the arrays that it was given.
         self._mesh = TriangleMesh(self._embree, self.verts, self.faces)
-
-    @cached_property
-    def bounds(self) -> Float[Floats, "2 2"]:
-        """Left, bottom; right, top of the part of the picture where anything can be."""
-        ends = [part.extent[:, :2] for part in self.surfaces]
-        if self.ground is not None:
-            ends += [np.stack([spot[:2] - spot[2:], spot[:2] + spot[2:]]) for spot in self.ground.spots]
-        return np.stack([np.min(ends, axis=(0, 1)), np.max(ends, axis=(0, 1))])
 
     def blocked(self, places: Vectors, directions: Vectors, reach: float) -> Bool[Bools, " N"]:
         """Whether anything lies within reach of each place along a unit direction."""

@@ -20,11 +20,8 @@ QUARTERS = to_linear(np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1.0]]))
 def weights_at(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Face and weights of places (N, 2) on the square."""
     face = (places[:, 1] > places[:, 0]).astype(int)
-    weights = []
-    for place, number in zip(places, face, strict=True):
-        corners = np.vstack([CORNERS[FACES[number], :2].T, np.ones(3)])
-        weights.append(np.linalg.solve(corners, [*place, 1.0]))
-    return face, np.array(weights)
+    corners = np.concatenate([CORNERS[FACES[face], :2].swapaxes(1, 2), np.ones((len(face), 1, 3))], axis=1)
+    return face, np.linalg.solve(corners, np.column_stack([places, np.ones(len(face))])[..., None])[..., 0]
 
 
 def look(*materials: Material, which: tuple[int, int] = (0, 0), colors: np.ndarray | None = None) -> Appearance:

@@ -109,14 +109,6 @@ def test_values_are_kept_if_nothing_is_asked_for() -> None:
     assert doubt == LowConfidence(SHEET.V, SHEET.V)
 
 
-def test_values_that_the_source_does_not_have_are_in_doubt() -> None:
-    values = SHEET.verts[:, 0].copy()
-    values[20] = np.nan
-    out, doubt = replace_low_values(values, np.ones(SHEET.V) < 0.3, SHEET, fill=True)
-    assert doubt.filled == 1
-    assert np.isfinite(out).all()
-
-
 @pytest.mark.parametrize("fill", [False, True])
 def test_what_one_column_lacks_says_nothing_of_the_others(fill: bool) -> None:
     values = SHEET.verts.copy()
