@@ -168,7 +168,7 @@ def _draw_strip(path: Path, result: "meshmatch.Interpolation", met: dict[float, 
 
 def _write_page(path: Path, result: "meshmatch.Interpolation", met: dict[float, str]) -> None:
     """In one frame, that of the first shape: what moves in the files moves on the page."""
-    from meshmatch.render.viewer.page import write_motion
+    from meshmatch.render.viewer.single_pages import write_motion
 
     shapes = [step.shape for step in result.steps]
     times = [step.time for step in result.steps]

@@ -38,7 +38,7 @@ from meshmatch.render.facing import facing
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes
 from meshmatch.render.scales import Scale
-from meshmatch.render.viewer.atlas_page import Varying, write_atlas_page
+from meshmatch.render.viewer.single_pages import Varying, write_atlas_page
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.formats.gltf_out import write_morphs
 from meshmatch.shapes.shape import Shape

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from meshmatch.errors import OptionError
-from meshmatch.render.viewer.atlas_page import MOST_MODES, Varying, write_atlas_page
+from meshmatch.render.viewer.single_pages import MOST_MODES, Varying, write_atlas_page
 from meshmatch.shapes.shape import Shape
 from tests.render.browser import PHONE, nameless, opened
 from tests.render.pages import read

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from meshmatch.errors import OptionError
-from meshmatch.render.viewer.page import write_motion
+from meshmatch.render.viewer.single_pages import write_motion
 from meshmatch.shapes.shape import Shape
 from tests.render.browser import opened
 from tests.render.pages import read

@@ -70,23 +70,6 @@ def test_a_shape_fills_its_picture_and_nothing_else(tmp_path: Path) -> None:
     assert np.mean(frame(wide)[:2]) == pytest.approx(29.5, abs=1)
 
 
-def test_without_a_size_the_picture_takes_the_room_that_the_shapes_need(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    height = 200  # four times smaller: the same shares
-    monkeypatch.setattr(module, "HEIGHT", height)
-    monkeypatch.setattr(module, "_WIDEST", 500)
-    bare = replace(SMALL, size=None)
-    narrow = draw(tmp_path, (box((0.1, 1, 0.1)), None), look=bare).shape
-    wide = draw(tmp_path, (box((1.5, 1, 0.1)), None), look=bare).shape
-    very_wide = draw(tmp_path, (box((9, 1, 0.1)), None), look=bare).shape
-    assert narrow[0] == wide[0] == height
-    assert narrow[1] < 0.7 * height
-    assert wide[1] == pytest.approx(1.5 * 0.91 * height + 0.09 * height, abs=3)
-    assert very_wide[1] == 500
-    assert very_wide[0] < 0.5 * height
-
-
 def redness(picture: np.ndarray, row: int, column: int) -> int:
     """How much more red than blue a pixel is."""
     return int(picture[row, column, 0] - picture[row, column, 2])
@@ -287,22 +270,12 @@ def test_a_shape_laid_over_another_tints_it_where_it_is_in_front(tmp_path: Path)
     assert np.array_equal(under[10:86, 10:86], bare[10:86, 10:86])
 
 
-def test_shapes_stand_in_a_row_on_one_ground_with_their_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shapes_stand_in_a_row_on_one_ground_in_one_scale(tmp_path: Path) -> None:
     low, high = box((1, 0.5, 1)), box((1, 1, 1))
-    look = replace(SMALL, size=(240, 100))
-    bare = something(draw(tmp_path, (low, None), (high, None), look=look))
-    halves = [np.argwhere(half) for half in (bare[:, :120], bare[:, 120:])]
+    seen = something(draw(tmp_path, (low, None), (high, None), look=replace(SMALL, size=(240, 100))))
+    halves = [np.argwhere(half) for half in (seen[:, :120], seen[:, 120:])]
     assert halves[0].max(axis=0)[0] == halves[1].max(axis=0)[0]
     assert halves[0].min(axis=0)[0] > halves[1].min(axis=0)[0] + 10
-    written: list[tuple[str, float]] = []
-    monkeypatch.setattr(module, "write", lambda image, place, text, *rest: written.append((text, place[0])))
-    draw(tmp_path, (low, None), Panel(high, label="a"), look=look)
-    named = something(draw(tmp_path, Panel(low, label="b"), (high, None), look=look))
-    assert [text for text, _ in written] == ["a", "b"]
-    columns = np.flatnonzero(named.any(axis=0))
-    gap = np.flatnonzero(np.diff(columns) > 1)[0]
-    assert written[0][1] == pytest.approx(columns[gap + 1 :].mean(), abs=2)
-    assert written[1][1] == pytest.approx(columns[: gap + 1].mean(), abs=2)
 
 
 def test_names_stay_in_the_picture(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from meshmatch.render import scales as module
-from meshmatch.render.picture import lay_out
+from meshmatch.render.picture import HEIGHT, lay_out
 from meshmatch.render.scales import Scale, Swatches, draw_legend, fitting, legend_height, readable, width_of, write
 from meshmatch.shapes.colors import label_colors
 
@@ -128,9 +128,19 @@ def test_figures_stand_on_one_line_inside_the_margins() -> None:
             bottom, top = (window.top - box[:, 1]) / window.pixel
             assert 0.02 * min(window.width, window.height) < left < right < window.width
             assert 0 < top < bottom < page.names[0, 1] < page.legend < window.height
+        middles = (page.feet + [box[:, 0].mean() for box in boxes] - window.left) / window.pixel
+        assert page.names[:, 0] == pytest.approx(middles)
         gaps = page.feet[1] + boxes[1][0, 0] - page.feet[0] - boxes[0][1, 0]
         assert gaps > 0.1
         assert (page.names[:, 1] == page.names[0, 1]).all()
+
+
+def test_without_a_size_the_picture_takes_the_room_that_the_shapes_need() -> None:
+    boxes = [[np.array([[-width / 2, 0.0], [width / 2, 1.0]])] for width in (0.1, 1.5, 9.0)]
+    narrow, wide, very_wide = (lay_out(each, False, None, None).viewport for each in boxes)
+    assert narrow.height == wide.height == HEIGHT > 1.4 * narrow.width
+    assert wide.width == pytest.approx((1.5 * 0.91 + 0.09) * HEIGHT, abs=3)
+    assert very_wide.width == 2000 and very_wide.height < 0.5 * HEIGHT
 
 
 def test_a_larger_picture_is_the_same_picture() -> None:
