@@ -4,20 +4,16 @@ Each test names all offenders at once.
 """
 
 import ast
-import inspect
 import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable, Container, Iterable, Iterator
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-import typer
-
-from meshmatch.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "meshmatch"
@@ -185,41 +181,6 @@ def circles(modules: dict[str, ast.Module]) -> list[str]:
         edges = {module: edges[module] & kept for module in kept}
 
 
-def functions(tree: ast.Module) -> Iterator[ast.FunctionDef]:
-    yield from (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
-
-
-def parameters(function: ast.FunctionDef) -> int:
-    """How many a caller may give; `self` is none."""
-    given = function.args
-    names = [each.arg for each in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
-    return len(names) - (names[:1] in (["self"], ["cls"]))
-
-
-def verbs(program: typer.Typer) -> Iterator[Callable[..., object]]:
-    """The functions behind the commands."""
-    yield from (command.callback for command in program.registered_commands if command.callback is not None)
-    for group in program.registered_groups:
-        if group.typer_instance is not None:
-            yield from verbs(group.typer_instance)
-
-
-def long_lists(modules: dict[str, ast.Module], verbs: Container[str], limit: int = 8) -> list[str]:
-    """Functions with too many parameters; the options of a verb are its interface and do not count, nor a program's."""
-    return [
-        f"{name}: {parameters(function)} parameters"
-        for module, tree in modules.items()
-        for function in functions(tree)
-        if parameters(function) > limit
-        and (name := f"{module}.{function.name}") not in verbs
-        and not (function.name == "main" and room_of(module) == "experiments")
-    ]
-
-
-def lines_of(function: Callable[..., object]) -> int:
-    return len(inspect.getsource(function).splitlines())
-
-
 def long_modules(folder: Path, limit: int = 500) -> list[str]:
     """Modules of more lines than that: each is asking to be two."""
     lines = {path: path.read_text(encoding="utf-8").count("\n") for path in folder.rglob("*.py")}
@@ -339,21 +300,6 @@ def test_the_rule_sees_a_module_that_is_too_long(tmp_path: Path) -> None:
     (tmp_path / "fine.py").write_text("a = 1\n" * 500)
     (tmp_path / "long.py").write_text("a = 1\n" * 501)
     assert long_modules(tmp_path) == ["long.py: 501 lines"]
-
-
-def test_no_list_of_parameters_is_too_long() -> None:
-    none(long_lists(trees(), {f"{verb.__module__}.{verb.__name__}" for verb in verbs(app)}))
-
-
-def test_the_rule_sees_a_list_that_is_too_long() -> None:
-    words = ", ".join("abcdefghi")
-    source = f"class C:\n def f(self, {words[:-3]}): ...\n def g(self, {words}): ...\ndef verb({words}): ..."
-    assert long_lists({"m": ast.parse(source)}, {"m.verb"}) == ["m.g: 9 parameters"]
-
-
-def test_no_verb_is_too_long() -> None:
-    """Its options included: a verb asks, calls the library and prints."""
-    none(f"{verb.__name__}: {lines} lines" for verb in verbs(app) if (lines := lines_of(verb)) > 80)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -139,7 +138,3 @@ def main(
                 path.write_text(after, encoding="utf-8")
     stopped = InputError(f"not fresh: {', '.join(stale)}", "run it without --check") if stale and check else None
     return runner.Report({"stale": stale}, stopped=stopped)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -3,7 +3,7 @@
 An experiment is a function with typer annotations that returns a `Report`; `command` makes its `main`. Shared options
 (`Data`, `Seed`, `Threads`, ...) are declared here once. Rows of a table are the dictionaries of the record:
 
-    @command
+    @command  # last in its module: where that is run as a program, it runs here
     def main(data: Data = DATA, seed: Seed = 0) -> Report:
         rows = [{"set": "scape", "mean_cm": 1.63}]
         return Report({"sets": rows}, [table("Errors", rows, {"set": "set", "mean": "mean_cm:.2f"})])
@@ -71,7 +71,8 @@ Save = Annotated[Path | None, typer.Option(help="write tables, values and circum
 
 
 def command(run: Callable[..., Report]) -> Callable[..., int]:
-    """The ``main`` of an experiment: parse words, run, print, and return the exit status.
+    """The ``main`` of an experiment: parse words, run, print, and return the exit status. Called at once in a module that is
+    run as a program.
 
     0: it ran; 1: the data or a choice stopped it (one line on stderr); 2: usage. The module's docstring is its help. The
     JSON line begins with the circumstances and the options; with ``--save`` it is written to a file too, with the tables.
@@ -125,6 +126,8 @@ def command(run: Callable[..., Report]) -> Callable[..., int]:
             return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
         return 0
 
+    if run.__module__ == "__main__":
+        sys.exit(main())
     return main
 
 

@@ -1,8 +1,8 @@
 """The dog that generated animals are made of: a symmetric mesh on a skeleton.
 
 It faces +z, stands along y and has its left at +x, with the vertices and triangles that the template of four-legged animals
-has. It comes with the package: the dog of dm_control (Apache-2.0), made ready by `experiments/makers/dog_rig.py` of a
-checkout.
+has. It comes with the package: the dog of dm_control (Apache-2.0) with its eyes closed, decimated, made symmetric and
+laid on the template's vertices.
 """
 
 from __future__ import annotations

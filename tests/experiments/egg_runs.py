@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from meshmatch.experiments.paper import ablation_setting
+from meshmatch.experiments.paper import ablation_training
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
@@ -18,10 +18,10 @@ from tests.conftest import icosphere
 from tests.training.small import NETWORK, bent_eggs
 
 TINY = replace(
-    ablation_setting.SMALL,
+    ablation_training.SMALL,
     network=replace(NETWORK, align_basis=0, corrections=0),
-    train=replace(ablation_setting.SMALL.train, shapes=4),
-    scan=replace(ablation_setting.SMALL.scan, points=64),
+    train=replace(ablation_training.SMALL.train, shapes=4),
+    scan=replace(ablation_training.SMALL.scan, points=64),
 )
 
 
@@ -43,8 +43,8 @@ def make_small(monkeypatch: pytest.MonkeyPatch, prepared: Path) -> None:
     template = read_template(prepared / "template.safetensors")
     shapes = torch.from_numpy(read_registered(prepared, template))
     sources = registered_source(shapes[:5]), registered_source(shapes[5:])
-    monkeypatch.setattr(ablation_setting, "SMALL", TINY)
-    monkeypatch.setattr(ablation_setting, "HELD_OUT_SHAPES", 5)
-    monkeypatch.setattr(ablation_setting.Setting, "resting", lambda *_: template)
-    monkeypatch.setattr(ablation_setting.Setting, "sources", lambda *_: sources)
-    monkeypatch.setattr(ablation_setting, "pool_of", ablation_setting.pool_of.__wrapped__)
+    monkeypatch.setattr(ablation_training, "SMALL", TINY)
+    monkeypatch.setattr(ablation_training, "HELD_OUT_SHAPES", 5)
+    monkeypatch.setattr(ablation_training.Setting, "resting", lambda *_: template)
+    monkeypatch.setattr(ablation_training.Setting, "sources", lambda *_: sources)
+    monkeypatch.setattr(ablation_training, "pool_of", ablation_training.pool_of.__wrapped__)

@@ -13,11 +13,17 @@ from scipy.spatial.transform import Rotation
 from meshmatch.errors import InputError
 from meshmatch.experiments.bench import baselines, methods
 from meshmatch.experiments.bench import methods as classical_baselines
-from meshmatch.experiments.bench.baselines import METHODS, Baseline, Choices, Coded, main
-from meshmatch.experiments.bench.methods import Method, Registration, ZoomOut, carried, library, placed
+from meshmatch.experiments.bench.baselines import METHODS, Baseline, Choices, main
+from meshmatch.experiments.bench.methods import Method, Registration, ZoomOut, carried, coded, library, placed
 from meshmatch.experiments.paper import learned_baselines
-from meshmatch.experiments.paper.learned_baselines import TransBatch, coded_recipe, draw_batch, train_transmatch
-from meshmatch.experiments.paper.transformer import TransConfig, Transformer
+from meshmatch.experiments.paper.learned_baselines import (
+    TransBatch,
+    TransConfig,
+    Transformer,
+    coded_recipe,
+    draw_batch,
+    train_transmatch,
+)
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.files import load_shape
@@ -85,7 +91,7 @@ def test_3d_coded_can_be_told_how_a_shape_stands(monkeypatch: pytest.MonkeyPatch
     ball = icosphere(1)
     turned = Shape(ball.verts @ turn.T, ball.faces, "turned")
     for model in ("", "human"):
-        Coded("coded", 7, 5, model).fit(turned)
+        coded("coded", 7, 5, model).fit(turned)
     (free, searched), (upright, told) = asked
     assert np.array_equal(free, turned.verts) and np.allclose(2 * upright, ball.verts)
     assert (searched.up, searched.front, told.up, told.front) == (None, None, "y", "z")

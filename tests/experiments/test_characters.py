@@ -1,5 +1,6 @@
 """Characters: robots whose solids hang on bones, clothes with their bodies, and what is measured of maps, by hand."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -44,8 +45,10 @@ def test_soldiers_wear_plates_on_the_bones_of_the_body_below(designer: Designer)
     assert soldier.shape.faces.max() < soldier.shape.V
 
 
-def ball(bones: np.ndarray, places: np.ndarray | None = None, body: Shape | None = None) -> Character:
-    return Character(icosphere(2), bones, body, places)
+def ball(
+    bones: np.ndarray, places: np.ndarray | None = None, body: Shape | None = None, name: str = "ball"
+) -> Character:
+    return Character(replace(icosphere(2), name=name), bones, body, places)
 
 
 def test_same_bones_and_distances_below_the_clothes_by_hand(tmp_path: Path) -> None:
@@ -79,7 +82,7 @@ def test_every_ordered_pair_counts_with_the_worse_verdict() -> None:
         def map(self, source: SimpleNamespace, target: SimpleNamespace) -> VertexMap:
             return VertexMap("a", "b", np.arange(len(bones)))
 
-    row = characters.row_of("robots", [ball(bones) for _ in range(3)], Stub(), None)  # type: ignore[arg-type]
+    row = characters.row_of("robots", [ball(bones, name=name) for name in "abc"], Stub(), None)  # type: ignore[arg-type]
     assert (row["pairs"], row["bone"], row["verdicts"]) == (6, 1.0, "0 / 2 / 4")
     assert "mean_cm" not in row
     assert row["slowest"] >= row["seconds"] > 0

@@ -34,6 +34,7 @@ def test_clutter_touches_the_shape_and_comes_last() -> None:
     assert found.V - BODY.V > 100
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("anny") is None, reason="anny is not installed")
 def test_hands_have_other_triangles_and_lose_places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rigs, "home_folder", lambda kind: tmp_path)

@@ -1,20 +1,14 @@
 """Generated chairs, tables and planes: watertight, of one piece, labelled, the same for the same seed."""
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 pytest.importorskip("skimage", reason="scikit-image is of the extra `bench`")
 
 from meshmatch.errors import OptionError
-from meshmatch.experiments.makers import furniture as command
 from meshmatch.experiments.makers.furniture import KINDS, furniture
-from meshmatch.experiments.makers.furniture_pieces import FLAT, inside
-from meshmatch.experiments.makers.furniture_solids import Assembly, Rod, Slab, plane
+from meshmatch.experiments.makers.furniture_solids import FLAT, Assembly, Rod, Slab, inside, plane
 from meshmatch.geometry.triangles import face_parts, is_watertight
-from meshmatch.shapes.files import load_shape
 
 BALL = Rod(np.zeros((2, 3)), np.array([0.5, 0.5]))
 
@@ -91,13 +85,3 @@ def test_points_are_drawn_in_under_a_plate() -> None:
     plate = Slab(np.zeros(3), FLAT, (1.0, 0.5), (0.02, 0.02), 2.0)
     found = inside(np.array([[2.0, 7, 0], [0.1, 7, 0.1]]), plate, 0.8)
     assert np.allclose(found, [[0.8, 7, 0], [0.1, 7, 0.1]])
-
-
-def test_command_writes_meshes_with_labels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = [str(tmp_path), "--kind", "table", "--count", "2", "--resolution", "32", "--first", "4"]
-    assert command.main(words) == 0
-    assert "2 meshes of" in capsys.readouterr().out
-    assert json.loads((tmp_path / "parts.json").read_text()) == list(KINDS["table"])
-    shape = load_shape(tmp_path / "table0005.ply")
-    labels = np.load(tmp_path / "table0005.labels.npy")
-    assert len(labels) == shape.V and labels.max() < 3

@@ -116,34 +116,25 @@ def test_a_library_that_hears_no_alarm_is_ended(
     assert [failure.kind for failure in run_batch(samples, 0, range(2), tmp_path)] == ["time", "time"]
 
 
-def test_it_goes_on_where_it_was_stopped(
+def test_it_goes_on_where_it_was_stopped_until_there_were_enough(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    seen: list[range] = []
-    monkeypatch.setattr(hostile, "make_samples", lambda folder: [Sample("maps", folder, ("a",))])
-    monkeypatch.setattr(hostile_inputs, "run_batch", lambda samples, seed, numbers, keep: seen.append(numbers) or [])
-    clock = iter(np.arange(0.0, 100.0))
-    monkeypatch.setattr(hostile, "time", type("Clock", (), {"monotonic": lambda: next(clock)}))
-    for _ in range(2):
-        assert hostile.main(["--minutes", "0.03", "--killing", "0", "--output", str(tmp_path)]) == 0
-    assert [numbers.start for numbers in seen] == [k * hostile_inputs.BATCH for k in range(len(seen))]
-    record = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert (record["failures"], record["inputs"]) == (0, seen[-1].stop)
-
-
-def test_it_goes_on_until_there_were_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """However little time there is."""
+    seen: list[range] = []
     samples = [Sample(family, tmp_path, ("a",)) for family in ("maps", "lists")]
     monkeypatch.setattr(hostile, "make_samples", lambda folder: samples)
-    monkeypatch.setattr(hostile_inputs, "run_batch", lambda samples, seed, numbers, keep: [])
+    monkeypatch.setattr(hostile_inputs, "run_batch", lambda samples, seed, numbers, keep: seen.append(numbers) or [])
     outcomes = iter(["fine", "missed", "fine", "fine"])
     monkeypatch.setattr(hostile_kills, "make_cases", lambda folder, training: [small_case(folder, False)])
     monkeypatch.setattr(hostile_kills, "kill", lambda *rest: hostile_kills.Outcome(next(outcomes)))
-    words = ["--minutes", "0", "--inputs", "1000", "--kills", "3", "--output", str(tmp_path / "out")]
-    assert hostile.main(words) == 0
+    words = ["--minutes", "0", "--kills", "3", "--output", str(tmp_path / "out"), "--inputs"]
+    assert hostile.main([*words, "400"]) == 0 and hostile.main([*words, "1000"]) == 0
+    assert [numbers.start for numbers in seen] == [k * hostile_inputs.BATCH for k in range(10)]
     state = json.loads((tmp_path / "out" / "hostile-0.json").read_text())
     assert state["tried"] == {"maps": 1000, "lists": 1000}
     assert state["kills"] == {"a command fine": 3, "a command missed": 1} and next(outcomes, None) is None
+    record = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (record["failures"], record["inputs"]) == (0, 2000)
 
 
 def test_what_somebody_signs_is_read(samples: list[Sample], tmp_path: Path) -> None:

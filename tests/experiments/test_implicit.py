@@ -20,16 +20,13 @@ from meshmatch.experiments.paper.implicit import (
     means,
     pairs_of,
     part_iou,
-    pieces,
     reconstruction,
-    volume,
 )
 from meshmatch.implicit.model import ImplicitModel
 from meshmatch.implicit.network import ImplicitConfig, ImplicitNetwork
 from meshmatch.implicit.space import CUBE_RADIUS, cube_nodes
 from meshmatch.models.implicit_card import ImplicitCard
 from meshmatch.shapes.sampling import sample_surface
-from meshmatch.shapes.shape import Shape
 from tests.implicit.boxes import box, box_sdf
 
 ONE, TWO = ((0.0, 0.0, 0.0),), ((-0.5, 0.0, 0.0), (0.5, 0.0, 0.0))
@@ -90,15 +87,6 @@ def test_distances_of_both_ways_count_alike() -> None:
     one, two = np.array([[0.0, 0, 0]]), np.array([[0.0, 0, 0], [3, 0, 0]])
     assert chamfer(one, two) == chamfer(two, one) == pytest.approx(0.75)  # (0 + (0 + 3) / 2) / 2
     assert chamfer(two, two) == 0
-
-
-def test_volume_and_pieces_of_boxes() -> None:
-    half = np.array([0.5, 0.2, 0.3])
-    one = box(half)
-    other = Shape(one.verts + np.array([5.0, 0, 0]), one.faces)
-    both = Shape(np.concatenate([one.verts, other.verts]), np.concatenate([one.faces, one.faces + one.V]))
-    assert [volume(one), volume(other), volume(both) / 2] == pytest.approx([8 * half.prod()] * 3)
-    assert (pieces(one), pieces(both)) == (1, 2)
 
 
 @pytest.mark.parametrize("centers", [ONE, TWO])

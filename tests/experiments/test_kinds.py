@@ -25,22 +25,20 @@ def test_rows_by_hand() -> None:
     assert rows[1]["mean_x100"] == 1.0
 
 
-@pytest.mark.parametrize("agree", ["pairs", "all", "no"])
-def test_every_pair_counts(agree: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_pair_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     build(tmp_path)
     (tmp_path / "faust").rename(tmp_path / "animal")
     spoiled = tmp_path / "animal" / "tr_reg_010.landmarks.npy"  # of the same body each: the maps are perfect
     np.save(spoiled, np.roll(np.load(spoiled), 1))
-    words = ["--data", str(tmp_path), "--cache", str(tmp_path / "cache")]
-    words += ["--sets", "animals", "--model", "human", "--agree", agree]
+    words = ["--data", str(tmp_path), "--cache", str(tmp_path / "cache"), "--sets", "animals", "--model", "human"]
     assert kinds.main(words) == 0
-    record = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert record["all"]["pairs"] == 6
-    assert sum(row["pairs"] for row in record["judged"]) == 6
+    record = json.loads(capsys.readouterr().out.splitlines()[-1])["animals"]
+    assert record["all"]["pairs"] == sum(row["pairs"] for row in record["verdict"]) == 6
+    assert [row["of"] for row in record["species"]] == ["other to other"]
     assert set(record["verdicts"]) == {"tr_reg_000", "tr_reg_001", "tr_reg_010"}
 
 
-def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
+def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Balls of which one is said to be a left hand; nothing is mirrored by a model of what is symmetric."""
     balls = [load_shape(file) for file in sorted(build(tmp_path).glob("faust/*.ply"))]
     own, kept = np.arange(balls[0].V), np.ones(balls[0].V, bool)
@@ -48,16 +46,18 @@ def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caps
     monkeypatch.setattr(kinds, "make_scans", lambda kind, count, seed: made[:count])
     human = as_model("human")
     both = TrainedModel(replace(human.card, mirror="auto"), human.template, human.inference)
-    record, tables = kinds.measured_scans("hand", 3, kinds.Matcher(both), "no", tmp_path / "cache")
-    assert len(tables) == 3
-    sides = record["sides"]
-    assert {row["of"]: row["pairs"] for row in sides["by_side"]} == {
-        "left to right": 2, "right to left": 2, "right to right": 2,
-    }  # fmt: skip
+    subjects = kinds.cut_scans("hand", 3, 0, tmp_path / "cache")
+    record, tables = kinds.measured("hand", subjects, kinds.Matcher(both))
+    assert [str(table.title).split()[-1] for table in tables] == ["length", "verdict", "sides", "Sides"]
+    assert {row["of"]: row["pairs"] for row in record["sides"]} == {
+        "left to right": 2,
+        "right to left": 2,
+        "right to right": 2,
+    }
+    sides = record["side"]
     assert (sides["shapes"], sides["left"], sides["found"]) == (3, 1, pytest.approx(2 / 3))
     good = [name for name, verdict in record["verdicts"].items() if verdict == "good"]
-    pairs = [1 for name in good for other in good if name != other and balls[1].name in (name, other)]
-    assert sides["wrong_called_good"] == len(pairs)
+    assert sides["wrong_called_good"] == sum(balls[1].name in (a, b) for a in good for b in good if a != b)
 
 
 def test_species_by_the_names_of_files() -> None:

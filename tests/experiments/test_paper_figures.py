@@ -20,7 +20,6 @@ from meshmatch.experiments.paper.figure_fields import (
     pulled_nodes,
     refinements,
     template_frame,
-    volume,
 )
 from meshmatch.experiments.paper.figures import refusals, refused, worst_candidate
 from meshmatch.maps.evaluate import CM_PER_UNIT
@@ -48,7 +47,6 @@ def test_change_of_triangles(cube: Shape) -> None:
     assert numbers["turned"] == pytest.approx(4 / 6) and numbers["change"] == pytest.approx(0)
     long, _ = change(cube.verts * [4, 1, 1], cube.verts, cube.faces)
     assert sorted(set(long.round(6).tolist())) == [0.0, 2.0]
-    assert volume(cube.verts, cube.faces) == pytest.approx(1) and volume(2 * cube.verts, cube.faces) == pytest.approx(8)
 
 
 def test_handles_are_the_nodes_of_the_arm(template: Template) -> None:
@@ -107,7 +105,7 @@ def test_a_field_is_fitted_without_a_network(template: Template) -> None:
     drawn = direct_fits([("mls", "none", "free"), ("mls", "vol+arap", "stiff")], template, bent, how)
     free, stiff = drawn.rows
     assert free["error_cm"] < 0.2 * off * CM_PER_UNIT and len(drawn.panels) == 3
-    assert stiff["error_cm"] != free["error_cm"]
+    assert stiff["error_cm"] != free["error_cm"] and abs(free["volume"]) < 0.1
     moved = fitted("pointwise", "vol", template, bent, replace(how, steps=2))
     assert moved.shape == bent.shape
 

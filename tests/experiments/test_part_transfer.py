@@ -6,15 +6,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 pytest.importorskip("skimage", reason="scikit-image is of the extra `bench`")
 
 from meshmatch.experiments.makers.furniture import KINDS, furniture
-from meshmatch.experiments.makers.furniture_models import Learned, chosen_templates, cloud_template, learned_shapes
 from meshmatch.experiments.paper import part_transfer
+from meshmatch.experiments.paper.part_transfer import Learned, chosen_templates, cloud_template, learned_shapes
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.network import PAPER
+from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template, template_radius
 from meshmatch.training.recipes import Recipe
+from tests.conftest import icosphere
 
 
 @pytest.fixture(scope="module")
@@ -86,3 +90,33 @@ def test_real_shapes_are_turned_like_generated_ones(kind: str) -> None:
     turn = part_transfer.UPRIGHT[kind]
     assert np.linalg.det(turn) == 1 and np.array_equal(turn @ turn.T, np.eye(3))
     assert furniture(kind, 0, 0).kind == kind
+
+
+def test_errors_of_keypoints_by_hand(cube: Shape) -> None:
+    shapes, points = {"a": cube, "b": cube}, {"a": np.arange(4), "b": np.arange(4)}
+    index = np.arange(8)
+    index[3] = 2  # an edge away: 1 / sqrt(3) of the diagonal
+    found = part_transfer.keypoint_errors(shapes, points, {("a", "b"): VertexMap("a", "b", index)})
+    assert found["mean"] == pytest.approx(1 / np.sqrt(3) / 4, abs=1e-3)
+    assert (found["median"], found["arrived"], found["pairs"]) == (0.0, 0.75, 1)
+
+
+def test_overlap_of_parts_by_hand() -> None:
+    truth, found = np.array([0, 0, 1, 1]), np.array([0, 1, 1, 1])
+    area = np.array([1.0, 1.0, 2.0, 0.0])
+    assert part_transfer.mean_overlap(found, truth, area) == pytest.approx((1 / 2 + 2 / 3) / 2)
+    ball = icosphere(1)
+    at = np.array([ball.verts[:, 2].argmin(), ball.verts[:, 2].argmax()])
+    parts = part_transfer.keypoint_parts(ball, at)
+    assert parts[at[0]] == 0 and parts[at[1]] == 1
+    assert (parts[ball.verts[:, 2] > 0.01] == 1).all()
+
+
+def test_shapes_are_stood_alike() -> None:
+    ball = icosphere(1)
+    verts = ball.verts * [1, 2, 3]
+    points = np.array([verts[:, k].argmax() for k in range(3)])
+    turn = Rotation.create_group("O").as_matrix()[7]
+    shapes = {"a": Shape(verts, ball.faces), "b": Shape(verts @ turn.T, ball.faces)}
+    stood = part_transfer.stood_alike(shapes, {"a": points, "b": points})
+    assert np.allclose(stood["b"].verts, verts)

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch.experiments.makers.rgbd_clouds import Body, Camera, Cloud, save_pcd, scan
 from meshmatch.experiments.paper import rgbd
+from meshmatch.experiments.paper.rgbd import Body, Camera, Cloud, save_pcd, scan
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere

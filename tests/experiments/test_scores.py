@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from meshmatch.errors import InputError
 from meshmatch.experiments.bench import scores as room
 from meshmatch.experiments.bench.scores import TruthDistances, area_under_curve, evaluate_set, summary
-from meshmatch.experiments.bench.sets import SET_NAMES, load_set
+from meshmatch.experiments.bench.sets import OUTLIERS, OUTLIERS_FILE, SET_NAMES, load_clouds, load_set, ordered_pairs
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors, map_errors
 from meshmatch.maps.geodesics import GeodesicDistances
 from tests.experiments.small_bench import BODY, build, truth
@@ -138,6 +138,11 @@ def test_distances_are_computed_once(small: Path, tmp_path: Path, monkeypatch: p
     assert len(paths) == 3
 
 
+def test_pairs_are_spread_evenly() -> None:
+    assert len(ordered_pairs("abcd")) == len(ordered_pairs("abcd", 99)) == 12
+    assert [pair[0] for pair in ordered_pairs("abcd", 4)] == list("abcd")
+
+
 def test_the_area_under_the_curve() -> None:
     assert area_under_curve([1, 2, 3, 4], [False, False, True, True]) == 1.0
     assert area_under_curve([4, 3, 2, 1], [False, False, True, True]) == 0.0
@@ -204,3 +209,21 @@ def test_the_noisy_cloud_set_is_scape_without_faces_and_with_noise(tmp_path: Pat
         assert np.array_equal(noisy.landmarks(name), clean.landmarks(name))
     first, second = (noisy.seen(name).verts - noisy.shape(name).verts for name in noisy.shapes)
     assert not np.allclose(first * 2, second)
+
+
+def test_clouds_with_outliers_are_measured_straight_and_every_row_counts(tmp_path: Path, kept: Path) -> None:
+    points = np.zeros((3, 40, 3), np.float32)
+    points[:, :, 0] = 0.2 * np.arange(40)  # metres: neighbours are 20 cm apart
+    np.save(tmp_path / OUTLIERS_FILE, points)
+    bench = load_set(OUTLIERS, tmp_path)
+    assert (len(bench.pairs), bench.seen("cloud 0").is_cloud, len(bench.landmarks("cloud 2"))) == (6, True, 40)
+    index = np.where(np.arange(40) < 30, np.arange(40), (np.arange(40) + 1) % 40)  # the last go to their neighbours
+    record = evaluate_set(bench, dict.fromkeys(bench.pairs, index), cache=kept).as_dict()
+    assert record["mean_cm"] == pytest.approx((9 * 20 + 39 * 20) / 40, rel=1e-5)
+    assert (record["median_cm"], record["share_over_15cm"], record["flips"]) == (0, 0.25, 1)
+    np.save(tmp_path / OUTLIERS_FILE, points[0])
+    load_clouds.cache_clear()
+    with pytest.raises(InputError, match="holds"):
+        load_set(OUTLIERS, tmp_path)
+    with pytest.raises(InputError, match="cannot read"):
+        load_set(OUTLIERS, tmp_path / "nowhere")

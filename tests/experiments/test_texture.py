@@ -54,6 +54,7 @@ def test_a_size_that_cannot_be_is_told(capsys: pytest.CaptureFixture[str]) -> No
     assert "16 to 8192" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_cow_loses_next_to_nothing(bench: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(texture, "POINTS", 5000)
     trip = texture.trip_of("spot", bench)

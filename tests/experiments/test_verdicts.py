@@ -21,7 +21,14 @@ def cases() -> Cases:
     return Cases("human", 5)
 
 
-@pytest.mark.parametrize("family", [name for name in FAMILIES if name not in ("dressed", "stylised", "furniture")])
+@pytest.mark.parametrize(
+    "family",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name == "two million" else ())
+        for name in FAMILIES
+        if name not in ("dressed", "stylised", "furniture")
+    ],
+)
 def test_a_case_is_drawn_again_alike_with_its_truth(cases: Cases, family: str) -> None:
     case, again = cases.draw(family, 0), cases.draw(family, 0)
     assert np.array_equal(case.shape.verts, again.shape.verts) and np.array_equal(case.truth, again.truth)

@@ -12,12 +12,11 @@ frame of that model's unrefined fit, and up and front are told. Maps are between
 from __future__ import annotations
 
 import multiprocessing
-import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,7 +25,7 @@ from rich.table import Table
 from typer import Option
 
 from meshmatch.api.inputs import as_model
-from meshmatch.arrays import Int, Ints
+from meshmatch.arrays import Ints
 from meshmatch.errors import MeshmatchError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.methods import Method, OurMethod
@@ -42,63 +41,38 @@ from meshmatch.render.charts import draw_curves
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import set_threads
 
-Maps = Mapping[Pair, Int[Ints, " V_src"]]
-
-
-@dataclass(frozen=True)
-class _Work:
-    """What a worker needs: it is sent once, not with every task."""
-
-    bench: BenchSet
-    method: Method
-    threads: int
-    fits: dict[str, Any]
-    kept: Path | None  # folder of maps
-
-    def map_file(self, pair: Pair) -> Path | None:
-        """Where the map of a pair is kept, if at all."""
-        return None if self.kept is None else _map_path(self.kept, self.bench, pair)
-
-
-_work: _Work | None = None
-
-
-def _begin(work: _Work) -> None:
-    global _work
-    set_threads(work.threads)
-    _work = work
-
 
 @lru_cache(maxsize=64)
 def _seen(bench: BenchSet, name: str) -> Shape:
     return bench.seen(name)
 
 
-def _fit_one(name: str) -> tuple[str, Any, float]:
-    assert _work is not None
-    shape = _seen(_work.bench, name)
+def _fit_one(bench: BenchSet, method: Method, name: str) -> tuple[str, Any, float]:
+    shape = _seen(bench, name)
     started = time.perf_counter()
     try:
-        fit = _work.method.fit(shape)
+        fit = method.fit(shape)
     except MeshmatchError as error:
         fit = error
     # one that was kept took longer than to read it
     return name, fit, max(time.perf_counter() - started, getattr(fit, "seconds", 0.0))
 
 
-def _map_one(pair: Pair) -> tuple[Pair, Ints | MeshmatchError, float]:
-    assert _work is not None
-    fits = [_work.fits[name] for name in pair]
+def _map_one(
+    bench: BenchSet, method: Method, kept: Path | None, task: tuple[Pair, tuple[Any, Any]]
+) -> tuple[Pair, Ints | MeshmatchError, float]:
+    """A map by its pair and their fits; in the folder ``kept`` it is looked for, and left."""
+    pair, fits = task
     for fit in fits:
         if isinstance(fit, MeshmatchError):
             return pair, fit, 0.0
-    source, target = (_seen(_work.bench, name) for name in pair)
-    file = _work.map_file(pair)
+    source, target = (_seen(bench, name) for name in pair)
+    file = None if kept is None else kept / bench.name / f"{pair[0]}-{pair[1]}.npy"
     if file is not None and file.is_file():
         return pair, load_map(file, source, target).index, 0.0
     started = time.perf_counter()
     try:
-        index = _work.method.map(source, fits[0], target, fits[1]).index
+        index = method.map(source, fits[0], target, fits[1]).index
     except MeshmatchError as error:
         return pair, error, time.perf_counter() - started
     seconds = time.perf_counter() - started
@@ -108,13 +82,13 @@ def _map_one(pair: Pair) -> tuple[Pair, Ints | MeshmatchError, float]:
     return pair, index, seconds
 
 
-def _each(task: Any, items: Sequence[Any], work: _Work, jobs: int) -> Iterator[Any]:
+def _each(task: Any, items: Sequence[Any], threads: int, jobs: int) -> Iterator[Any]:
     if jobs <= 1:
-        _begin(work)
+        set_threads(threads)
         yield from map(task, items)
         return
     context = multiprocessing.get_context("spawn")  # a fork would inherit torch's and scipy's thread pools
-    with ProcessPoolExecutor(jobs, context, initializer=_begin, initargs=(work,)) as pool:
+    with ProcessPoolExecutor(jobs, context, initializer=set_threads, initargs=(threads,)) as pool:
         yield from pool.map(task, items, chunksize=1)
 
 
@@ -166,13 +140,14 @@ def run_set(
     names = sorted({name for pair in pairs for name in pair}, key=bench.shapes.index)
     fits: dict[str, Any] = {}
     fit_seconds: dict[str, float] = {}
-    work = _each(_fit_one, names, _Work(bench, method, threads, {}, kept), jobs)
+    work = _each(partial(_fit_one, bench, method), names, threads, jobs)
     for name, fit, seconds in runner.track(work, f"{bench.name}: fitting", len(names)):
         fits[name], fit_seconds[name] = fit, seconds
     maps: dict[Pair, Ints] = {}
     map_seconds: dict[Pair, float] = {}
     failed: dict[Pair, str] = {}
-    work = _each(_map_one, pairs, _Work(bench, method, threads, fits, kept), jobs)
+    tasks = [(pair, (fits[pair[0]], fits[pair[1]])) for pair in pairs]
+    work = _each(partial(_map_one, bench, method, kept), tasks, threads, jobs)
     for pair, index, seconds in runner.track(work, f"{bench.name}: mapping", len(pairs)):
         if isinstance(index, MeshmatchError):
             failed[pair] = index.message
@@ -182,10 +157,6 @@ def run_set(
             if seconds:
                 map_seconds[pair] = seconds
     return SetRun(evaluate_set(bench, maps, pairs=pairs, cache=cache), fit_seconds, map_seconds, failed, fits)
-
-
-def _map_path(folder: Path, bench: BenchSet, pair: Pair) -> Path:
-    return folder / bench.name / f"{pair[0]}-{pair[1]}.npy"
 
 
 def scores_table(sets: Sequence[SetScores], oriented_by: str = "") -> Table:
@@ -245,7 +216,3 @@ def main(
         notes.append(INCOMPLETE)
     record = {"geodesic": GEODESIC, "sets": {each.scores.bench.name: each.as_dict() for each in runs}}
     return runner.Report(record, [scores_table(scores, oriented_by)], notes)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -23,7 +23,6 @@ measured, and how long learned methods were trained.
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -36,7 +35,7 @@ from typer import Option
 
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.accuracy import INCOMPLETE, run_set
-from meshmatch.experiments.bench.methods import Coded, Method, OurMethod, Registration, ZoomOut
+from meshmatch.experiments.bench.methods import Method, OurMethod, Registration, ZoomOut, coded
 from meshmatch.experiments.bench.sets import ALL_SETS, SET_NAMES, BenchSet, load_set
 from meshmatch.maps.evaluate import LOST_CM, SKIN_M2
 from meshmatch.maps.geodesics import GEODESIC
@@ -92,7 +91,8 @@ def _plain(
 def _coded(choices: Choices) -> list[Baseline]:
     if choices.coded is None:
         return [Baseline("coded", "3D-CODED", None, _NOT_GIVEN.format("coded"))]
-    card, method = find_model(choices.coded)[1], Coded(choices.coded, choices.coded_steps, choices.seed)
+    card = find_model(choices.coded)[1]
+    method = coded(choices.coded, choices.coded_steps, choices.seed)
     oriented = replace(method, oriented_by=choices.model)
     told = f"{card.weights_sha256} {find_model(choices.model)[1].weights_sha256}"
     minutes = card.training_minutes
@@ -179,7 +179,9 @@ def main(
     minutes: Annotated[float, Option(help="start nothing new after so long")] = 1e6,
     output: Annotated[Path, Option(help="folder of the results")] = Path("out/baselines"),
     model: runner.Model = "human",
-    coded: Annotated[str | None, Option(help="a model folder of experiments.paper.learned_baselines")] = None,
+    coded_model: Annotated[
+        str | None, Option("--coded", help="a model folder of experiments.paper.learned_baselines")
+    ] = None,
     coded_steps: Annotated[int, Option(min=1, help="of its search over codes")] = 2000,
     transmatch: Annotated[Path | None, Option(help="a folder of experiments.paper.learned_baselines")] = None,
     seed: runner.Seed = 0,
@@ -189,7 +191,7 @@ def main(
 ) -> runner.Report:
     until = time.monotonic() + 60 * minutes
     benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
-    choices = Choices(model, coded, coded_steps, transmatch, seed, threads)
+    choices = Choices(model, coded_model, coded_steps, transmatch, seed, threads)
     known = [row for name in runner.names_of(methods, METHODS, "method") for row in METHODS[name](choices)]
     make_folder(output)
     rows, skipped = [], {}
@@ -212,7 +214,3 @@ def main(
         notes.append(INCOMPLETE)
     drawn = runner.table(f"Geodesic error, cm at {SKIN_M2} m2 of skin ({GEODESIC})", rows, COLUMNS)
     return runner.Report({"geodesic": GEODESIC, "skipped": skipped, "rows": rows}, [drawn], notes)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -12,7 +12,6 @@ Each body is a line of ``bodies.jsonl``, and its fit a file beside it: a run tha
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -269,7 +268,3 @@ def main(
     columns = {"error": "error"} | {name: f"{name}:d" for name in (*VERDICTS, "all")}
     tables = [runner.table(f"{len(rows)} bodies, of which {refused} refused", found, columns)]
     return runner.Report({"bodies": len(rows), "refused": refused, "bands": found}, tables)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

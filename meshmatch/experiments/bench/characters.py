@@ -9,9 +9,6 @@ loosely): the share of vertices whose partner hangs on the same bone. Every orde
 
 from __future__ import annotations
 
-import itertools
-import sys
-import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -19,15 +16,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from rich.table import Table
 from scipy.spatial.transform import Rotation
 from typer import Option
 
 from meshmatch.api.matching import Matcher
 from meshmatch.experiments import runner
+from meshmatch.experiments.bench.pairs import VERDICTS, matched
 from meshmatch.experiments.bench.scores import TruthDistances
+from meshmatch.experiments.bench.sets import ordered_pairs
 from meshmatch.experiments.makers.character_designs import Character, Designer
-from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.generators.proportions import BUILT, CHILD, PLAIN, TOON
 from meshmatch.maps.evaluate import CM_PER_UNIT
@@ -41,7 +38,6 @@ GROUPS = ("clothed", "children", "stylised", "built", "robots", "soldiers", "rog
 KINDS = {"clothed": PLAIN, "children": CHILD, "stylised": TOON, "built": BUILT}
 HELD = ("Knife*", "*Crossbow*", "Throwable*", "*Cape*")
 """Meshes of the evaluation data's characters that are no part of them."""
-VERDICTS = ("good", "fair", "poor")
 _EVERY = 20  # vertex of the body is a place where errors are measured
 COLUMNS = {
     "group": "group", "pairs": "pairs:d", "mean cm": "mean_cm:.2f", "median": "median_cm:.2f", "worst": "worst_cm:.1f",
@@ -91,47 +87,25 @@ def measured(source: Character, target: Character, found: VertexMap, cache: Path
     return record
 
 
-def row_of(group: str, cast: list[Character], matcher: Matcher, cache: Path | None) -> dict[str, Any]:
+def row_of(group: str, cast: Sequence[Character], matcher: Matcher, cache: Path | None) -> dict[str, Any]:
     """All ordered pairs of a group."""
-    fits: list[Fit] = []
-    fitted = []
-    for each in runner.track(cast, f"{group}: fitting", len(cast)):
-        began = time.process_time()
-        fits.append(matcher.fit(each.shape))
-        fitted.append(time.process_time() - began)
-    pairs = list(itertools.permutations(range(len(cast)), 2))
-    found, seconds, verdicts = [], [], Counter[str]()
-    for a, b in runner.track(pairs, f"{group}: mapping", len(pairs)):
-        began = time.process_time()
-        vertex_map = matcher.map(fits[a], fits[b])
-        seconds.append(fitted[a] + fitted[b] + time.process_time() - began)
-        verdicts[max((fits[a].verdict, fits[b].verdict), key=VERDICTS.index)] += 1
-        found.append(measured(cast[a], cast[b], vertex_map, cache))
-    bone = [each["bone"] for each in found]
-    row = {"group": group, "pairs": len(pairs), "bone": float(np.mean(bone)), "lowest": min(bone)}
-    if "cm" in found[0]:
-        cm = [each["cm"] for each in found]
+    of = {each.shape.name: each for each in cast}
+    shapes = {name: each.shape for name, each in of.items()}
+    fits, found = matched(matcher, shapes, ordered_pairs(of), group)
+    errors = {(a, b): measured(of[a], of[b], each.map, cache) for (a, b), each in found.items()}
+    bone = [each["bone"] for each in errors.values()]
+    row = {"group": group, "pairs": len(found), "bone": float(np.mean(bone)), "lowest": min(bone)}
+    if cm := [each["cm"] for each in errors.values() if "cm" in each]:
         row |= {"mean_cm": float(np.mean(cm)), "median_cm": float(np.median(cm)), "worst_cm": max(cm)}
-    row["verdicts"] = " / ".join(str(verdicts[word]) for word in VERDICTS)
-    row |= {
+    verdicts = Counter(each.verdict for each in found.values())
+    seconds = [each.seconds for each in found.values()]
+    return row | {
+        "verdicts": " / ".join(str(verdicts[word]) for word in VERDICTS),
         "seconds": float(np.mean(seconds)),
         "slowest": max(seconds),
-        "each": [[cast[a].shape.name, cast[b].shape.name, each] for (a, b), each in zip(pairs, found, strict=True)],
+        "each": [[*pair, each] for pair, each in errors.items()],
+        "fits": {name: [fit.verdict, [reason.code for reason in fit.reasons]] for name, fit in fits.items()},
     }
-    return row | {
-        "fits": {
-            each.shape.name: [fit.verdict, [r.code for r in fit.reasons]] for each, fit in zip(cast, fits, strict=True)
-        }
-    }
-
-
-def measured_groups(
-    data: Path, groups: Sequence[str], matcher: Matcher, count: int = 4, seed: int = 0, cache: Path | None = None
-) -> tuple[list[dict[str, Any]], Table]:
-    """Rows and table of some groups, of generated ones so many characters each, drawn by a seed."""
-    designer = Designer.unseen(read_template("human-T"), seed)
-    rows = [row_of(group, characters_of(group, count, designer, data), matcher, cache) for group in groups]
-    return rows, runner.table(f"Characters with {matcher.model.card.name}", rows, COLUMNS)
 
 
 @runner.command
@@ -145,9 +119,9 @@ def main(
     seed: runner.Seed = 0,
 ) -> runner.Report:
     matcher = Matcher(model, FitConfig(), threads)
-    rows, table = measured_groups(data, runner.names_of(groups, GROUPS, "group"), matcher, count, seed, cache)
-    return runner.Report({"rows": rows}, [table])
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    designer = Designer.unseen(read_template("human-T"), seed)
+    rows = [
+        row_of(group, characters_of(group, count, designer, data), matcher, cache)
+        for group in runner.names_of(groups, GROUPS, "group")
+    ]
+    return runner.Report({"rows": rows}, [runner.table(f"Characters with {matcher.model.card.name}", rows, COLUMNS)])

@@ -1,17 +1,24 @@
-"""Charts of experiments: lines with bands over axes that may be logarithmic."""
+"""Charts of experiments: lines with bands over axes that may be logarithmic; and pictures above each other."""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from meshmatch.errors import OptionError
+from meshmatch.outputs import replace_on_success
 from meshmatch.render.charts import COLORS, pen, saved
+from meshmatch.render.figures import Panel
+from meshmatch.render.picture import Look, render_shapes
 from meshmatch.render.scales import short
+
+_WIDEST = 1400  # pixels of a picture
 
 
 @dataclass(frozen=True)
@@ -83,3 +90,24 @@ def _draw_chart(axes: Any, chart: Chart, pens: Mapping[str, Mapping[str, Any]]) 
         if len(line.spread):
             low, high = np.maximum(np.subtract(line.y, line.spread), 0), np.add(line.y, line.spread)
             axes.fill_between(line.x, low, high, color=pens[name]["color"], alpha=0.18, linewidth=0)
+
+
+def stacked(rows: Sequence[tuple[Sequence[Panel], Look]], path: Path) -> None:
+    """Rows of panels above each other in one picture, as wide as the widest."""
+    with tempfile.TemporaryDirectory() as folder:
+        images = []
+        for number, (panels, look) in enumerate(rows):
+            part = Path(folder) / f"{number}.png"
+            render_shapes(panels, part, look)
+            with Image.open(part) as drawn:
+                images.append(drawn.convert("RGB"))
+    width = max(image.width for image in images)
+    whole = Image.new("RGB", (width, sum(image.height for image in images)), (255, 255, 255))
+    top = 0
+    for image in images:
+        whole.paste(image, ((width - image.width) // 2, top))
+        top += image.height
+    if width > _WIDEST:
+        whole = whole.resize((_WIDEST, round(whole.height * _WIDEST / width)), Image.Resampling.LANCZOS)
+    with replace_on_success(path) as temporary:
+        whole.save(temporary, format="PNG", compress_level=9)

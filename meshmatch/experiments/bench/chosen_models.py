@@ -11,14 +11,12 @@ hearts, chairs, tables and planes, every other one with a tenth of strays.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import trimesh
-from rich.table import Table
 from typer import Option
 
 from meshmatch.api.inputs import validated
@@ -26,7 +24,7 @@ from meshmatch.api.kinds import category_residuals, classify_shapes, installed_m
 from meshmatch.errors import InputError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.characters import characters_of
-from meshmatch.experiments.bench.sets import CLOUD_SET, SET_NAMES, load_set
+from meshmatch.experiments.bench.sets import CLOUD_SET, SET_NAMES, load_clouds, load_set
 from meshmatch.experiments.makers.character_designs import Designer
 from meshmatch.experiments.makers.cut_scans import make_scans
 from meshmatch.experiments.makers.furniture import KINDS, furniture
@@ -64,7 +62,7 @@ def shapes_of(name: str, data: Path) -> Iterator[Shape]:
         bench = load_set(name, data)
         yield from (bench.seen(shape) for shape in bench.shapes)
     elif name == "outliers":
-        yield from (as_shape(np.asarray(points, float)) for points in np.load(data / "faust_outliers.npy"))
+        yield from load_clouds(data).values()
     elif name == "spot":
         yield as_shape(data / "textured" / "spot_triangulated.obj")
     elif name == "clouds":
@@ -127,25 +125,16 @@ def row_of(name: str, shapes: list[Shape]) -> dict[str, Any]:
     return record | {"wrong": len(wrong), "own": own or None, "others": others, "which": wrong}
 
 
-def measured_sets(
-    data: Path, sets: Sequence[str] = SETS, limit_shapes: int | None = None
-) -> tuple[dict[str, Any], Table, list[str]]:
-    """Record and table of some sets, and what is wrong."""
-    rows = [row_of(name, runner.spread(list(shapes_of(name, data)), limit_shapes)) for name in sets]
-    notes = [f"wrong: {word}" for row in rows for word in row["which"]]
-    record = {"known": KNOWN, "models": [model.card.name for model in installed_models()], "rows": rows}
-    return record, runner.table("The kind of every shape", rows, COLUMNS), notes
-
-
 @runner.command
 def main(
     data: runner.Data = runner.DATA,
     sets: Annotated[str, Option(help=f"of {', '.join(SETS)}")] = ",".join(SETS),
     limit_shapes: Annotated[int | None, Option(min=1, help="of each set, evenly spread")] = None,
 ) -> runner.Report:
-    record, table, notes = measured_sets(data, runner.names_of(sets, SETS, "set"), limit_shapes)
-    return runner.Report(record, [table], notes)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    rows = [
+        row_of(name, runner.spread(list(shapes_of(name, data)), limit_shapes))
+        for name in runner.names_of(sets, SETS, "set")
+    ]
+    notes = [f"wrong: {word}" for row in rows for word in row["which"]]
+    record = {"known": KNOWN, "models": [model.card.name for model in installed_models()], "rows": rows}
+    return runner.Report(record, [runner.table("The kind of every shape", rows, COLUMNS)], notes)

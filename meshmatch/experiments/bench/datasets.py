@@ -7,8 +7,7 @@ something. A set may have more or other shapes than the published numbers are of
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,8 +18,7 @@ from typer import Argument, Option
 
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.outliers import FILE, load_clouds
-from meshmatch.experiments.bench.sets import SET_NAMES, load_set
+from meshmatch.experiments.bench.sets import OUTLIERS_FILE, SET_NAMES, load_clouds, load_set
 from meshmatch.experiments.bench.texture import CHARACTERS
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
@@ -37,21 +35,23 @@ class Layout:
     Parameters
     ----------
     published : number of shapes that docs/results.md is of
-    suffix : of the file of what is true of each shape; empty where there is none, or vertex i is vertex i
+    suffix : of the file of what is true of each shape; empty where there is none
     columns : of that file: 1 a vertex for each landmark, 2 a row for each vertex
+    words : what is true, where not every shape's landmarks are counted
     """
 
     published: int
     suffix: str = ""
     columns: int = 1
+    words: str = "none"
 
 
 LAYOUTS = {
     "shrec19": Layout(18, ".landmarks.npy"),
-    "scape": Layout(20),
+    "scape": Layout(20, words="vertex i is vertex i"),
     "faust": Layout(30, ".landmarks.npy"),
     "faust_scans": Layout(10),
-    "heart": Layout(10, ".truth.npy", 2),
+    "heart": Layout(10, ".truth.npy", 2, "every vertex"),
     **dict.fromkeys(("chair", "table", "plane"), Layout(10, ".keypoints.npy")),
     "animal": Layout(32, ".landmarks.npy"),
 }
@@ -87,28 +87,21 @@ def check_shapes(name: str, layout: Layout, folder: Path) -> dict[str, Any]:
     shapes = [load_shape(file) for file in runner.track(files, name)]
     if flat := [file.name for file, shape in zip(files, shapes, strict=True) if shape.is_cloud]:
         raise InputError(f"{folder / name / flat[0]} has no faces")
-    words = "vertex i is vertex i" if name == "scape" else "none"
-    counts = {shape.V for shape in shapes} if name == "scape" else set()
+    words, counts = layout.words, {shape.V for shape in shapes} if name == "scape" else set()
     if layout.suffix:
-        marks = [
-            checked_truth(file.with_name(file.stem + layout.suffix), layout, shape)
-            for file, shape in zip(files, shapes, strict=True)
-        ]
-        counts = set() if layout.columns > 1 else set(marks)
-        words = "every vertex" if layout.columns > 1 else f"{marks[0]:,} landmarks"
+        truths = [file.with_name(file.stem + layout.suffix) for file in files]
+        marks = [checked_truth(path, layout, shape) for path, shape in zip(truths, shapes, strict=True)]
+        if layout.columns == 1:
+            words, counts = f"{marks[0]:,} landmarks", set(marks)
     if len(counts) > 1:
-        raise InputError(f"shapes in {folder / name} have different numbers of landmarks: {_range(list(counts))}")
-    return {
-        **{"shapes": len(files), "vertices": _range([each.V for each in shapes])},
-        **{"faces": _range([each.F for each in shapes]), "truth": words},
-        "pairs": len(load_set(name, folder).pairs) if name in SET_NAMES else None,
-    }
+        raise InputError(f"shapes in {folder / name} have different numbers of landmarks: {_range(counts)}")
+    return row_of(shapes, words) | {"pairs": len(load_set(name, folder).pairs) if name in SET_NAMES else None}
 
 
-def check_outliers(folder: Path) -> dict[str, Any]:
-    """The clouds with outliers."""
-    clouds = load_clouds(folder)
-    return {"shapes": len(clouds), "vertices": _range([each.V for each in clouds]), "truth": "row i is row i"}
+def row_of(shapes: Collection[Shape], truth: str) -> dict[str, Any]:
+    """What some shapes are like."""
+    sizes = {"vertices": _range(each.V for each in shapes), "faces": _range(each.F for each in shapes)}
+    return {"shapes": len(shapes), **sizes, "truth": truth}
 
 
 def check_textured(folder: Path) -> dict[str, Any]:
@@ -116,19 +109,17 @@ def check_textured(folder: Path) -> dict[str, Any]:
     paths = [folder / "textured" / name for name in CHARACTERS.values()]
     if missing := [path for path in paths if not path.is_file()]:
         raise InputError(f"there is no {missing[0]}")
-    shapes = [load_shape(path) for path in paths]
-    sizes = {"vertices": _range([each.V for each in shapes]), "faces": _range([each.F for each in shapes])}
-    return {"shapes": len(shapes), **sizes, "truth": "none"}
+    return row_of([load_shape(path) for path in paths], "none")
 
 
-def _range(numbers: list[int]) -> str:
-    least, most = min(numbers), max(numbers)
+def _range(numbers: Iterable[int]) -> str:
+    least, *_, most = sorted([*numbers] * 2)
     return f"{least:,}" if least == most else f"{least:,} to {most:,}"
 
 
 CHECKS: dict[str, tuple[int, Callable[[Path], dict[str, Any]]]] = {
     **{name: (layout.published, partial(check_shapes, name, layout)) for name, layout in LAYOUTS.items()},
-    FILE: (30, check_outliers),
+    OUTLIERS_FILE: (30, lambda folder: row_of(load_clouds(folder).values(), "row i is row i")),
     "textured": (3, check_textured),
 }
 """By set: how many shapes the published numbers are of, and what looks at it."""
@@ -153,7 +144,3 @@ def main(
     if wrong:
         stopped = InputError(f"{len(wrong)} of {len(rows)} sets lack something: {'; '.join(wrong)}", HINT)
     return runner.Report({"sets": rows}, [runner.table(str(data), rows, COLUMNS)], stopped=stopped)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

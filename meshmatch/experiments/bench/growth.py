@@ -11,7 +11,6 @@ import base64
 import json
 import math
 import struct
-import sys
 import tempfile
 import time
 import zlib
@@ -246,7 +245,3 @@ def main(
             row["exponent"] = round(math.log10(last / before), 2)
             rows.append(row)
     return runner.Report({"rows": rows}, [runner.table("Seconds of CPU", rows, COLUMNS)])
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,10 +1,9 @@
 """Animals, hands and heads through models that have never seen one of them.
 
 Cats, dogs, cows, horses and hippos of the benchmark, each fitted once and turned every way; then every ordered pair is
-matched as `match` does it (--agree all lets the fits of all shapes agree once, instead of those of every pair), and every
-landmark counts. The error is the distance along the target between the matched and the true point, in units of sqrt(area),
-times 100; "off" is the share of points beyond 10. Beside it how far the verdicts tell the truth: the worse one of the two
-fits, and the error of the pair.
+matched as `match` does it, and every landmark counts. The error is the distance along the target between the matched and
+the true point, in units of sqrt(area), times 100; "off" is the share of points beyond 10. Beside it how far the verdicts
+tell the truth: the worse one of the two fits, and the error of the pair.
 
 Hands and heads are generated (meshmatch/experiments/makers/cut_scans.py): of people and in poses that no training
 drew, with other triangles, cut at random, turned anywhere, every other one with a thing beside it, and hands of both
@@ -14,35 +13,29 @@ in percent of the length of the hand (wrist to fingertips) or the head (chin to 
 
 from __future__ import annotations
 
-import sys
-import time
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from rich.table import Table
 from typer import Option
 
-from meshmatch.api.inputs import validated
 from meshmatch.api.matching import Matcher
 from meshmatch.arrays import Ints
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.category import Shapes, ordered_pairs
+from meshmatch.experiments.bench.pairs import matched
 from meshmatch.experiments.bench.scores import TruthDistances
-from meshmatch.experiments.bench.sets import Pair, load_folder
+from meshmatch.experiments.bench.sets import Pair, Shapes, load_folder, ordered_pairs
 from meshmatch.experiments.makers.cut_scans import make_scans, scan_errors
-from meshmatch.fitting.agree import agreed_fits
-from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.maps.build import build_map
-from meshmatch.maps.places import Places
 from meshmatch.maps.vertex_map import VertexMap
 
 OFF = 0.1
 """In units of sqrt(area): a point further off is lost."""
-VERDICTS = ("good", "fair", "poor")
 SETS = ("animals", "hand", "head")
 MODELS = {"animals": "quadruped"}
 """Of the sets that are not named as theirs."""
@@ -53,11 +46,25 @@ _SPECIES = {
     "cow": ("cow",),
     "hippo": ("hippo",),
 }
-BARS = {"hand": 4.0, "head": 2.0}
-"""Percent of the length."""
 _COLUMNS = {"pairs": "pairs:d", "mean": "mean_x100:.2f", "median": "median_x100:.2f", "off": "off:.1%"}
+_SIDES = {"shapes": "shapes:d", "left": "left:d", "right side found": "found:.1%"}
+_SIDES |= {"wrong pairs called good": "wrong_called_good:d"}
 
-Agree = Literal["pairs", "all", "no"]
+Errors = dict[Pair, np.ndarray]
+Group = Callable[[Pair], str]
+
+
+@dataclass(frozen=True, eq=False)
+class Subjects:
+    """Shapes of a set, how their maps are measured, by what else than verdicts their pairs are grouped, and of sided ones
+    which are left.
+    """
+
+    title: str
+    shapes: Shapes
+    errors: Callable[[Mapping[Pair, VertexMap]], Errors]
+    groups: Mapping[str, Group] = field(default_factory=dict)
+    left: Mapping[str, bool] = field(default_factory=dict)
 
 
 def species_of(name: str) -> str:
@@ -66,31 +73,7 @@ def species_of(name: str) -> str:
     return next((kind for kind, signs in _SPECIES.items() if any(sign in words for sign in signs)), "other")
 
 
-def maps_of(matcher: Matcher, fits: Mapping[str, Fit], pairs: Sequence[Pair], agree: Agree) -> dict[Pair, VertexMap]:
-    """Maps of pairs through their fits, which agree first: those of each pair, or all of them at once."""
-    threads = matcher.threads
-    clean = {name: validated(fit.repaired.original) for name, fit in fits.items() if fit.repaired is not None}
-
-    def agreed(names: Sequence[str]) -> dict[str, Fit]:
-        own = [fits[name] for name in names]
-        if agree == "no":
-            return dict(zip(names, own, strict=True))
-        shapes = [clean[name].shape for name in names]
-        return dict(zip(names, agreed_fits(matcher.model, shapes, own, matcher.config, threads=threads), strict=True))
-
-    def placed(names: Sequence[str]) -> dict[str, Places]:
-        return {name: Places.of(clean[name], fit, fits[name]) for name, fit in agreed(names).items()}
-
-    together = placed(list(fits)) if agree == "all" else {}
-    found = {}
-    for a, b in runner.track(sorted({(min(pair), max(pair)) for pair in pairs}), "mapping"):
-        both = together or placed([a, b])
-        for pair in {(a, b), (b, a)} & set(pairs):
-            found[pair] = build_map(both[pair[0]], both[pair[1]])
-    return found
-
-
-def rows_of(errors: Mapping[Pair, np.ndarray], group: Any) -> list[dict[str, Any]]:
+def rows_of(errors: Errors, group: Group) -> list[dict[str, Any]]:
     """A row for every group of pairs, with the mean over pairs of their means, medians and shares beyond `OFF`."""
     groups: dict[str, list[np.ndarray]] = defaultdict(list)
     for pair, values in errors.items():
@@ -108,10 +91,10 @@ def rows_of(errors: Mapping[Pair, np.ndarray], group: Any) -> list[dict[str, Any
 
 
 def geodesic_errors(
-    shapes: Shapes, truth: Mapping[str, Ints], maps: Mapping[Pair, VertexMap], cache: Path | None
-) -> dict[Pair, np.ndarray]:
+    shapes: Shapes, truth: Mapping[str, Ints], cache: Path | None, maps: Mapping[Pair, VertexMap]
+) -> Errors:
     """Distances along the target at every landmark of every pair, in units of sqrt(area)."""
-    found: dict[Pair, np.ndarray] = {}
+    found: Errors = {}
     for target in runner.track(sorted({b for _, b in maps}), "measuring"):
         mine = [pair for pair in maps if pair[1] == target]
         distances = TruthDistances(shapes[target], truth[target], cache)
@@ -120,63 +103,47 @@ def geodesic_errors(
     return found
 
 
-def measured_animals(
-    data: Path, matcher: Matcher, agree: Agree, limits: tuple[int | None, int | None], cache: Path | None
-) -> tuple[dict[str, Any], list[Table]]:
-    """Record and tables of the animals; ``limits``: of shapes and of pairs."""
+def animals(data: Path, limit: int | None, cache: Path | None) -> Subjects:
+    """Those of the evaluation data."""
     shapes, truth = load_folder(data / "animal", TRUTH)
-    shapes = {name: shapes[name] for name in runner.spread(list(shapes), limits[0])}
-    began = time.perf_counter()
-    fits = dict(zip(shapes, matcher.fit_all(list(shapes.values())), strict=True))
-    fitted = time.perf_counter() - began
-    maps = maps_of(matcher, fits, ordered_pairs(shapes, limits[1]), agree)
-    mapped = time.perf_counter() - began - fitted
-    errors = geodesic_errors(shapes, truth, maps, cache)
-    verdicts = {name: fit.verdict for name, fit in fits.items()}
-    worse = {pair: max((verdicts[name] for name in pair), key=VERDICTS.index) for pair in maps}
-    whole = rows_of(errors, lambda _: "all")[0]
-    kinds = rows_of(errors, lambda pair: f"{species_of(pair[0])} to {species_of(pair[1])}")
-    judged = rows_of(errors, worse.__getitem__)
-    title = "error x 100 / sqrt(area)"
-    tables = [
-        runner.table(f"Animals with {matcher.model.card.name}: {title}", [*kinds, whole], {"of": "of", **_COLUMNS}),
-        runner.table(f"By the worse verdict: {title}", judged, {"verdict": "of", **_COLUMNS}),
-    ]
-    record: dict[str, Any] = {"all": whole, "kinds": kinds, "judged": judged, "verdicts": verdicts}
-    record |= {"fit_seconds": round(fitted / len(fits), 2), "map_seconds": round(mapped / len(maps), 2)}
-    return record, tables
+    shapes = {name: shapes[name] for name in runner.spread(list(shapes), limit)}
+    groups: dict[str, Group] = {"species": lambda pair: " to ".join(map(species_of, pair))}
+    return Subjects("error x 100 / sqrt(area)", shapes, partial(geodesic_errors, shapes, truth, cache), groups)
 
 
-def measured_scans(
-    kind: str, count: int, matcher: Matcher, agree: Agree, cache: Path | None
+def cut_scans(kind: str, count: int, seed: int, cache: Path | None) -> Subjects:
+    """Generated hands or heads."""
+    scans = {scan.shape.name: scan for scan in make_scans(kind, count, seed)}
+    side = {name: "left" if scan.mirrored else "right" for name, scan in scans.items()}
+    return Subjects(
+        "error in percent of its length",
+        {name: scan.shape for name, scan in scans.items()},
+        lambda maps: scan_errors(scans, maps, cache),
+        {"sides": lambda pair: " to ".join(side[name] for name in pair)} if "left" in side.values() else {},
+        {name: scan.mirrored for name, scan in scans.items()},
+    )
+
+
+def measured(
+    name: str, subjects: Subjects, matcher: Matcher, limit: int | None = None
 ) -> tuple[dict[str, Any], list[Table]]:
-    """Record and table of generated hands or heads: all pairs, then by the worse verdict."""
-    scans = {scan.shape.name: scan for scan in make_scans(kind, count, matcher.config.seed)}
-    shapes = {name: scan.shape for name, scan in scans.items()}
-    fits = dict(zip(shapes, matcher.fit_all(list(shapes.values())), strict=True))
-    maps = maps_of(matcher, fits, ordered_pairs(shapes, None), agree)
-    errors = scan_errors(scans, maps, cache)
-    worse = {pair: max((fits[name].verdict for name in pair), key=VERDICTS.index) for pair in maps}
-    rows = [*rows_of(errors, lambda _: "all"), *rows_of(errors, worse.__getitem__)]
-    title = f"{kind} with {matcher.model.card.name}: error in percent of its length, bar {BARS[kind]:g}"
-    whole = rows[0] | {"bar": BARS[kind], "met": rows[0]["mean_x100"] <= BARS[kind]}
-    record = {"all": whole, "judged": rows[1:], "verdicts": {name: fit.verdict for name, fit in fits.items()}}
-    tables = [runner.table(title, rows, {"of": "of", **_COLUMNS})]
+    """Record and tables of all pairs of a set, or of ``limit`` of them: all together, by groups, by the worse verdict."""
+    fits, found = matched(matcher, subjects.shapes, ordered_pairs(subjects.shapes, limit), name)
+    errors = subjects.errors({pair: each.map for pair, each in found.items()})
+    whole = rows_of(errors, lambda _: "all")[0]
+    groups = {"verdict": lambda pair: found[pair].verdict, **subjects.groups}
+    rows = {heading: rows_of(errors, group) for heading, group in groups.items()}
+    record: dict[str, Any] = {"all": whole, **rows, "verdicts": {each: fit.verdict for each, fit in fits.items()}}
+    title = f"{name} with {matcher.model.card.name}: {subjects.title}"
+    tables = [runner.table(title, [whole], {"of": "of", **_COLUMNS})]
+    tables += [runner.table(f"By {heading}", some, {heading: "of", **_COLUMNS}) for heading, some in rows.items()]
     if matcher.model.card.mirror == "auto":
-        wrong = {name for name, fit in fits.items() if fit.frame.mirrored != scans[name].mirrored}
-        good = sum(worse[pair] == "good" and len(wrong & set(pair)) == 1 for pair in maps)
-        left = sum(scan.mirrored for scan in scans.values())
-        sides: dict[str, Any] = {"shapes": len(scans), "left": left, "found": 1 - len(wrong) / len(scans)}
-        sides["wrong_called_good"] = good
-        columns = {"shapes": "shapes:d", "left": "left:d", "right side found": "found:.1%"}
-        tables.append(runner.table("Sides", [sides], columns | {"wrong pairs called good": "wrong_called_good:d"}))
-
-        def side(name: str) -> str:
-            return "left" if scans[name].mirrored else "right"
-
-        each = rows_of(errors, lambda pair: f"{side(pair[0])} to {side(pair[1])}")
-        tables.append(runner.table("By the sides of a pair", each, {"sides": "of", **_COLUMNS}))
-        record["sides"] = sides | {"by_side": each, "wrong": sorted(wrong)}
+        wrong = {each for each, fit in fits.items() if fit.frame.mirrored != subjects.left[each]}
+        good = sum(each.verdict == "good" and len(wrong & set(pair)) == 1 for pair, each in found.items())
+        sides: dict[str, Any] = {"shapes": len(fits), "left": sum(subjects.left.values())}
+        sides |= {"found": 1 - len(wrong) / len(fits), "wrong_called_good": good, "wrong": sorted(wrong)}
+        tables.append(runner.table("Sides", [sides], _SIDES))
+        record["side"] = sides
     return record, tables
 
 
@@ -185,7 +152,6 @@ def main(
     data: runner.Data = runner.DATA,
     sets: Annotated[str, Option(help=f"of {', '.join(SETS)}")] = ",".join(SETS),
     model: Annotated[str | None, Option(help="default: the kind's own")] = None,
-    agree: Annotated[Agree, Option(help="which fits agree before they are composed")] = "pairs",
     limit_pairs: runner.LimitPairs = None,
     limit_shapes: Annotated[int | None, Option(min=2, help="animals, evenly spread")] = None,
     scans: Annotated[int, Option(min=2, help="hands, and heads")] = 10,
@@ -197,15 +163,7 @@ def main(
     tables: list[Table] = []
     for name in runner.names_of(sets, SETS, "set"):
         matcher = Matcher(model or MODELS.get(name, name), FitConfig(seed=seed), threads)
-        if name == "animals":
-            found, several = measured_animals(data, matcher, agree, (limit_shapes, limit_pairs), cache)
-            record |= found
-            tables += several
-        else:
-            record[name], several = measured_scans(name, scans, matcher, agree, cache)
-            tables += several
+        subjects = animals(data, limit_shapes, cache) if name == "animals" else cut_scans(name, scans, seed, cache)
+        record[name], some = measured(name, subjects, matcher, limit_pairs)
+        tables += some
     return runner.Report(record, tables)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -12,7 +12,7 @@ import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -67,9 +67,10 @@ class OurMethod:
     threads: int = 1
     oriented_by: str = ""  # a model; empty: the fitted model searches by itself
     kept: Path | None = None
+    latent: LatentRefineConfig = field(default_factory=LatentRefineConfig)  # of the search over codes
 
     def _matcher(self) -> Matcher:
-        config = FitConfig(refine=self.refine, seed=self.seed, partial=self.partial)
+        config = FitConfig(refine=self.refine, seed=self.seed, partial=self.partial, latent=self.latent)
         return Matcher(self.model, config, self.threads)
 
     def fit(self, shape: Shape) -> Fit:
@@ -111,31 +112,12 @@ def upright(model: str, shape: Shape, seed: int = 0) -> Shape:
     return in_frame(shape, replace(frame, rotation=frame.turn))
 
 
-@dataclass(frozen=True)
-class Coded:
-    """3D-CODED behind the benchmark's `Method`: its code is refined by the Chamfer distance alone.
-
-    ``model`` is a folder of `meshmatch.experiments.paper.learned_baselines`: its losses had no constraint.
-    ``oriented_by``: a model whose unrefined fit finds the orientation, which is then told.
+def coded(model: str, steps: int = 2000, seed: int = 0, oriented_by: str = "") -> OurMethod:
+    """3D-CODED, a folder of `meshmatch.experiments.paper.learned_baselines`, whose losses had no constraint: its code is
+    refined by the Chamfer distance alone.
     """
-
-    model: str
-    steps: int = 2000
-    seed: int = 0
-    oriented_by: str = ""
-
-    def fit(self, shape: Shape) -> Fit:
-        """Orient, predict, search the code."""
-        latent = replace(LatentRefineConfig(steps=self.steps), volume=0.0, arap=0.0)
-        config = FitConfig(refine="latent", seed=self.seed, partial="no", latent=latent)
-        if self.oriented_by:
-            shape = upright(self.oriented_by, shape, self.seed)
-            config = replace(config, up="y", front="z")
-        return Matcher(self.model, config).fit(shape)
-
-    def map(self, source: Shape, source_fit: Fit, target: Shape, target_fit: Fit) -> VertexMap:
-        """Through the template."""
-        return Matcher(self.model).map(source_fit, target_fit, agree=False)
+    latent = replace(LatentRefineConfig(steps=steps), volume=0.0, arap=0.0)
+    return OurMethod(model, "latent", seed, "no", oriented_by=oriented_by, latent=latent)
 
 
 @dataclass(frozen=True, eq=False)

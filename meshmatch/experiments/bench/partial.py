@@ -12,7 +12,6 @@ those above; 0.5 is guessing. --partial auto is what `meshmatch match` does, no 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from functools import cache as remembered
 from functools import partial as bound
@@ -142,7 +141,3 @@ def main(
     asked = {"weights": as_model(model).card.weights_sha256, "seed": seed, "partial": partial}
     rows = [measure(bench, kind, *methods, limit_pairs, cache, work, asked) for bench in benches for kind in KINDS]
     return runner.Report({"rows": rows}, [runner.table("Parts matched to wholes, cm at 1.9 m2", rows, COLUMNS)])
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError, OutputError
 from meshmatch.experiments.bench.sets import BenchSet, Pair
-from meshmatch.maps.evaluate import LOST_CM, Errors
+from meshmatch.maps.evaluate import CM_PER_UNIT, LOST_CM, Errors
 from meshmatch.maps.geodesics import GEODESIC, GeodesicDistances
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.shape import Shape
@@ -191,7 +191,8 @@ class SetScores:
 def evaluate_set(
     bench: BenchSet, maps: Mapping[Pair, ArrayLike], *, pairs: Sequence[Pair] | None = None, cache: Path | None = None
 ) -> SetScores:
-    """Errors of maps on a set, at the source's landmarks, as geodesic distance on the target.
+    """Errors of maps on a set, at the source's landmarks: geodesic distance on the target, between clouds straight distance
+    in metres.
 
     Parameters
     ----------
@@ -230,8 +231,13 @@ def evaluate_set(
             if index.min() < 0 or index.max() >= shape.V:
                 raise InputError(f"{bench.name} {source} -> {target}: an index is outside the target")
             predictions.append(index[bench.landmarks(source)])
-        truth = TruthDistances(shape, bench.landmarks(target), cache)
-        for source, values in zip(names, truth.errors(predictions), strict=True):
+        marks = bench.landmarks(target)
+        if shape.is_cloud:
+            off = [shape.verts[index] - shape.verts[marks] for index in predictions]
+            errors = [(np.linalg.norm(each, axis=1) * 100 / CM_PER_UNIT).astype(np.float32) for each in off]
+        else:
+            errors = TruthDistances(shape, marks, cache).errors(predictions)
+        for source, values in zip(names, errors, strict=True):
             found[source, target] = Errors(values)
     return SetScores(bench, {pair: found[pair] for pair in wanted})
 

@@ -9,6 +9,9 @@ landmark names its vertex:
 - ``faust``: ``tr_reg_NNN.landmarks.npy`` (5000,) vertex ids; all ordered pairs, of one subject or of two. Ten
   consecutive numbers are one subject.
 
+- ``faust-outliers``: row i of every cloud of ``faust_outliers.npy``, (30, 1000, 3) in metres, many of which are not on the
+  surface; all of them count. There is no mesh, so errors are straight distances.
+
 ``scape-pcn`` is ``scape`` as the paper's *PC+N*: the method gets the vertices alone, with Gaussian noise of 1 % of the
 bounding box's diagonal; errors are measured on the mesh that they come from.
 
@@ -17,7 +20,7 @@ Several landmarks may share a vertex where a mesh is coarser than the landmarks.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import permutations
@@ -27,13 +30,16 @@ import numpy as np
 
 from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError, OptionError
+from meshmatch.experiments.runner import spread
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 
 Pair = tuple[str, str]
+Shapes = Mapping[str, Shape]
 SET_NAMES = ("shrec19", "scape", "faust")
 CLOUD_SET = "scape-pcn"
-ALL_SETS = (*SET_NAMES, CLOUD_SET)
+OUTLIERS, OUTLIERS_FILE = "faust-outliers", "faust_outliers.npy"
+ALL_SETS = (*SET_NAMES, CLOUD_SET, OUTLIERS)
 NOISE = 0.01  # of the bounding box's diagonal, along each axis
 
 
@@ -52,6 +58,8 @@ class BenchSet:
 
     def shape(self, shape: str) -> Shape:
         """The shape as its file has it: every vertex, in the file's order."""
+        if self.name == OUTLIERS:
+            return load_clouds(self.folder)[shape]
         return load_shape(self.path(shape))
 
     def seen(self, shape: str) -> Shape:
@@ -64,6 +72,8 @@ class BenchSet:
 
     def landmarks(self, shape: str) -> Int[Ints, " N"]:
         """Vertex id of every landmark; N is the same for every shape of a set."""
+        if self.name == OUTLIERS:
+            return np.arange(self.shape(shape).V)
         return _landmarks(self.path(shape), self.folder.name == "scape")
 
     def group(self, pair: Pair) -> str:
@@ -85,6 +95,9 @@ def load_set(name: str, data: Path) -> BenchSet:
     """
     if name not in ALL_SETS:
         raise OptionError(f"unknown set '{name}'", f"choose from {', '.join(ALL_SETS)}")
+    if name == OUTLIERS:
+        clouds = tuple(load_clouds(Path(data)))
+        return BenchSet(name, Path(data), clouds, tuple(permutations(clouds, 2)))
     folder = Path(data) / ("scape" if name == CLOUD_SET else name)
     shapes = tuple(sorted((path.stem for path in folder.glob("*.ply")), key=_by_number))
     if not shapes:
@@ -101,6 +114,26 @@ def load_set(name: str, data: Path) -> BenchSet:
     if missing:
         raise InputError(f"{folder} lacks {', '.join(missing)}, named by its pairs")
     return BenchSet(name, folder, shapes, pairs)
+
+
+@cache
+def load_clouds(folder: Path) -> dict[str, Shape]:
+    """The clouds with outliers.
+
+    Raises
+    ------
+    InputError
+        The file is missing or holds something else.
+    """
+    path = folder / OUTLIERS_FILE
+    try:
+        points = np.load(path, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {path}", "--data names the folder that holds it") from error
+    if points.ndim != 3 or points.shape[2] != 3:
+        raise InputError(f"{path} holds {points.shape}, not (N, P, 3)")
+    none = np.empty((0, 3), np.int64)
+    return {f"cloud {k}": Shape(cloud, none, f"cloud {k}") for k, cloud in enumerate(points)}
 
 
 def _by_number(name: str) -> tuple[int, str]:
@@ -122,6 +155,11 @@ def _landmarks(path: Path, every_vertex: bool) -> Int[Ints, " N"]:
         raise InputError(f"the landmarks of {path} do not name its vertices")
     ids.setflags(write=False)
     return ids
+
+
+def ordered_pairs(names: Iterable[str], limit: int | None = None) -> list[Pair]:
+    """All ordered pairs, or so many of them, evenly spread."""
+    return spread(list(permutations(names, 2)), limit)
 
 
 def load_folder(folder: Path, suffix: str) -> tuple[dict[str, Shape], Mapping[str, Ints]]:

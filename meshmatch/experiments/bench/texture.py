@@ -14,7 +14,6 @@ bytes (0..255), the mean over points and channels, and PSNR.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -172,7 +171,3 @@ def main(
     record = {"cases": rows}
     title = f"Textures of {size} there and back, errors of bytes"
     return runner.Report(record, [runner.table(title, rows, COLUMNS)], notes)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

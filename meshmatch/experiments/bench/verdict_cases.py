@@ -18,10 +18,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+from meshmatch.experiments.bench.partial import seen_faces
 from meshmatch.experiments.makers.character_designs import Designer
 from meshmatch.experiments.makers.furniture import KINDS, furniture
 from meshmatch.experiments.makers.human_bodies import unseen_bodies
-from meshmatch.experiments.makers.simulated_scans import scanned
 from meshmatch.generators.generator import Generator
 from meshmatch.generators.kinds import GENERATORS, Kind
 from meshmatch.generators.proportions import CHILD, PLAIN, TOON
@@ -41,6 +41,29 @@ LIMBS = (
     ("hips", "left thigh", "left shin", "left foot", "right thigh", "right shin", "right foot"),
 )  # fmt: skip
 """Labels of parts of people that are cut out together."""
+
+
+CAMERAS, ENOUGH = 8, 2
+"""Around a body that is scanned; and how many must see a face."""
+NOISE = 0.0015  # of a scan, in shares of the bounding box's diagonal: 3 mm on a person
+_HEIGHTS = (-0.15, 0.45)  # of the cameras' directions, by turns: from below the middle and from above
+
+
+def ring(cameras: int = CAMERAS) -> Float[Floats, "C 3"]:
+    """Directions from a body, y up, to cameras around it."""
+    angle = 2 * np.pi * np.arange(cameras) / cameras + 0.2
+    towards = np.stack([np.sin(angle), np.resize(_HEIGHTS, cameras), np.cos(angle)], axis=1)
+    return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True))
+
+
+def scanned(body: Shape, seed: int) -> Shape:
+    """The faces of a body that enough cameras see, with noise along the normals: armpits, crotch and soles are holes."""
+    centers = body.verts[body.faces].mean(axis=1)
+    views = np.sum([seen_faces(body, centers, towards) for towards in ring()], axis=0)
+    faces = body.faces[views >= ENOUGH]
+    used = np.unique(faces)
+    off = NOISE * body.diagonal * np.random.default_rng(seed).standard_normal((len(used), 1))
+    return Shape(body.verts[used] + off * body.vertex_normals[used], np.searchsorted(used, faces), body.name)
 
 
 def direction(rng: np.random.Generator) -> Float[Floats, " 3"]:

@@ -13,7 +13,6 @@ never is. All maps weigh the same, however many vertices they have. The longest 
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
@@ -279,7 +278,3 @@ def main(
         )
         notes.append(str(fitted))
     return runner.Report(record, tables, notes)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

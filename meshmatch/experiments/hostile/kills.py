@@ -65,7 +65,7 @@ class Outcome:
     what: str = ""
 
 
-def make_cases(folder: Path, training: bool) -> list[Case]:
+def make_cases(folder: Path, training: bool) -> list[Case]:  # noqa: C901
     """Cheap commands come more often in a turn. Each is run once to its end, to know what the new is."""
     shape = small_shape()
 

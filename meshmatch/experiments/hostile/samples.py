@@ -55,7 +55,7 @@ def small_shape() -> Shape:
     return Shape(body.verts, body.faces, "small.ply", colors)
 
 
-def make_samples(folder: Path) -> list[Sample]:
+def make_samples(folder: Path) -> list[Sample]:  # noqa: C901
     """Write all samples, each into a folder of its own; the order is always the same."""
     found: list[Sample] = []
     shape = small_shape()

@@ -21,7 +21,7 @@ from meshmatch.api.inputs import as_model, validated
 from meshmatch.arrays import Float, Floats
 from meshmatch.experiments.bench.scores import TruthDistances
 from meshmatch.experiments.bench.sets import BenchSet
-from meshmatch.experiments.paper.ablation_setting import Setting
+from meshmatch.experiments.paper.ablation_training import Setting
 from meshmatch.experiments.paper.ablation_views import BASE, CODED, Run
 from meshmatch.experiments.paper.learned_baselines import TransModel, load_transmatch
 from meshmatch.experiments.runner import spread
@@ -40,8 +40,8 @@ from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 
-METHODS = ("none", "code", "chamfer", "nodes")
-"""Refinements: none; of the code with the run's regularisers, or without; least squares on the nodes."""
+METHODS = ("none", "code", "chamfer")
+"""Refinements: none; of the code with the run's regularisers, or without. Figure 6 also has least squares on the nodes."""
 TRANS_POINTS, TRANS_ROUNDS = 1024, 2  # each network is asked twice, the second time in the frame of its first answer
 Refinement = LatentRefineConfig | NodeRefineConfig | None
 

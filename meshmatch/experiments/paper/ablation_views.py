@@ -78,7 +78,7 @@ class Row:
 
 @dataclass(frozen=True)
 class View:
-    """A table or figure: its title, the headings of its rows' words, rows, and whether nodes are refined too.
+    """A table or figure: its title, the headings of its rows' words, and rows.
 
     ``across`` is set where the first word is a number against which errors are drawn as lines, one for each last word.
     """
@@ -86,7 +86,6 @@ class View:
     title: str
     heads: tuple[str, ...]
     rows: tuple[Row, ...]
-    nodes: bool = False
     across: bool = False
 
     @property
@@ -149,7 +148,6 @@ VIEWS = {
             for each in TABLE4
             for field in FIELDS
         ),
-        nodes=True,
     ),
     "table5": View(
         "Table 5",
@@ -200,15 +198,13 @@ def all_runs(views: Sequence[str], seeds: int = 1, repeated: Sequence[str] = ())
 
 
 def methods_of(run: Run) -> tuple[str, ...]:
-    """With which refinements a run is measured, whatever its seed, the most usual one first: the paper's; those of tables
-    4 and 5 where they look; none where there is no code.
+    """With which refinements a run is measured, whatever its seed, the most usual one first: the paper's; those of table 5
+    where it looks; none where there is no code.
     """
     if run.field == "transmatch":
         return ("none",)
     alike = replace(run, seed=BASE.seed)
-    if alike == BASE:
-        return ("code", "none", "chamfer", "nodes")
-    return ("code", "nodes") if alike in VIEWS["table4"].runs and run.field != "pointwise" else ("code",)
+    return ("code", "none", "chamfer") if alike == BASE else ("code",)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ beside them are of long trainings on an A100 and of its own pairs.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -28,7 +27,6 @@ from meshmatch.api.inputs import as_model
 from meshmatch.errors import OptionError, TemplateError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.sets import ALL_SETS, CLOUD_SET, BenchSet, load_set
-from meshmatch.experiments.paper.ablation_claims import Claim, claims
 from meshmatch.experiments.paper.ablation_errors import (
     LINES,
     METHODS,
@@ -41,9 +39,8 @@ from meshmatch.experiments.paper.ablation_errors import (
     subject,
     transformer_errors,
 )
-from meshmatch.experiments.paper.ablation_results import draw_views, tables
-from meshmatch.experiments.paper.ablation_setting import Preset, Setting
-from meshmatch.experiments.paper.ablation_training import timed, train_run, train_transformer
+from meshmatch.experiments.paper.ablation_results import claims, claims_table, draw_views, tables
+from meshmatch.experiments.paper.ablation_training import Preset, Setting, timed, train_run, train_transformer
 from meshmatch.experiments.paper.ablation_views import BASE, CODED, VIEWS, Known, Run, all_runs, methods_of
 from meshmatch.geometry.frames import Frame
 from meshmatch.models.registry import find_model
@@ -195,15 +192,6 @@ class Kept:
         return ", ".join([*words, f"the pairs of {self.measure.shapes} shapes of a set"])
 
 
-def claims_table(found: Sequence[Claim]) -> Any:
-    """Each claim in a row, its verdicts on the held-out shapes and each set."""
-    rows: dict[str, dict[str, str]] = {}
-    for claim in found:
-        rows.setdefault(claim.words, {"claim": claim.words})[claim.where] = claim.verdict
-    columns = {"claim": "claim", **{claim.where: claim.where for claim in found}}
-    return runner.table("What the paper claims", list(rows.values()), columns)
-
-
 @runner.command
 def main(
     output: Annotated[Path, Option(help="folder of what is measured, and of the figures")],
@@ -249,7 +237,3 @@ def main(
         **{"times": known.times, "figure6": known.descent, "claims": [asdict(claim) for claim in found]},
     }
     return runner.Report(record, drawn, notes)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

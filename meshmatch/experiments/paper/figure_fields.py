@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
@@ -27,6 +28,7 @@ from meshmatch.fields.shape_functions import FIELDS, FieldName, has_nodes, shape
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.kernels import Kernel
+from meshmatch.geometry.triangles import dot, triangle_areas, triangle_vectors
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.layers import PointDecoder
 from meshmatch.models.trained import TrainedModel
@@ -61,16 +63,6 @@ class Drawn:
     rows: list[dict[str, Any]]
 
 
-def areas(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Float[Floats, " F"]:
-    """Areas of triangles."""
-    return np.asarray(np.linalg.norm(_normals(verts, faces), axis=1) / 2)
-
-
-def _normals(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Float[Floats, "F 3"]:
-    a, b, c = (verts[faces[:, k]] for k in range(3))
-    return np.asarray(np.cross(b - a, c - a))
-
-
 def change(
     verts: Float[Floats, "V 3"], right: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]
 ) -> tuple[Float[Floats, " F"], dict[str, Any]]:
@@ -78,21 +70,15 @@ def change(
 
     ``turned``: triangles whose normal points away from the right one's.
     """
-    before = areas(right, faces)
-    found = np.log2(np.maximum(areas(verts, faces), 1e-12) / np.maximum(before, 1e-12))
+    before = triangle_areas(right, faces)
+    found = np.log2(np.maximum(triangle_areas(verts, faces), 1e-12) / np.maximum(before, 1e-12))
     weight, off = before / before.sum(), np.abs(found)
-    turned = (_normals(verts, faces) * _normals(right, faces)).sum(1) < 0
+    turned = dot(triangle_vectors(verts, faces), triangle_vectors(right, faces)) < 0
     numbers = {
         **{"change": float(weight @ off), "over_quarter": float(weight @ (off > np.log2(1.25)))},
         **{"over_twice": float(weight @ (off > 1)), "turned": float(weight @ turned)},
     }
     return found, numbers
-
-
-def volume(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> float:
-    """Signed volume inside a closed mesh."""
-    a, b, c = (verts[faces[:, k]] for k in range(3))
-    return float((a * np.cross(b, c)).sum() / 6)
 
 
 def pulled_nodes(template: Template) -> Bool[Bools, " K"]:
@@ -258,7 +244,8 @@ def direct_fits(
     for field, constraint, label in cases:
         verts = fitted(field, constraint, template, target, how)
         found, numbers = change(verts, target, faces)
-        row: dict[str, Any] = {"what": label, **numbers, "volume": volume(verts, faces) / volume(target, faces) - 1}
+        volumes = [trimesh.Trimesh(each, faces, process=False).volume for each in (target, verts)]
+        row: dict[str, Any] = {"what": label, **numbers, "volume": volumes[1] / volumes[0] - 1}
         off = np.linalg.norm(verts - target, axis=1).mean()
         rows.append(row | {"error_cm": float(off * CM_PER_UNIT)})
         colors = SCALE.colors(found)

@@ -10,16 +10,12 @@
 
 from __future__ import annotations
 
-import sys
-import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from PIL import Image
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from typer import Option
@@ -27,6 +23,7 @@ from typer import Option
 from meshmatch.api.inputs import as_model
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.experiments import runner
+from meshmatch.experiments.bench.charts import stacked
 from meshmatch.experiments.makers.human_bodies import diameter, unseen_bodies
 from meshmatch.experiments.paper.ablation_errors import Measure
 from meshmatch.experiments.paper.ablation_views import BASE
@@ -43,9 +40,9 @@ from meshmatch.experiments.paper.figure_fields import (
     refinements,
 )
 from meshmatch.fields.shape_functions import FIELDS, FieldName
-from meshmatch.outputs import make_folder, replace_on_success
+from meshmatch.outputs import make_folder
 from meshmatch.render.figures import Panel
-from meshmatch.render.picture import Look, render_shapes
+from meshmatch.render.picture import Look
 from meshmatch.render.scales import CLAY
 from meshmatch.shapes.colors import label_colors
 from meshmatch.shapes.sampling import farthest_points
@@ -55,29 +52,7 @@ from meshmatch.templates.template import Template, read_template
 
 FIGURES = ("4", "5", "6", "7")
 _FRONT = Look(turn=0.0, tilt=4.0)
-_WIDEST = 1400  # pixels
 _REFINED = 2  # bodies of figure 6
-
-
-def stacked(rows: Sequence[tuple[Sequence[Panel], Look]], path: Path) -> None:
-    """Rows of panels above each other in one picture, as wide as the widest."""
-    with tempfile.TemporaryDirectory() as folder:
-        images = []
-        for number, (panels, look) in enumerate(rows):
-            part = Path(folder) / f"{number}.png"
-            render_shapes(panels, part, look)
-            with Image.open(part) as drawn:
-                images.append(drawn.convert("RGB"))
-    width = max(image.width for image in images)
-    whole = Image.new("RGB", (width, sum(image.height for image in images)), (255, 255, 255))
-    top = 0
-    for image in images:
-        whole.paste(image, ((width - image.width) // 2, top))
-        top += image.height
-    if width > _WIDEST:
-        whole = whole.resize((_WIDEST, round(whole.height * _WIDEST / width)), Image.Resampling.LANCZOS)
-    with replace_on_success(path) as temporary:
-        whole.save(temporary, format="PNG", compress_level=9)
 
 
 KEPT, REFUSED, NODE = (0.20, 0.55, 0.80), (0.85, 0.15, 0.12), (0.86, 0.30, 0.12)
@@ -268,7 +243,3 @@ def main(
     notes = [f"wrote {pictures / f'paper-figure-{name}.png'}" for name in wanted]
     notes += [str(row) for key in ("bad", "stages") for row in found.get(key, ())]
     return runner.Report(found, drawn, notes)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -20,7 +20,6 @@ shapes between two, colored by how far the deformation moves each point to the t
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -28,14 +27,13 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
-from PIL import Image
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import trimesh
 from scipy.spatial import cKDTree
 from typer import Option
 
 from meshmatch.arrays import Floats, Ints
 from meshmatch.experiments import runner
+from meshmatch.experiments.bench.charts import stacked
 from meshmatch.experiments.makers.furniture import KINDS, furniture
 from meshmatch.fields.field import arap_energy, volume_energy
 from meshmatch.implicit.model import ImplicitFit, ImplicitModel, load_implicit, nearest_on_template
@@ -45,7 +43,7 @@ from meshmatch.implicit.training import AS_PUBLISHED, DIF_NET, TRAINING, train_i
 from meshmatch.models.implicit_card import IMPLICIT
 from meshmatch.outputs import make_folder
 from meshmatch.render.figures import Panel
-from meshmatch.render.picture import Look, render_shapes
+from meshmatch.render.picture import Look
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
@@ -144,17 +142,6 @@ def label_transfer(model: ImplicitModel, points: Labelled, pairs: list[tuple[int
     return dict(zip(("label_iou", "facing_iou", "undeformed_iou"), np.mean(found, 0).tolist(), strict=True))
 
 
-def volume(shape: Shape) -> float:
-    a, b, c = shape.verts[shape.faces].transpose(1, 0, 2)
-    return float((a * np.cross(b, c)).sum() / 6)
-
-
-def pieces(shape: Shape) -> int:
-    edges = shape.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    joined = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (shape.V, shape.V))
-    return int(connected_components(joined, directed=False)[0])
-
-
 def interpolation(model: ImplicitModel, pairs: list[tuple[int, int]]) -> dict[str, float]:
     """Mean measures of the way between two shapes, in the cube, where the longest side is 1.7."""
     times, found = np.linspace(0, 1, FRAMES), []
@@ -162,7 +149,8 @@ def interpolation(model: ImplicitModel, pairs: list[tuple[int, int]]) -> dict[st
     for pair in pairs:
         coded = [model.blend(learned(model, pair[0]), learned(model, pair[1]), float(time)) for time in times]
         shapes = [model.surface(each) for each in coded]
-        volumes = np.array([volume(shape) / each.frame.scale**3 for shape, each in zip(shapes, coded, strict=True)])
+        solids = [trimesh.Trimesh(shape.verts, shape.faces, process=False) for shape in shapes]
+        volumes = np.array([solid.volume / each.frame.scale**3 for solid, each in zip(solids, coded, strict=True)])
         even = volumes[0] + times * (volumes[-1] - volumes[0])
         rows = []
         for k in range(1, FRAMES - 1):
@@ -173,7 +161,7 @@ def interpolation(model: ImplicitModel, pairs: list[tuple[int, int]]) -> dict[st
             with torch.no_grad():
                 F = model.network(torch.from_numpy(points).float()[None], coded[k].code[None]).F
             energies = float(volume_energy(F).mean()), float(arap_energy(F).mean())
-            rows.append((step * bent, bent / moved, pieces(shapes[k]), *energies))
+            rows.append((step * bent, bent / moved, shapes[k].face_parts.max() + 1, *energies))
         found.append((*np.mean(rows, 0), 100 * np.abs(volumes / even - 1).mean()))
     names = ("bend", "bend_share", "pieces", "volume_energy", "arap_energy", "volume_change")
     return dict(zip(names, np.mean(found, 0).tolist(), strict=True))
@@ -213,18 +201,9 @@ def draw(path: Path, models: Mapping[tuple[str, str], ImplicitModel], pair: tupl
             shape = model.surface(coded, resolution=96)
             colors = moved_colors(model, coded, shape)
             panels.append(Panel(shape, colors, f"{kind}, {method}" if time_ == 0 else f"{time_:.1f}"))
-        strip = path.with_name(f"{path.stem}-{kind}-{METHODS[method]}.png")
         tilt = 35.0 if kind == "plane" else 14.0
-        render_shapes(panels, strip, Look((1500, 260), up="y", front="z", turn=30.0, tilt=tilt))
-        rows.append(strip)
-    images = [Image.open(strip).convert("RGB") for strip in rows]
-    whole = Image.new("RGB", (images[0].width, sum(image.height for image in images)), "white")
-    top = 0
-    for image, strip in zip(images, rows, strict=True):
-        whole.paste(image, (0, top))
-        top += image.height
-        strip.unlink()
-    whole.save(path, optimize=True)
+        rows.append((panels, Look((1500, 260), up="y", front="z", turn=30.0, tilt=tilt)))
+    stacked(rows, path)
 
 
 @runner.command
@@ -279,17 +258,9 @@ def main(
         **{"bend %": "bend:.3f", "of motion": "bend_share:.3f", "volume %": "volume_change:.2f"},
         **{"pieces": "pieces:.1f", "(det F-1)^2": "volume_energy:.3f", "|F'F-I|": "arap_energy:.3f"},
     }
-    tables = [runner.table(title_of(shapes, steps, seeds), rows, columns)]
+    title = f"Implicit surfaces, {shapes} shapes of a kind, {steps} steps, {seeds} training{'s' * (seeds > 1)} of each"
+    tables = [runner.table(title, rows, columns)]
     if seeds > 1:
         deviations = {"kind": "kind", "deformation": "method"} | {name: f"{name}_sd:.3f" for name in _COMPARED}
         tables.append(runner.table("Standard deviations over trainings", rows, deviations))
     return runner.Report({"rows": rows}, tables)
-
-
-def title_of(shapes: int, steps: int, seeds: int) -> str:
-    """Of the table."""
-    return f"Implicit surfaces, {shapes} shapes of a kind, {steps} steps, {seeds} training{'s' * (seeds > 1)} of each"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

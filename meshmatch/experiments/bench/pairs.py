@@ -1,0 +1,42 @@
+"""The loop of the benchmarks of kinds and characters: every shape fitted once, pairs matched as `match` does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from meshmatch.api.matching import Matcher
+from meshmatch.experiments.bench.sets import Pair, Shapes
+from meshmatch.experiments.runner import track
+from meshmatch.fitting.fit import Fit
+from meshmatch.maps.vertex_map import VertexMap
+
+VERDICTS = ("good", "fair", "poor")
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """The map of a pair, the worse verdict of its fits, and the CPU seconds of both fits and the map."""
+
+    map: VertexMap
+    verdict: str
+    seconds: float
+
+
+def matched(
+    matcher: Matcher, shapes: Shapes, pairs: Sequence[Pair], what: str
+) -> tuple[dict[str, Fit], dict[Pair, Matched]]:
+    """Fits by name, and maps by pair."""
+    fits, spent = {}, {}
+    for name, shape in track(shapes.items(), f"{what}: fitting", len(shapes)):
+        began = time.process_time()
+        fits[name] = matcher.fit(shape)
+        spent[name] = time.process_time() - began
+    found = {}
+    for a, b in track(pairs, f"{what}: mapping", len(pairs)):
+        began = time.process_time()
+        vertex_map = matcher.map(fits[a], fits[b])
+        seconds = spent[a] + spent[b] + time.process_time() - began
+        found[a, b] = Matched(vertex_map, max(fits[a].verdict, fits[b].verdict, key=VERDICTS.index), seconds)
+    return fits, found
