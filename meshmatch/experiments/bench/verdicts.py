@@ -53,6 +53,7 @@ _STEPS = {"confidence": "of", "vertices": "vertices:d", "mean": "confidence:.3f"
 _IN_ALL = {"maps": "maps:d", "good": "good:d", "fair": "fair:d", "poor": "poor:d"}
 _IN_ALL |= {
     "good, over 8 cm": "good_and_wrong:d",
+    "of good ones, at most": "at_most:.1%",
     "under 5 cm": "right:d",
     "of these good or fair": "right_and_believed:d",
 }
@@ -194,34 +195,26 @@ def fitted_weights(found: Sequence[Mapping[str, Any]]) -> tuple[Float[Floats, " 
     return p[1:] / deviation, float(p[0])
 
 
-@dataclass(frozen=True)
-class Request:
-    """How many cases of each family, of which seed; and where they are kept."""
-
-    count: int
-    seed: int
-    threads: int
-    folder: Path
-
-
-def of_seed(kind: str, names: Sequence[str], asked: Request) -> Iterator[dict[str, Any]]:
-    """All cases of one seed, measured where they are not kept already."""
-    cases, matcher = Cases(kind, asked.seed), Matcher(kind, FitConfig(seed=asked.seed), asked.threads)
-    onto = cache(partial(target_of, Cases(kind, 900 + asked.seed), matcher))
+def of_seed(
+    kind: str, names: Sequence[str], count: int, seed: int, threads: int, folder: Path
+) -> Iterator[dict[str, Any]]:
+    """So many cases of each family, of one seed, measured where they are not kept in the folder already."""
+    cases, matcher = Cases(kind, seed), Matcher(kind, FitConfig(seed=seed), threads)
+    onto = cache(partial(target_of, Cases(kind, 900 + seed), matcher))
 
     def family(name: str) -> dict[str, Any]:
-        first = list(FAMILIES).index(name) * asked.count
-        numbers = runner.track(range(asked.count), f"{name}, seed {asked.seed}", asked.count)
+        first = list(FAMILIES).index(name) * count
+        numbers = runner.track(range(count), f"{name}, seed {seed}", count)
         return {"found": [measured(cases.draw(name, k), onto((first + k) % _TARGETS), matcher) for k in numbers]}
 
     for name in names:
-        which = {"kind": kind, "family": name, "count": asked.count, "seed": asked.seed, "targets": _TARGETS}
-        path = asked.folder / f"{kind}-{name.replace(' ', '-')}-{asked.seed}.json"
+        which = {"kind": kind, "family": name, "count": count, "seed": seed, "targets": _TARGETS}
+        path = folder / f"{kind}-{name.replace(' ', '-')}-{seed}.json"
         kept = runner.once(path, which, partial(family, name))["found"]
         # null is what JSON makes of infinity
         found = [each | {"error": np.inf if each["error"] is None else each["error"]} for each in kept]
         (row,) = rows_of(found, "family", [name])
-        runner.tell(f"{name}, seed {asked.seed}: " + ", ".join(f"{row[word]} {word}" for word in (*VERDICTS, REFUSED)))
+        runner.tell(f"{name}, seed {seed}: " + ", ".join(f"{row[word]} {word}" for word in (*VERDICTS, REFUSED)))
         yield from found
 
 
@@ -239,7 +232,7 @@ def main(
     names = GROUPS.get(families) or runner.names_of(families, FAMILIES, "family")
     found: list[dict[str, Any]] = []
     for number in range(seed, seed + seeds):
-        found += of_seed(kind, names, Request(count, number, threads, output))
+        found += of_seed(kind, names, count, number, threads, output)
     mapped = [each for each in found if each["verdict"] != REFUSED]
     steps, auc = calibration(mapped)
     bars, by_family, by_verdict = bars_of(found), rows_of(found, "family", names), rows_of(found, "verdict", VERDICTS)
@@ -260,11 +253,7 @@ def main(
         runner.table("By verdict", by_verdict, {"verdict": "of", **_COLUMNS}),
         runner.table("Confidence of vertices", steps, _STEPS),
     ]
-    notes = [
-        f"good: {bars['good']}, of which over {WRONG_CM:g} cm: {bars['good_and_wrong']}, at most {bars['at_most']:.1%}",
-        f"under {RIGHT_CM:g} cm: {bars['right']}, of which good or fair: {bars['right_and_believed']}",
-        f"confidence: AUC {auc:.3f}, furthest from the truth {furthest:.3f}",
-    ]
+    notes = [f"confidence: AUC {auc:.3f}, furthest from the truth {furthest:.3f}"]
     record: dict[str, Any] = {"families": by_family, "verdicts": by_verdict, "confidence": steps, "auc": auc, **bars}
     if fit:
         weights, offset = fitted_weights([each for each in found if each["family"] not in KEPT])
