@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import InputError
 from meshmatch.experiments.bench import baselines, methods
-from meshmatch.experiments.bench import methods as classical_baselines
 from meshmatch.experiments.bench.baselines import METHODS, Baseline, Choices, main
 from meshmatch.experiments.bench.methods import Method, Registration, ZoomOut, carried, coded, library, placed
 from meshmatch.experiments.paper import learned_baselines
@@ -80,11 +79,11 @@ def test_3d_coded_can_be_told_how_a_shape_stands(monkeypatch: pytest.MonkeyPatch
     turn, asked = Rotation.from_rotvec([1.4, 0.4, -0.9]).as_matrix(), []
 
     class Told:
-        def __init__(self, model: str, config: FitConfig) -> None:
+        def __init__(self, model: str, config: FitConfig, threads: int) -> None:
             self.config = config
 
-        def fit(self, shape: Shape) -> None:
-            asked.append((shape.verts, self.config))
+        def fit(self, shape: Shape, config: FitConfig | None) -> None:
+            asked.append((shape.verts, config or self.config))
 
     monkeypatch.setattr(methods, "frame_by", lambda *given: Frame(2.0, turn.T, np.zeros(3)))
     monkeypatch.setattr(methods, "Matcher", Told)
@@ -102,7 +101,7 @@ def test_the_frame_of_a_model_is_upright_whatever_the_files_is() -> None:
     dancer = load_shape("templates/samples/dancer.ply")
     turn = Rotation.from_rotvec([1.4, 0.4, -0.9]).as_matrix()
     turned = Shape(7 * dancer.verts @ turn.T, dancer.faces, "turned")
-    first, second = (classical_baselines.frame_by("human", shape).apply(shape.verts) for shape in (dancer, turned))
+    first, second = (methods.frame_by("human", shape).apply(shape.verts) for shape in (dancer, turned))
     assert np.linalg.norm(first - second, axis=1).mean() < 0.15  # turned the wrong way it would be 0.4 or more
 
 

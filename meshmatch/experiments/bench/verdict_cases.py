@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 
 import numpy as np
 import torch
@@ -145,6 +145,48 @@ def no_body(verts: Floats, faces: Ints) -> tuple[Shape, Ints]:
     return Shape(verts * (METRES / np.ptp(verts, axis=0).max()), faces), np.full(len(verts), -1)
 
 
+def rough(shape: Shape, rng: np.random.Generator) -> Float[Floats, "V 3"]:
+    """The vertices with noise."""
+    return np.asarray(shape.verts + rng.uniform(0.002, 0.04) * rng.standard_normal(shape.verts.shape))
+
+
+def swollen(shape: Shape, rng: np.random.Generator) -> Float[Floats, "V 3"]:
+    """The vertices moved outwards."""
+    return np.asarray(shape.verts + rng.uniform(0.01, 0.06) * shape.vertex_normals)
+
+
+def melted(shape: Shape, rng: np.random.Generator) -> Float[Floats, "V 3"]:
+    """The vertices smoothed, up to some hundred times."""
+    mesh = trimesh.Trimesh(shape.verts, shape.faces, process=False)
+    trimesh.smoothing.filter_laplacian(mesh, iterations=int(rng.integers(20, 400)))
+    return np.asarray(mesh.vertices)
+
+
+def twisted(shape: Shape, rng: np.random.Generator) -> Float[Floats, "V 3"]:
+    """The vertices turned about the y axis, the further the higher."""
+    middle = shape.verts.mean(0)
+    local = shape.verts - middle
+    turns = Rotation.from_rotvec(np.outer(local[:, 1] * rng.uniform(0.3, 4.0), [0, 1, 0]))
+    return np.asarray(turns.apply(local) + middle)
+
+
+def sheared(shape: Shape, rng: np.random.Generator) -> Float[Floats, "V 3"]:
+    """The vertices moved along one axis as another one says."""
+    axis, verts = rng.permutation(3), np.array(shape.verts)
+    verts[:, axis[0]] += rng.uniform(0.2, 1.5) * verts[:, axis[1]]
+    return verts
+
+
+def lumpy(shape: Shape, rng: np.random.Generator) -> Float[Floats, "V 3"]:
+    """The vertices moved by a smooth random field."""
+    verts = np.array(shape.verts)
+    for _ in range(12):
+        wave = direction(rng) * rng.uniform(2, 9)
+        phase = rng.uniform(0, 2 * np.pi)
+        verts += np.outer(np.sin(shape.verts @ wave + phase), direction(rng)) * rng.uniform(0.0, 0.05)
+    return verts
+
+
 @dataclass(frozen=True, eq=False)
 class Case:
     """A shape, and of every vertex the template's vertex that it belongs to, or -1."""
@@ -214,11 +256,6 @@ class Cases:
 
     # Right as a rule.
 
-    def _rough(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        shape, truth = self.body(number, rng)
-        noise = rng.uniform(0.002, 0.04) * rng.standard_normal(shape.verts.shape)
-        return Shape(shape.verts + noise, shape.faces), truth
-
     def _cloud(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
         points = sample_surface(shape, int(rng.integers(1_500, 12_000)), rng).points
@@ -258,30 +295,28 @@ class Cases:
     def _casts(self) -> dict[int, list[tuple[Shape, Ints]]]:
         return {}
 
-    def _swollen(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        shape, truth = self.body(number, rng)
-        return Shape(shape.verts + rng.uniform(0.01, 0.06) * shape.vertex_normals, shape.faces), truth
-
     def _inside_out(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
         return Shape(shape.verts, shape.faces[:, ::-1]), truth
 
     # Damaged.
 
-    def _squashed(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        return self._scaled(number, rng, rng.uniform(0.2, 0.8))
-
-    def _flattened(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        return self._scaled(number, rng, rng.choice([0.0, rng.uniform(0, 0.15)]))
-
-    def _pulled(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        return self._scaled(number, rng, rng.uniform(1.25, 4.0))
-
-    def _scaled(self, number: int, rng: np.random.Generator, factor: float) -> tuple[Shape, Ints]:
+    def _scaled(
+        self, number: int, rng: np.random.Generator, factor: Callable[[np.random.Generator], float]
+    ) -> tuple[Shape, Ints]:
+        """Along one axis."""
+        times = factor(rng)
         shape, truth = self.body(number, rng)
         axis = np.eye(3)[rng.integers(3)] if number % 3 else direction(rng)
         along = shape.verts @ axis
-        return Shape(shape.verts + np.outer(along * (factor - 1), axis), shape.faces), truth
+        return Shape(shape.verts + np.outer(along * (times - 1), axis), shape.faces), truth
+
+    def _warped(
+        self, number: int, rng: np.random.Generator, warp: Callable[[Shape, np.random.Generator], Floats]
+    ) -> tuple[Shape, Ints]:
+        """Its vertices elsewhere."""
+        shape, truth = self.body(number, rng)
+        return Shape(warp(shape, rng), shape.faces), truth
 
     def _mirrored(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
@@ -316,12 +351,6 @@ class Cases:
         whole = on_floor(shape, rng.uniform(0.8, 6.0))
         return whole, np.append(truth, np.full(whole.V - shape.V, -1))
 
-    def _melted(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        shape, truth = self.body(number, rng)
-        mesh = trimesh.Trimesh(shape.verts, shape.faces, process=False)
-        trimesh.smoothing.filter_laplacian(mesh, iterations=int(rng.integers(20, 400)))
-        return Shape(np.asarray(mesh.vertices), shape.faces), truth
-
     # No bodies.
 
     def _animal(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
@@ -346,13 +375,6 @@ class Cases:
 
     # Kept: nothing is tuned on these.
 
-    def _twisted(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        shape, truth = self.body(number, rng)
-        middle = shape.verts.mean(0)
-        local = shape.verts - middle
-        turns = Rotation.from_rotvec(np.outer(local[:, 1] * rng.uniform(0.3, 4.0), [0, 1, 0]))
-        return Shape(turns.apply(local) + middle, shape.faces), truth
-
     def _amputated(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
         lost = self._in_limb(truth, rng, 8)[shape.faces].all(1)
@@ -368,23 +390,6 @@ class Cases:
             shape = joined(shape, thing, thing.verts + at)
             truth = np.append(truth, np.full(thing.V, -1))
         return shape, truth
-
-    def _sheared(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        shape, truth = self.body(number, rng)
-        axis = rng.permutation(3)
-        verts = np.array(shape.verts)
-        verts[:, axis[0]] += rng.uniform(0.2, 1.5) * verts[:, axis[1]]
-        return Shape(verts, shape.faces), truth
-
-    def _lumpy(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        """The body bent by a smooth random field."""
-        shape, truth = self.body(number, rng)
-        verts = np.array(shape.verts)
-        for _ in range(12):
-            wave = direction(rng) * rng.uniform(2, 9)
-            phase = rng.uniform(0, 2 * np.pi)
-            verts += np.outer(np.sin(shape.verts @ wave + phase), direction(rng)) * rng.uniform(0.0, 0.05)
-        return Shape(verts, shape.faces), truth
 
     def _two_cut(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         """Two cuts: what lies between two parallel planes."""
@@ -409,15 +414,37 @@ class Cases:
 
 Family = Callable[[Cases, int, np.random.Generator], tuple[Shape, Ints]]
 TUNED: dict[str, Family] = {
-    "sound": Cases.body, "rough": Cases._rough, "cloud": Cases._cloud, "holes": Cases._holes, "scan": Cases._scan,
-    "dressed": Cases._dressed, "stylised": Cases._stylised, "swollen": Cases._swollen, "inside out": Cases._inside_out,
-    "squashed": Cases._squashed, "flattened": Cases._flattened, "pulled": Cases._pulled, "mirrored": Cases._mirrored,
-    "limb": Cases._limb, "cut": Cases._cut, "merged": Cases._merged, "floor": Cases._floor, "melted": Cases._melted,
-    "animal": Cases._animal, "furniture": Cases._furniture, "solid": Cases._solid,
-}  # fmt: skip
+    "sound": Cases.body,
+    "rough": partial(Cases._warped, warp=rough),
+    "cloud": Cases._cloud,
+    "holes": Cases._holes,
+    "scan": Cases._scan,
+    "dressed": Cases._dressed,
+    "stylised": Cases._stylised,
+    "swollen": partial(Cases._warped, warp=swollen),
+    "inside out": Cases._inside_out,
+    "squashed": partial(Cases._scaled, factor=lambda rng: rng.uniform(0.2, 0.8)),
+    "flattened": partial(Cases._scaled, factor=lambda rng: rng.choice([0.0, rng.uniform(0, 0.15)])),
+    "pulled": partial(Cases._scaled, factor=lambda rng: rng.uniform(1.25, 4.0)),
+    "mirrored": Cases._mirrored,
+    "limb": Cases._limb,
+    "cut": Cases._cut,
+    "merged": Cases._merged,
+    "floor": Cases._floor,
+    "melted": partial(Cases._warped, warp=melted),
+    "animal": Cases._animal,
+    "furniture": Cases._furniture,
+    "solid": Cases._solid,
+}
 KEPT: dict[str, Family] = {
-    "twisted": Cases._twisted, "amputated": Cases._amputated, "things beside": Cases._beside, "sheared": Cases._sheared,
-    "lumpy": Cases._lumpy, "cut twice": Cases._two_cut, "two million": Cases._dense, "not manifold": Cases._not_manifold,
+    "twisted": partial(Cases._warped, warp=twisted),
+    "amputated": Cases._amputated,
+    "things beside": Cases._beside,
+    "sheared": partial(Cases._warped, warp=sheared),
+    "lumpy": partial(Cases._warped, warp=lumpy),
+    "cut twice": Cases._two_cut,
+    "two million": Cases._dense,
+    "not manifold": Cases._not_manifold,
     "kit": Cases._kit,
-}  # fmt: skip
+}
 FAMILIES = TUNED | KEPT
