@@ -60,6 +60,8 @@ def test_same_bones_and_distances_below_the_clothes_by_hand(tmp_path: Path) -> N
     source, target = ball(bones, own, half), ball(bones, own, half)
     same = characters.measured(source, target, VertexMap("a", "b", own), tmp_path)
     assert same == {"bone": 1.0, "cm": 0.0}
+    astray = np.where(bones < 0, np.flatnonzero(bones == 1)[0], own)  # wherever the weapon goes
+    assert characters.measured(source, target, VertexMap("a", "b", astray), tmp_path)["bone"] == 1.0
     turned = VertexMap(
         "a", "b", np.array([int(np.argmin(np.linalg.norm(shape.verts + v, axis=1))) for v in shape.verts])
     )

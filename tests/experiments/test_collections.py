@@ -35,6 +35,9 @@ def test_errors_of_hearts_by_hand(cube: Shape) -> None:
     assert found["mean_x100"] == pytest.approx(100 / 7 / np.sqrt(6), abs=1e-3)
     assert found["right_chamber"] == pytest.approx(6 / 7, abs=1e-3)
     assert found["worst_pair"] == ["a", "b"]
+    near = right.copy()
+    near[1] = right[2]  # another vertex of its chamber
+    assert groupwise.heart_errors(shapes, truth, {("a", "b"): VertexMap("a", "b", near)})["right_chamber"] == 1.0
     # the normal of a corner, whatever its triangles weigh, looks away from the middle
     assert 0.2 * found["mean_x100"] < found["across_x100"] < 0.9 * found["mean_x100"]
 

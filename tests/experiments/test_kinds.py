@@ -61,4 +61,4 @@ def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
 
 
 def test_species_by_the_names_of_files() -> None:
-    assert [kinds.species_of(name) for name in ("fox-05", "Davis_cow_00000", "timthumb")] == ["dog", "cow", "other"]
+    assert [kinds.species_of(name) for name in ("fox-05", "Davis_Cow_00000", "timthumb")] == ["dog", "cow", "other"]

@@ -82,12 +82,13 @@ def test_what_is_counted() -> None:
         case_of("a", "good", 9.0),
         case_of("a", "poor", 4.0),
         case_of("b", "fair", 6.0),
+        case_of("c", "fair", 2.0),
         case_of("b", verdicts.REFUSED, math.inf),
         case_of("b", "poor", math.inf),
     ]
     bars = verdicts.bars_of(found)
     assert bars.pop("at_most") == pytest.approx(0.987, abs=0.001)  # one of two
-    assert bars == {"good": 2, "good_and_wrong": 1, "right": 2, "right_and_believed": 1}
+    assert bars == {"good": 2, "good_and_wrong": 1, "right": 3, "right_and_believed": 2}
     first, second = verdicts.rows_of(found, "family", ["a", "b"])
     assert (first["maps"], first["good"], first["right"], first["wrong"], first["worst_cm"]) == (3, 2, 2, 1, 9.0)
     assert first["seconds"] == 2.0
