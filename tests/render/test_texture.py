@@ -75,17 +75,6 @@ def test_alpha_means_what_the_material_says(alpha: str, factor: float, wanted: l
     assert paint(look(material, colors=faint))[:2, 3].tolist() == wanted
 
 
-def test_a_textured_square_in_a_picture() -> None:
-    appearance = look(Material(image=quarters(64)))
-    surface = mesh_surface(CORNERS, FACES, TexturePaint(appearance, SQUARE, 1.0))
-    light = draw(Scene([surface]), Viewport(40, 40, 0.0, 1.0, 0.025)).light
-    red, green, blue, white = (light[r, c] for r, c in ((10, 10), (10, 30), (30, 10), (30, 30)))
-    assert red[0] > 5 * red[1:].max()
-    assert green[1] > 5 * green[[0, 2]].max()
-    assert blue[2] > 5 * blue[:2].max()
-    assert np.ptp(white) < 0.12 * white.max()
-
-
 def test_the_middle_of_a_border_is_blended_by_many_rays() -> None:
     """A border of the image that runs along a slope through the pixels has no steps."""
     v, u = np.mgrid[0:512, 0:512] / 512

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
-from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
@@ -14,7 +13,7 @@ from meshmatch.templates.location import bundled_folder
 from meshmatch.transfer.mapped_mesh import invert_map
 from tests.conftest import icosphere
 from tests.maps.solids import grid
-from tests.transfer.known import brute_force, split
+from tests.transfer.known import split
 
 COARSE = Shape(icosphere(1).verts, icosphere(1).faces, "coarse.ply")
 FINE, FORWARD, BACK = split(COARSE, "fine.ply")
@@ -58,21 +57,6 @@ def test_a_coarser_copy_takes_its_own_vertices() -> None:
     back = invert_map(BACK, FINE, COARSE)
     assert np.array_equal(back.index, np.arange(COARSE.V))
     assert np.abs(back.points(FINE) - COARSE.verts).max() < 1e-12
-
-
-def test_the_closest_points_are_those_of_asking_every_triangle() -> None:
-    rng = np.random.default_rng(3)
-    source, target = COARSE, Shape(icosphere(2).verts, icosphere(2).faces, "other")
-    index = np.linalg.norm(source.verts[:, None] - target.verts, axis=2).argmin(axis=1)
-    moved = VertexMap.between(source, target, index, confidence=rng.uniform(0.6, 1, source.V))
-    back = invert_map(moved, source, target)
-    image = target.verts[index]
-    distance, _ = brute_force(target.verts, image, source.faces)
-    corners = source.faces[back.face]
-    found = interpolate(image, corners, back.barycentric)
-    found[back.face < 0] = image[back.index[back.face < 0]]
-    assert np.allclose(np.linalg.norm(found - target.verts, axis=1), distance, atol=1e-12)
-    assert distance.max() > 0.01  # not all of them trivial
 
 
 def test_where_vertices_pile_up_the_middle_one_is_taken(sphere: Shape) -> None:
