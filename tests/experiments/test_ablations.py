@@ -31,10 +31,14 @@ from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.models.registry import load_model
 from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.make import NodeConfig, make_template
+from meshmatch.templates.template import Template
 from meshmatch.training.train import build_loss_points
-from tests.experiments.egg_runs import make_small, prepare_eggs
+from tests.conftest import icosphere
 from tests.experiments.small_bench import BODY, build, order
 from tests.fitting.eggs import egg_model, write_model
+from tests.training.small import NETWORK, bent_eggs
 
 QUICK = Measure(shapes=3, landmarks=20, code_steps=3, code_points=200, samples=300)
 
@@ -45,13 +49,23 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return prepare_eggs(tmp_path_factory.mktemp("eggs"))
+def eggs() -> Template:
+    """With as many vertices as the most nodes, and more."""
+    ball = icosphere(3)
+    return make_template(Shape(ball.verts * [0.8, 1.5, 1.0], ball.faces, "egg"), "egg", NodeConfig("uniform", 36, 0.5))
 
 
 @pytest.fixture
-def setting(prepared: Path, monkeypatch: pytest.MonkeyPatch) -> Setting:
-    make_small(monkeypatch, prepared)
+def setting(eggs: Template, monkeypatch: pytest.MonkeyPatch) -> Setting:
+    """The preset "small" is tiny, and eggs take the place of bodies."""
+    small = ablation_training.SMALL
+    network = replace(NETWORK, align_basis=0, corrections=0)
+    tiny = replace(small, network=network, train=replace(small.train, shapes=4), scan=replace(small.scan, points=64))
+    monkeypatch.setattr(ablation_training, "SMALL", tiny)
+    monkeypatch.setattr(ablation_training, "HELD_OUT_SHAPES", 5)
+    monkeypatch.setattr(Setting, "resting", lambda *_: eggs)
+    monkeypatch.setattr(Setting, "sources", lambda *_: (bent_eggs(eggs), bent_eggs(eggs)))
+    monkeypatch.setattr(ablation_training, "pool_of", pool_of.__wrapped__)
     return Setting()
 
 
@@ -142,6 +156,7 @@ def test_fewer_supervised_points_are_regularised_everywhere(setting: Setting) ->
     assert fewer(points, 1000) is points
 
 
+@pytest.mark.slow
 def test_a_template_of_heavy_people_stands_as_the_usual_one() -> None:
     pytest.importorskip("anny", reason="the body model is of the extra `train`")
     usual, heavy = (Setting().resting(pose) for pose in ("T", "T-heavy"))
@@ -276,6 +291,7 @@ def test_refinement_is_followed_step_by_step(setting: Setting) -> None:
     assert nodes[1] != nodes[0]
 
 
+@pytest.mark.slow
 def test_the_command_goes_on(
     small: Path, setting: Setting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

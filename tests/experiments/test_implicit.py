@@ -19,7 +19,6 @@ from meshmatch.experiments.paper.implicit import (
     labelled_points,
     means,
     pairs_of,
-    part_iou,
     reconstruction,
 )
 from meshmatch.implicit.model import ImplicitModel
@@ -76,11 +75,6 @@ def test_labels_arrive_where_they_came_from(model: ImplicitModel) -> None:
     assert same == {"label_iou": 1, "facing_iou": 1, "undeformed_iou": 1}
     other = label_transfer(model, points, [(0, 1)])
     assert 0.1 < other["label_iou"] < 1
-
-
-def test_overlap_of_parts() -> None:
-    truth, found = np.array([0, 0, 1, 1]), np.array([0, 1, 1, 1])
-    assert part_iou(truth, found, [0, 1]) == pytest.approx((1 / 2 + 2 / 3) / 2)
 
 
 def test_distances_of_both_ways_count_alike() -> None:

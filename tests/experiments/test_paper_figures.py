@@ -64,7 +64,7 @@ def test_handles_are_the_nodes_of_the_arm(template: Template) -> None:
 
 
 def test_the_rules_refuse_what_the_choice_of_nodes_refuses(template: Template) -> None:
-    config = NodeConfig(K=100, radius=0.2)
+    config = NodeConfig(K=40, radius=0.2)
     found, rules, _ = refused(template, config)
     kept = found.points[~rules["parts"]]
     first = kept[farthest_points(kept, config.K)]

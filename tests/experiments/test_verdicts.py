@@ -16,6 +16,9 @@ from meshmatch.shapes.shape import Shape
 pytest.importorskip("anny")
 
 
+SLOW = ("two million", "melted", "animal")
+
+
 @pytest.fixture(scope="module")
 def cases() -> Cases:
     return Cases("human", 5)
@@ -24,7 +27,7 @@ def cases() -> Cases:
 @pytest.mark.parametrize(
     "family",
     [
-        pytest.param(name, marks=pytest.mark.slow if name == "two million" else ())
+        pytest.param(name, marks=pytest.mark.slow if name in SLOW else ())
         for name in FAMILIES
         if name not in ("dressed", "stylised", "furniture")
     ],

@@ -35,6 +35,7 @@ from meshmatch.arrays import Floats, Ints
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.charts import stacked
 from meshmatch.experiments.makers.furniture import KINDS, furniture
+from meshmatch.experiments.paper.part_transfer import mean_overlap
 from meshmatch.fields.field import arap_energy, volume_energy
 from meshmatch.implicit.model import ImplicitFit, ImplicitModel, load_implicit, nearest_on_template
 from meshmatch.implicit.network import ImplicitConfig
@@ -105,14 +106,6 @@ def reconstruction(model: ImplicitModel, kind: str, numbers: list[int], seed: in
     return dict(zip(("chamfer", "iou"), np.mean(found, 0).tolist(), strict=True))
 
 
-def part_iou(truth: Ints, found: Ints, parts: list[int]) -> float:
-    """Mean over parts of intersection over union."""
-    both = [
-        np.count_nonzero((truth == k) & (found == k)) / np.count_nonzero((truth == k) | (found == k)) for k in parts
-    ]
-    return float(np.mean(both))
-
-
 Labelled = dict[int, tuple[Floats, Floats, Ints]]
 """Points of shapes by their numbers, with normals and parts."""
 
@@ -137,7 +130,7 @@ def label_transfer(model: ImplicitModel, points: Labelled, pairs: list[tuple[int
         row = []
         for at, share in ((places, 0), (places, 1), (cubes, 0)):
             index = nearest_on_template(at[b][asked], at[a][known], share * n[asked], share * m[known])
-            row.append(part_iou(truth[asked], labels[known][index], common))
+            row.append(mean_overlap(labels[known][index], truth[asked]))
         found.append(row)
     return dict(zip(("label_iou", "facing_iou", "undeformed_iou"), np.mean(found, 0).tolist(), strict=True))
 

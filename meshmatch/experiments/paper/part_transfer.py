@@ -52,8 +52,6 @@ from meshmatch.training.train import CardFacts, train_model
 KEYPOINTS = ".keypoints.npy"
 RIGHT = 0.1
 """Share of the target's diagonal within which a keypoint has arrived."""
-
-
 _POINTS = 2048  # of each training shape
 _COARSE = 64  # voxels along a training shape
 _COMPARED, _CANDIDATES, _OTHERS = 128, 24, 200  # points and shapes, where these are compared to choose templates
@@ -72,8 +70,6 @@ COLUMNS = {
     **{"real: mean": "mean:.3f", "median": "median:.3f", f"within {RIGHT:g}": "arrived:.1%"},
     **{"IoU": "iou:.2f", "s a fit": "fit_seconds:.1f"},
 }
-
-
 METHODS = ("paper", "ours")
 Labeller = Callable[[Shape, OrientedPoints], Int[Ints, " N"]]
 """Gives labels to points of a shape."""
@@ -178,20 +174,20 @@ def by_models(models: Sequence[TrainedModel], config: FitConfig) -> Labeller:
 
 def part_overlap(give: Labeller, kind: str, numbers: range, seed: int) -> dict[str, Any]:
     """Mean overlap of the parts of held-out shapes with those that their points are given."""
-    shares: list[float] = []
-    each: dict[int, list[float]] = {}
+    shapes = []
     began = time.monotonic()
     for number in runner.track(numbers, "generated"):
         made = furniture(kind, seed, number)
         points, normals, truth = made.sample(3000, np.random.default_rng([seed, number, 2]))
-        found = give(made.surface, OrientedPoints(points, normals))
-        shares.append(mean_overlap(found, truth, np.ones(len(points))))
-        for part in np.unique(truth):
-            ours, theirs = found == part, truth == part
-            each.setdefault(int(part), []).append(float((ours & theirs).sum() / (ours | theirs).sum()))
-    names = {KINDS[kind][part]: float(np.mean(values)) for part, values in sorted(each.items())}
+        shapes.append(overlaps(give(made.surface, OrientedPoints(points, normals)), truth))
+    each = {part: [one[part] for one in shapes if part in one] for part in range(len(KINDS[kind]))}
+    names = {KINDS[kind][part]: float(np.mean(values)) for part, values in each.items() if values}
     seconds = (time.monotonic() - began) / max(len(numbers), 1)
-    return {"generated_iou": float(np.mean(shares)), "parts_iou": names, "fit_seconds": seconds}
+    return {
+        "generated_iou": float(np.mean([np.mean(list(one.values())) for one in shapes])),
+        "parts_iou": names,
+        "fit_seconds": seconds,
+    }
 
 
 def best_maps(
@@ -260,13 +256,21 @@ def keypoint_parts(shape: Shape, keypoints: Int[Ints, " N"]) -> Int[Ints, " V"]:
     return np.asarray(cKDTree(shape.verts[keypoints]).query(shape.verts)[1])
 
 
-def mean_overlap(found: Int[Ints, " V"], truth: Int[Ints, " V"], area: Float[Floats, " V"]) -> float:
-    """Intersection over union of labels with true ones, by the area of vertices; the mean over true parts."""
-    shares = []
-    for part in np.unique(truth):
+def overlaps(
+    found: Int[Ints, " V"], truth: Int[Ints, " V"], area: Float[Floats, " V"] | None = None
+) -> dict[int, float]:
+    """Intersection over union of labels with true ones, by true part; by the area of vertices, if that is given."""
+    weight = np.ones(len(truth)) if area is None else area
+    shares = {}
+    for part in np.unique(truth).tolist():
         ours, theirs = found == part, truth == part
-        shares.append(area[ours & theirs].sum() / area[ours | theirs].sum())
-    return float(np.mean(shares))
+        shares[part] = float(weight[ours & theirs].sum() / weight[ours | theirs].sum())
+    return shares
+
+
+def mean_overlap(found: Ints, truth: Ints, area: Float[Floats, " V"] | None = None) -> float:
+    """The mean over true parts."""
+    return float(np.mean(list(overlaps(found, truth, area).values())))
 
 
 @dataclass(frozen=True)
