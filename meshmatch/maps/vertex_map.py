@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, Pickled, as_numbers, frozen, off_torch
 from meshmatch.errors import InputError
-from meshmatch.geometry.quick_scipy import csr_array
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.shapes.shape import Shape, checked_shape
 
