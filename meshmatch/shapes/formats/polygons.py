@@ -12,6 +12,7 @@ import numpy as np
 
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.errors import warn
+from meshmatch.geometry.triangles import cross_product, dot
 from meshmatch.shapes.formats import runs
 from meshmatch.shapes.shape import LARGEST
 
@@ -22,7 +23,6 @@ MOST_TESTS = 300_000_000
 _BENT = 1e-3  # radians that a polygon's corners may turn back, in all, and still count as convex
 _TOGETHER = 1 << 18  # corners
 _FLAT = 1e-12  # of the square of a polygon's extent: a doubled area that is rounding
-_NARROW = 64  # corners, of which all are looked at
 _ON = 1e-9  # the same for a corner on the edge of an ear
 
 
@@ -38,67 +38,39 @@ def triangles_of(
     `corners` are numbers of vertices, one polygon after the other, of which `sizes` has how many each has; `name` is the
     file's.
     """
-    starts, counts = np.cumsum(sizes) - sizes, np.maximum(sizes - 2, 0)
     if len(sizes) and (sizes == 3).all():
         return np.arange(len(corners)).reshape(-1, 3)
+    starts, counts = np.cumsum(sizes) - sizes, np.maximum(sizes - 2, 0)
     first, second = np.repeat(starts, counts), runs(starts + 1, counts)
     triangles = np.stack([first, second, second + 1], axis=1)
-    begins = np.cumsum(counts) - counts
-    fine = bool(len(corners) == 0 or (corners.min() >= 0 and corners.max() < len(verts)))
+    if len(verts) == 0 or not (sizes > 3).any():
+        return triangles
 
-    def places_of(at: Ints) -> Floats:
-        """Positions of corners; nan for one that has none."""
-        number = corners[at]
-        found = verts[number if fine else np.clip(number, 0, len(verts) - 1)]
-        unusable = ~(np.abs(found) < LARGEST).all(axis=1)
-        if not fine:
-            unusable |= (number < 0) | (number >= len(verts))
-        if unusable.any():
-            found[unusable] = np.nan
+    def places_of(polygons: Ints) -> Floats:
+        """Positions of the corners of some polygons, one after the other; nan for one that has none."""
+        number = corners[runs(starts[polygons], sizes[polygons])]
+        found = verts[np.clip(number, 0, len(verts) - 1)]
+        found[(number < 0) | (number >= len(verts)) | ~(np.abs(found) < LARGEST).all(axis=1)] = np.nan
         return found
 
-    if len(verts) == 0:
-        return triangles
-    quads = np.flatnonzero(sizes == 4)
-    for few in np.array_split(quads, max(1, -(-len(quads) // (_TOGETHER // 4)))):
-        at = starts[few, None] + np.arange(4)
-        turned = few[_other_diagonal(places_of(at.ravel()).reshape(-1, 4, 3))]
-        a, b, c, d = (starts[turned] + k for k in range(4))
-        triangles[begins[turned]] = np.stack([b, c, d], axis=1)
-        triangles[begins[turned] + 1] = np.stack([b, d, a], axis=1)
-    larger = np.flatnonzero(sizes > 4)
-    concave, left_out = [np.empty(0, np.int64)], 0
-    for few in _parts(larger, sizes):
-        if sizes[few[0]] > _TOGETHER:  # one polygon
-            left_out += 1
-            continue
-        bent = few[_turns_back(places_of(runs(starts[few], sizes[few])), sizes[few])]
-        concave.append(bent[sizes[bent] <= MOST_CORNERS])
-        left_out += int((sizes[bent] > MOST_CORNERS).sum())
-    chosen = np.concatenate(concave)
-    chosen = chosen[np.argsort(sizes[chosen], kind="stable")]
-    enough = int(np.searchsorted(np.cumsum(sizes[chosen].astype(np.float64) ** 2), MOST_TESTS, side="right"))
-    left_out += len(chosen) - enough
-    chosen = chosen[:enough]
+    larger = np.flatnonzero(sizes > 3)
+    batches = np.split(larger, np.flatnonzero(np.diff(np.cumsum(sizes[larger]) // _TOGETHER)) + 1)
+    bent = np.concatenate([few[_turns_back(places_of(few), sizes[few])] for few in batches])
+    bent = bent[np.argsort(sizes[bent], kind="stable")]
+    tests = np.cumsum(sizes[bent].astype(np.float64) ** 2)
+    chosen = bent[(sizes[bent] <= MOST_CORNERS) & (tests <= MOST_TESTS)]
+    begins = np.cumsum(counts) - counts
     for few in _alike(chosen, sizes):
         own = sizes[few]
-        flat = _flattened(places_of(runs(starts[few], own)), own)
-        cut, whole = _ears(flat, own)
+        cut, whole = _ears(_flattened(places_of(few), own), own)
         rows = runs(begins[few][whole], counts[few][whole])
         shifted = cut[whole] + starts[few][whole][:, None, None]
         triangles[rows] = shifted[np.arange(cut.shape[1]) < counts[few][whole][:, None]]
-    if left_out:
+    if len(chosen) < len(bent):
+        left_out = len(bent) - len(chosen)
         many = f"{left_out:,} polygons have" if left_out > 1 else "a polygon has"
         warn(f"{name}: {many} too many corners; what is concave there is split into triangles that overlap")
     return triangles
-
-
-def _parts(polygons: Ints, sizes: Ints) -> Iterator[Ints]:
-    """Polygons, some `_TOGETHER` corners at a time; one with more of them alone."""
-    number = np.cumsum(sizes[polygons]) // _TOGETHER
-    alone = sizes[polygons] > _TOGETHER
-    edges = np.flatnonzero((np.diff(number) > 0) | alone[1:] | alone[:-1]) + 1
-    yield from (few for few in np.split(polygons, edges) if len(few))
 
 
 def _alike(polygons: Ints, sizes: Ints) -> Iterator[Ints]:
@@ -109,31 +81,10 @@ def _alike(polygons: Ints, sizes: Ints) -> Iterator[Ints]:
         yield from np.array_split(same, max(1, -(-(len(same) << each) // _TOGETHER)))
 
 
-def _other_diagonal(quads: Float[Floats, "Q 4 3"]) -> Bools:
-    """(Q,) True for a quad that is concave at its second or fourth corner, and there alone."""
-    normal = _cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
-    edges = [quads[:, (k + 1) % 4] - quads[:, k] for k in range(4)]
-    turns = [np.einsum("qi,qi->q", _cross(edges[k - 1], edges[k]), normal) for k in range(4)]
-    out = np.zeros(len(quads), bool)
-    some = np.flatnonzero(np.minimum(np.minimum(turns[0], turns[1]), np.minimum(turns[2], turns[3])) < 0)
-    back = np.stack([_sines(edges[k][some], edges[k - 1][some], normal[some]) for k in range(4)], axis=1) < -_BENT
-    out[some] = (back.sum(axis=1) == 1) & (back[:, 1] | back[:, 3])
-    return out
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    """Cross products of rows; `np.cross` takes several times as long."""
-    out = np.empty_like(a)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        out[:, i] = a[:, j] * b[:, k] - a[:, k] * b[:, j]
-    return out
-
-
 def _sines(edges: Floats, before: Floats, normal: Floats) -> Floats:
     """(N,) sine of the turn at each corner, seen along a normal; 0 at an edge of no length."""
-    turn = np.einsum("ni,ni->n", _cross(before, edges), normal)
-    lengths = [np.einsum("ni,ni->n", each, each) for each in (before, edges, normal)]
-    size = np.sqrt(lengths[0]) * np.sqrt(lengths[1]) * np.sqrt(lengths[2])
+    turn = dot(cross_product(before, edges), normal)
+    size = np.prod([np.sqrt(dot(each, each)) for each in (before, edges, normal)], axis=0)
     return np.asarray(np.divide(turn, size, out=np.zeros_like(turn), where=size > 0))
 
 
@@ -152,13 +103,13 @@ def _normals(places: Floats, sizes: Ints) -> Floats:
     after = _neighbours(sizes)[1]
     begins = np.cumsum(sizes) - sizes
     own = places - np.repeat(places[begins], sizes, axis=0)
-    return np.add.reduceat(_cross(own, own[after]), begins, axis=0)
+    return np.add.reduceat(cross_product(own, own[after]), begins, axis=0)
 
 
 def _turns_back(places: Floats, sizes: Ints) -> Bools:
     """(P,) True for a polygon whose corners turn back, by more than what may be rounding."""
-    before = _neighbours(sizes)[0]
-    edges = places[_neighbours(sizes)[1]] - places
+    before, after = _neighbours(sizes)
+    edges = places[after] - places
     sines = _sines(edges, edges[before], np.repeat(_normals(places, sizes), sizes, axis=0))
     begins = np.cumsum(sizes) - sizes
     return np.asarray(np.add.reduceat(np.maximum(-sines, 0.0), begins) > _BENT)
@@ -176,10 +127,7 @@ def _flattened(places: Floats, sizes: Ints) -> Floats:
     right /= np.linalg.norm(right, axis=1)[:, None]
     up = np.cross(normal, right)
     own = places - np.repeat(places[begins], sizes, axis=0)
-    flat = np.stack([np.einsum("ni,ni->n", own, np.repeat(each, sizes, axis=0)) for each in (right, up)], axis=1)
-    low, high = (each.reduceat(flat, begins, axis=0) for each in (np.minimum, np.maximum))
-    tall = np.repeat((high - low)[:, 1] > (high - low)[:, 0], sizes)
-    flat[tall] = np.stack([flat[tall, 1], -flat[tall, 0]], axis=1)  # lying: ears are looked for by the first coordinate
+    flat = np.stack([dot(own, np.repeat(each, sizes, axis=0)) for each in (right, up)], axis=1)
     extent = np.maximum.reduceat(np.abs(flat).max(axis=1), begins)
     out = np.full((len(sizes), int(sizes.max()), 2), np.nan)
     out[np.arange(out.shape[1]) < sizes[:, None]] = flat / np.repeat(extent, sizes)[:, None]
@@ -195,21 +143,16 @@ def _ears(flat: Floats, sizes: Ints) -> tuple[Ints, Bools]:
     then the polygon is given up.
     """
     many, width = flat.shape[:2]
-    out = np.zeros((many, max(width - 2, 1), 3), np.int64)
+    out = np.zeros((many, width - 2, 3), np.int64)
     whole = np.zeros(many, bool)
     number, alive = np.arange(many), np.ones(many, bool)
-    order = np.argsort(flat[..., 0], axis=1, kind="stable")  # within, corners are numbered from left to right
-    rank = np.argsort(order, axis=1)
-    after, before = np.empty_like(rank), np.empty_like(rank)
-    for step, neighbour in ((1, after), (-1, before)):
-        own = np.arange(width) + step
-        np.put_along_axis(neighbour, rank, np.take_along_axis(rank, own[None] % sizes[:, None], axis=1), axis=1)
-    there = np.take_along_axis(np.arange(width) < sizes[:, None], order, axis=1)
+    place, last = np.arange(width), sizes[:, None] - 1
+    there = place <= last
+    after, before = np.where(place < last, place + 1, 0), np.where(place > 0, place - 1, last)
     queue = np.zeros((many, 6 * width), np.int32)
-    queue[:, :width] = rank
+    queue[:, :width] = place
     head, tail, left, patience = np.zeros(many, np.int64), sizes.copy(), sizes.copy(), np.zeros(many, np.int64)
-    x, y = (np.take_along_axis(flat[..., k], order, axis=1) for k in range(2))
-    keys = _keys(x)
+    x, y = flat[..., 0], flat[..., 1]
     while len(number):
         row = np.arange(len(number))
         at = queue[row, head].astype(np.int64)
@@ -222,17 +165,9 @@ def _ears(flat: Floats, sizes: Ints) -> tuple[Ints, Bools]:
         if len(look):
             triangle = [each[look, None] for each in (px, py, qx, qy, rx, ry)]
             on = np.where(patience[look] > 0, _ON, -_ON)[:, None]
-            if width > _NARROW:
-                seen = _window(
-                    keys, look, np.minimum(np.minimum(px, qx), rx)[look], np.maximum(np.maximum(px, qx), rx)[look]
-                )
-                points = x.reshape(-1)[seen], y.reshape(-1)[seen], there.reshape(-1)[seen]
-            else:
-                points = x[look], y[look], there[look]
-            ear[look] = ~_any_inside(points, triangle, on)
+            ear[look] = ~_any_inside((x[look], y[look], there[look]), triangle, on)
         cut = np.flatnonzero(ear)
-        corners = [order[number[cut], each[cut]] for each in (p, at, r)]
-        out[number[cut], sizes[cut] - left[cut]] = np.stack(corners, axis=1)
+        out[number[cut], sizes[cut] - left[cut]] = np.stack([p[cut], at[cut], r[cut]], axis=1)
         after[cut, p[cut]], before[cut, r[cut]] = r[cut], p[cut]
         there[cut, at[cut]] = False
         left[cut] -= 1
@@ -251,20 +186,8 @@ def _ears(flat: Floats, sizes: Ints) -> tuple[Ints, Bools]:
             number, sizes, head, tail, left, patience = (e[alive] for e in (number, sizes, head, tail, left, patience))
             after, before, queue = after[alive], before[alive], queue[alive]
             there, x, y = there[alive], x[alive], y[alive]
-            alive, keys = np.ones(len(number), bool), _keys(x)
+            alive = np.ones(len(number), bool)
     return out, whole
-
-
-def _keys(x: Floats) -> Floats:
-    """First coordinates (P, n) within -1..1, sorted, as one list that is sorted: those of each polygon lie 3 further on."""
-    return (np.nan_to_num(x, nan=1.5) + 3.0 * np.arange(len(x))[:, None]).reshape(-1)
-
-
-def _window(keys: Floats, polygons: Ints, low: Floats, high: Floats) -> Ints:
-    """(K, widest) where in `_keys` the corners of some polygons lie between two coordinates; the last again for the rest."""
-    first = np.searchsorted(keys, low + 3.0 * polygons - 1e-6)
-    last = np.searchsorted(keys, high + 3.0 * polygons + 1e-6)
-    return np.minimum(first[:, None] + np.arange((last - first).max()), last[:, None] - 1)
 
 
 def _any_inside(points: tuple[Floats, Floats, Bools], triangle: list[Floats], on: Floats) -> Bools:
