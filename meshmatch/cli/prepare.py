@@ -82,8 +82,8 @@ def prepare(
     otherwise without it. Writes template.safetensors, a picture of the nodes (nodes.png) and, from a folder,
     shapes.safetensors, points.safetensors, normalised/ and prepared.json.
     """
-    from meshmatch.maps.table_files import load_points
     from meshmatch.render.compose import compose_shapes
+    from meshmatch.shapes.table_files import load_points
     from meshmatch.templates.make import NodeConfig
     from meshmatch.templates.prepare import PrepareConfig
     from meshmatch.templates.prepare import prepare as prepare_shapes

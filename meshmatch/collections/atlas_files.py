@@ -32,7 +32,6 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.collections.atlas import FILE, Atlas
 from meshmatch.collections.groups import Comparison
 from meshmatch.collections.measures import Measures
-from meshmatch.maps.table_files import write_rows
 from meshmatch.render.charts import draw_beside, draw_histogram
 from meshmatch.render.facing import facing
 from meshmatch.render.figures import Panel
@@ -42,6 +41,7 @@ from meshmatch.render.viewer.single_pages import Varying, write_atlas_page
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.formats.gltf_out import write_morphs
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.table_files import write_rows
 
 MORPHS = 10
 """Modes in modes.glb."""

@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
-from meshmatch.maps import MAP_SUFFIXES, table_files
+from meshmatch.maps import MAP_SUFFIXES
 from meshmatch.maps.mat_file import read_mat
 from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap, check_map
 from meshmatch.outputs import replace_on_success
+from meshmatch.shapes import table_files
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.input_files import check_memory, read_bytes, read_json, read_npy, read_npz
 from meshmatch.shapes.text_tables import read_table, whole

@@ -51,20 +51,7 @@ class LandmarkFile:
     places: tuple[Place, ...]
     has_names: bool  # names are the file's, else they are numbers
     space: Space  # the frame, where 3D Slicer says it
-
-    def in_space(self, space: Space) -> LandmarkFile:
-        """The same landmarks for a mesh in a frame of 3D Slicer: x and y change signs if theirs is the other one."""
-        if not self.turns_to(space):
-            return self
-        turned = [
-            Place(p.name, p.kind, [-p.where[0], -p.where[1], p.where[2]]) if p.kind == "position" else p
-            for p in self.places
-        ]
-        return LandmarkFile(tuple(turned), self.has_names, space)
-
-    def turns_to(self, space: Space) -> bool:
-        """Whether `in_space` changes anything."""
-        return "" not in (space, self.space) and space != self.space
+    turned: str  # what to say where x and y changed signs, because the mesh is in the other frame; else empty
 
 
 def mesh_space(path: str | Path) -> Space:
@@ -77,7 +64,7 @@ def mesh_space(path: str | Path) -> Space:
     return _SPACES[found[1].decode()] if found else ""
 
 
-def read_landmark_file(path: Path, shape: str = "") -> LandmarkFile:
+def read_landmark_file(path: Path, shape: str = "", space: Space = "") -> LandmarkFile:
     """The landmarks in a file, by its suffix (see `LANDMARK_READERS`).
 
     Parameters
@@ -86,6 +73,8 @@ def read_landmark_file(path: Path, shape: str = "") -> LandmarkFile:
         The file.
     shape
         The name of the shape that they are on: a .tps file may hold landmarks of several.
+    space
+        The frame that 3D Slicer gave the shape's file (`mesh_space`): landmarks in its other frame are turned.
 
     Raises
     ------
@@ -93,14 +82,20 @@ def read_landmark_file(path: Path, shape: str = "") -> LandmarkFile:
         The file holds no landmarks, or some that cannot be read.
     """
     reader = LANDMARK_READERS[path.suffix.lower()]
-    records, space = reader(path, Path(shape).stem) if reader is _read_tps else reader(path)
+    records = reader(path, Path(shape).stem) if reader is _read_tps else reader(path)
     if not records:
         raise InputError(f"{path.name} holds no landmark")
+    if len(spaces := {record.get("space", "") for record in records}) > 1:
+        raise InputError("its markups are in several coordinate systems", "save each list in a file of its own")
+    (own,), turned = spaces, ""
+    if own and space and own != space:
+        turned = f"{path.name} is in {own}, {shape} is in {space}: x and y change their signs"
     named = [not is_missing(str(record.get("name") or "")) for record in records]
-    return LandmarkFile(tuple(_place(record, k) for k, record in enumerate(records)), all(named), space)
+    places = tuple(_place(record, k, bool(turned)) for k, record in enumerate(records))
+    return LandmarkFile(places, all(named), own, turned)
 
 
-def _place(record: Record, number: int) -> Place:
+def _place(record: Record, number: int, turned: bool) -> Place:
     given = record.get("name")
     words = "".join(c if c.isprintable() else " " for c in str(number if given in (None, "") else given))
     name = plain_text(" ".join(words.split()))
@@ -110,9 +105,10 @@ def _place(record: Record, number: int) -> Place:
     if not (vertex is None or vertex == -1 or vertex != vertex):
         return Place(name, "vertex", _whole(vertex, name))
     if record.get("position") is not None:
-        position = _three(record["position"], name)
-        absent = any(each != each for each in position)
-        return Place(name, "missing", " has no position") if absent else Place(name, "position", position)
+        x, y, z = _three(record["position"], name)
+        if any(each != each for each in (x, y, z)):
+            return Place(name, "missing", " has no position")
+        return Place(name, "position", [-x, -y, z] if turned else [x, y, z])
     if not {"vertex", "position"} & set(record):
         raise InputError(f"landmark {name} has no vertex and no position")
     return Place(name, "missing", " is vertex -1" if vertex == -1 else " has no vertex and no position")
@@ -131,15 +127,11 @@ def _three(values: Any, name: str) -> list[float]:
     return [number(value) if isinstance(value, str) else float("nan" if value is None else value) for value in values]
 
 
-def _bare(records: list[Record]) -> tuple[list[Record], Space]:
-    return records, ""
-
-
-def _read_npy(path: Path) -> tuple[list[Record], Space]:
+def _read_npy(path: Path) -> list[Record]:
     array = read_npy(path)
     check_memory(path.name, path.stat().st_size, _RECORD * len(array) if array.ndim else 0)
     if array.dtype.kind in "fiu" and array.ndim == 2 and array.shape[1] == 3:
-        return _bare([{"position": row} for row in array.astype(np.float64).tolist()])
+        return [{"position": row} for row in array.astype(np.float64).tolist()]
     flat = array[:, 0] if array.ndim == 2 and array.shape[1] == 1 else array
     with np.errstate(invalid="ignore"):
         is_list = (
@@ -151,15 +143,15 @@ def _read_npy(path: Path) -> tuple[list[Record], Space]:
         raise InputError(
             problem, "either a list of vertices (-1: missing), or x, y and z of every point (nan: missing)"
         )
-    return _bare([{"vertex": vertex} for vertex in flat.tolist()])
+    return [{"vertex": vertex} for vertex in flat.tolist()]
 
 
-def _read_table(path: Path) -> tuple[list[Record], Space]:
+def _read_table(path: Path) -> list[Record]:
     """A row for each: a vertex, three coordinates, or these behind a name; or columns that are named."""
     table = read_table(path, comments="ends" if path.suffix.lower() == ".txt" else "lines", whole=True)
     rows = table.rows()
     if not rows:
-        return _bare([])
+        return []
     check_memory(path.name, path.stat().st_size, _RECORD * len(rows))
     head = _columns(rows[0])
     said = _columns(next(csv.reader([table.comment.replace(";", ",").replace("\t", ",")]), []))
@@ -188,7 +180,7 @@ def _read_table(path: Path) -> tuple[list[Record], Space]:
         if {"x", "y", "z"} <= set(value):
             record["position"] = [value[axis] for axis in "xyz"]
         records.append(record)
-    return _bare(records)
+    return records
 
 
 def _columns(row: Sequence[str]) -> list[str]:
@@ -206,7 +198,7 @@ def _usual_columns(row: Sequence[str]) -> list[str]:
     return {1: ["vertex"], 2: ["name", "vertex"], 3: ["x", "y", "z"], 4: ["name", "x", "y", "z"]}[width]
 
 
-def _read_json(path: Path) -> tuple[list[Record], Space]:
+def _read_json(path: Path) -> list[Record]:
     found = read_json(path)
     if isinstance(found, dict) and isinstance(found.get("markups"), list):
         return _markups(path, found["markups"])
@@ -215,9 +207,9 @@ def _read_json(path: Path) -> tuple[list[Record], Space]:
     if isinstance(found, dict | list):
         check_memory(path.name, path.stat().st_size, _RECORD * len(found))
     if isinstance(found, dict):
-        return _bare([{"name": name, **_record(value)} for name, value in found.items()])
+        return [{"name": name, **_record(value)} for name, value in found.items()]
     if isinstance(found, list):
-        return _bare([_record(value) for value in found])
+        return [_record(value) for value in found]
     raise InputError("it holds no list of landmarks")
 
 
@@ -231,27 +223,23 @@ def _record(value: Any) -> Record:
     return {"vertex" if isinstance(value, int | float) else "position": value}
 
 
-def _markups(path: Path, lists: list[Any]) -> tuple[list[Record], Space]:
+def _markups(path: Path, lists: list[Any]) -> list[Record]:
     """The control points of 3D Slicer's markups."""
     records: list[Record] = []
-    spaces = set()
     for markup in lists:
         points = markup.get("controlPoints", []) if isinstance(markup, dict) else None  # a region has none
         if not isinstance(points, list) or not all(isinstance(point, dict) for point in points):
             raise InputError("its markups hold no list of control points")
         check_memory(path.name, path.stat().st_size, _RECORD * (len(records) + len(points)))
-        if points:
-            spaces.add(_SPACES.get(str(markup.get("coordinateSystem", "")).upper(), ""))
+        space = _SPACES.get(str(markup.get("coordinateSystem", "")).upper(), "") if points else ""
         for point in points:
             is_set = point.get("positionStatus", "defined") == "defined"
             position = point.get("position") if is_set else None
-            records.append({"name": point.get("label"), "position": position or None})
-    if len(spaces) > 1:
-        raise InputError("its markups are in several coordinate systems", "save each list in a file of its own")
-    return records, next(iter(spaces), "")
+            records.append({"name": point.get("label"), "position": position or None, "space": space})
+    return records
 
 
-def _read_fcsv(path: Path) -> tuple[list[Record], Space]:
+def _read_fcsv(path: Path) -> list[Record]:
     """3D Slicer's fiducials: comments say the frame and the columns."""
     text = read_text(path, _RECORD)
     space = re.search(r"^#\s*CoordinateSystem\s*=\s*(\w+)", text, re.MULTILINE)
@@ -272,11 +260,12 @@ def _read_fcsv(path: Path) -> tuple[list[Record], Space]:
                 f"landmark {len(records)} has {len(row)} cells, but there are {len(head)} columns", DECIMAL_COMMA
             )
         name = cell.get("label") or cell.get("id")
-        records.append({"name": name, "position": [number(cell.get(axis, "")) for axis in "xyz"]})
-    return records, _SPACES[space[1].upper()] if space else ""
+        position = [number(cell.get(axis, "")) for axis in "xyz"]
+        records.append({"name": name, "position": position, "space": _SPACES[space[1].upper()] if space else ""})
+    return records
 
 
-def _read_pts(path: Path) -> tuple[list[Record], Space]:
+def _read_pts(path: Path) -> list[Record]:
     """Points a line, with or without a name before the three coordinates, among lines that count them."""
     records = []
     for line in read_text(path, _RECORD).splitlines():
@@ -293,10 +282,10 @@ def _read_pts(path: Path) -> tuple[list[Record], Space]:
         missing = all(abs(each) == _ABSENT for each in position)
         name = words[0] if len(words) == 4 else None
         records.append({"name": name, "position": None if missing else position})
-    return _bare(records)
+    return records
 
 
-def _read_tps(path: Path, shape: str) -> tuple[list[Record], Space]:
+def _read_tps(path: Path, shape: str) -> list[Record]:
     """Landmarks of one specimen (LM3=), then the points of its curves; of several, those of the shape's name."""
     specimens: list[tuple[list[list[float]], dict[str, str]]] = []
     for line in read_text(path, _RECORD).splitlines():
@@ -323,10 +312,10 @@ def _read_tps(path: Path, shape: str) -> tuple[list[Record], Space]:
         raise InputError(problem, "write the name of the shape's file behind ID=, or save each in a file of its own")
     points, facts = chosen[0] if chosen else ([], {})
     scale = number(facts.get("SCALE", "1"))
-    return _bare([{"position": [scale * each for each in point]} for point in points])
+    return [{"position": [scale * each for each in point]} for point in points]
 
 
-def _read_pp(path: Path) -> tuple[list[Record], Space]:
+def _read_pp(path: Path) -> list[Record]:
     data = read_bytes(path)
     if len(data) > _LARGEST_PP:
         raise InputError(f"it is too large: over {_LARGEST_PP // 10**6} MB", "landmarks are a few named points")
@@ -338,16 +327,14 @@ def _read_pp(path: Path) -> tuple[list[Record], Space]:
         raise InputError(f"it is not XML: {error}") from error
     if root.tag != "PickedPoints":
         raise InputError(f"it is not a file of MeshLab's picked points: its root is '{root.tag}'")
-    return _bare(
-        [
-            {"name": point.get("name"), "position": [number(point.get(axis, "")) for axis in "xyz"]}
-            for point in root.iter("point")
-            if point.get("active", "1") != "0"  # the name of a template that nobody has placed
-        ]
-    )
+    return [
+        {"name": point.get("name"), "position": [number(point.get(axis, "")) for axis in "xyz"]}
+        for point in root.iter("point")
+        if point.get("active", "1") != "0"  # the name of a template that nobody has placed
+    ]
 
 
-LANDMARK_READERS: Mapping[str, Callable[..., tuple[list[Record], Space]]] = {
+LANDMARK_READERS: Mapping[str, Callable[..., list[Record]]] = {
     ".csv": _read_table,
     ".json": _read_json,
     ".pp": _read_pp,

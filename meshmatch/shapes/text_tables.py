@@ -303,7 +303,7 @@ def _separator(text: str, blanks: bool) -> str:
     strong = next((mark for mark in even if mark != ","), None)
     if strong and "," in even and not all(_has_decimal_commas(row) for row in even[strong]):
         # Both divide all rows: the one that stands first does, and the other is part of a word.
-        return min((strong, ","), key=lambda mark: _place(body[0], mark))
+        return min((strong, ","), key=body[0].index)
     if strong:
         return strong
     if blanks:
@@ -332,10 +332,6 @@ def _floats(row: list[str]) -> list[float]:
         return [number(cell) for cell in row]
 
 
-def _place(line: str, mark: str) -> int:
-    return line.find(mark) % (len(line) + 1)
-
-
 def _has_decimal_commas(row: list[str]) -> bool:
     """Whether all cells with a comma are numbers."""
     return all(_NUMBER.fullmatch(cell) for cell in row if "," in cell)
@@ -356,7 +352,8 @@ def _one_column(text: str, whole: bool) -> bool | None:
     if _OTHER_LINE.search(body):
         broken = not header and head.count(",") % 2 and _WHOLE_NUMBERS.fullmatch(body) and _PADDED.search(body)
         return None if broken else False  # 0,05,1,25: pairs of them may be numbers
-    if _is_numbered(body):
+    numbers = [line.partition(",")[0].strip() for line in _lines(body) if line.strip()]
+    if len(numbers) > 2 and numbers == list(map(str, range(len(numbers)))):
         return False
     if "," in header:  # names of two columns, or a comma in the name of one
         return None if _FRACTION.search(body) else False
@@ -368,14 +365,3 @@ def _one_column(text: str, whole: bool) -> bool | None:
     # Decimals have all the same number of digits, or none that could be left out.
     padded = any(len(digits) > 1 and digits.endswith("0") for digits in second)
     return False if padded and len({len(digits) for digits in second}) > 1 else None
-
-
-def _is_numbered(body: str) -> bool:
-    """Whether the numbers before the commas are 0, 1, 2, ..., three at least."""
-    count = 0
-    for line in _lines(body):
-        if line.strip():
-            if line.partition(",")[0].strip() != str(count):
-                return False
-            count += 1
-    return count > 2

@@ -7,7 +7,6 @@ on each of a folder's shapes, in one order.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -27,6 +26,7 @@ from meshmatch.shapes.landmark_files import LANDMARK_READERS, Space, read_landma
 from meshmatch.shapes.normalise import ALIGNS, Align, align, residual
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.table_files import read_by_suffix
 from meshmatch.templates.template import SCALES, Scale, Template, template_radius, template_samples, unit_frame
 
 T = TypeVar("T")
@@ -190,21 +190,10 @@ def read_known_points(file: Path, clean: Repaired, space: Space = "") -> KnownPo
     InputError
         The file cannot be read, or names a vertex or face that is not there.
     """
-    if file.suffix.lower() not in LANDMARK_READERS:
-        known = " ".join(LANDMARK_READERS)
-        raise InputError(
-            f"{file.name}: landmarks are not read from '{file.suffix}' files", f"they are read from {known}"
-        )
-    try:
-        found = read_landmark_file(file, clean.original.name)
-    except InputError as error:
-        words = error.message if error.message.startswith(file.name) else f"{file.name}: {error.message}"
-        raise InputError(words, error.hint or _LANDMARKS_HINT) from error
-    except (OSError, ValueError, TypeError, LookupError, ArithmeticError, csv.Error) as error:
-        raise InputError(f"{file.name} holds no landmarks that can be read: {error}", _LANDMARKS_HINT) from error
-    if found.turns_to(space):
-        warn(f"{file.name} is in {found.space}, {clean.original.name} is in {space}: x and y change their signs")
-        found = found.in_space(space)
+    readers = dict.fromkeys(LANDMARK_READERS, lambda path: read_landmark_file(path, clean.original.name, space))
+    found = read_by_suffix(file, readers, "landmarks", _LANDMARKS_HINT)
+    if found.turned:
+        warn(found.turned)
     original, points = clean.original, np.full((len(found.places), 3), np.nan)
     for k, place in enumerate(found.places):
         if place.kind == "position":

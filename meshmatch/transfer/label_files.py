@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from meshmatch.arrays import Brief, Int, Ints
 from meshmatch.errors import InputError, OptionError
-from meshmatch.maps import table_files
 from meshmatch.outputs import plain_text
+from meshmatch.shapes import table_files
 from meshmatch.shapes.colors import label_colors
 from meshmatch.shapes.input_files import read_json, read_npy, read_text
 from meshmatch.shapes.shape import Shape

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -16,8 +17,8 @@ from numpy.typing import ArrayLike
 from meshmatch.arrays import Brief, Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
-from meshmatch.maps import table_files
 from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.shapes import table_files
 from meshmatch.shapes.landmark_files import (
     LANDMARK_READERS,
     LandmarkFile,
@@ -161,31 +162,30 @@ def load_landmarks(path: str | Path, shape: Shape, space: Space = "") -> tuple[L
     InputError
         The file holds no landmark, or one is not on `shape`.
     """
-    on_shape = dict.fromkeys(
-        LANDMARK_READERS, lambda path: _on_shape(read_landmark_file(path, shape.name), shape, space)
+    readers = dict.fromkeys(
+        LANDMARK_READERS, lambda path: _on_shape(read_landmark_file(path, shape.name, space), shape)
     )
-    return table_files.read_by_suffix(path, on_shape, "landmarks", _HINT)
+    return table_files.read_by_suffix(path, readers, "landmarks", _HINT)
 
 
-def _on_shape(found: LandmarkFile, shape: Shape, space: Space) -> tuple[Landmarks, float]:
+def _on_shape(found: LandmarkFile, shape: Shape) -> tuple[Landmarks, float]:
     """Landmarks in the order of the file; and the largest distance of a position from the surface."""
-    notes = []
-    if found.turns_to(space):
-        notes.append(f"the landmarks are in {found.space}, {shape.name} is in {space}: x and y change their signs")
-    places = found.in_space(space).places
-    missing = [f"landmark {place.name}{place.where}" for place in places if place.kind == "missing"]
+    notes, missing = [found.turned] if found.turned else [], []
+    by_kind: dict[str, list[tuple[int, str, Any]]] = {}
+    for k, place in enumerate(found.places):
+        if place.kind == "missing":
+            missing.append(f"landmark {place.name}{place.where}")
+        else:
+            by_kind.setdefault(place.kind, []).append((k, place.name, place.where))
     if missing:
         told = missing[0] + (f", and {len(missing) - 1} more are missing" if len(missing) > 1 else "")
-        if len(missing) == len(places):
+        if not by_kind:
             raise InputError(told)
         notes.append(f"{told}: left out")
     parts: list[Landmarks] = []
     rows: list[int] = []
     largest = 0.0
-    for kind in ("vertex", "face", "position"):
-        own = [(k, place.name, place.where) for k, place in enumerate(places) if place.kind == kind]
-        if not own:
-            continue
+    for kind, own in by_kind.items():
         numbers, names, where = zip(*own, strict=True)
         rows += numbers
         if kind == "vertex":

@@ -18,8 +18,8 @@ from scipy.sparse import csr_array, issparse
 
 from meshmatch.arrays import Brief, Float, Floats
 from meshmatch.errors import InputError, OptionError
-from meshmatch.maps import table_files
 from meshmatch.outputs import plain_text
+from meshmatch.shapes import table_files
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.input_files import read_bytes, read_json, read_npy, read_npz

@@ -23,7 +23,6 @@ from meshmatch.generators.pose_files import load_poses
 from meshmatch.implicit.model import load_implicit
 from meshmatch.implicit.samples import samples_of
 from meshmatch.maps.files import load_map
-from meshmatch.maps.table_files import load_pairs, load_points
 from meshmatch.models.card import read_card
 from meshmatch.models.checkpoint import load_weights as load_network
 from meshmatch.models.implicit_card import IMPLICIT, read_implicit_card
@@ -33,6 +32,7 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.parts import Parts
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.table_files import load_pairs, load_points
 from meshmatch.shapes.textured_files import find_appearance, load_coordinates
 from meshmatch.templates.prepared_folder import (
     frame_of,

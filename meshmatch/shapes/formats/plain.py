@@ -12,6 +12,7 @@ from meshmatch.shapes import formats
 from meshmatch.shapes.formats import NO_FACES, Raw, columns, damaged, numbers, words_per_line
 from meshmatch.shapes.input_files import check_text, read_npy
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.table_files import write_npy
 
 _MOST_HEADERS = 30
 _WORDS = re.compile(
@@ -113,5 +114,4 @@ def read_points(path: Path, data: bytes) -> Raw:
 
 def write_points(path: Path, shape: Shape) -> None:
     """An npy array (N, 3) of float64."""
-    with path.open("wb") as file:
-        np.save(file, shape.verts_or_nan, allow_pickle=False)
+    write_npy(path, shape.verts_or_nan)

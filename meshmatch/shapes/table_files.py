@@ -111,27 +111,20 @@ def short_floats(values: np.ndarray) -> list[Any]:
 
 def load_pairs(path: str | Path) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
     """Read pairs: vertices of the source, and the same N points on the target; `InputError` as `load_points`."""
-    first, second = _table(Path(path), 2, _PAIRS).T.copy()
+    first, second = _vertices(Path(path), 2, _PAIRS).T.copy()
     return first, second
 
 
 def load_points(path: str | Path) -> Int[Ints, " N"]:
     """Read a list of vertices of one shape; `InputError` if the file is missing or empty, or is none."""
-    return _table(Path(path), 1, _POINTS)[:, 0].copy()
+    return _vertices(Path(path), 1, _POINTS)[:, 0].copy()
 
 
-def _table(path: Path, columns: int, hint: str) -> Ints:
-    existing(path, hint)
-    try:
-        if path.suffix.lower() == ".npy":
-            rows = whole(read_npy(path))
-        else:
-            rows = whole(read_table(path, comments="ends", whole=True).numbers()[1])
-    except (ValueError, OSError, EOFError, csv.Error) as error:
-        raise InputError(f"{path.name} is not a list of vertices: {error}", hint) from error
-    except InputError as error:
-        words = error.message if error.message.startswith(path.name) else f"{path.name}: {error.message}"
-        raise InputError(words, error.hint or hint) from error
+def _vertices(path: Path, columns: int, hint: str) -> Ints:
+    """(N, columns) numbers of vertices."""
+    suffix = path.suffix.lower()
+    read = read_npy if suffix == ".npy" else lambda path: read_table(path, comments="ends", whole=True).numbers()[1]
+    rows = read_by_suffix(path, {suffix: lambda path: whole(read(path))}, "vertices", hint)
     if rows.ndim == 1 and columns == 1:
         rows = rows[:, None]
     if rows.size == 0:
