@@ -1,6 +1,7 @@
 """``meshmatch info``: what is in a file."""
 
 from bisect import bisect_right
+from collections import Counter
 from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -58,7 +59,7 @@ def _is_list(file: Path) -> bool:
 
 
 def _shape(file: Path) -> Json:
-    from meshmatch.shapes.files import load_shape, mesh_list, summed
+    from meshmatch.shapes.files import load_shape, mesh_list
     from meshmatch.shapes.normalise import guess_unit, long_axis
     from meshmatch.shapes.parts import Parts
     from meshmatch.shapes.repair import repair
@@ -76,7 +77,10 @@ def _shape(file: Path) -> Json:
         parts = {"parts": len(found)} | ({"largest_parts": _parts(found, meshes)} if len(found) > 1 else {})
     about: Json = {"kind": "point cloud" if shape.is_cloud else "mesh", "vertices": shape.V, "faces": shape.F}
     if meshes:
-        about["meshes"] = [f"{name} ({count:,} vertices)" for name, count in summed(meshes).items()]
+        counts: Counter[str] = Counter()
+        for name, count in meshes:
+            counts[name] += count
+        about["meshes"] = [f"{name} ({count:,} vertices)" for name, count in counts.items()]
     about |= {"size": size, "area": shape.area, "colors": shape.colors is not None}
     usual = {"longest_along": long_axis(clean.shape), "unit_if_a_person": guess_unit(clean.shape)}
     repaired = {"repaired_vertices": clean.shape.V, "repaired_faces": clean.shape.F}

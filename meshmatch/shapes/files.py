@@ -10,16 +10,17 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from meshmatch.arrays import Bool, Bools, Floats, off_torch
+from meshmatch.arrays import Bool, Bools, Floats, as_numbers, off_torch
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import as_path, plain_text, replace_on_success
+from meshmatch.shapes import table_files
 from meshmatch.shapes.colors import INVISIBLE
 from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, obj, off, plain, ply, stl
 from meshmatch.shapes.input_files import existing, read_bytes
@@ -41,7 +42,7 @@ _FORMATS: dict[str, tuple[Callable[[Path, bytes], Raw], Callable[[Path, Shape], 
 _WRITERS = {suffix: write for suffix, (_, write) in _FORMATS.items() if write is not None}
 SUFFIXES = tuple(_FORMATS)
 """The suffixes that `load_shape` knows; `save_shape` writes all of them but .gltf and .pcd."""
-
+check_suffix = partial(table_files.check_suffix, suffixes=_WRITERS, what="shapes")
 
 Choice: TypeAlias = str | int | Sequence[str | int]
 """Meshes of a scene by name, or parts of a mesh by number: one or several."""
@@ -169,36 +170,15 @@ def _visible(name: str, colors: Floats | None) -> Floats | None:
     return np.insert(colors[:, :3], 3, 1.0, axis=1)
 
 
-def mesh_names(path: str | Path) -> dict[str, int]:
-    """Names of a scene's meshes, as ``only`` and ``without`` of `load_shape` know them, and how many vertices each has; none
-    for formats without names. Errors are those of `load_shape`.
-    """
-    return summed(mesh_list(path))
-
-
-def summed(meshes: Sequence[tuple[str, int]]) -> dict[str, int]:
-    """Vertices of all meshes of a name together."""
-    found: dict[str, int] = {}
-    for label, count in meshes:
-        found[label] = found.get(label, 0) + count
-    return found
-
-
 def mesh_list(path: str | Path) -> list[tuple[str, int]]:
-    """As `mesh_names`, in the order of the vertices; meshes of one name one by one."""
+    """The names of a scene's meshes, as ``only`` and ``without`` of `load_shape` know them, and how many vertices each has,
+    in the order of the vertices; none for formats without names. Errors are those of `load_shape`.
+    """
     path = existing(as_path(path), suffixes=SUFFIXES)
     if path.suffix.lower() not in (".glb", ".gltf"):
         return []
     meshes = gltf.read(path, read_bytes(path)).meshes
     return [(names[0] if names else "(no name)", count) for names, count in meshes]
-
-
-def check_suffix(path: Path) -> str:
-    """The suffix in lower case; `OptionError` if shapes are not written with it."""
-    suffix = path.suffix.lower()
-    if suffix not in _WRITERS:
-        raise OptionError(f"cannot write a shape as {suffix or '(no suffix)'}", f"choose one of {', '.join(_WRITERS)}")
-    return suffix
 
 
 def save_shape(path: str | Path, shape: ShapeLike) -> None:
@@ -279,7 +259,7 @@ def as_shape(source: ShapeLike, name: str = "") -> Shape:
     found = None if isinstance(source, np.ndarray | tuple | list) else arrays_of(source, name)
     if found is not None:
         return _from_arrays(found.verts, found.faces, name, found.colors)
-    if isinstance(source, tuple | list) and len(source) == 2 and _is_table(source[0]):
+    if isinstance(source, tuple | list) and len(source) == 2 and _array(source[0]).ndim == 2:
         return _from_arrays(source[0], as_faces(source[1], source[0], name or "the shape"), name)
     if hasattr(source, "__array__") or isinstance(source, tuple | list):
         return _from_arrays(source, None, name)
@@ -291,36 +271,24 @@ def as_shapes(sources: Sequence[ShapeLike]) -> list[Shape]:
     single = isinstance(sources, str | os.PathLike | Shape | HasVertices | HasPoints)
     if single or not isinstance(sources, Iterable):
         raise InputError(f"expected a list of shapes, not {type(sources).__name__}", "write [shape]")
-    if isinstance(sources, tuple) and len(sources) == 2 and _are_whole(sources[1]):
+    if isinstance(sources, tuple) and len(sources) == 2 and _array(sources[1]).dtype.kind in "iu":
         raise InputError("expected a list of shapes, not one mesh", "write [(vertices, faces)]")
     return [as_shape(source) for source in sources]
 
 
-def _is_table(values: Any) -> bool:
+def _array(values: Any) -> NDArray[Any]:
+    """The values as an array; an empty one where they are none, such as rows of different lengths."""
     try:
-        return np.ndim(off_torch(values)) == 2
-    except (TypeError, ValueError):  # rows of different lengths
-        return False
-
-
-def _are_whole(values: Any) -> bool:
-    try:
-        return np.asarray(off_torch(values)).dtype.kind in "iu"
+        return np.asarray(off_torch(values))
     except (TypeError, ValueError):
-        return False
+        return np.empty(0)
 
 
 def _from_arrays(verts: Any, faces: Any, name: str, colors: Any = None) -> Shape:
     label = name or "the shape"
-    try:
-        verts = np.ma.asanyarray(verts) if isinstance(verts, np.ma.MaskedArray) else np.asarray(off_torch(verts))
-        if verts.dtype.kind == "c":
-            raise TypeError("complex ones have two parts")
-        verts = verts.astype(np.float64)  # a copy
-        if isinstance(verts, np.ma.MaskedArray):
-            verts = verts.filled(np.nan)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{label}: not an array of numbers ({error})", HINT) from error
+    if isinstance(verts, np.ma.MaskedArray):
+        verts = np.ma.filled(verts.astype(np.float64), np.nan)
+    verts = as_numbers(verts, f"{label}: vertices")
     if verts.ndim == 3 and verts.shape[2] == 3:
         raise InputError(f"{label}: vertices are a batch of {verts.shape}, not (V, 3)", "pass one of them: vertices[0]")
     if verts.ndim != 2 or verts.shape[1] != 3:

@@ -14,7 +14,7 @@ import numpy as np
 
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints, off_torch
 from meshmatch.errors import InputError
-from meshmatch.shapes.formats import fan, painted, runs
+from meshmatch.shapes.formats import fan, joined_colors, painted, runs
 from meshmatch.shapes.formats.polygons import triangles_of
 
 HINT = "pass a path, a Shape, (vertices, faces), an (N, 3) array, or an object with .vertices and .faces"
@@ -277,11 +277,8 @@ def _scene(scene: Any, label: str) -> Arrays:
         start += len(points)
     if not verts:
         raise InputError(f"{label} is a scene without meshes", HINT)
-    painted_ones = None
-    if any(each is not None for each in colors):
-        each_own = [np.ones((len(v), 4)) if own is None else own for v, own in zip(verts, colors, strict=True)]
-        painted_ones = np.concatenate(each_own)
-    return Arrays(np.concatenate(verts), np.concatenate(faces) if faces else None, painted_ones)
+    joined = joined_colors(colors, [len(own) for own in verts])
+    return Arrays(np.concatenate(verts), np.concatenate(faces) if faces else None, joined)
 
 
 def _batch(source: Any, label: str) -> Arrays:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Bools, Brief, Float, Floats, Int, Ints
+from meshmatch.arrays import Bools, Brief, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
@@ -45,15 +45,6 @@ class Repaired(Brief):
     kept_face: Int[Ints, " F"]
     far_parts: int = 0
     left_out: tuple[int, ...] = ()
-
-    def original_face(
-        self, face: Int[Ints, " N"], weights: Float[Floats, "N 3"]
-    ) -> tuple[Int[Ints, " N"], Float[Floats, "N 3"]]:
-        """Repaired faces and weights of their corners, numbered and ordered as originally."""
-        theirs = self.kept_face[face]
-        corners = self.original_to_repaired[self.original.faces[theirs]]  # N 3
-        same = corners[:, :, None] == self.shape.faces[face][:, None, :]  # N original repaired
-        return theirs, np.take_along_axis(weights, same.argmax(axis=2), axis=1)
 
 
 def repair(shape: Shape) -> Repaired:

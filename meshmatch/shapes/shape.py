@@ -65,11 +65,10 @@ class Shape(Pickled):
     def __post_init__(self) -> None:
         label = self.name or "the shape"
         verts = read_only(self.verts, np.float64, label)
-        faces = off_torch(self.faces)
-        faces = np.empty((0, 3), np.int64) if faces is None or np.size(faces) == 0 else faces
-        if np.asarray(faces).dtype.kind not in "iu":
-            raise InputError(f"{label}: faces must be integers, not {np.asarray(faces).dtype}")
-        faces = read_only(faces, np.int64, label)
+        given = np.asarray([] if self.faces is None else off_torch(self.faces))
+        if given.size and given.dtype.kind not in "iu":
+            raise InputError(f"{label}: faces must be integers, not {given.dtype}")
+        faces = read_only(given if given.size else np.empty((0, 3)), np.int64, label)
         if verts.ndim != 2 or verts.shape[1] != 3:
             raise InputError(f"{label}: vertices must be an array of (V, 3), not {verts.shape}")
         if faces.ndim != 2 or faces.shape[1] != 3:
@@ -85,19 +84,19 @@ class Shape(Pickled):
             worst = int(faces.min()) if faces.min() < 0 else int(faces.max())
             what = f"{label}: a face refers to vertex {worst}, but there are only {V} vertices"
             raise InputError(what, "the file is damaged, or was cut short")
-        colors = None if self.colors is None else read_only(self.colors, np.float64, label)
-        if colors is not None and colors.shape != (V, 4):
-            raise InputError(f"{label}: colors must be an array of ({V}, 4), not {colors.shape}")
-        invalid = None if self.invalid is None else read_only(self.invalid, np.bool_, label)
-        if invalid is not None and invalid.shape != (V,):
-            raise InputError(f"{label}: invalid must be an array of ({V},), not {invalid.shape}")
-        invalid = invalid if invalid is not None and invalid.any() else None
-        weights = None if self.weights is None else read_only(self.weights, np.float64, label)
-        if weights is not None and (weights.shape != (V,) or not ((weights >= 0) & (weights <= 1)).all()):
-            raise InputError(f"{label}: weights must be {V} numbers from 0 to 1", "one for each vertex")
-        arrays = {"verts": verts, "faces": faces, "colors": colors, "invalid": invalid, "weights": weights}
-        for name, array in arrays.items():
-            object.__setattr__(self, name, array)
+        object.__setattr__(self, "verts", verts)
+        object.__setattr__(self, "faces", faces)
+        kinds = {"colors": (np.float64, (V, 4)), "invalid": (np.bool_, (V,)), "weights": (np.float64, (V,))}
+        for name, (kind, shape) in kinds.items():
+            if (values := getattr(self, name)) is not None:
+                array = read_only(values, kind, label)
+                if array.shape != shape:
+                    raise InputError(f"{label}: {name} must be an array of {shape}, not {array.shape}")
+                object.__setattr__(self, name, array)
+        if self.invalid is not None and not self.invalid.any():
+            object.__setattr__(self, "invalid", None)
+        if self.weights is not None and not ((self.weights >= 0) & (self.weights <= 1)).all():
+            raise InputError(f"{label}: weights must lie in 0 to 1", "one for each vertex")
 
     @classmethod
     def with_invalid(

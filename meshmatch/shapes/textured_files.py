@@ -20,6 +20,12 @@ from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
 TEXTURED_SUFFIXES = (".glb", ".obj")
+_READERS = {  # of the look, and of texture coordinates alone
+    ".glb": (gltf_attributes.read_look, gltf_attributes.read_coordinates),
+    ".gltf": (gltf_attributes.read_look, gltf_attributes.read_coordinates),
+    ".obj": (obj_look.read_look, obj_look.read_coordinates),
+    ".ply": (ply_look.read_look, ply_look.read_coordinates),
+}
 
 
 def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = None) -> Appearance:
@@ -46,17 +52,13 @@ def find_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
     path = Path(path)
     suffix, reader = path.suffix.lower(), ImageReader()
     picture = None if image is None else reader.decode(read_bytes(Path(image)), Path(image).name)
-    with np.errstate(invalid="ignore", over="ignore"):  # coordinates are judged by the appearance
-        if suffix in (".glb", ".gltf"):
-            found = gltf_attributes.read_look(path, read_bytes(path), reader, picture)
-        elif suffix == ".obj":
-            found = obj_look.read_look(path, read_bytes(path), shape, reader, picture)
-        elif suffix == ".ply":
-            found = ply_look.read_look(path, read_bytes(path), shape, reader, picture)
-        elif picture is not None:
-            raise appearance.no_coordinates(path.name)
-        else:
-            found = appearance.vertex_colors_alone(shape)
+    if suffix in _READERS:
+        with np.errstate(invalid="ignore", over="ignore"):  # coordinates are judged by the appearance
+            found = _READERS[suffix][0](path, read_bytes(path), shape, reader, picture)
+    elif picture is not None:
+        raise appearance.no_coordinates(path.name)
+    else:
+        found = appearance.vertex_colors_alone(shape)
     if len(found.material) != shape.F or (found.colors is not None and len(found.colors) != shape.V):
         raise InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
     return None if found.plain else appearance.visible(found, path.name)
@@ -68,13 +70,8 @@ def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] |
     `shape` is what `load_shape` made of the same file; `InputError` if that is damaged.
     """
     path = Path(path)
-    suffix, found = path.suffix.lower(), None
-    if suffix in (".glb", ".gltf"):
-        found = gltf_attributes.read_coordinates(path, read_bytes(path))
-    elif suffix == ".obj":
-        found = obj_look.read_coordinates(path, read_bytes(path), shape)
-    elif suffix == ".ply":
-        found = ply_look.read_coordinates(path, read_bytes(path), shape)
+    suffix = path.suffix.lower()
+    found = _READERS[suffix][1](path, read_bytes(path), shape) if suffix in _READERS else None
     if found is not None and len(found) != shape.F:
         raise InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
     return found if shape.F else None

@@ -136,15 +136,23 @@ def as_float32(values: Floats, suffix: str) -> NDArray[np.float32]:
     return written
 
 
-def colors_of_faces(count: int, faces: Int[Ints, "F 3"], colors: Float[Floats, "F 4"]) -> Float[Floats, "count 4"]:
-    """Colors of vertices where a file has them for faces: the mean light of those around; white where there are none."""
-    total, many = np.zeros((count, 4)), np.zeros(count)
-    own = light(colors)
-    for k in range(3):
-        many += np.bincount(faces[:, k], minlength=count)[:count]
-        for channel in range(4):
-            total[:, channel] += np.bincount(faces[:, k], own[:, channel], minlength=count)[:count]
-    return np.where(many[:, None] > 0, seen(total / np.maximum(many, 1)[:, None]), 1.0)
+def joined_colors(colors: list[Float[Floats, "_ 4"] | None], counts: list[int]) -> Float[Floats, "V 4"] | None:
+    """Colors of meshes one after the other, white for those without; None if none has any."""
+    if all(color is None for color in colors):
+        return None
+    return np.vstack([np.ones((n, 4)) if c is None else c for c, n in zip(colors, counts, strict=True)])
+
+
+def colors_of_faces(count: int, corners: Int[Ints, " N"], colors: Float[Floats, "N 4"]) -> Float[Floats, "count 4"]:
+    """Colors of vertices where a file has them for faces: the mean light of those around; white where there are none.
+
+    `corners` are the vertices of all faces, one face after the other, each with the color of its face.
+    """
+    fine = (corners >= 0) & (corners < count)
+    corners, own = corners[fine], light(colors[fine])
+    many = np.bincount(corners, minlength=count)[:, None]
+    total = np.stack([np.bincount(corners, channel, count) for channel in own.T], axis=1)
+    return np.where(many > 0, seen(total / np.maximum(many, 1)), 1.0)
 
 
 def without_comments(text: bytes) -> bytes:

@@ -23,7 +23,7 @@ from meshmatch.errors import InputError, warn
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import to_srgb
 from meshmatch.shapes.companions import beside
-from meshmatch.shapes.formats import NO_FACES, WRONG_SUFFIX, Raw, check_places, damaged
+from meshmatch.shapes.formats import NO_FACES, WRONG_SUFFIX, Raw, check_places, damaged, joined_colors
 from meshmatch.shapes.input_files import check_text, json_of, read_bytes
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -363,13 +363,6 @@ def _data_of(uri: str) -> bytes:
         return data
     data = b"".join(data.translate(bytes.maketrans(b"-_", b"+/")).split()).rstrip(b"=")
     return base64.b64decode(data + b"=" * (-len(data) % 4), validate=True)
-
-
-def joined_colors(colors: list[Float[Floats, "_ 4"] | None], counts: list[int]) -> Float[Floats, "V 4"] | None:
-    """Colors of primitives one after the other, white for those without; None if none has any."""
-    if all(color is None for color in colors):
-        return None
-    return np.vstack([np.ones((n, 4)) if c is None else c for c, n in zip(colors, counts, strict=True)])
 
 
 def _local(node: dict[str, Any]) -> Floats:

@@ -20,20 +20,21 @@ from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import InputError
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap, no_coordinates
-from meshmatch.shapes.formats import damaged
-from meshmatch.shapes.formats.gltf import Document, embedded, joined_colors, understood
+from meshmatch.shapes.formats import damaged, joined_colors
+from meshmatch.shapes.formats.gltf import Document, embedded, understood
+from meshmatch.shapes.shape import Shape
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _ALPHAS: dict[str, Alpha] = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
 _NEAREST = 9728
 
 
-def read_look(path: Path, data: bytes, reader: ImageReader, picture: Pixels | None) -> Appearance:
+def read_look(path: Path, data: bytes, _: Shape, reader: ImageReader, picture: Pixels | None) -> Appearance:
     """Materials and texture coordinates; `picture` replaces all images."""
     return understood(path, data, "materials make", lambda document: _Look(document, reader, picture).scene())
 
 
-def read_coordinates(path: Path, data: bytes) -> Float[Floats, "F 3 2"] | None:
+def read_coordinates(path: Path, data: bytes, _: Shape) -> Float[Floats, "F 3 2"] | None:
     """First texture coordinates of all faces; None where a part has none."""
     return understood(path, data, "texture coordinates make", _coordinates)
 

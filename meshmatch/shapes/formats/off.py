@@ -59,11 +59,10 @@ def read(path: Path, data: bytes) -> Raw:
     corner = formats.indices(name, faces[formats.runs(starts + 1, many)])
     triangles = corner[triangles_of(name, verts, corner, many)]
     formats.tell_lost_faces(name, F, triangles)
-    if colors is None and len(triangles) and 0 <= triangles.min() and triangles.max() < V:
-        found = _face_colors(faces, starts + 1 + many, sizes - 1 - many)
-        if found is not None:
-            warn(f"{name} has colors of faces: each vertex gets the mean of those around it")
-            colors = formats.colors_of_faces(V, triangles, np.repeat(found, np.maximum(many - 2, 0), axis=0))
+    found = None if colors is not None else _face_colors(faces, starts + 1 + many, sizes - 1 - many)
+    if found is not None and len(triangles):
+        warn(f"{name} has colors of faces: each vertex gets the mean of those around it")
+        colors = formats.colors_of_faces(V, corner, np.repeat(found, many, axis=0))
     return Raw(verts, triangles, colors)
 
 

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError, warn
-from meshmatch.shapes.colors import to_linear, to_srgb
 from meshmatch.shapes.formats import (
     NO_FACES,
     NO_MESH,
     WRONG_SUFFIX,
     Raw,
     check_places,
+    colors_of_faces,
     damaged,
     indices,
     tell_lost_faces,
@@ -76,7 +76,7 @@ def read(path: Path, data: bytes) -> Raw:
     for (corners, sizes), (faced, own) in zip(lists, content.faces, strict=True) if colors is None else ():
         painted = _colors(faced, own)
         if painted is not None and len(painted):
-            colors = _of_vertices(painted, corners, sizes, len(verts))
+            colors = colors_of_faces(len(verts), corners, np.repeat(painted, sizes, axis=0))
             warn(f"{name} has a color for each face: each vertex gets the mean of the faces around it")
             break
     return Raw(verts, joined, colors)
@@ -296,19 +296,4 @@ def _colors(element: Element, table: Table) -> Floats | None:
         for k, name, each in zip(range(first, last), group, values, strict=False):
             largest = 1.0 if small else 65535.0 if kinds[name].kind == "u2" else 255.0
             out[:, k] = np.clip(np.nan_to_num(each) / largest, 0.0, 1.0)
-    return out
-
-
-def _of_vertices(painted: Floats, corners: Ints, sizes: Ints, count: int) -> Floats:
-    """(V, 4) the mean, as light, of the colors (P, 4) of the polygons around each vertex; white where there is none."""
-    face = np.repeat(np.arange(len(sizes)), sizes)
-    fine = (corners >= 0) & (corners < count)
-    corners, face = corners[fine], face[fine]
-    lit = np.concatenate([to_linear(painted[:, :3]), painted[:, 3:]], axis=1)
-    around = np.bincount(corners, minlength=count)
-    out = np.ones((count, 4))
-    for k in range(4):
-        total = np.bincount(corners, lit[face, k], count)
-        out[around > 0, k] = total[around > 0] / around[around > 0]
-    out[:, :3] = to_srgb(out[:, :3])
     return out
