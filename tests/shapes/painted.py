@@ -37,6 +37,37 @@ def write_square_obj(path: Path, mtl: str | None = "square.mtl", vt: bool = True
     path.write_text("\n".join([*lines, ""]))
 
 
+def write_document(
+    path: Path, document: dict[str, Any], *arrays: np.ndarray, file: str = "", normalized: int = -1
+) -> None:
+    """A glb or gltf: array k is accessor k and view k of one buffer, which a gltf has within it, or in a file beside it."""
+    kinds = {"float32": 5126, "int16": 5122, "uint8": 5121, "uint16": 5123, "uint32": 5125}
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    body = b""
+    for k, array in enumerate(arrays):
+        width = 1 if array.ndim == 1 else array.shape[1]
+        kind = {1: "SCALAR", 16: "MAT4"}.get(width, f"VEC{width}")
+        accessors.append({"bufferView": k, "componentType": kinds[array.dtype.name], "count": len(array), "type": kind})
+        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": array.nbytes})
+        body += array.tobytes() + b"\0" * (-array.nbytes % 4)
+    if normalized >= 0:
+        accessors[normalized]["normalized"] = True
+    buffer: dict[str, Any] = {"byteLength": len(body)}
+    if path.suffix == ".gltf":
+        buffer["uri"] = file or "data:;base64," + base64.b64encode(body).decode()
+    made = {"asset": {"version": "2.0"}, "bufferViews": views, "accessors": accessors, "buffers": [buffer]} | document
+    if file:
+        (path.parent / file).write_bytes(body)
+    if path.suffix == ".gltf":
+        path.write_text(json.dumps(made))
+        return
+    text = json.dumps(made).encode()
+    text += b" " * (-len(text) % 4)
+    head = b"glTF" + np.array([2, 28 + len(text) + len(body), len(text)], "<u4").tobytes() + b"JSON"
+    path.write_bytes(head + text + np.array([len(body)], "<u4").tobytes() + b"BIN\0" + body)
+
+
 def write_gltf(
     path: Path,
     *,
@@ -50,66 +81,36 @@ def write_gltf(
     A primitive may have `material`, `uv` (4, 2) or None, `uv1`, `colors` (4, n). Images are bytes, kept in the
     buffer (`embed`) or as data URIs, or URIs themselves. `rest` goes into the document as it is.
     """
-    parts: list[bytes] = []
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
+    arrays: list[np.ndarray] = []
 
-    def view(data: bytes) -> int:
-        views.append({"buffer": 0, "byteOffset": sum(map(len, parts)), "byteLength": len(data)})
-        parts.append(data + b"\0" * (-len(data) % 4))
-        return len(views) - 1
-
-    def array(values: np.ndarray, kind: str, component: int) -> int:
-        accessors.append({"bufferView": view(values.tobytes()), "componentType": component, "type": kind,
-                          "count": len(values)})  # fmt: skip
-        return len(accessors) - 1
+    def array(values: Any, kind: str = "<f4") -> int:
+        arrays.append(np.asarray(values).astype(kind))
+        return len(arrays) - 1
 
     meshes = []
     for own in primitives if primitives is not None else [{}]:
-        attributes = {"POSITION": array(CORNERS.astype("<f4"), "VEC3", 5126)}
+        attributes = {"POSITION": array(CORNERS)}
         if own.get("uv", UV) is not None:
-            attributes["TEXCOORD_0"] = array(np.asarray(own.get("uv", UV), "<f4"), "VEC2", 5126)
-        if "uv1" in own:
-            attributes["TEXCOORD_1"] = array(np.asarray(own["uv1"]).astype("<f4"), "VEC2", 5126)
-        if "colors" in own:
-            colors = np.asarray(own["colors"]).astype("<f4")
-            attributes["COLOR_0"] = array(colors, f"VEC{colors.shape[1]}", 5126)
-        entry: dict[str, Any] = {
-            "attributes": attributes,
-            "indices": array(FACES.ravel().astype("<u4"), "SCALAR", 5125),
+            attributes["TEXCOORD_0"] = array(own.get("uv", UV))
+        attributes |= {
+            key: array(own[name]) for name, key in (("uv1", "TEXCOORD_1"), ("colors", "COLOR_0")) if name in own
         }
-        if "material" in own:
-            entry["material"] = own["material"]
-        meshes.append({"primitives": [entry]})
-    listed = []
+        entry: dict[str, Any] = {"attributes": attributes, "indices": array(FACES.ravel(), "<u4")}
+        meshes.append({"primitives": [entry | ({"material": own["material"]} if "material" in own else {})]})
+    listed: list[dict[str, Any]] = []
     for image in images:
         if isinstance(image, str):
             listed.append({"uri": image})
         elif embed:
-            listed.append({"bufferView": view(image), "mimeType": "image/png"})
+            listed.append({"bufferView": array(np.frombuffer(image, "u1"), "u1"), "mimeType": "image/png"})
         else:
             listed.append({"uri": "data:image/png;base64," + base64.b64encode(image).decode()})
-    body = b"".join(parts)
     document: dict[str, Any] = {
-        "asset": {"version": "2.0"},
         "nodes": [{"mesh": k, "translation": [k, 0, 0]} for k in range(len(meshes))],
         "meshes": meshes,
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(body)}],
     }
     if listed:
-        document["images"] = listed
-        document["textures"] = [{"source": k} for k in range(len(listed))]
-        document["materials"] = [
-            {"pbrMetallicRoughness": {"baseColorTexture": {"index": k}}} for k in range(len(listed))
-        ]
-    document |= rest
-    if path.suffix == ".gltf":
-        document["buffers"][0]["uri"] = "data:;base64," + base64.b64encode(body).decode()
-        path.write_text(json.dumps(document))
-        return
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    head = b"glTF" + np.array([2, 28 + len(text) + len(body), len(text)], "<u4").tobytes() + b"JSON"
-    path.write_bytes(head + text + np.array([len(body)], "<u4").tobytes() + b"BIN\0" + body)
+        textures = [{"source": k} for k in range(len(listed))]
+        materials = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": k}}} for k in range(len(listed))]
+        document |= {"images": listed, "textures": textures, "materials": materials}
+    write_document(path, document | rest, *arrays)

@@ -16,7 +16,7 @@ def pear(sphere: Shape) -> OrientedPoints:
     verts = sphere.verts * [0.25, 0.45, 0.33]
     verts[:, 0] *= 1 + 0.8 * sphere.verts[:, 1]
     verts[:, 2] *= 1 + 0.5 * sphere.verts[:, 0]
-    samples = sample_surface(Shape(verts, sphere.faces), 1500, np.random.default_rng(0))
+    samples = sample_surface(Shape(verts, sphere.faces), 700, np.random.default_rng(0))
     return OrientedPoints(samples.points - samples.points.mean(0), samples.normals)
 
 
@@ -24,7 +24,7 @@ def turned(part: OrientedPoints, rotation: np.ndarray, center: np.ndarray) -> Or
     return OrientedPoints(part.points @ rotation.T + center, part.normals @ rotation.T)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_any_turn_is_found(pear: OrientedPoints, seed: int) -> None:
     rotation = Rotation.random(random_state=np.random.default_rng(seed)).as_matrix()
     center = np.array([0.02, -0.03, 0.01])

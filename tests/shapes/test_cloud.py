@@ -17,13 +17,13 @@ from meshmatch.shapes.shape import Shape
 def on_sphere(P: int, seed: int = 0, density: float = 0.0) -> np.ndarray:
     """Points of the unit sphere; `density` > 0 favours the upper half, up to e^(2 density) times."""
     rng = np.random.default_rng(seed)
-    points = rng.normal(size=(20 * P, 3))
+    tried = 20 * P if density else P
+    points = rng.normal(size=(tried, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
-    return points[rng.random(20 * P) < np.exp(density * (points[:, 2] - 1))][:P]
+    return points[rng.random(tried) < np.exp(density * (points[:, 2] - 1))][:P]
 
 
-@pytest.mark.parametrize("P", [500, 2000, 10_000, 50_000])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("P", "seed"), [(500, 0), (500, 1), (2000, 0), (2000, 1), (10_000, 0), (25_000, 0)])
 def test_area_of_a_sphere(P: int, seed: int) -> None:
     assert local_areas(on_sphere(P, seed)).sum() == pytest.approx(4 * np.pi, rel=0.05)
 
@@ -48,19 +48,10 @@ def test_area_does_not_depend_on_density(density: float) -> None:
 def test_area_of_a_noisy_sphere(noise: float) -> None:
     points = on_sphere(10_000)
     noisy = points + np.random.default_rng(5).normal(size=points.shape) * noise
-    naive = _naive_area(noisy)
     assert local_areas(noisy).sum() == pytest.approx(4 * np.pi, rel=0.08)
-    if noise == 0.03:
-        assert naive > 1.3 * 4 * np.pi  # what the correction is for
 
 
-def _naive_area(points: np.ndarray, k: int = 12) -> float:
-    from scipy.spatial import cKDTree
-
-    return float((np.pi * cKDTree(points).query(points, k + 1)[0][:, -1] ** 2 / k).sum())
-
-
-@pytest.mark.parametrize("splits", [3, 4, 5])
+@pytest.mark.parametrize("splits", [3, 4])
 def test_area_of_the_vertices_of_an_even_mesh(make_sphere: Callable[[int], Shape], splits: int) -> None:
     assert local_areas(make_sphere(splits).verts).sum() == pytest.approx(4 * np.pi, rel=0.12)
 

@@ -1,7 +1,5 @@
 """glTF files that use extensions: read where that is possible, else refused in words; and nothing hidden is drawn."""
 
-import json
-from base64 import b64encode
 from pathlib import Path
 from typing import Any
 
@@ -9,37 +7,27 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError, MeshmatchWarning
-from meshmatch.shapes.files import load_shape, mesh_names
+from meshmatch.shapes.files import load_shape, mesh_list
 from meshmatch.shapes.formats import gltf
 from meshmatch.shapes.textured_files import find_appearance, load_coordinates
+from tests.shapes.painted import write_document
 
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
 SHIFT = np.array([[0, 0, 0], [5, 0, 0], [0, 0, 7]], np.float32)
 TURN = np.array([[0, 0, 0, 1], [0, 0, 2**-0.5, 2**-0.5], [0, 0, 0, 1]], np.float32)  # x to y
 SCALE = np.array([[1, 1, 1], [2, 2, 2], [1, 1, 3]], np.float32)
 UP = np.array([0, 9, 0])
-_TYPES = {2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
 
 def scene(folder: Path, *arrays: np.ndarray, **changes: Any) -> Path:
     """A gltf of one triangle; accessor k is the k-th array, the first of them its positions."""
-    body, views, accessors = b"", [], []
-    for k, array in enumerate([TRIANGLE, *arrays]):
-        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": array.nbytes})
-        accessors.append({"bufferView": k, "componentType": 5126, "count": len(array), "type": _TYPES[array.shape[1]]})
-        body += array.tobytes()
     document = {
-        "asset": {"version": "2.0"},
-        "buffers": [{"byteLength": len(body), "uri": f"data:;base64,{b64encode(body).decode()}"}],
-        "bufferViews": views,
-        "accessors": accessors,
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
         "nodes": [{"mesh": 0, "name": "one"}],
         "scenes": [{"nodes": [0]}],
     }
-    path = folder / "a.gltf"
-    path.write_text(json.dumps(document | changes))
-    return path
+    write_document(folder / "a.gltf", document | changes, TRIANGLE, *arrays)
+    return folder / "a.gltf"
 
 
 def instances(**attributes: int) -> list[dict[str, Any]]:
@@ -96,7 +84,7 @@ def test_hidden_meshes_are_left_out_and_said(tmp_path: Path) -> None:
     with pytest.warns(MeshmatchWarning, match="hides 2 of its meshes, which are left out: spare, below"):
         assert load_shape(path).V == 3
     with pytest.warns(MeshmatchWarning):
-        assert mesh_names(path) == {"seen": 3}
+        assert mesh_list(path) == [("seen", 3)]
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from meshmatch.cli import main
 from meshmatch.errors import InputError
 from meshmatch.shapes import formats, input_files
-from meshmatch.shapes.files import load_shape, mesh_names, save_shape
+from meshmatch.shapes.files import load_shape, mesh_list, save_shape
 from meshmatch.shapes.formats import gltf, ply_rows
 from meshmatch.shapes.formats.gltf_attributes import read_skin
 from meshmatch.shapes.input_files import read_npy
@@ -35,44 +36,11 @@ def ply(*lines: str, body: str = "0 0 0\n1 0 0\n0 1 0\n") -> bytes:
 XYZ = [f"property float {axis}" for axis in "xyz"]
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (ply("element vertex 3"), "no x, y and z"),
-        (ply("element vertex 3", "property list uchar float x", *XYZ[1:]), "declares x of the element vertex as lists"),
-        (ply("element vertex 3", *XYZ, "property list uchar uchar red"), "red of the element vertex as lists"),
-        (
-            ply("element vertex 3", *XYZ, "element face 1", "property int vertex_indices"),
-            "vertex_indices of the element face as numbers",
-        ),
-        (ply("element vertex 3", *XYZ, "element tristrips 1", "property int strip"), "strip of the element"),
-    ],
-)
-def test_ply_lists_where_numbers_belong(tmp_path: Path, content: bytes, words: str) -> None:
-    refused(tmp_path / "a.ply", content, words)
-
-
-@pytest.mark.parametrize(
-    "lines",
-    [
-        ("element vertex 3", *XYZ, "property float x"),
-        ("element vertex 3", *XYZ, "property list uchar float x"),
-        ("element vertex 3", *XYZ, "element tristrips 1", "property list int int v", "property int v"),
-    ],
-)
-def test_ply_properties_named_twice(tmp_path: Path, lines: tuple[str, ...]) -> None:
-    refused(tmp_path / "a.ply", ply(*lines, body="0 0 0 1\n" * 9), "twice")
-
-
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 def test_ply_comments_may_name_the_end_of_the_header(tmp_path: Path, end: str) -> None:
     content = ply("comment end_header", "comment made by end_header tool", "element vertex 3", *XYZ)
     (tmp_path / "a.ply").write_bytes(content.replace(b"\n", end.encode()))
     assert load_shape(tmp_path / "a.ply").V == 3
-
-
-def test_obj_cut_before_the_corners_of_a_face(tmp_path: Path) -> None:
-    refused(tmp_path / "a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf ", "a face has no corners")
 
 
 def test_ply_other_elements_may_be_anything(tmp_path: Path) -> None:
@@ -83,11 +51,6 @@ def test_ply_other_elements_may_be_anything(tmp_path: Path) -> None:
     assert load_shape(tmp_path / "a.ply").faces.tolist() == [[0, 1, 2]]
 
 
-def test_off_with_a_number_of_thousands_of_digits(tmp_path: Path) -> None:
-    refused(tmp_path / "a.off", b"OFF\n" + b"9" * 5000 + b" 1 0\n", "does not say how many")
-    refused(tmp_path / "a.off", b"OFF\n1 " + b"9" * 5000 + b" 0\n", "does not say how many")
-
-
 def test_obj_with_texture_coordinates_that_are_no_numbers(tmp_path: Path) -> None:
     path = tmp_path / "a.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/99999999999999999999 3/1\n")
@@ -95,37 +58,13 @@ def test_obj_with_texture_coordinates_that_are_no_numbers(tmp_path: Path) -> Non
         find_appearance(path, load_shape(path))
 
 
-@pytest.mark.parametrize(
-    ("header", "words"),
-    [
-        (b"{'descr': '<f8', 'fortran_order': False, 'shape': (99999999999999999999, 3), }", "promises"),
-        (b"{'descr': '<f8', 'fortran_order': False, 'shape': (-1, 3), }", "promises"),
-        (b"{'descr': '<U0', 'fortran_order': False, 'shape': (999999999,), }", "promises"),
-        (b"{'descr': '<f8', 'fortran_order': False, 'shape': (4L, 3), }", "promises"),
-        (b"{'descr': '<f8', ''' 'fortran_order': False}", "can be read"),
-        (b"(" * 3000, "can be read"),
-    ],
-)
-def test_npy_headers(tmp_path: Path, header: bytes, words: str) -> None:
-    content = b"\x93NUMPY\x01\x00" + len(header + b"\n").to_bytes(2, "little") + header + b"\n"
-    refused(tmp_path / "a.npy", content, words)
-
-
-def test_npy_headers_do_not_say_where_the_parser_has_its_nodes(tmp_path: Path) -> None:
-    content = b"\x93NUMPY\x01\x00" + bytes([60, 0]) + b"{'descr': f(), 'fortran_order': x}".ljust(59) + b"\n"
-    refused(tmp_path / "a.npy", content, "can be read: malformed node or string on line 1$")
-
-
-def test_damaged_stl_says_nothing_else(tmp_path: Path) -> None:
+def test_damaged_stl_says_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
     text = f"solid x\n{lines}{lines}endsolid x\n"
-    for number, old in enumerate(("normal 0 0 1", "normal 0 0 1\nouter", "vertex 1 0 0")):
-        (tmp_path / f"{number}.stl").write_text(text.replace(old, old.replace("0", "?", 1)))
-    code = "import sys; from meshmatch.cli import main; sys.exit(main(sys.argv[1:]))"
-    for path in sorted(tmp_path.iterdir()):
-        told = subprocess.run([sys.executable, "-c", code, "info", path], capture_output=True, text=True)
-        assert "Traceback" not in told.stderr
-        assert told.stderr.count("\n") == (2 if told.returncode else 0)
+    for old in ("normal 0 0 1", "normal 0 0 1\nouter", "vertex 1 0 0"):
+        (tmp_path / "a.stl").write_text(text.replace(old, old.replace("0", "?", 1)))
+        code = main(["info", str(tmp_path / "a.stl")])
+        assert capsys.readouterr().err.count("\n") == (2 if code else 0)
 
 
 SIGNALLING = np.array([0x7F800001, 0x3F800000, 0x80000000], np.uint32).view(np.float32)
@@ -194,7 +133,7 @@ def test_gltf_nodes_that_stand_nowhere(tmp_path: Path, key: str, value: float) -
     path = broken(tmp_path, (("nodes", 0, key), [value] * four), (("nodes", 4, key), [value] * four))
     shape = load_shape(path)
     assert shape.V == 10
-    assert sum(mesh_names(path).values()) == 10
+    assert sum(count for _, count in mesh_list(path)) == 10
     find_appearance(path, shape)
     read_skin(path, path.read_bytes())
 
@@ -222,16 +161,16 @@ def test_gltf_with_a_buffer_that_claims_a_terabyte(tmp_path: Path) -> None:
         load_shape(path)
 
 
-def test_gltf_of_one_mesh_a_thousand_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    copies = [{"mesh": 0}] * 1000
-    path = broken(tmp_path, (("nodes",), copies), (("scenes", 0, "nodes"), list(range(1000))))
-    assert load_shape(path).V == 4000
-    monkeypatch.setattr(formats, "FEW_PLACES", 3_000)
+def test_gltf_of_one_mesh_many_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copies = [{"mesh": 0}] * 100
+    path = broken(tmp_path, (("nodes",), copies), (("scenes", 0, "nodes"), list(range(100))))
+    assert load_shape(path).V == 400
+    monkeypatch.setattr(formats, "FEW_PLACES", 300)
     with pytest.raises(InputError, match=r"makes [0-9,]+ vertices and faces"):
         load_shape(path)
     monkeypatch.undo()
-    monkeypatch.setattr(gltf, "MOST_NODES", 900)
-    with pytest.raises(InputError, match="over 900 nodes"):
+    monkeypatch.setattr(gltf, "MOST_NODES", 90)
+    with pytest.raises(InputError, match="over 90 nodes"):
         load_shape(path)
 
 
@@ -280,11 +219,6 @@ def test_more_than_the_bytes_of_a_file_can_mean(tmp_path: Path, monkeypatch: pyt
     refused(path, path.read_bytes(), "vertices and faces")
 
 
-@pytest.mark.parametrize("line", ["element e 0", "comment x\nproperty int p"])
-def test_ply_headers_of_thousands_of_lines(tmp_path: Path, line: str) -> None:
-    refused(tmp_path / "a.ply", ply("element vertex 3", *XYZ, "element other 0", *[line] * 5000), "header has over")
-
-
 def test_text_of_more_lines_than_it_may_have(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(input_files, "ROOM", 10_000)
     for name, content in (("a.obj", b"v 0 0 0\n"), ("a.xyz", b"0 0 0\n"), ("a.off", b"OFF 1 0 0\n0 0 0\n")):
@@ -293,10 +227,12 @@ def test_text_of_more_lines_than_it_may_have(tmp_path: Path, monkeypatch: pytest
     refused(tmp_path / "a.ply", ply("element vertex 300", *XYZ, body="0 0 0\n" * 300), "too large for a file of text")
 
 
-# 100,000 points that stand two thousand times in a scene; an index of half a billion zeros, deflated.
+# 100,000 points that stand two thousand times in a scene; an index of fifty million zeros, deflated.
 BOMBS = r"""
-import json, resource, struct, sys, zipfile
-from meshmatch.cli import main
+import json, resource, struct, zipfile
+from meshmatch.errors import InputError
+from meshmatch.maps.files import load_map
+from meshmatch.shapes.files import load_shape
 
 body = bytes(1_200_000)
 words = json.dumps({
@@ -310,22 +246,24 @@ head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(words) + len(body), len(word
 open("a.glb", "wb").write(head + words + struct.pack("<I4s", len(body), b"BIN\0") + body)
 with zipfile.ZipFile("a.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
     with archive.open("index.npy", "w") as file:
-        header = "{'descr': '|i1', 'fortran_order': False, 'shape': (536870912,), }".ljust(117) + "\n"
+        header = "{'descr': '|i1', 'fortran_order': False, 'shape': (50331648,), }".ljust(117) + "\n"
         file.write(b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header.encode())
-        for _ in range(512):
+        for _ in range(48):
             file.write(bytes(1 << 20))
 resource.setrlimit(resource.RLIMIT_AS, (3 << 29, 3 << 29))
-sys.exit(main(["info", "a.glb"]) + 2 * main(["info", "a.npz"]))
+for read, name in ((load_shape, "a.glb"), (load_map, "a.npz")):
+    try:
+        read(name)
+    except InputError as error:
+        print(error)
 """
 
 
 def test_small_files_that_promise_gigabytes(tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
-    done = subprocess.run(
-        [sys.executable, "-c", BOMBS], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 3, done.stderr
-    errors = [line for line in done.stderr.splitlines() if line.startswith("error")]
+    command = [sys.executable, "-c", BOMBS]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    errors = done.stdout.splitlines()
     assert "a.glb makes" in errors[0] and "index.npy promises" in errors[1]
 
 

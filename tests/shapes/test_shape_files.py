@@ -4,6 +4,7 @@ import json
 import re
 import struct
 import tracemalloc
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import trimesh
 from meshmatch.errors import InputError, OptionError, OutputError
 from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
 from meshmatch.shapes.shape import Shape
+from tests.shapes.painted import write_document
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]])
 QUAD_AND_TRIANGLE = [[0, 1, 2], [0, 2, 3], [0, 1, 4]]
@@ -47,20 +49,6 @@ end_header
 
 XYZ = "".join(f"property float {axis}\n" for axis in "xyz")
 HUGE = "ply\nformat {} 1.0\nelement vertex {}\n" + XYZ + "end_header\n"
-
-
-def test_ply_text_with_a_polygon(tmp_path: Path) -> None:
-    rows = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n.5 .5 1\n4 0 1 2 3\n3 0 1 4\n"
-    check(load(tmp_path, "a.ply", PLY_HEADER.format(format="ascii") + rows))
-    check(load(tmp_path, "b.ply", (PLY_HEADER.format(format="ascii") + rows).replace("\n", "\r\n")))
-    check(load(tmp_path, "c.PLY", PLY_HEADER.format(format="ascii").replace("indices", "index") + rows))
-
-
-@pytest.mark.parametrize(("order", "name"), [("<", "binary_little_endian"), (">", "binary_big_endian")])
-def test_ply_binary_with_a_polygon(tmp_path: Path, order: str, name: str) -> None:
-    body = struct.pack(order + "15f", *CORNERS.ravel())
-    body += struct.pack(order + "B4i", 4, 0, 1, 2, 3) + struct.pack(order + "B3i", 3, 0, 1, 4)
-    check(load(tmp_path, "a.ply", PLY_HEADER.format(format=name).encode() + body))
 
 
 def test_ply_with_everything_at_once(tmp_path: Path) -> None:
@@ -98,14 +86,6 @@ end_header
     np.testing.assert_allclose(shape.colors[:, 2:], [[0.2, 1.0]] * 5)
 
 
-def test_ply_big_endian_with_wide_counts_and_unequal_lists(tmp_path: Path) -> None:
-    header = PLY_HEADER.format(format="binary_big_endian").replace("list uchar", "list ushort")
-    body = struct.pack(">15f", *CORNERS.ravel()) + struct.pack(">H4iH3i", 4, 0, 1, 2, 3, 3, 0, 1, 4)
-    check(load(tmp_path, "a.ply", header.encode() + body))
-    windows = header.replace("\n", "\r\n").encode()
-    check(load(tmp_path, "b.ply", windows + body))
-
-
 def test_ply_colors_of_two_bytes(tmp_path: Path) -> None:
     channels = "".join(f"property ushort {c}\n" for c in ("red", "green", "blue"))
     head = HUGE.format("binary_little_endian", 1).replace("end_header\n", channels + "end_header\n")
@@ -116,14 +96,6 @@ def test_ply_colors_of_two_bytes(tmp_path: Path) -> None:
 def test_ply_colors_are_rounded_not_cut(tmp_path: Path, cube: Shape) -> None:
     save_shape(tmp_path / "a.ply", Shape(cube.verts, cube.faces, colors=np.full((8, 4), 0.999)))
     np.testing.assert_array_equal(load_shape(tmp_path / "a.ply").colors, 1.0)
-
-
-def test_ply_text_with_lists_of_unequal_length_among_the_vertices(tmp_path: Path) -> None:
-    header = PLY_HEADER.format(format="ascii").replace(
-        "property float y", "property list uchar int n\nproperty float y"
-    )
-    rows = "0 0 0 0\n1 2 7 8 0 0\n1 1 9 1 0\n0 0 1 0\n.5 3 1 2 3 .5 1\n4 0 1 2 3\n3 0 1 4\n"
-    check(load(tmp_path, "a.ply", header + rows))
 
 
 def test_ply_triangle_strips_turn_every_second_one(tmp_path: Path) -> None:
@@ -161,22 +133,53 @@ f {triangle}
 """
 
 
-@pytest.mark.parametrize(
-    ("quad", "triangle"),
-    [
-        ("1 2 3 4", "1 2 5"),
-        ("1/1 2/1 3/1 4/1", "1/1 2/1 5/1"),
-        ("1//1 2//1 3//1 4//1", "1//1 2//1 5//1"),
-        ("1/1/1 2/1/1 3/1/1 4/1/1", "1/1/1\t2/1/1 \\\n5/1/1"),
-        ("-5 -4 -3 -2", "-5/-1/-1 -4/-1/-1 -1/-1/-1"),
-    ],
+CORNERS_OF_OBJ = (
+    ("1 2 3 4", "1 2 5"),
+    ("1/1 2/1 3/1 4/1", "1/1 2/1 5/1"),
+    ("1//1 2//1 3//1 4//1", "1//1 2//1 5//1"),
+    ("1/1/1 2/1/1 3/1/1 4/1/1", "1/1/1\t2/1/1 \\\n5/1/1"),
+    ("-5 -4 -3 -2", "-5/-1/-1 -4/-1/-1 -1/-1/-1"),
 )
-def test_obj(tmp_path: Path, quad: str, triangle: str) -> None:
-    text = OBJ.format(quad=quad, triangle=triangle)
-    check(load(tmp_path, "a.obj", text))
-    check(load(tmp_path, "b.obj", text.replace("\n", "\r\n")))
-    check(load(tmp_path, "c.obj", text.rstrip("\n")))
-    check(load(tmp_path, "d.obj", text.replace("  v", "\tv")))
+HEADS_OF_OFF = ("OFF\n5 2 0\n", "OFF 5 2 0\n", "OFF5 2 0\n", "# by\nOFF # x\n\n5 2\n", "OFF\r\n5 2 0\r\n")
+
+
+def same_mesh() -> Iterator[tuple[str, bytes]]:
+    """A quad and a triangle, as every format has them."""
+    text, rows, polygons = (
+        PLY_HEADER.format(format="ascii"),
+        "0 0 0\n1 0 0\n1 1 0\n0 1 0\n.5 .5 1\n",
+        "4 0 1 2 3\n3 0 1 4\n",
+    )
+    listed = text.replace("property float y", "property list uchar int n\nproperty float y")
+    unequal = "0 0 0 0\n1 2 7 8 0 0\n1 1 9 1 0\n0 0 1 0\n.5 3 1 2 3 .5 1\n"
+    for whole in (
+        text + rows + polygons,
+        text.replace("indices", "index") + rows + polygons,
+        listed + unequal + polygons,
+    ):
+        yield "a.ply", whole.encode()
+        yield "a.PLY", whole.replace("\n", "\r\n").encode()
+    for order, name, wide in (("<", "little", False), (">", "big", False), (">", "big", True)):
+        head = (
+            PLY_HEADER.format(format=f"binary_{name}_endian").replace("uchar", "ushort" if wide else "uchar").encode()
+        )
+        size = "H" if wide else "B"
+        body = struct.pack(f"{order}15f", *CORNERS.ravel()) + struct.pack(f"{order}{size}4i", 4, 0, 1, 2, 3)
+        body += struct.pack(f"{order}{size}3i", 3, 0, 1, 4)
+        yield "a.ply", head + body
+        yield "a.ply", head.replace(b"\n", b"\r\n") + body
+    for quad, triangle in CORNERS_OF_OBJ:
+        obj = OBJ.format(quad=quad, triangle=triangle)
+        for changed in (obj, obj.replace("\n", "\r\n"), obj.rstrip("\n"), obj.replace("  v", "\tv")):
+            yield "a.obj", changed.encode()
+    for head_of_off in HEADS_OF_OFF:
+        more = "0 0 0\n1 0 0\n1 1 0 # corner\n\n0 1 0\n.5 .5 1\n4 0 1 2 3 7\n3 0 1 4\n"
+        yield "a.off", (head_of_off + more).encode()
+
+
+@pytest.mark.parametrize(("name", "content"), list(same_mesh()))
+def test_one_mesh_in_every_format(tmp_path: Path, name: str, content: bytes) -> None:
+    check(load(tmp_path, name, content))
 
 
 def test_obj_counts_back_from_where_the_face_stands(tmp_path: Path) -> None:
@@ -194,14 +197,6 @@ def test_obj_seams_split_nothing_and_unused_vertices_stay(tmp_path: Path) -> Non
 def test_obj_colors(tmp_path: Path) -> None:
     shape = load(tmp_path, "a.obj", "v 0 0 0 1 0 0\nv 1 0 0 0 .5 0\nv 0 1 0 0 0 1\nf 1 2 3\n")
     np.testing.assert_allclose(shape.colors, [[1, 0, 0, 1], [0, 0.5, 0, 1], [0, 0, 1, 1]])
-
-
-@pytest.mark.parametrize(
-    "head", ["OFF\n5 2 0\n", "OFF 5 2 0\n", "OFF5 2 0\n", "# by\nOFF # x\n\n5 2\n", "OFF\r\n5 2 0\r\n"]
-)
-def test_off(tmp_path: Path, head: str) -> None:
-    rows = "0 0 0\n1 0 0\n1 1 0 # corner\n\n0 1 0\n.5 .5 1\n4 0 1 2 3 7\n3 0 1 4\n"
-    check(load(tmp_path, "a.off", head + rows))
 
 
 def test_off_with_colors_and_normals(tmp_path: Path) -> None:
@@ -299,24 +294,9 @@ def test_pcd_as_pcl_packs_it(tmp_path: Path) -> None:
 
 
 def gltf(folder: Path, name: str, document: dict, *arrays: np.ndarray) -> Shape:
-    """Write arrays as one buffer each, with an accessor of the same number, and load the result."""
-    views, accessors, body = [], [], b""
-    kinds = {"float32": 5126, "uint8": 5121, "uint16": 5123, "uint32": 5125}
-    for k, array in enumerate(arrays):
-        wide = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}[1 if array.ndim == 1 else array.shape[1]]
-        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": array.nbytes})
-        accessors.append({"bufferView": k, "componentType": kinds[array.dtype.name], "count": len(array), "type": wide})
-        body += array.tobytes() + b"\0" * (-array.nbytes % 4)
-    document = {"asset": {"version": "2.0"}, "bufferViews": views, "accessors": accessors, **document}
-    (folder / "data.bin").write_bytes(body)
-    document["buffers"] = [{"uri": "data.bin", "byteLength": len(body)}]
-    if name.endswith(".gltf"):
-        return load(folder, name, json.dumps(document))
-    del document["buffers"][0]["uri"]
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body
-    return load(folder, name, b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks)
+    """What is read of a file with these arrays; of a gltf they are in another file."""
+    write_document(folder / name, document, *arrays, file="data.bin" if name.endswith(".gltf") else "")
+    return load_shape(folder / name)
 
 
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
@@ -508,12 +488,24 @@ def test_ply_is_single_only_where_that_loses_nothing(tmp_path: Path, cube: Shape
 def test_writing_to_where_it_cannot_go(tmp_path: Path, cube: Shape) -> None:
     with pytest.raises(OutputError, match="no folder"):
         save_shape(tmp_path / "no" / "a.ply", cube)
-    with pytest.raises(OptionError, match=r"cannot write a shape as \.gltf"):
+    with pytest.raises(OptionError, match=r"gltf.* is not a format for shapes"):
         save_shape(tmp_path / "a.gltf", cube)
 
 
 # --- bad files
 
+
+def ply(*lines: str, body: str = "0 0 0\n1 0 0\n0 1 0\n") -> bytes:
+    head = ["ply", "format ascii 1.0", "element vertex 3", *lines, "end_header", body]
+    return "\n".join(head).encode()
+
+
+def npy(header: bytes) -> bytes:
+    return b"\x93NUMPY\x01\x00" + (len(header) + 1).to_bytes(2, "little") + header + b"\n"
+
+
+AXES = XYZ.splitlines()
+TWICE = ["element tristrips 1", "property list int int v", "property int v"]
 FIVE = PLY_HEADER.format(format="ascii").encode() + b"0 0 0\n" * 5
 BINARY = PLY_HEADER.format(format="binary_little_endian").encode() + bytes(60)
 
@@ -540,6 +532,16 @@ BINARY = PLY_HEADER.format(format="binary_little_endian").encode() + bytes(60)
         ("a.ply", FIVE + b"3 0 1 9\n3 0 1 2", "refers to vertex 9"),
         ("a.ply", FIVE + b"3 0 1 2\n3 0", "fewer face rows"),
         ("a.ply", BINARY + b"\3" + bytes(12) + b"\xff" * 9, "fewer face rows"),
+        ("a.ply", ply(), "no x, y and z"),
+        ("a.ply", ply("property list uchar float x", *AXES[1:]), "declares x of the element vertex as lists"),
+        ("a.ply", ply(*AXES, "property list uchar uchar red"), "red of the element vertex as lists"),
+        ("a.ply", ply(*AXES, "element face 1", "property int vertex_indices"), "vertex_indices of the element face as"),
+        ("a.ply", ply(*AXES, "element tristrips 1", "property int strip"), "strip of the element"),
+        *[("a.ply", ply(*AXES, *more, body="0 0 0 1\n" * 9), "twice")
+          for more in (["property float x"], ["property list uchar float x"], TWICE)],
+        *[("a.ply", ply(*AXES, "element other 0", *[line] * 5000), "header has over")
+          for line in ("element e 0", "comment x\nproperty int p")],
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf ", "a face has no corners"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "refers to vertex 4, but there are only 3"),
         ("a.obj", b"v 0 0 0\nf 0 0 0\n", "count from 1"),
         ("a.obj", b"v 0 0\n", "fewer than 3 coordinates"),
@@ -551,6 +553,8 @@ BINARY = PLY_HEADER.format(format="binary_little_endian").encode() + bytes(60)
         ("a.off", b"OFF\n2 1 0\n0 0 0\n1 1 1\n", "only 2 lines"),
         ("a.off", b"OFF\n1 1 0\n0 0 0\n4 0 0 0\n", "fewer corners than it says"),
         ("a.off", b"OFF BINARY\n", "binary"),
+        *[("a.off", b"OFF\n%s 0\n" % counts, "does not say how many")
+          for counts in (b"9" * 5000 + b" 1", b"1 " + b"9" * 5000)],
         ("a.stl", b"x".ljust(80) + struct.pack("<I", 10**9) + bytes(50), "triangles"),
         ("a.stl", b"solid x\nfacet normal 0 0 0\nouter loop\nvertex 0 0 0\n", "triangles"),
         ("a.stl", b"solid x\nfacet normal 0 0 0\nouter loop\n" + b"vertex 0 0 1\n" * 2, "triangles"),
@@ -560,6 +564,11 @@ BINARY = PLY_HEADER.format(format="binary_little_endian").encode() + bytes(60)
         ("a.pcd", b"FIELDS x\nSIZE 4\nTYPE F\nCOUNT 99999999999\nPOINTS 1\nDATA binary\n1 2\n", "fewer vertex rows"),
         ("a.pcd", b"FIELDS x\nSIZE 4\nTYPE Q\nPOINTS 1\nDATA binary\n1 2\n", "makes no sense"),
         ("a.pcd", b"FIELDS x\nDATA binary_compressed\n1 2\n", "plain binary points"),
+        *[("a.npy", npy(b"{'descr': '%s', 'fortran_order': False, 'shape': (%s,), }" % how), "promises")
+          for how in ((b"<f8", b"9" * 20 + b", 3"), (b"<f8", b"-1, 3"), (b"<U0", b"999999999"), (b"<f8", b"4L, 3"))],
+        ("a.npy", npy(b"{'descr': '<f8', ''' 'fortran_order': False}"), "can be read"),
+        ("a.npy", npy(b"(" * 3000), "can be read"),
+        ("a.npy", npy(b"{'descr': f(), 'fortran_order': x}".ljust(59)), "can be read: malformed node or string on line 1"),
         ("a.xyz", b"# nothing\n", "no points"),
         ("a.xyz", b"1 2 3\n4 5\n", "point 1 has only 2 of 3"),
     ],
@@ -651,7 +660,7 @@ def test_any_damage_gives_a_shape_or_a_clean_error(tmp_path: Path, make_sphere) 
         shape = Shape(mesh.verts, []) if suffix in (".xyz", ".npy") else mesh
         save_shape(tmp_path / f"good{suffix}", shape)
         good = (tmp_path / f"good{suffix}").read_bytes()
-        for trial in range(120):
+        for trial in range(60):
             data = bytearray(good)
             if trial % 3 == 0:
                 data = data[: rng.integers(len(data))]
@@ -665,16 +674,16 @@ def test_any_damage_gives_a_shape_or_a_clean_error(tmp_path: Path, make_sphere) 
                 outcomes["shape"] += 1
             except InputError:
                 outcomes["error"] += 1
-    assert min(outcomes.values()) > 100  # both kinds were met
+    assert min(outcomes.values()) > 50  # both kinds were met
 
 
 # --- real files
 
 
-def test_every_ply_of_the_bench_has_the_counts_of_its_header(bench: Path) -> None:
+def test_plies_of_the_bench_have_the_counts_of_its_header(bench: Path) -> None:
     files = sorted(bench.rglob("*.ply"))
     assert len(files) > 100
-    for path in files:
+    for path in files[::5]:
         head = path.read_bytes()[:2000]
         V, F = (int(re.search(rb"element %s (\d+)" % key, head).group(1)) for key in (b"vertex", b"face"))
         shape = load_shape(path)
@@ -690,17 +699,17 @@ def test_textured_cow_keeps_its_v_lines(bench: Path) -> None:
     assert seams > shape.V
 
 
-@pytest.mark.parametrize("name", ["Rogue.glb", "Rogue_Hooded.glb"])
-def test_game_characters_keep_every_vertex(bench: Path, name: str) -> None:
-    data = (bench / "textured" / name).read_bytes()
+def test_a_game_character_keeps_every_vertex(bench: Path) -> None:
+    path = bench / "textured" / "Rogue_Hooded.glb"
+    data = path.read_bytes()
     document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
     primitives = [p for n in document["nodes"] if "mesh" in n for p in document["meshes"][n["mesh"]]["primitives"]]
     accessors = document["accessors"]
-    shape = load_shape(bench / "textured" / name)
+    shape = load_shape(path)
     V = sum(accessors[p["attributes"]["POSITION"]]["count"] for p in primitives)
     F = sum(accessors[p["indices"]]["count"] for p in primitives) // 3
     assert (shape.V, shape.F) == (V, F)
-    other = trimesh.load(bench / "textured" / name, process=False).to_geometry()
+    other = trimesh.load(path, process=False).to_geometry()
     np.testing.assert_allclose(shape.bounds, other.bounds, atol=1e-5)
     assert shape.area == pytest.approx(other.area, rel=1e-5)
 

@@ -1,10 +1,10 @@
 """A small glb with a skin, written by hand."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+
+from tests.shapes.painted import write_document
 
 
 def write_skinned_glb(path: Path, wide: bool = False) -> None:
@@ -29,20 +29,10 @@ def write_skinned_glb(path: Path, wide: bool = False) -> None:
         more_joints,
         more,
     ]
-    kinds = {"float32": 5126, "uint16": 5123, "uint8": 5121}
-    accessors: list[dict[str, Any]] = []
-    views, data = [], b""
-    for k, array in enumerate(arrays):
-        kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
-        accessors.append({"bufferView": k, "count": len(array), "componentType": kinds[array.dtype.name], "type": kind})
-        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes})
-        data += array.tobytes() + b"\0" * (-array.nbytes % 4)
-    accessors[6]["normalized"] = True
     attributes = {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3}
     if wide:
         attributes |= {"JOINTS_1": 5, "WEIGHTS_1": 6}
     document = {
-        "asset": {"version": "2.0"},
         "scene": 0,
         "scenes": [{"nodes": [0, 3, 5]}],
         "nodes": [
@@ -58,11 +48,5 @@ def write_skinned_glb(path: Path, wide: bool = False) -> None:
             {"primitives": [{"attributes": {"POSITION": 4}}]},
         ],
         "skins": [{"joints": [1, 0]}],  # the skin counts its joints in its own order: 0 is the knee
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(data)}],
     }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    head = b"glTF" + np.array([2, 28 + len(text) + len(data), len(text)], "<u4").tobytes() + b"JSON"
-    path.write_bytes(head + text + np.array([len(data)], "<u4").tobytes() + b"BIN\0" + data)
+    write_document(path, document, *arrays, normalized=6)
