@@ -85,7 +85,7 @@ def read_landmark_file(path: Path, shape: str = "", space: Space = "") -> Landma
     records = reader(path, Path(shape).stem) if reader is _read_tps else reader(path)
     if not records:
         raise InputError(f"{path.name} holds no landmark")
-    if len(spaces := {record.get("space", "") for record in records}) > 1:
+    if len(spaces := {_SPACES.get(str(record.get("space")), "") for record in records}) > 1:
         raise InputError("its markups are in several coordinate systems", "save each list in a file of its own")
     (own,), turned = spaces, ""
     if own and space and own != space:

@@ -4,6 +4,8 @@ import os
 import struct
 import subprocess
 import sys
+import zlib
+from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -42,11 +44,8 @@ def test_light_and_color_are_inverses_and_match_the_standard() -> None:
     assert to_linear(1.0) == pytest.approx(1.0)
 
 
-def test_every_byte_survives_light() -> None:
-    assert (bytes_of(LINEAR_OF_BYTE) == np.arange(256)).all()
-
-
 def test_the_nearest_byte_is_taken() -> None:
+    assert (bytes_of(LINEAR_OF_BYTE) == np.arange(256)).all()
     light = np.linspace(0, 1, 100_001).astype(np.float32)
     exact = 255 * to_srgb(light.astype(float))
     assert np.abs(bytes_of(light) - exact).max() < 0.55
@@ -256,82 +255,115 @@ def test_vertex_colors_where_nothing_else_is(tmp_path: Path) -> None:
         found = look(tmp_path / f"a.{suffix}")
         assert found.colors is not None and not found.textured
         assert found.colors[2, 0] == pytest.approx(to_linear(0.5), abs=0.01)  # ply: 8 bits
-
-
-def test_vertex_colors_save_an_obj_whose_mtl_was_lost(tmp_path: Path) -> None:
-    text = "mtllib lost.mtl\n" + "".join(f"v {x} {y} {z} 1 0 0\n" for x, y, z in CORNERS)
-    (tmp_path / "a.obj").write_text(text + "f 1 2 3\nf 1 3 4\n")
+    text = (tmp_path / "a.obj").read_text()
+    (tmp_path / "a.obj").write_text("mtllib lost.mtl\n" + text)
     assert look(tmp_path / "a.obj").colors is not None
 
 
 # What can be wrong
 
 
-def refused(path: Path, image: Path | None = None) -> InputError:
-    with pytest.raises(InputError) as caught:
-        look(path, image)
-    assert caught.value.hint
-    return caught.value
+def obj(folder: Path, *lines: str, vt: bool = True, corners: str = "") -> Path:
+    """A square whose mtl has some lines; with none, it names no mtl."""
+    write_square_obj(folder / "a.obj", "square.mtl" if lines else None, vt)
+    with (folder / "a.obj").open("a") as file:
+        file.write(corners)
+    if any(lines):
+        (folder / "square.mtl").write_text("\n".join(["newmtl paint", *lines, ""]))
+    return folder / "a.obj"
 
 
-def test_no_look_at_all(tmp_path: Path, sphere: Shape) -> None:
-    save_shape(tmp_path / "a.ply", sphere)
-    write_square_obj(tmp_path / "a.obj", mtl=None)
-    write_gltf(tmp_path / "a.glb")
-    for suffix in ("ply", "obj", "glb"):
-        assert "has no texture and no vertex colors" in refused(tmp_path / f"a.{suffix}").message
+def gltf(folder: Path, name: str = "a.glb", **parts: Any) -> Path:
+    write_gltf(folder / name, **{"primitives": [{"material": 0}], **parts})
+    return folder / name
 
 
-def test_a_missing_image_and_a_missing_mtl_are_named(tmp_path: Path) -> None:
-    write_square_obj(tmp_path / "a.obj")
-    assert "a.obj has its materials in square.mtl" in refused(tmp_path / "a.obj").message
-    (tmp_path / "square.mtl").write_text("newmtl paint\nmap_Kd skin.jpg\n")
-    assert "a.obj needs the image skin.jpg of its material paint" in refused(tmp_path / "a.obj").message
-    write_gltf(tmp_path / "a.gltf", images=["skin.png"], primitives=[{"material": 0}])
-    assert "needs the file skin.png" in refused(tmp_path / "a.gltf").message
+def bare_ply(folder: Path) -> Path:
+    save_shape(folder / "a.ply", Shape(CORNERS, FACES))
+    return folder / "a.ply"
 
 
-def test_images_outside_the_folder_are_not_followed(tmp_path: Path) -> None:
-    inner = tmp_path / "inner"
-    inner.mkdir()
-    (tmp_path / "p.png").write_bytes(encoded(quarters()))
-    for name in ("../p.png", str(tmp_path / "p.png")):
-        write_square_obj(inner / "a.obj")
-        (inner / "square.mtl").write_text(f"newmtl paint\nmap_Kd {name}\n")
-        assert "which is not there" in refused(inner / "a.obj").message
-    write_gltf(inner / "a.gltf", images=["../p.png"], primitives=[{"material": 0}])
-    assert "not in its folder" in refused(inner / "a.gltf").message
-    # one of the same name beside the mtl is meant, where a path leads elsewhere
-    (inner / "p.png").write_bytes(encoded(quarters()))
-    write_square_obj(inner / "a.obj")
-    (inner / "square.mtl").write_text("newmtl paint\nmap_Kd C:\\Users\\me\\p.png\n")
-    assert look(inner / "a.obj").textured
-
-
-def test_an_image_without_coordinates(tmp_path: Path, sphere: Shape) -> None:
-    (tmp_path / "b.png").write_bytes(encoded(quarters()))
-    save_shape(tmp_path / "a.ply", sphere)
-    write_square_obj(tmp_path / "a.obj", mtl=None, vt=False)
-    write_gltf(tmp_path / "a.glb", primitives=[{"uv": None}])
-    for suffix in ("ply", "obj", "glb"):
-        assert "no texture coordinates" in refused(tmp_path / f"a.{suffix}", tmp_path / "b.png").message
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e9])
-def test_coordinates_that_are_no_places(tmp_path: Path, bad: float) -> None:
+def stray_uv(value: float) -> np.ndarray:
     uv = UV.copy()
-    uv[2, 1] = bad
-    write_gltf(tmp_path / "a.glb", images=[encoded(quarters())], primitives=[{"material": 0, "uv": uv}])
-    assert "texture coordinates of 2 faces are out of range" in refused(tmp_path / "a.glb").message
+    uv[2, 1] = value
+    return uv
 
 
-def test_damaged_and_foreign_images(tmp_path: Path) -> None:
-    whole = encoded(quarters(64))
-    write_square_obj(tmp_path / "a.obj", mtl=None)
-    for data, word in ((whole[: len(whole) // 2], "damaged"), (b"GIF89a" + whole, "cannot be read as an image"),
-                       (whole[:40] + b"\0" * 40, "")):  # fmt: skip
-        (tmp_path / "b.png").write_bytes(data)
-        assert word in refused(tmp_path / "a.obj", tmp_path / "b.png").message
+def huge_png() -> bytes:
+    """An honest header of 60,000 x 60,000 pixels."""
+    whole = bytearray(encoded(quarters()))
+    whole[16:24] = (60_000).to_bytes(4, "big") * 2
+    whole[29:33] = zlib.crc32(bytes(whole[12:29])).to_bytes(4, "big")
+    return bytes(whole)
+
+
+GOOD, LARGE = encoded(quarters()), encoded(quarters(64))
+BASIS = [{"extensions": {"KHR_texture_basisu": {"source": 0}}}]
+NOTHING, APART, NOWHERE = "has no texture and no vertex colors", "no texture coordinates", "which is not there"
+
+
+@pytest.mark.parametrize(
+    ("make", "image", "words"),
+    [
+        (bare_ply, None, NOTHING),
+        (obj, None, NOTHING),
+        (lambda folder: gltf(folder, primitives=[{}]), None, NOTHING),
+        (lambda folder: obj(folder, ""), None, "a.obj has its materials in square.mtl"),
+        (lambda folder: obj(folder, "map_Kd s.jpg"), None, "a.obj needs the image s.jpg of its material paint"),
+        (lambda folder: gltf(folder, "a.gltf", images=["skin.png"]), None, "needs the file skin.png"),
+        (lambda folder: obj(folder, "map_Kd ../p.png"), None, NOWHERE),
+        (lambda folder: obj(folder, f"map_Kd {folder.parent / 'p.png'}"), None, NOWHERE),
+        (lambda folder: gltf(folder, "a.gltf", images=["../p.png"]), None, "not in its folder"),
+        (bare_ply, GOOD, APART),
+        (lambda folder: obj(folder, vt=False), GOOD, APART),
+        (lambda folder: gltf(folder, primitives=[{"uv": None}]), GOOD, APART),
+        *[
+            (
+                lambda folder, bad=bad: gltf(folder, images=[GOOD], primitives=[{"material": 0, "uv": stray_uv(bad)}]),
+                None,
+                "texture coordinates of 2 faces are out of range",
+            )
+            for bad in (np.nan, np.inf, 1e9)
+        ],
+        (obj, LARGE[: len(LARGE) // 2], "damaged"),
+        (obj, b"GIF89a" + LARGE, "cannot be read as an image"),
+        (obj, LARGE[:40] + b"\0" * 40, ""),
+        (obj, huge_png(), "too large"),
+        (lambda folder: gltf(folder, images=[GOOD], primitives=[{"material": 7}]), None, "materials make no sense"),
+        (lambda folder: gltf(folder, images=[b"..."], textures=BASIS), None, "KHR_texture_basisu"),
+        *[
+            (lambda folder, line=line: obj(folder, line), None, f"the line '{line}'")
+            for line in ("Kd red", "map_Kd -what 1 a.png", "map_Kd -s a.png")  # empty statements say nothing
+        ],
+        (lambda folder: obj(folder, "Kd 1 0 0", corners="f 1/9 2/2 3/3\n"), None, "texture coordinate"),
+        (lambda folder: obj(folder, "Kd 1 0 0", corners="f 1/-9 2/2 3/3\n"), None, "texture coordinate"),
+    ],
+)
+def test_what_is_wrong_is_told(tmp_path: Path, make: Callable[[Path], Path], image: bytes | None, words: str) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "p.png").write_bytes(GOOD)
+    if image is not None:
+        (tmp_path / "b.png").write_bytes(image)
+    with pytest.raises(InputError) as caught:
+        look(make(tmp_path / "in"), None if image is None else tmp_path / "b.png")
+    assert words in caught.value.message and caught.value.hint
+
+
+def test_a_path_that_leads_elsewhere_means_a_file_beside_the_mtl(tmp_path: Path) -> None:
+    (tmp_path / "p.png").write_bytes(GOOD)
+    assert look(obj(tmp_path, "map_Kd C:\\Users\\me\\p.png")).textured
+
+
+def test_large_images_are_refused_before_they_are_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One, and several together."""
+    monkeypatch.setattr(appearance, "MAX_ALL_PIXELS", 64 * 64 + 1)
+    two = gltf(tmp_path, images=[LARGE, GOOD], primitives=[{"material": 0}, {"material": 1}])
+    with pytest.raises(InputError, match="too large"):
+        look(two)
+    monkeypatch.setattr(appearance, "MAX_PIXELS", 64 * 63)
+    monkeypatch.setattr(appearance, "_rgba", lambda image: pytest.fail("it was unpacked"))
+    with pytest.raises(InputError, match="too large: 64 x 64"):
+        ImageReader().decode(LARGE, "b.png")
 
 
 def test_a_damaged_tiff_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
@@ -362,48 +394,6 @@ def test_nothing_is_logged_where_nobody_listens(tmp_path: Path) -> None:
     words = [sys.executable, "-c", code, tmp_path / "a.tif"]
     told = subprocess.run(words, capture_output=True, text=True, check=True)
     assert (told.stderr, told.stdout) == ("", "a.tif cannot be read as an image\n")
-
-
-def test_a_huge_image_is_refused_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_square_obj(tmp_path / "a.obj", mtl=None)
-    (tmp_path / "b.png").write_bytes(encoded(quarters(64)))
-    monkeypatch.setattr(appearance, "MAX_PIXELS", 64 * 63)
-    monkeypatch.setattr(appearance, "_rgba", lambda image: pytest.fail("it was unpacked"))
-    assert "too large: 64 x 64" in refused(tmp_path / "a.obj", tmp_path / "b.png").message
-
-
-def test_many_large_images_are_refused_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(appearance, "MAX_ALL_PIXELS", 64 * 64 + 1)
-    two = [encoded(quarters(64)), encoded(quarters(2))]
-    write_gltf(tmp_path / "a.glb", images=two, primitives=[{"material": 0}, {"material": 1}])
-    assert "too large" in refused(tmp_path / "a.glb").message
-
-
-def test_an_honest_header_of_a_huge_png(tmp_path: Path) -> None:
-    whole = bytearray(encoded(quarters()))
-    whole[16:24] = (60_000).to_bytes(4, "big") * 2
-    import zlib
-
-    whole[29:33] = zlib.crc32(bytes(whole[12:29])).to_bytes(4, "big")
-    write_square_obj(tmp_path / "a.obj", mtl=None)
-    (tmp_path / "b.png").write_bytes(bytes(whole))
-    assert "too large" in refused(tmp_path / "a.obj", tmp_path / "b.png").message
-
-
-def test_materials_that_make_no_sense(tmp_path: Path) -> None:
-    write_gltf(tmp_path / "a.glb", images=[encoded(quarters())], primitives=[{"material": 7}])
-    assert "materials make no sense" in refused(tmp_path / "a.glb").message
-    basis = [{"extensions": {"KHR_texture_basisu": {"source": 0}}}]
-    write_gltf(tmp_path / "a.glb", images=[b"..."], primitives=[{"material": 0}], textures=basis)
-    assert "KHR_texture_basisu" in refused(tmp_path / "a.glb").message
-    write_square_obj(tmp_path / "a.obj")
-    for line in ("Kd red", "map_Kd -what 1 a.png", "map_Kd -s a.png"):  # empty statements say nothing
-        (tmp_path / "square.mtl").write_text(f"newmtl paint\n{line}\n")
-        assert f"the line '{line}'" in refused(tmp_path / "a.obj").message
-    text = (tmp_path / "a.obj").read_text()
-    for wrong in ("f 1/9 2/2 3/3", "f 1/-9 2/2 3/3"):
-        (tmp_path / "a.obj").write_text(text + wrong)
-        assert "texture coordinate" in refused(tmp_path / "a.obj").message
 
 
 def test_sixteen_bits_of_grey(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from scipy.spatial import cKDTree
 
 from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.triangles import is_watertight
-from meshmatch.shapes import decimate as module
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.shape import Shape
 
@@ -54,7 +53,10 @@ def test_colors_come_from_the_nearest_vertex(make_sphere: Callable[[int], Shape]
     np.testing.assert_array_equal(small.colors, colors[cKDTree(ball.verts).query(small.verts)[1]])
 
 
-def test_open_result_for_a_closed_mesh_is_tried_again(sphere: Shape, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("lost", "tries", "faces"), [([2, 0], 2, 300), ([18, 4, 10, 14], 4, 296)])
+def test_the_first_closed_result_is_taken_or_the_best(
+    sphere: Shape, monkeypatch: pytest.MonkeyPatch, lost: list[int], tries: int, faces: int
+) -> None:
     import fast_simplification
 
     real, asked = fast_simplification.simplify, []
@@ -62,29 +64,12 @@ def test_open_result_for_a_closed_mesh_is_tried_again(sphere: Shape, monkeypatch
     def leaky(points: np.ndarray, faces: np.ndarray, target_count: int, agg: float):
         asked.append(agg)
         verts, small = real(points, faces, target_count=target_count, agg=agg)
-        return verts, small[len(asked) < 2 :]  # the first try has a hole
-
-    monkeypatch.setattr(fast_simplification, "simplify", leaky)
-    assert is_watertight(decimate(sphere, 300).faces)
-    assert len(asked) == 2
-
-
-def test_best_of_bad_results_is_used(sphere: Shape, monkeypatch: pytest.MonkeyPatch) -> None:
-    import fast_simplification
-
-    real, lost = fast_simplification.simplify, iter([9, 2, 5, 7])
-
-    def leaky(points: np.ndarray, faces: np.ndarray, target_count: int, agg: float):
-        verts, small = real(points, faces, target_count=target_count, agg=agg)
-        return verts, small[2 * next(lost) :]
+        return verts, small[lost[len(asked) - 1] :]
 
     monkeypatch.setattr(fast_simplification, "simplify", leaky)
     small = decimate(sphere, 300)
-    assert abs(small.F - 296) < 4
-
-
-def test_first_choice_is_gentle() -> None:
-    assert module._AGGRESSIVENESS[0] == 3.0
+    assert abs(small.F - faces) < 4 and is_watertight(small.faces) == (faces == 300)
+    assert len(asked) == tries and asked[0] == 3.0  # the gentlest way first
 
 
 def test_target_is_reached_where_the_gentle_way_stops_short(sphere: Shape) -> None:

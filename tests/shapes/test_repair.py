@@ -317,11 +317,11 @@ def test_edges_by_hand(cube: Shape) -> None:
 
 
 def test_bench_shapes_are_repaired_and_answered(bench: Path) -> None:
-    for name in ("shrec19/15.ply", "shrec19/31.ply", "faust_scans/test_scan_080.ply", "heart/heart02.ply"):
+    for name in ("shrec19/15.ply", "heart/heart02.ply"):
         shape = load_shape(bench / name)
         done = repair(shape)
         assert done.notes
-        assert not edges_of(done.shape.faces).disagreeing.any() or "scan" in name
+        assert not edges_of(done.shape.faces).disagreeing.any()
         np.testing.assert_array_equal(done.original_to_repaired[done.kept_vertex], np.arange(done.shape.V))
         moved = np.linalg.norm(done.shape.verts[done.original_to_repaired] - shape.verts, axis=1)
         assert moved.max() < 0.2 * shape.diagonal

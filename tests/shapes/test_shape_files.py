@@ -660,7 +660,7 @@ def test_any_damage_gives_a_shape_or_a_clean_error(tmp_path: Path, make_sphere) 
         shape = Shape(mesh.verts, []) if suffix in (".xyz", ".npy") else mesh
         save_shape(tmp_path / f"good{suffix}", shape)
         good = (tmp_path / f"good{suffix}").read_bytes()
-        for trial in range(60):
+        for trial in range(36):
             data = bytearray(good)
             if trial % 3 == 0:
                 data = data[: rng.integers(len(data))]
@@ -674,7 +674,7 @@ def test_any_damage_gives_a_shape_or_a_clean_error(tmp_path: Path, make_sphere) 
                 outcomes["shape"] += 1
             except InputError:
                 outcomes["error"] += 1
-    assert min(outcomes.values()) > 50  # both kinds were met
+    assert min(outcomes.values()) > 30  # both kinds were met
 
 
 # --- real files
@@ -699,6 +699,7 @@ def test_textured_cow_keeps_its_v_lines(bench: Path) -> None:
     assert seams > shape.V
 
 
+@pytest.mark.slow
 def test_a_game_character_keeps_every_vertex(bench: Path) -> None:
     path = bench / "textured" / "Rogue_Hooded.glb"
     data = path.read_bytes()

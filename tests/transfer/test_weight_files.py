@@ -87,6 +87,7 @@ def test_a_skin_of_more_than_four_joints(tmp_path: Path) -> None:
     assert np.allclose(found.matrix.toarray()[3], [share / (share + 0.75), 0.75 / (share + 0.75)])
 
 
+@pytest.mark.slow
 def test_characters_of_the_bench(bench: Path) -> None:
     for file in sorted((bench / "textured").glob("*.glb")):
         shape = load_shape(file)

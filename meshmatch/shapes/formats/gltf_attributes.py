@@ -160,15 +160,18 @@ def _skin(document: Document) -> tuple[csr_array, tuple[str, ...]]:
     parent = {int(c): k for k, node in enumerate(document.nodes) for c in node.get("children", [])}
     found: list[tuple[Ints, Ints, Floats]] = []  # vertices, joints, weights
     listed: dict[int, Ints] = {}  # of each skin, the places of its joints
-    above: dict[int, int | None] = {}  # of each node, the joint that it hangs from
     seen = 0
-    for number, primitive, _ in document.primitives():
+    drawn = list(document.primitives())
+    above: dict[int | None, int | None] = {}  # of each node, the joint that it hangs from
+    for node in document.world:  # parents before children
+        above[node] = node if node in place else above.get(parent.get(node))
+    for number, primitive, _ in drawn:
         attributes = primitive["attributes"]
-        V, node = document.count(attributes["POSITION"]), document.nodes[number]
-        if "skin" in node and "JOINTS_0" in attributes:
-            if node["skin"] not in listed:
-                listed[node["skin"]] = np.array([place[int(joint)] for joint in skins[node["skin"]]["joints"]])
-            own = listed[node["skin"]]
+        V, skin = document.count(attributes["POSITION"]), document.nodes[number].get("skin")
+        if skin is not None and "JOINTS_0" in attributes:
+            if skin not in listed:
+                listed[skin] = np.array([place[int(joint)] for joint in skins[skin]["joints"]])
+            own = listed[skin]
             for numbers, amount in document.influences(primitive):
                 if numbers.shape != (V, 4) or amount.shape != (V, 4):
                     raise ValueError("joints or weights are not four for each vertex")
@@ -177,16 +180,8 @@ def _skin(document: Document) -> tuple[csr_array, tuple[str, ...]]:
                 if not ((used >= 0) & (used < len(own))).all():
                     raise ValueError(f"a vertex refers to a joint that is not among the {len(own)} of its skin")
                 found.append((seen + row, own[used.astype(np.int64)], amount[row, column]))
-        else:
-            joint: int | None = number
-            passed: list[int] = []
-            while joint is not None and joint not in place and joint not in above:
-                passed.append(joint)
-                joint = parent.get(joint)
-            joint = above.get(joint, joint) if joint is not None else None
-            above |= dict.fromkeys(passed, joint)
-            if joint is not None:
-                found.append((seen + np.arange(V), np.full(V, place[joint]), np.ones(V)))
+        elif (joint := above[number]) is not None:
+            found.append((seen + np.arange(V), np.full(V, place[joint]), np.ones(V)))
         seen += V
     if not found:
         raise InputError(f"{document.name} has a skin that moves no vertex", "was it exported with its weights?")
