@@ -62,11 +62,13 @@ def test_shape_refuses(verts: object, faces: object, words: str) -> None:
     assert "thing" in caught.value.message
 
 
-def test_shape_refuses_wrong_colors_and_flags() -> None:
-    with pytest.raises(InputError, match="colors must be"):
-        Shape(np.zeros((2, 3)), [], colors=np.zeros((2, 3)))
-    with pytest.raises(InputError, match="invalid must be"):
-        Shape(np.zeros((2, 3)), [], invalid=np.zeros(3, bool))
+@pytest.mark.parametrize(
+    "more",
+    [{"colors": np.zeros((2, 3))}, {"invalid": np.zeros(3, bool)}, {"weights": np.ones(3)}, {"weights": [0.5, 1.5]}],
+)
+def test_shape_refuses_more_of_the_wrong_size(more: dict[str, object]) -> None:
+    with pytest.raises(InputError, match=f"{next(iter(more))} must"):
+        Shape(np.zeros((2, 3)), [], **more)
 
 
 def test_arrays_are_its_own_and_read_only() -> None:

@@ -41,7 +41,6 @@ _END = re.compile(rb"(?<=[\r\n])end_header[ \t]*(?:\r\n|[\r\n]|\Z)")
 _DATA = re.compile(rb"^DATA[ \t]+(ascii|binary)[ \t]*\r?\n", re.MULTILINE)
 _CHANNELS = ("red", "green", "blue", "alpha")
 _PREFIXES = ("", "diffuse_", "color_", "vertex_", "vertex_color_", "face_", "face_color_", "ambient_")
-Table: TypeAlias = dict[str, Any]
 Columns: TypeAlias = Mapping[str, NDArray[Any]]
 _NONE: Columns = MappingProxyType({})
 _NUMBERS = ("x", "y", "z", *_CHANNELS, "r", "g", "b", "a")
@@ -52,9 +51,9 @@ class Content:
     """What a ply file holds: its vertices, its polygons or strips, and the comments of its header."""
 
     comments: list[str]
-    vertices: tuple[Element, Table]
-    faces: list[tuple[Element, Table]]
-    strips: list[tuple[Element, Table]]
+    vertices: Element
+    faces: list[Element]
+    strips: list[Element]
     unread: list[Element]  # others whose lists look like those of faces
 
 
@@ -62,19 +61,17 @@ def read(path: Path, data: bytes) -> Raw:
     """Vertices, faces (polygons or strips) and colors of vertices, or else of faces."""
     name = path.name
     content = parsed(name, data)
-    element, table = content.vertices
-    verts = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    colors = _colors(element, table)
-    lists = [corners_of(name, *each) for each in content.faces]
+    verts = np.stack([content.vertices.table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    colors = _colors(content.vertices)
+    lists = [corners_of(name, each) for each in content.faces]
     faces = [corners[triangles_of(name, verts, corners, sizes)] for corners, sizes in lists]
-    faces += [faces_of(*corners_of(name, *each)) for each in content.strips]
+    faces += [faces_of(*corners_of(name, each)) for each in content.strips]
     joined = np.concatenate([NO_FACES, *faces])
     for other in content.unread:
         warn(f"{name}: its {other.count} {other.name} are not read; faces should be an element face")
-    listed = sum(element.count for element, _ in [*content.faces, *content.strips])
-    tell_lost_faces(name, listed, joined)
-    for (corners, sizes), (faced, own) in zip(lists, content.faces, strict=True) if colors is None else ():
-        painted = _colors(faced, own)
+    tell_lost_faces(name, sum(element.count for element in [*content.faces, *content.strips]), joined)
+    for (corners, sizes), element in zip(lists, content.faces, strict=True) if colors is None else ():
+        painted = _colors(element)
         if painted is not None and len(painted):
             colors = colors_of_faces(len(verts), corners, np.repeat(painted, sizes, axis=0))
             warn(f"{name} has a color for each face: each vertex gets the mean of the faces around it")
@@ -85,44 +82,37 @@ def read(path: Path, data: bytes) -> Raw:
 def parsed(name: str, data: bytes) -> Content:
     """The elements of a file that make a shape; `InputError` where there are no positions, or the file is damaged."""
     order, elements, start, comments = _header(name, data)
-    roles = _roles(elements)
-    if "vertex" not in roles:
+    _give_roles(elements)
+    vertices = next((element for element in elements if element.role == "vertex"), None)
+    if vertices is None:
         raise InputError(f"{name}: the header declares no vertices", NO_MESH)
-    counted = zip(elements, roles, strict=True)
-    promised = sum(element.count for element, role in counted if role in ("vertex", "face") and element.properties)
+    promised = sum(each.count for each in elements if each.role in ("vertex", "face") and each.properties)
     if promised < len(data):  # else it is told as damage, below
         check_places(name, len(data), promised, text=order is None)
     body = Body(name, data, start, order)
-    found: dict[str, list[tuple[Element, Table]]] = {role: [] for role in _NAMES}
-    last = max(k for k, role in enumerate(roles) if role)
-    for element, role in zip(elements[: last + 1], roles, strict=False):
-        if not element.properties:
-            continue  # rows of nothing, however many
-        _check_kinds(name, element, role)
-        table = body.element(element)
-        if role:
-            found[role].append((element, table))
-        if role == "vertex" and not set("xyz") <= set(table):
-            break
-    if not found["vertex"] or not set("xyz") <= set(found["vertex"][0][1]):
-        raise InputError(f"{name}: the vertices have no x, y and z", NO_MESH)
-    faces, strips = ([each for each in found[role] if each[0].count] for role in ("face", "tristrips"))
-    others = [element for element, role in zip(elements, roles, strict=True) if element.count and not role]
+    last = max(k for k, element in enumerate(elements) if element.role)
+    for element in elements[: last + 1]:
+        if element.properties:  # else rows of nothing, however many
+            _check_kinds(name, element)
+            element.table = body.element(element)
+        if element is vertices and not set("xyz") <= set(element.table):
+            raise InputError(f"{name}: the vertices have no x, y and z", NO_MESH)
+    some = [element for element in elements if element.count and element.properties]
+    faces, strips, others = ([each for each in some if each.role == role] for role in ("face", "tristrips", ""))
     unread = [element for element in others if any(p.count_kind and _is_usual(p) for p in element.properties)]
-    return Content(comments, found["vertex"][0], faces, strips, unread)
+    return Content(comments, vertices, faces, strips, unread)
 
 
-def _roles(elements: Sequence[Element]) -> list[str]:
-    """For each element whether it is the "vertex", a "face" or "tristrips", by its usual name, or, where there is none of
-    that, by one that it has elsewhere; else "".
+def _give_roles(elements: Sequence[Element]) -> None:
+    """Say of each element what it is, by its usual name, or, where there is none of that, by one that it has elsewhere; of
+    several kinds of vertices the first are meant.
     """
-    roles = []
-    usual = {element.name for element in elements}
+    usual, seen = {element.name for element in elements}, set()
     for element in elements:
         role = next((role for role, others in _NAMES.items() if element.name.lower() in (role, *others)), "")
-        roles.append(role if element.name == role or role not in usual else "")
-    first = roles.index("vertex") if "vertex" in roles else 0
-    return [role if role != "vertex" or k == first else "" for k, role in enumerate(roles)]
+        if (element.name == role or role not in usual) and not (role == "vertex" and role in seen):
+            element.role = role
+            seen.add(role)
 
 
 def _is_usual(listed: Property) -> bool:
@@ -130,7 +120,7 @@ def _is_usual(listed: Property) -> bool:
     return listed.name.lower().replace("_", "") in _FACE_LISTS
 
 
-def corners_of(name: str, element: Element, table: Table) -> tuple[Ints, Ints]:
+def corners_of(name: str, element: Element) -> tuple[Ints, Ints]:
     """Vertices of polygons or strips, one after the other, and how many each has: the list with a usual name, or else
     the only list of whole numbers. `InputError` where no list is that, for faces must not be lost without a word.
     """
@@ -141,7 +131,7 @@ def corners_of(name: str, element: Element, table: Table) -> tuple[Ints, Ints]:
     if not chosen:
         which = "none of its lists is" if not whole else "it cannot be told which of its lists is"
         raise InputError(f"{name}: {which} that of the vertices of each {element.name}", _FACE_HINT)
-    items, sizes = table[chosen[0].name]
+    items, sizes = element.table[chosen[0].name]
     return indices(name, items), sizes
 
 
@@ -164,8 +154,8 @@ def read_pcd(path: Path, data: bytes) -> Raw:
         held = body.rows_left(points)
         points.count = held if held and (promised <= 0 or promised > held or grid == held) else promised
         check_places(name, len(data), points.count)
-        table = body.element(points)
-        verts = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        points.table = body.element(points)
+        verts = np.stack([points.table[axis].astype(np.float64) for axis in "xyz"], axis=1)
     except (KeyError, ValueError, IndexError) as error:
         raise damaged(name, "its header makes no sense, or names no x, y and z") from error
     if points.count != promised:
@@ -174,13 +164,13 @@ def read_pcd(path: Path, data: bytes) -> Raw:
         warn(f"{name} holds more than its {points.count} points, which is not read")
     for p in points.properties:
         if p.name in ("rgb", "rgba"):
-            colors = _unpacked(p, table)
+            colors = _unpacked(points, p)
     return Raw(verts, NO_FACES, colors)
 
 
-def _unpacked(p: Property, table: Table) -> Floats:
+def _unpacked(element: Element, p: Property) -> Floats:
     """(N, 4) opaque colors from numbers that hold red, green and blue in a byte each: of a float its bits count."""
-    packed = table[p.name].astype(p.kind[0] + "4").view(np.uint32)[:, None]
+    packed = element.table[p.name].astype(p.kind[0] + "4").view(np.uint32)[:, None]
     return np.insert((packed >> np.array([16, 8, 0], np.uint32) & 255) / 255.0, 3, 1.0, axis=1)
 
 
@@ -259,11 +249,11 @@ def _header(name: str, data: bytes) -> tuple[str | None, list[Element], int, lis
     return order, elements, end.end(), comments
 
 
-def _check_kinds(name: str, element: Element, role: str) -> None:
+def _check_kinds(name: str, element: Element) -> None:
     """Refuse a list where a number is needed, and the other way round."""
     for place, p in enumerate(element.properties):
-        lists = {"face": p.name in ("vertex_indices", "vertex_index"), "tristrips": place == 0}.get(role, False)
-        number = role == "vertex" and p.name in _NUMBERS
+        lists = {"face": p.name in ("vertex_indices", "vertex_index"), "tristrips": place == 0}.get(element.role, False)
+        number = element.role == "vertex" and p.name in _NUMBERS
         if (number and p.count_kind) or (lists and not p.count_kind):
             what = "lists" if p.count_kind else "numbers"
             raise damaged(name, f"its header declares {p.name} of the element {element.name} as {what}")
@@ -280,18 +270,18 @@ def faces_of(corners: Ints, sizes: Ints) -> Ints:
     return np.asarray(faces[(a >= 0) & (b >= 0) & (c >= 0) & (row[: len(a)] == row[2:])])
 
 
-def _colors(element: Element, table: Table) -> Floats | None:
+def _colors(element: Element) -> Floats | None:
     """(N, 4) sRGB colors and alpha of the rows of an element; None if it has none."""
     kinds = {p.name.lower(): p for p in element.properties if not p.count_kind}
     prefix = next((p for p in _PREFIXES if all(p + channel in kinds for channel in _CHANNELS[:3])), None)
     names = [f"{prefix}{channel}" for channel in _CHANNELS] if prefix is not None else list("rgba")
     if not all(name in kinds for name in names[:3]):
         packed = next((kinds[name] for name in ("rgb", "rgba") if name in kinds and kinds[name].kind[1:] == "4"), None)
-        return None if packed is None else _unpacked(packed, table)
+        return None if packed is None else _unpacked(element, packed)
     alpha = next((name for name in (names[3], "alpha", "a") if name in kinds), None)
     out = np.ones((element.count, 4))
     for first, last, group in ((0, 3, names[:3]), (3, 4, [alpha] if alpha else [])):
-        values = [table[kinds[name].name].astype(np.float64) for name in group]
+        values = [element.table[kinds[name].name].astype(np.float64) for name in group]
         small = all(kinds[name].kind[0] == "f" for name in group) and not any((each > 1).any() for each in values)
         for k, name, each in zip(range(first, last), group, values, strict=False):
             largest = 1.0 if small else 65535.0 if kinds[name].kind == "u2" else 255.0

@@ -18,7 +18,7 @@ from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Appearance, ImageReader, Material, Pixels
 from meshmatch.shapes.companions import beside
 from meshmatch.shapes.formats import damaged
-from meshmatch.shapes.formats.ply import Content, Table, corners_of, faces_of, parsed
+from meshmatch.shapes.formats.ply import Content, corners_of, faces_of, parsed
 from meshmatch.shapes.formats.ply_rows import Element
 from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.input_files import read_bytes
@@ -80,13 +80,12 @@ def _image(path: Path, name: str, reader: ImageReader, shape: Shape) -> Pixels |
 
 def _coordinates(name: str, content: Content, shape: Shape) -> tuple[Floats, Bools, Ints]:
     """(F, 3, 2) coordinates with v down, (F,) whether a face has them, and (F,) the number of its image."""
-    element, table = content.vertices
-    own = _of_vertices(element, table)
+    own = _of_vertices(content.vertices)
     uvs, laid, numbers = [np.empty((0, 3, 2))], [np.empty(0, bool)], [np.empty(0, np.int64)]
-    for face, rows in content.faces:
-        corners, sizes = corners_of(name, face, rows)
+    for face in content.faces:
+        corners, sizes = corners_of(name, face)
         triangles = triangles_of(name, shape.verts_or_nan, corners, sizes)
-        of_corners = _of_corners(name, face, rows, sizes)
+        of_corners = _of_corners(name, face, sizes)
         polygon = np.repeat(np.arange(len(sizes)), sizes)[triangles[:, 0]]
         if of_corners is not None:
             uvs.append(of_corners[0][triangles])
@@ -95,10 +94,10 @@ def _coordinates(name: str, content: Content, shape: Shape) -> tuple[Floats, Boo
             uvs.append(_at(own, corners[triangles]))
             laid.append(np.full(len(triangles), own is not None))
         chosen = next((p.name for p in face.properties if _plain(p.name) in _NUMBERS and not p.count_kind), None)
-        number = np.zeros(len(sizes), np.int64) if chosen is None else _whole(rows[chosen])
+        number = np.zeros(len(sizes), np.int64) if chosen is None else _whole(face.table[chosen])
         numbers.append(number[polygon])
-    for strip, rows in content.strips:
-        triangles = faces_of(*corners_of(name, strip, rows))
+    for strip in content.strips:
+        triangles = faces_of(*corners_of(name, strip))
         uvs.append(_at(own, triangles))
         laid.append(np.full(len(triangles), own is not None))
         numbers.append(np.zeros(len(triangles), np.int64))
@@ -117,7 +116,7 @@ def _whole(values: Floats | Ints) -> Ints:
     return np.where(np.abs(values) < 2**31, np.nan_to_num(values, posinf=0.0, neginf=0.0), -1).astype(np.int64)
 
 
-def _of_vertices(element: Element, table: Table) -> Floats | None:
+def _of_vertices(element: Element) -> Floats | None:
     """(V, 2) coordinates, v up, of the vertices; None if they have none."""
     known: dict[str, dict[str, str]] = {}  # what a name begins with, its axis, the name itself
     for p in element.properties:
@@ -127,7 +126,7 @@ def _of_vertices(element: Element, table: Table) -> Floats | None:
     for pair in _PAIRS:
         for names in known.values():
             if set(pair) <= set(names):
-                return np.stack([table[names[axis]].astype(np.float64) for axis in pair], axis=1)
+                return np.stack([element.table[names[axis]].astype(np.float64) for axis in pair], axis=1)
     return None
 
 
@@ -137,12 +136,12 @@ def _at(own: Floats | None, faces: Ints) -> Floats:
     return np.asarray(own[np.clip(faces, 0, len(own) - 1)])  # a face of no vertex is judged by the shape
 
 
-def _of_corners(name: str, face: Element, rows: Table, sizes: Ints) -> tuple[Floats, Bools] | None:
+def _of_corners(name: str, face: Element, sizes: Ints) -> tuple[Floats, Bools] | None:
     """(N, 2) coordinates, v up, of the corners of all polygons, and (P,) which polygons have them; None if none has."""
     chosen = next((p.name for p in face.properties if p.count_kind and _plain(p.name) in _LISTS), None)
     if chosen is None:
         return None
-    values, many = rows[chosen]
+    values, many = face.table[chosen]
     fine = many == 2 * sizes
     if not fine.any():
         return None

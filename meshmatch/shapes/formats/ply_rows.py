@@ -33,6 +33,10 @@ class Element:
     name: str
     count: int
     properties: list[Property] = field(default_factory=list)
+    role: str = ""
+    """One of vertex, face and tristrips; empty for what makes no shape."""
+    table: dict[str, Any] = field(default_factory=dict)
+    """What was read, by property; see `Body.element`."""
 
 
 class Body:
