@@ -72,17 +72,17 @@ def _similar(path: Path, suffixes: tuple[str, ...]) -> str:
     return f"did you mean {path.parent / close[0]}?" if close else "check the name and the folder"
 
 
-def read_bytes(path: Path, hint: str = "", largest: int = LARGEST_FILE) -> bytes:
+def read_bytes(path: Path, largest: int = LARGEST_FILE) -> bytes:
     """All of a file, of text without the mark of its encoding (`_unmarked`); `InputError` as `existing`, for one of text
     that is larger than that, or if reading fails.
     """
     try:
-        if existing(path, hint).stat().st_size > largest:
+        if existing(path).stat().st_size > largest:
             raise _much_text(path.name, path.stat().st_size, largest)
         data = path.read_bytes()
         return _unmarked(path.name, data) if path.suffix.lower() in _MAYBE_TEXT else data
     except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}", hint or "check the disk") from error
+        raise InputError(f"cannot read {path}: {error.strerror}", "check the disk") from error
 
 
 def _unmarked(name: str, data: bytes) -> bytes:

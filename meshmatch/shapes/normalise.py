@@ -123,11 +123,11 @@ def _distinct(found: list[Alignment]) -> list[Alignment]:
     return distinct
 
 
-def residual(shape: OrientedPoints, target: OrientedPoints, cap: float = _CAP) -> float:
+def residual(shape: OrientedPoints, target: OrientedPoints) -> float:
     """Mean of the capped six-dimensional nearest distances, one way and back; of where both lie."""
     forward = target.tree.query(shape.tree.data)[0]
     back = shape.tree.query(target.tree.data)[0]
-    return float(0.5 * np.minimum(forward, cap).mean() + 0.5 * np.minimum(back, cap).mean())
+    return float(0.5 * np.minimum(forward, _CAP).mean() + 0.5 * np.minimum(back, _CAP).mean())
 
 
 def _icp(shape: OrientedPoints, target: OrientedPoints, pose: RigidPose, steps: int) -> Alignment:

@@ -60,8 +60,8 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
     return Samples(points, unit(shape.face_vectors[face]), True, trust, face=face, barycentric=weights, vertex=vertex)
 
 
-def farthest_points(points: Float[Floats, "N D"], K: int, start: int = 0) -> Int[Ints, " K"]:
-    """Indices of points that are each as far as possible from all before them, beginning with `start`.
+def farthest_points(points: Float[Floats, "N D"], K: int) -> Int[Ints, " K"]:
+    """Indices of points that are each as far as possible from all before them, beginning with the first.
 
     Takes K passes over the points. With fewer distinct points than `K` the last ones repeat positions, never
     indices. `InputError` if there are fewer points.
@@ -69,12 +69,10 @@ def farthest_points(points: Float[Floats, "N D"], K: int, start: int = 0) -> Int
     points = np.asarray(points, np.float64)
     if not 0 < K <= len(points):
         raise InputError(f"cannot choose {K} of {len(points)} points")
-    if not 0 <= start < len(points):
-        raise ValueError(f"start {start} is not one of {len(points)} points")
     first, *others = np.ascontiguousarray(points.T)
     chosen = np.empty(K, np.int64)
     nearest = np.full(len(points), np.inf)
-    current = start
+    current = 0
     for k in range(K):
         chosen[k] = current
         squared = (first - first[current]) ** 2

@@ -67,7 +67,8 @@ def test_the_residual_by_hand() -> None:
     a = OrientedPoints(np.array([[0.0, 0, 0], [1, 0, 0]]), up)
     b = OrientedPoints(np.array([[0.0, 0, 0.1], [1, 0, 0.1]]), up)
     assert residual(a, b) == pytest.approx(0.1)
-    assert residual(a, OrientedPoints(b.points, -up), cap=1.0) == pytest.approx(np.hypot(0.1, 0.3))
+    slanted = np.tile([np.sin(np.pi / 3), 0.0, 0.5], (2, 1))  # as far from up as up is long
+    assert residual(a, OrientedPoints(b.points, slanted)) == pytest.approx(np.hypot(0.1, 0.15))
     assert residual(a, OrientedPoints(b.points + 50, up)) == pytest.approx(0.2)  # capped
 
 

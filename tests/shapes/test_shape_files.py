@@ -86,13 +86,6 @@ end_header
     np.testing.assert_allclose(shape.colors[:, 2:], [[0.2, 1.0]] * 5)
 
 
-def test_ply_colors_of_two_bytes(tmp_path: Path) -> None:
-    channels = "".join(f"property ushort {c}\n" for c in ("red", "green", "blue"))
-    head = HUGE.format("binary_little_endian", 1).replace("end_header\n", channels + "end_header\n")
-    shape = load(tmp_path, "a.ply", head.encode() + struct.pack("<3f3H", 1, 2, 3, 65535, 13107, 0))
-    np.testing.assert_allclose(shape.colors, [[1, 0.2, 0, 1]])
-
-
 def test_ply_colors_are_rounded_not_cut(tmp_path: Path, cube: Shape) -> None:
     save_shape(tmp_path / "a.ply", Shape(cube.verts, cube.faces, colors=np.full((8, 4), 0.999)))
     np.testing.assert_array_equal(load_shape(tmp_path / "a.ply").colors, 1.0)
@@ -192,33 +185,6 @@ def test_obj_seams_split_nothing_and_unused_vertices_stay(tmp_path: Path) -> Non
     shape = load(tmp_path, "a.obj", text)
     assert shape.V == 5
     np.testing.assert_array_equal(shape.faces, [[1, 2, 3], [3, 2, 1]])
-
-
-def test_obj_colors(tmp_path: Path) -> None:
-    shape = load(tmp_path, "a.obj", "v 0 0 0 1 0 0\nv 1 0 0 0 .5 0\nv 0 1 0 0 0 1\nf 1 2 3\n")
-    np.testing.assert_allclose(shape.colors, [[1, 0, 0, 1], [0, 0.5, 0, 1], [0, 0, 1, 1]])
-
-
-def test_off_with_colors_and_normals(tmp_path: Path) -> None:
-    rows = "".join(f"{x} {y} {z} 0 0 1 255 0 51 255\n" for x, y, z in CORNERS)
-    shape = load(tmp_path, "a.off", "CNOFF\n5 2 0\n" + rows + "4 0 1 2 3\n3 0 1 4\n")
-    check(shape)
-    np.testing.assert_allclose(shape.colors, [[1, 0, 0.2, 1]] * 5)
-
-
-def test_stl_has_three_vertices_a_triangle(tmp_path: Path) -> None:
-    triangles = CORNERS[np.array(QUAD_AND_TRIANGLE)]
-    text = "solid x\n"
-    binary = b"solid, says the header of many binary files".ljust(80) + struct.pack("<I", 3)
-    for a, b, c in triangles:
-        corners = "".join(f"vertex {x} {y} {z}\n" for x, y, z in (a, b, c))
-        text += f"facet normal 0 0 0\nouter loop\n{corners}endloop\nendfacet\n"
-        binary += struct.pack("<12fH", 0, 0, 0, *a, *b, *c, 0)
-    named = binary.replace(b"says the header", b"a facet, header")
-    for k, content in enumerate((text.encode() + b"endsolid x\n", binary, named)):
-        shape = load(tmp_path, f"{k}.stl", content)
-        np.testing.assert_array_equal(shape.verts, triangles.reshape(-1, 3))
-        np.testing.assert_array_equal(shape.faces, np.arange(9).reshape(3, 3))
 
 
 @pytest.mark.parametrize(

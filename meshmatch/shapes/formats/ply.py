@@ -107,7 +107,7 @@ def _give_roles(elements: Sequence[Element]) -> None:
     """Say of each element what it is, by its usual name, or, where there is none of that, by one that it has elsewhere; of
     several kinds of vertices the first are meant.
     """
-    usual, seen = {element.name for element in elements}, set()
+    usual, seen = {element.name for element in elements}, set[str]()
     for element in elements:
         role = next((role for role, others in _NAMES.items() if element.name.lower() in (role, *others)), "")
         if (element.name == role or role not in usual) and not (role == "vertex" and role in seen):
