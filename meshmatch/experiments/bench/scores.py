@@ -156,11 +156,6 @@ class SetScores:
         return dict(sorted(means.items(), key=lambda item: -item[1]))
 
     @property
-    def flips(self) -> float:
-        """Share (0..1) of the pairs whose mean error exceeds 15 cm."""
-        return float(np.mean([mean > LOST_CM for mean in self.means_cm.values()]))
-
-    @property
     def joined(self) -> Errors:
         """All points of all pairs."""
         return joined_errors(self.errors.values())
