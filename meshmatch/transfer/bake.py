@@ -1,7 +1,7 @@
 """Baking: for every texel of the target's atlas the color of its place on the source.
 
 A texel is a point of a triangle of the target. The map says where the triangle's corners lie on the source; the
-point between these images slides onto the source (`meshmatch.transfer.surface_walk`), and the face that it ends on says
+point between these images slides onto the source (`meshmatch.transfer.surface_walk`), and the face that it ends on gives
 its texture coordinates: they are never interpolated across the source's seams. Colors are averaged as light.
 """
 
@@ -29,7 +29,7 @@ from meshmatch.transfer.unwrap import Atlas
 _LARGEST = 8192  # texels along a side
 # So many texels past a seam show the surface that goes on there; further out, the nearest mean (see `fill`).
 _OVERHANG = 2
-# Texels that cover more than this of the source's are sampled several times.
+# A texel that covers more than this many of the source's is sampled several times.
 _COARSE = 1.25
 _CHUNK = 1 << 16
 

@@ -1,7 +1,7 @@
-"""Images texel by texel: which triangle of an atlas lies on each, and what they are in ever smaller sizes.
+"""Images texel by texel: which triangle of an atlas covers each texel, and pyramids of ever smaller images.
 
 A pyramid is made of known texels alone. Every texel of a smaller level is the mean, in light, of those known among its
-four; texels that nobody painted then take the color of the next smaller level. So a mip level that a viewer makes of a
+four; unpainted texels then take the color of the next smaller level. So a mip level that a viewer makes of a
 filled image never shows a background: each of its texels that touches a chart is the mean of chart texels.
 """
 

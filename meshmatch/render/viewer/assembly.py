@@ -33,7 +33,7 @@ _KINDS = {
 
 
 def check_page(path: str | Path) -> None:
-    """Refuse a name that no browser would open (`OptionError`). Cheap: ask before work."""
+    """Refuse a name that no browser would open (`OptionError`). Call it before long work."""
     if Path(path).suffix.lower() not in (".html", ".htm"):
         raise OptionError(f"{Path(path).name}: a page is HTML", "end the name in .html")
 

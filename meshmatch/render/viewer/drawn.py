@@ -1,4 +1,4 @@
-"""What of two shapes a page draws, all of it or less of a large one, and where: both upright and in one scale."""
+"""What a page draws of two shapes, which is less of a large one, and where: both upright and in one scale."""
 
 from __future__ import annotations
 
