@@ -16,7 +16,7 @@ def pear(sphere: Shape) -> OrientedPoints:
     verts = sphere.verts * [0.25, 0.45, 0.33]
     verts[:, 0] *= 1 + 0.8 * sphere.verts[:, 1]
     verts[:, 2] *= 1 + 0.5 * sphere.verts[:, 0]
-    samples = sample_surface(Shape(verts, sphere.faces), 700, np.random.default_rng(0))
+    samples = sample_surface(Shape(verts, sphere.faces), 400, np.random.default_rng(0))
     return OrientedPoints(samples.points - samples.points.mean(0), samples.normals)
 
 
@@ -28,10 +28,14 @@ def turned(part: OrientedPoints, rotation: np.ndarray, center: np.ndarray) -> Or
 def test_any_turn_is_found(pear: OrientedPoints, seed: int) -> None:
     rotation = Rotation.random(random_state=np.random.default_rng(seed)).as_matrix()
     center = np.array([0.02, -0.03, 0.01])
-    best = align(turned(pear, rotation, center), pear, "rigid")[0]
+    best, *others = found = align(turned(pear, rotation, center), pear, "rigid", keep=4)
     assert np.allclose(best.pose.rotation, rotation, atol=0.02)
     assert np.allclose(best.pose.center, center, atol=0.01)
     assert best.residual < 0.02
+    assert 1 <= len(others) <= 3
+    for k, one in enumerate(found):  # answers are different turns
+        for other in found[:k]:
+            assert np.degrees(Rotation.from_matrix(one.pose.rotation.T @ other.pose.rotation).magnitude()) > 15
 
 
 def test_near_improves_a_small_turn_and_none_leaves_it(pear: OrientedPoints) -> None:
@@ -45,21 +49,12 @@ def test_near_improves_a_small_turn_and_none_leaves_it(pear: OrientedPoints) -> 
 
 
 def test_where_every_turn_fits_the_given_one_is_taken(sphere: Shape) -> None:
-    drawn = (sample_surface(sphere, 1500, np.random.default_rng(seed)) for seed in (0, 1))
+    drawn = (sample_surface(sphere, 600, np.random.default_rng(seed)) for seed in (0, 1))
     ball, other = (OrientedPoints(0.28 * samples.points, samples.normals) for samples in drawn)
     best, *others = align(ball, other, "rigid", keep=3)
     assert np.degrees(Rotation.from_matrix(best.pose.rotation).magnitude()) < 10
     assert len(others) == 2
     assert min(turn.residual for turn in others) < 1.1 * best.residual  # chance alone would have chosen one of these
-
-
-def test_several_answers_are_different_turns(pear: OrientedPoints) -> None:
-    found = align(pear, pear, "rigid", keep=4)
-    assert 2 <= len(found) <= 4
-    for k, one in enumerate(found):
-        for other in found[:k]:
-            angle = np.degrees(Rotation.from_matrix(one.pose.rotation.T @ other.pose.rotation).magnitude())
-            assert angle > 15
 
 
 def test_the_residual_by_hand() -> None:

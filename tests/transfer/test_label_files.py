@@ -155,6 +155,10 @@ def test_as_many_vertices_as_faces_are_asked_about(tmp_path: Path) -> None:
         load_labels(tmp_path / "b.json", SQUARE, "vertices")
 
 
+def lines(*texts: str) -> Callable[[Path], object]:
+    return lambda path: path.write_text("\n".join([*texts, ""]))
+
+
 BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "not there": ("a.npy", lambda path: None, "there is no file"),
     "a folder": ("a.npy", lambda path: path.mkdir(), "is a folder"),
@@ -168,34 +172,14 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "no json": ("a.json", lambda path: path.write_text("[1,"), "can be read"),
     "a number": ("a.json", lambda path: path.write_text("7"), "no list of labels"),
     "lists": ("a.json", lambda path: path.write_text(json.dumps([[1]] * 42)), "whole number or a word"),
-    "on what": (
-        "a.json",
-        lambda path: path.write_text(json.dumps({"on": "hair", "labels": [1] * 42})),
-        "not on 'hair'",
-    ),
+    "on what": ("a.json", lines('{"on": "hair", "labels": [1, 2]}'), "not on 'hair'"),
     "parts out of range": ("a.json", lambda path: path.write_text('{"arm": [42]}'), "'arm' is not a list"),
     "parts of words": ("a.json", lambda path: path.write_text('{"arm": "left"}'), "'arm' is not a list"),
     "ragged csv": ("a.csv", lambda path: path.write_text("0,a\n1\n"), "not equally long"),
-    "unsorted csv": (
-        "a.csv",
-        lambda path: path.write_text("vertex,label\n" + "".join(f"{41 - k},a\n" for k in range(42))),
-        "in order",
-    ),
-    "csv that counts from 1": (
-        "a.csv",
-        lambda path: path.write_text("vertex,label\n" + "".join(f"{k + 1},a\n" for k in range(42))),
-        "in order",
-    ),
-    "columns split by spaces": (
-        "a.csv",
-        lambda path: path.write_text("vertex label\n" + "".join(f"{k} 1\n" for k in range(42))),
-        "names two columns",
-    ),
-    "columns split by bars": (
-        "a.txt",
-        lambda path: path.write_text("vertex|label\n" + "".join(f"{k}|1\n" for k in range(42))),
-        "names two columns",
-    ),
+    "unsorted csv": ("a.csv", lines("vertex,label", *[f"{41 - k},a" for k in range(42)]), "in order"),
+    "csv that counts from 1": ("a.csv", lines("vertex,label", *[f"{k + 1},a" for k in range(42)]), "in order"),
+    "columns split by spaces": ("a.csv", lines("vertex label", *[f"{k} 1" for k in range(42)]), "names two columns"),
+    "columns split by bars": ("a.txt", lines("vertex|label", *[f"{k}|1" for k in range(42)]), "names two columns"),
     "nameless csv": ("a.csv", lambda path: path.write_text("1,2,3\n" * 42), "none is called label"),
     "not text": ("a.txt", lambda path: path.write_bytes(b"\xff\xfe\x00"), "can be read"),
     "a suffix": ("a.xlsx", lambda path: path.write_text("x"), "not read from '.xlsx'"),
