@@ -13,7 +13,7 @@ import numpy as np
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.errors import warn
 from meshmatch.geometry.triangles import cross_product, dot
-from meshmatch.shapes.formats import runs
+from meshmatch.shapes.formats import fan, runs
 from meshmatch.shapes.shape import LARGEST
 
 MOST_CORNERS = 16_384
@@ -38,13 +38,10 @@ def triangles_of(
     `corners` are numbers of vertices, one polygon after the other, of which `sizes` has how many each has; `name` is the
     file's.
     """
-    if len(sizes) and (sizes == 3).all():
-        return np.arange(len(corners)).reshape(-1, 3)
-    starts, counts = np.cumsum(sizes) - sizes, np.maximum(sizes - 2, 0)
-    first, second = np.repeat(starts, counts), runs(starts + 1, counts)
-    triangles = np.stack([first, second, second + 1], axis=1)
+    triangles = fan(np.arange(len(corners)), sizes)
     if len(verts) == 0 or not (sizes > 3).any():
         return triangles
+    starts, counts = np.cumsum(sizes) - sizes, np.maximum(sizes - 2, 0)
 
     def places_of(polygons: Ints) -> Floats:
         """Positions of the corners of some polygons, one after the other; nan for one that has none."""
