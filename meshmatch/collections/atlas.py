@@ -42,7 +42,7 @@ class Projection:
     residual: float
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Atlas(Brief, Pickled):
     """The mean of S registered shapes, and the M modes in which they vary.
 
@@ -160,18 +160,18 @@ class Atlas(Brief, Pickled):
         for array in (mean, kept, found.deviations, scores, sizes, faces, laid.weights):
             frozen(array)
         return cls(
-            mean,
-            kept,
-            found.deviations,
-            scores,
-            sizes,
-            faces,
-            laid.weights,
-            called,
-            found.total,
-            scale,
-            robust,
-            template,
+            mean=mean,
+            modes=kept,
+            deviations=found.deviations,
+            scores=scores,
+            sizes=sizes,
+            faces=faces,
+            weights=laid.weights,
+            names=called,
+            total=found.total,
+            scale=scale,
+            robust=robust,
+            template=template,
         )
 
     @property
@@ -457,29 +457,38 @@ def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
     version = given.pop("version", np.empty(0))
     if version.dtype.kind not in "iu" or version.shape != () or version != VERSION:
         raise InputError(f"{file} is not an atlas of version {VERSION}", "make it again with this meshmatch")
-    kinds = {each.name: "f" for each in fields(Atlas)} | {"faces": "i", "names": "U", "scale": "U", "robust": "b"}
-    kinds["template"] = "U"
-    wrong = [name for name in kinds if name not in given or given[name].dtype.kind != kinds[name]]
+    M, V, S, F = (
+        len(given[name]) if np.ndim(given.get(name, 0)) else -1 for name in ("modes", "mean", "names", "faces")
+    )
+    layout: dict[str, tuple[str, tuple[int, ...]]] = {  # kinds and sizes
+        **{"mean": ("f", (V, 3)), "modes": ("f", (M, V, 3)), "deviations": ("f", (M,)), "scores": ("f", (S, M))},
+        **{
+            "sizes": ("f", (S,)),
+            "faces": ("i", (F, 3)),
+            "weights": ("f", (V,)),
+            "names": ("U", (S,)),
+            "total": ("f", ()),
+        },
+        **{"scale": ("U", ()), "robust": ("b", ()), "template": ("U", ())},
+    }
+    fits = {n: n in given and (given[n].dtype.kind, given[n].shape) == about for n, about in layout.items()}
+    numbers = {n: given[n].astype(np.float64) for n in layout if fits[n] and layout[n][0] == "f"}  # any float is read
+    wrong = [n for n in layout if not fits[n] or not (np.abs(numbers.get(n, 0.0)) < LARGEST).all()]
+    if not wrong:
+        weights, faces = numbers["weights"], given["faces"]
+        right = {
+            "deviations": (numbers["deviations"] > 0).all(),
+            "sizes": (numbers["sizes"] > 0).all(),
+            "weights": (weights >= 0).all() and abs(weights.sum() - 1) <= _ROUNDED,
+            "faces": F > 0 and faces.min() >= 0 and faces.max() < V,
+            "scale": str(given["scale"]) in get_args(Scale),
+        }
+        wrong = [name for name, holds in right.items() if not holds]
     if wrong:
         raise InputError(f"{file} is damaged: {', '.join(wrong)}", "make it again")
-    M, V, S = (len(given[name]) if given[name].ndim else -1 for name in ("modes", "mean", "names"))
-    sizes = {"mean": (V, 3), "modes": (M, V, 3), "deviations": (M,), "scores": (S, M), "sizes": (S,)}
-    sizes |= {"weights": (V,), "names": (S,), "total": (), "scale": (), "robust": (), "template": ()}
-    wrong = [name for name, size in sizes.items() if given[name].shape != size]
-    numbers = {name: given[name].astype(np.float64) for name, kind in kinds.items() if kind == "f"}  # any float is read
-    wrong += [name for name, array in numbers.items() if not (np.abs(array) < LARGEST).all()]
-    wrong += [name for name in ("deviations", "sizes") if not (numbers[name] > 0).all()]
-    if (numbers["weights"] < 0).any() or abs(numbers["weights"].sum() - 1) > _ROUNDED:
-        wrong.append("weights")
-    faces = given["faces"]
-    if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces) or faces.min() < 0 or faces.max() >= V:
-        wrong.append("faces")
-    if wrong or str(given["scale"]) not in get_args(Scale):
-        raise InputError(f"{file} is damaged: {', '.join(wrong) or 'scale'}", "make it again")
     found: dict[str, Any] = {name: frozen(array) for name, array in (given | numbers).items()}
-    found |= {"names": tuple(str(name) for name in given["names"]), "scale": str(given["scale"])}
-    found["template"] = str(given["template"])
-    return found | {"total": float(given["total"]), "robust": bool(given["robust"])}
+    words = {"names": tuple(map(str, given["names"])), "scale": str(given["scale"]), "template": str(given["template"])}
+    return found | words | {"total": float(given["total"]), "robust": bool(given["robust"])}
 
 
 def _outward(modes: Floats, mean: Floats, weights: Floats) -> Floats:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
-from functools import cached_property, lru_cache
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -16,10 +15,10 @@ from meshmatch.api.results import MapPair
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.fit_all import Fitted, fit_all
-from meshmatch.collections.fit_files import load_finished, load_words
+from meshmatch.collections.fit_files import load_words
 from meshmatch.collections.map_all import Pair, map_all
 from meshmatch.collections.registered import Registered, held
-from meshmatch.collections.setting import FITS, SUFFIX, TEMPLATE, Record, Setting
+from meshmatch.collections.setting import FITS, SUFFIX, Record, Setting, finished_fit, forget, template_at
 from meshmatch.collections.settle import read_about, settled
 from meshmatch.collections.sources import find_sources
 from meshmatch.collections.stores import Store
@@ -37,9 +36,7 @@ from meshmatch.models.registry import AUTO
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.templates.prepared_folder import RegisteredShapes
-from meshmatch.templates.template import Template, load_template
-
-_KEPT = 64  # fits in memory
+from meshmatch.templates.template import Template
 
 
 class Collection:
@@ -70,14 +67,9 @@ class Collection:
         self.store = Store.of(folder)
         self.workers = workers
         self.progress = progress
-        self._read = lru_cache(maxsize=_KEPT)(self._load)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"store": self.store, "workers": self.workers, "progress": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._read = lru_cache(maxsize=_KEPT)(self._load)
 
     def __repr__(self) -> str:
         return f"Collection({self.store.location!r})"
@@ -137,7 +129,7 @@ class Collection:
         with self.store.alone(), hired(self.workers) as crew:
             setting = settled(wish, sources)
             made = fit_all(setting, sources, crew, agree, self.progress, tell)
-        self._read.cache_clear()
+        forget()
         return made
 
     @property
@@ -149,11 +141,10 @@ class Collection:
             raise InputError(f"{self.store.location} holds no finished fit", "run `meshmatch fit` to its end")
         return found
 
-    @cached_property
+    @property
     def template(self) -> Template:
         """The template of all fits."""
-        with self.store.reading(TEMPLATE) as path:
-            return load_template(path)
+        return template_at(self.store)
 
     @property
     def model(self) -> str:
@@ -260,8 +251,11 @@ class Collection:
         return MapPair(*shapes, self.map(a, b).for_shapes(*shapes), opposite=self.map(b, a).for_shapes(*shapes[::-1]))
 
     def _hash_of(self, name: str) -> str:
+        return str(self._words(name).get("shape_hash", ""))
+
+    def _words(self, name: str) -> dict[str, Any]:
         with self.store.reading(f"{FITS}/{name}{SUFFIX}") as path:
-            return str(load_words(path)[0].get("shape_hash", ""))
+            return load_words(path)[0]
 
     def pairs(self, to: str | None = None) -> list[Pair]:
         """All ordered pairs of names.
@@ -355,10 +349,7 @@ class Collection:
         InputError
             Fewer than three shapes are left.
         """
-        verdicts = {}
-        for name in self.names:
-            with self.store.reading(f"{FITS}/{name}{SUFFIX}") as path:
-                verdicts[name] = str(load_words(path)[0]["verdict"])
+        verdicts = {name: str(self._words(name)["verdict"]) for name in self.names}
         left_out = {name: verdict for name, verdict in verdicts.items() if verdict == "poor" and not poor}
         names = tuple(name for name in verdicts if name not in left_out)
         if len(names) < 3:
@@ -380,11 +371,9 @@ class Collection:
             raise InputError(f"{self.store.location} is not a folder of fits", hint)
         return about
 
-    def _load(self, name: str) -> tuple[Fit, Places]:
-        file = f"{FITS}/{name}{SUFFIX}"
-        if not self.store.exists(file):
+    def _read(self, name: str) -> tuple[Fit, Places]:
+        if not self.store.exists(f"{FITS}/{name}{SUFFIX}"):
             close = get_close_matches(name, self.names, n=1)
             hint = f"did you mean {close[0]}?" if close else "names are those of the fitted files, without the suffix"
             raise InputError(f"the collection has no fit of {name}", hint)
-        with self.store.reading(file) as path:
-            return load_finished(path, self.template)
+        return finished_fit(self.store, name)

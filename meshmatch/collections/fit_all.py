@@ -150,7 +150,7 @@ class _Run:
 
     def last_tasks(self, records: Mapping[int, Record], groups: Sequence[Group]) -> dict[int, FinishTask]:
         """What finishes each fit; a digest of all that agree tells whether that was done before."""
-        steps = AgreeConfig.for_collection(self.setting.trained).steps if groups else 0
+        steps = AgreeConfig.for_collection(self.setting.trained).schedule.steps if groups else 0
         group_of = {name: group for group in groups for name in group.names}
         found = {}
         for number, record in records.items():
@@ -164,7 +164,7 @@ class _Run:
         the order of the groups.
         """
         how, store = AgreeConfig.for_collection(self.setting.trained), self.setting.store
-        steps, first = how.steps, common_file(groups[0].agreement, 1)
+        steps, first = how.schedule.steps, common_file(groups[0].agreement, 1)
         for step in range(steps + 1):
             common = common_file(groups[0].agreement, step + 1)
             if store.exists(common):

@@ -157,14 +157,6 @@ def regularity_of(about: Words) -> Regularity | None:
     return found
 
 
-def load_finished(path: str | Path, template: Template) -> tuple[Fit, Places]:
-    """Read a finished fit, with where the shape's vertices belong; errors as `load_fit`, or the fit is not finished."""
-    found = load_fit(path, template)
-    if found.places is None:
-        raise InputError(f"the fit of {Path(path).stem} is not finished", "run `meshmatch fit` to its end")
-    return found.fit, found.places
-
-
 def _places(arrays: dict[str, np.ndarray], about: Words, fit: Fit) -> Places | None:
     if "resting" not in arrays:
         return None

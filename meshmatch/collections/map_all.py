@@ -5,27 +5,22 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
-from meshmatch.collections.fit_files import load_finished
-from meshmatch.collections.setting import FITS, SUFFIX, TEMPLATE
+from meshmatch.collections.setting import FITS, SUFFIX, finished_fit
 from meshmatch.collections.stores import Store
 from meshmatch.collections.workers import Died, Workers
 from meshmatch.errors import InputError
 from meshmatch.maps.build import build_map
 from meshmatch.maps.files import save_map
-from meshmatch.maps.places import Places
 from meshmatch.outputs import as_path
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.input_files import read_text
-from meshmatch.templates.template import Template, load_template
 
 Pair = tuple[str, str]
 """Names of a source and of a target."""
 _SOURCES = 64  # of one task: enough to pay for the target's tree
 _LINE = 400  # bytes of memory for a pair
-_KEPT = 64  # shapes' places in memory
 
 
 @dataclass(frozen=True)
@@ -72,7 +67,7 @@ def map_some(task: MapTask) -> int:
     """Write maps to one shape; how many there are. Those that are as new as the fits are kept."""
     for source in task.sources:
         if not _is_new(task, source):
-            found = build_map(_places(task.fits, source), _places(task.fits, task.target))
+            found = build_map(*(finished_fit(task.fits, name)[1] for name in (source, task.target)))
             with task.output.writing(task.file(source)) as path:
                 save_map(path, found)
     return len(task.sources)
@@ -112,15 +107,3 @@ def _is_new(task: MapTask, source: str) -> bool:
     path = Path(task.output.location, task.file(source))
     both = [Path(task.fits.location, FITS, f"{name}{SUFFIX}") for name in (source, task.target)]
     return path.is_file() and path.stat().st_mtime > max(fit.stat().st_mtime for fit in both)
-
-
-@lru_cache(maxsize=_KEPT)
-def _places(fits: Store, name: str) -> Places:
-    with fits.reading(f"{FITS}/{name}{SUFFIX}") as path:
-        return load_finished(path, _template(fits))[1]
-
-
-@lru_cache(maxsize=1)
-def _template(fits: Store) -> Template:
-    with fits.reading(TEMPLATE) as path:
-        return load_template(path)

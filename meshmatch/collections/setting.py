@@ -16,8 +16,8 @@ from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.without_model import NO_MODEL, fit_viscously, viscous_system
+from meshmatch.maps.places import Places
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
@@ -113,7 +113,13 @@ class Setting:
     @property
     def template(self) -> Template:
         """The template, read once in each process."""
-        return _template(self.store, self.template_file, self.template_hash)
+        found = template_at(self.store, self.template_file)
+        if found.hash != self.template_hash:
+            raise InputError(
+                f"{self.store.location}/{self.template_file} has changed",
+                "run `meshmatch fit` again, and one at a time",
+            )
+        return found
 
     @property
     def agrees(self) -> bool:
@@ -130,7 +136,7 @@ class Setting:
         if self.model == NO_MODEL:
             part, template = validated(shape), self.template
             with thread_limit(1):
-                found = fit_viscously(template, _system(self.store, self.template_file, self.template_hash), part.shape)
+                found = fit_viscously(template, viscous_system(template), part.shape)
             return replace(found, repaired=part)
         matcher = Matcher(self.trained, self.config, 1)
         return matcher.fit(shape) if last is None else matcher.follow(shape, last)
@@ -147,14 +153,23 @@ class Setting:
 
 
 @lru_cache(maxsize=4)
-def _template(store: Store, file: str, digest: str) -> Template:
+def template_at(store: Store, file: str = TEMPLATE) -> Template:
+    """A template of a collection, read once in each process."""
     with store.reading(file) as path:
-        found = load_template(path)
-    if found.hash != digest:
-        raise InputError(f"{store.location}/{file} has changed", "run `meshmatch fit` again, and one at a time")
-    return found
+        return load_template(path)
 
 
-@lru_cache(maxsize=2)
-def _system(store: Store, file: str, digest: str) -> NodeSystem:
-    return viscous_system(_template(store, file, digest))
+@lru_cache(maxsize=64)
+def finished_fit(store: Store, name: str) -> tuple[Fit, Places]:
+    """A finished fit, and where the shape's vertices belong; some are kept in memory. Errors as `load_fit`."""
+    with store.reading(f"{FITS}/{name}{SUFFIX}") as path:
+        found = load_fit(path, template_at(store))
+    if found.places is None:
+        raise InputError(f"the fit of {name} is not finished", "run `meshmatch fit` to its end")
+    return found.fit, found.places
+
+
+def forget() -> None:
+    """Read templates and fits again, for they may have changed."""
+    template_at.cache_clear()
+    finished_fit.cache_clear()

@@ -181,7 +181,7 @@ def _member(read: StoredFit, how: AgreeConfig) -> Member:
 def _starts(members: Sequence[Member], now: Floats, before: Floats) -> list[Floats]:
     """Where a step begins: a little further on along the last one."""
     paths = zip(members, now, before, strict=True)
-    return [here + member.config.momentum * (here - last) for member, here, last in paths]
+    return [here + member.config.schedule.momentum * (here - last) for member, here, last in paths]
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ def test_a_cluster_of_which_one_worker_is_killed(scheduler: Scheduler, tmp_path:
     shapes = tmp_path / "shapes"
     shapes.mkdir()
     dancer = load_shape(SAMPLES / "dancer.ply")
-    for number in range(4):
+    for number in range(3):
         save_shape(shapes / f"dancer-{number}.ply", Shape((number + 1) * dancer.verts, dancer.faces))
     shutil.copy(SAMPLES / "climber.ply", shapes)
     killed = []
@@ -90,12 +90,13 @@ def test_a_cluster_of_which_one_worker_is_killed(scheduler: Scheduler, tmp_path:
             killed.append(record)
 
     far = meshmatch.Collection(tmp_path / "far", workers=scheduler.address)
-    made = far.fit(shapes, model="human", tell=kill_one)
-    assert killed and [record.verdict for record in made.records] == ["good"] * 5
+    quick = meshmatch.FitConfig(refine="none", copies=16, careful=1)
+    made = far.fit(shapes, model="human", config=quick, tell=kill_one)
+    assert killed and all(record.fitted for record in made.records)
     here = meshmatch.Collection(tmp_path / "here", workers=1)
-    here.fit(shapes, model="human")
+    here.fit(shapes, model="human", config=quick)
     assert contents(tmp_path / "far") == contents(tmp_path / "here")
-    assert far.save_maps(tmp_path / "maps") == 20
+    assert far.save_maps(tmp_path / "maps") == 12
 
 
 def test_nobody_at_the_address(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import csv
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
+from scipy.spatial.transform import Rotation
 
 import meshmatch
 from meshmatch.cli import main
@@ -25,9 +26,11 @@ from meshmatch.locks import locked
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
+from tests.conftest import icosphere
 
 SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
 NAMES = ["climber", "dancer", "turned"]
+pytestmark = pytest.mark.usefixtures("remembered_fits")
 
 
 @pytest.fixture(scope="module")
@@ -44,13 +47,15 @@ def shapes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def made(shapes: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, tuple[Record, ...]]]:
+def made(
+    shapes: Path, tmp_path_factory: pytest.TempPathFactory, remembered_fits: Callable
+) -> tuple[Path, tuple[Record, ...]]:
     folder = tmp_path_factory.mktemp("out") / "fits"
     told: list[Record] = []
     found = meshmatch.Collection(folder, workers=1).fit(shapes, model="human", tell=told.append)
     finished = [replace(record, inverted=0.0, volume=0.0) for record in found.records]  # of the fits that agreed
     assert finished == [replace(record, inverted=0.0, volume=0.0) for record in told] and found.agreed == 3
-    yield folder, found.records
+    return folder, found.records
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -389,8 +394,10 @@ def test_without_a_model_the_shapes_make_their_template(tmp_path: Path) -> None:
     folder.mkdir()
     eggs = {}
     for number, squash in enumerate((0.8, 0.9, 1.1, 1.2)):
-        verts, faces = egg(10 + number)
-        eggs[f"egg{number}"] = Shape(verts * [1, squash, 1.4], faces)
+        ball = icosphere(3)
+        x, y, z = (ball.verts @ Rotation.random(rng=number).as_matrix()).T  # other triangles in the same places
+        radius = 1 + 0.15 * z + 0.1 * x  # its ends, and its sides, differ
+        eggs[f"egg{number}"] = Shape(radius[:, None] * np.stack([x, y, z], 1) * [1, squash, 1.4], ball.faces)
         save_shape(folder / f"egg{number}.ply", eggs[f"egg{number}"])
     collection = meshmatch.Collection(tmp_path / "fits", workers=1)
     made = collection.fit(folder, model="none")
@@ -415,23 +422,6 @@ def test_where_no_fit_is_to_be_trusted_maps_can_be_made(tmp_path: Path) -> None:
     assert {record.verdict for record in made.records} == {"poor"}
     assert collection.map("egg0", "egg2").verdict == "poor"
     assert collection.save_maps(tmp_path / "maps") == 6
-
-
-def egg(rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """A sphere whose one end is pointed, of so many rings, 2 * rings vertices each, with bumps that tell its sides."""
-    polar = np.linspace(0, np.pi, rings + 2)[1:-1]
-    around = np.linspace(0, 2 * np.pi, 2 * rings, endpoint=False)
-    a, b = (each.reshape(-1) for each in np.meshgrid(polar, around, indexing="ij"))
-    radius = 1 + 0.15 * np.cos(a) + 0.1 * np.cos(b) * np.sin(a)
-    verts = radius[:, None] * np.stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)], 1)
-    verts = np.concatenate([verts, [[0, 0, 1.15], [0, 0, -0.85]]])
-    n, count = 2 * rings, rings * 2 * rings
-    ring = np.arange(count).reshape(rings, n)
-    p, q = ring[:-1].reshape(-1), ring[1:].reshape(-1)
-    r, t = np.roll(ring[1:], -1, 1).reshape(-1), np.roll(ring[:-1], -1, 1).reshape(-1)
-    top = np.stack([np.full(n, count), ring[0], np.roll(ring[0], -1)], 1)
-    low = np.stack([np.full(n, count + 1), np.roll(ring[-1], -1), ring[-1]], 1)
-    return verts, np.concatenate([np.stack([p, q, r], 1), np.stack([p, r, t], 1), top, low])
 
 
 def test_a_shape_of_another_kind_is_called_so(tmp_path: Path) -> None:
