@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize as unit
 
-from meshmatch.arrays import Float
+from meshmatch.arrays import Float, Int
 from meshmatch.errors import OptionError
 from meshmatch.generators.generator import Source
 from meshmatch.generators.limbs import FOLDED, Draw, Limbs, draw_arms, draw_limbs, mirrored, with_legs
@@ -100,10 +100,17 @@ def human_source(
     `OptionError` if the template is not made from the body model, or the extra ``train`` is not installed; `InputError` if
     the body has no joint of a name in ``poses``.
     """
+    return partial(sample_bodies, posable_rig(template, identities, seed, progress, poses), poses=poses)
+
+
+def posable_rig(
+    template: Template, identities: int, seed: int, progress: Progress | None, poses: GivenPoses | None
+) -> Rig:
+    """`template_rig`, with all joints that are named in ``poses``; errors as `human_source`."""
     rig = template_rig(template, identities, seed, progress)
     if poses is not None:
         poses.columns(rig)  # checks the names
-    return partial(sample_bodies, rig, poses=poses)
+    return rig
 
 
 def template_rig(template: Template, identities: int = 4096, seed: int = 0, progress: Progress | None = None) -> Rig:
@@ -127,10 +134,15 @@ def sample_free_pose(
     B = heads.shape[0]
     repeated = heads.repeat(tries, 1, 1)
     world, offset = forward_kinematics(rig, repeated, sample_pose(rig, repeated, generator))
-    depth = penetration(rig, repeated, world, offset).view(tries, B)
-    order = torch.where(depth < tolerance, torch.arange(tries)[:, None] - 1e3, depth)
-    pick = order.argmin(0) * B + torch.arange(B)
+    pick = first_free(penetration(rig, repeated, world, offset), B, tolerance)
     return world[pick], offset[pick]
+
+
+def first_free(depth: Float[Tensor, " T_times_B"], B: int, tolerance: float) -> Int[Tensor, " B"]:
+    """Of several poses of each body, one after the other, the row of the first that is less deep, else of the best."""
+    depth = depth.view(-1, B)
+    order = torch.where(depth < tolerance, torch.arange(len(depth))[:, None] - 1e3, depth)
+    return order.argmin(0) * B + torch.arange(B)
 
 
 def sample_pose(rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Generator) -> Float[Tensor, "B J 3 3"]:
@@ -142,7 +154,7 @@ def sample_pose(rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Genera
     draw = Draw(B, generator)
     vectors = torch.zeros(B, J, 3)
     joint = rig.joint
-    family = torch.multinomial(torch.tensor([0.34, 0.24, 0.14, 0.08, 0.1, 0.1]), B, True, generator=generator)
+    family = draw.family([0.34, 0.24, 0.14, 0.08, 0.1, 0.1])
     arms = draw_arms(draw)
     left, right = (draw_limbs(draw, arm, family) for arm in arms)
     same_arms = (torch.rand(B, generator=generator) < 0.3) & (arms[0] != FOLDED)
@@ -157,6 +169,13 @@ def sample_pose(rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Genera
     neck = torch.stack([draw.normal(2, 18), draw.normal(0, 28), draw.normal(0, 14)], -1) * DEGREE
     for name, share in (("neck01", 0.3), ("neck02", 0.2), ("neck03", 0.2), ("head", 0.3)):
         vectors[:, joint(name)] = neck * share
+    return joint_rotations(vectors, matrices)
+
+
+def joint_rotations(
+    vectors: Float[Tensor, "B J 3"], matrices: dict[int, Float[Tensor, "B 3 3"]]
+) -> Float[Tensor, "B J 3 3"]:
+    """Rotations of all joints, by vectors, and of some by matrices."""
     rotations = rotation_from_vector(vectors)
     for index, rotation in matrices.items():
         rotations[:, index] = rotation

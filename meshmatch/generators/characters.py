@@ -13,9 +13,10 @@ from meshmatch.generators.bodies import (
     Bodies,
     draw_identities,
     human_source,
+    joint_rotations,
+    posable_rig,
     pose_limbs,
     sample_free_pose,
-    template_rig,
 )
 from meshmatch.generators.clothes import dressed, skirted
 from meshmatch.generators.figure import Figure
@@ -24,7 +25,6 @@ from meshmatch.generators.limbs import Draw, Limbs
 from meshmatch.generators.pose_files import GivenPoses
 from meshmatch.generators.proportions import PLAIN, SHARES, TOON, draw_style, rounded, stretched
 from meshmatch.generators.rig import Rig, forward_kinematics, skin
-from meshmatch.generators.rotations import rotation_from_vector
 from meshmatch.progress import Progress
 from meshmatch.templates.template import Template
 
@@ -42,20 +42,13 @@ class Cast:
     poses: GivenPoses | None = None
     kinds: tuple[float, ...] = SHARES
 
-    @classmethod
-    def of(cls, rig: Rig, share: float, poses: GivenPoses | None = None) -> Cast:
-        """The cast of a rig."""
-        return cls(Figure.of(rig), share, poses)
-
 
 def people_source(template: Template, bodies: Bodies, seed: int = 0, progress: Progress | None = None) -> Source:
     """Generated people on a human template's vertices; errors as `meshmatch.generators.bodies.human_source`."""
     if not bodies.characters:
         return human_source(template, bodies.identities, seed, progress, bodies.poses)
-    rig = template_rig(template, bodies.identities, seed, progress)
-    if bodies.poses is not None:
-        bodies.poses.columns(rig)  # checks the names
-    return partial(sample_characters, Cast.of(rig, bodies.characters, bodies.poses))
+    rig = posable_rig(template, bodies.identities, seed, progress, bodies.poses)
+    return partial(sample_characters, Cast(Figure.of(rig), bodies.characters, bodies.poses))
 
 
 def sample_characters(cast: Cast, B: int, generator: torch.Generator) -> Float[Tensor, "B V 3"]:
@@ -119,7 +112,4 @@ def standing(rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Generator
     }  # fmt: skip
     limbs = Limbs(**angles)
     matrices = pose_limbs(vectors, rig, heads, limbs, limbs, draw)
-    rotations = rotation_from_vector(vectors)
-    for index, rotation in matrices.items():
-        rotations[:, index] = rotation
-    return rotations
+    return joint_rotations(vectors, matrices)

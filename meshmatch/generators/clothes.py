@@ -10,31 +10,26 @@ from torch import Tensor
 
 from meshmatch.arrays import Float
 from meshmatch.generators.figure import LEG, Figure, joints_of, part
+from meshmatch.generators.limbs import Draw
 from meshmatch.generators.rig import Rig
 
 _HEM = 0.03  # over so much of a limb a hem rises
 _TORSO = 0.57  # metres between root and neck, for which the sizes below are meant
 
 
-class Wear:
+class Wear(Draw):
     """Seeded draws for B bodies, each (B, 1)."""
-
-    def __init__(self, B: int, generator: torch.Generator) -> None:
-        self.B, self.generator = B, generator
 
     def some(self, share: float) -> Tensor:
         """1 for so many of the bodies, else 0."""
-        return (torch.rand(self.B, 1, generator=self.generator) < share).float()
+        return (self.uniform(0, 1) < share).float()
 
     def uniform(self, low: float, high: float) -> Tensor:
-        return low + (high - low) * torch.rand(self.B, 1, generator=self.generator)
+        return super().uniform(low, high)[:, None]
 
     def thick(self, low: float, high: float) -> Tensor:
         """Thin is more frequent than thick."""
-        return low * (high / low) ** torch.rand(self.B, 1, generator=self.generator)
-
-    def normal(self, *size: int) -> Tensor:
-        return torch.randn(self.B, *size, generator=self.generator)
+        return low * (high / low) ** self.uniform(0, 1)
 
 
 def torso(rig: Rig, heads: Float[Tensor, "B J 3"]) -> Float[Tensor, "B 1 1"]:
@@ -59,9 +54,7 @@ def dressed(
     thickness = thickness + _bulges(figure, rest, wear)
     thickness = thickness * (1 + 0.5 * wear.uniform(0, 1) * _folds(rest, wear))
     out = figure.normals(rest) * torso(figure.rig, heads)
-    clothed = rest + thickness[..., None] * out
-    clothed = _headwear(figure, clothed, wear)
-    return clothed
+    return _headwear(figure, rest + thickness[..., None] * out, wear)
 
 
 def _garments(figure: Figure, wear: Wear) -> Tensor:
@@ -104,10 +97,10 @@ def _bulges(figure: Figure, rest: Tensor, wear: Wear) -> Tensor:
     """Bags, pouches, pads: bumps at random places, and now and then something large on the back."""
     total = torch.zeros(rest.shape[:2])
     rows = torch.arange(wear.B)
-    for chance, low, high, narrow, wide in ((0.4, 0.01, 0.06, 0.03, 0.12), (0.4, 0.01, 0.06, 0.03, 0.12)):
+    for _ in range(2):
         at = torch.randint(rest.shape[1], (wear.B,), generator=wear.generator)
-        near = (rest - rest[rows, at][:, None]).square().sum(-1) / wear.thick(narrow, wide) ** 2
-        total += wear.some(chance) * wear.thick(low, high) * torch.exp(-(near**2))
+        near = (rest - rest[rows, at][:, None]).square().sum(-1) / wear.thick(0.03, 0.12) ** 2
+        total += wear.some(0.4) * wear.thick(0.01, 0.06) * torch.exp(-(near**2))
     back = (figure.height > 0.25) & (figure.share[:, [part("belly"), part("chest")]].sum(1) > 0.5)
     back = back & (rest.mean(0)[:, 2] < -0.02)
     pack = torch.exp(-(((figure.height - wear.uniform(0.45, 0.75)) / wear.uniform(0.2, 0.4)) ** 4)) * back
@@ -118,7 +111,9 @@ def _folds(rest: Tensor, wear: Wear) -> Tensor:
     """Waves over the surface, between -1 and 1."""
     total = torch.zeros(rest.shape[:2])
     for frequency in (15.0, 35.0):
-        direction = wear.normal(3, 1) * frequency * torch.tensor([1.0, 0.5, 1.0])[:, None]
+        direction = (
+            torch.randn(wear.B, 3, 1, generator=wear.generator) * frequency * torch.tensor([1.0, 0.5, 1.0])[:, None]
+        )
         total += 0.5 * torch.sin((rest @ direction)[..., 0] + wear.uniform(0, 6.3))
     return total
 
@@ -135,39 +130,28 @@ def _headwear(figure: Figure, verts: Tensor, wear: Wear) -> Tensor:
         torch.stack([wear.uniform(-0.15, 0.15), wear.uniform(-0.6, -0.1), wear.uniform(1, 1)], -1), dim=-1
     )
     angle = torch.rad2deg(torch.acos((toward * face).sum(-1).clamp(-1, 1)))
+    across, up = figure.skull[:, [0, 2]][None], figure.skull[:, 1][None]
     rim = wear.uniform(35, 85) * (1 - wear.some(0.15))  # some have no face: closed helmets
-    above = step(figure.skull[:, 1][None], wear.uniform(-1.1, 0.2), 0.12)
+    above = step(up, wear.uniform(-1.1, 0.2), 0.12)
     down = wear.some(0.3)  # long hair and hoods reach the neck
-    above = torch.maximum(above, down * step(figure.skull[:, 1][None], torch.tensor(-2.2), 0.12))
+    above = torch.maximum(above, down * step(up, torch.tensor(-2.2), 0.12))
     near = (own + figure.share[:, part("neck")]).clamp(0, 1)
     mask = near * step(angle, rim, 6.0) * above * wear.some(0.7)
     grown = 1 + wear.thick(0.04, 0.5) * (1 + 0.25 * _folds(figure.skull.expand_as(verts), wear))
     radius = local.norm(dim=-1)
     floor = size[..., 0] * wear.uniform(0.8, 1.15)  # hair makes a skull round
-    target = torch.maximum(
-        radius * grown, floor * step(figure.skull[:, 1][None], torch.tensor(-0.9), 0.8) * wear.some(0.5)
-    )
+    target = torch.maximum(radius * grown, floor * step(up, torch.tensor(-0.9), 0.8) * wear.some(0.5))
     moved = middle + local / radius.clamp_min(1e-6)[..., None] * target[..., None]
     # Pointed: up and back, at the top.
     tip = wear.some(0.3) * wear.uniform(0.2, 1.2)
-    top = torch.exp(
-        -(
-            (
-                (figure.skull[:, [0, 2]][None] - torch.stack([wear.uniform(-0.2, 0.2), wear.uniform(-0.6, 0.2)], -1))
-                / wear.uniform(0.25, 0.7)[..., None]
-            ).square()
-        ).sum(-1)
-    )
-    top = top * step(figure.skull[:, 1][None], torch.tensor(0.0), 1.0)
+    peak = torch.stack([wear.uniform(-0.2, 0.2), wear.uniform(-0.6, 0.2)], -1)
+    away = (across - peak) / wear.uniform(0.25, 0.7)[..., None]
+    top = torch.exp(-away.square().sum(-1)) * step(up, torch.tensor(0.0), 1.0)
     moved = moved + (tip * top)[..., None] * size * torch.nn.functional.normalize(
         torch.stack([0 * tip, 1 + 0 * tip, wear.uniform(-0.8, 0.2)], -1), dim=-1
     )
-    brim = (
-        wear.some(0.12)
-        * wear.uniform(0.2, 0.9)
-        * torch.exp(-(((figure.skull[:, 1][None] - wear.uniform(0.1, 0.5)) / 0.12) ** 2))
-        * near
-    )
+    wide = wear.some(0.12) * wear.uniform(0.2, 0.9)
+    brim = wide * torch.exp(-(((up - wear.uniform(0.1, 0.5)) / 0.12) ** 2)) * near
     flat = local * torch.tensor([1.0, 0.0, 1.0])
     verts = torch.lerp(verts, moved, mask[..., None])
     return verts + brim[..., None] * flat

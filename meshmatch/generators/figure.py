@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from scipy.sparse import csr_array
+from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from meshmatch.arrays import Float, Int
+from meshmatch.generators.quadruped_rig import mean_of_neighbours
 from meshmatch.generators.rig import Rig
 
 # Beginnings of the names of a part's joints, and the joints between which its axis runs; `SIDED` parts come twice.
@@ -52,7 +54,7 @@ class Figure:
     reach: Float[Tensor, "V 2"]
     height: Float[Tensor, " V"]
     skull: Float[Tensor, "V 3"]
-    mean_of_neighbours: csr_array
+    mean_of_neighbours: csr_matrix
 
     @classmethod
     def of(cls, rig: Rig) -> Figure:
@@ -74,7 +76,9 @@ class Figure:
         middle = (own[:, None] * rest).sum(0) / own.sum()
         size = ((own[:, None] * (rest - middle)).square().sum(0) / own.sum()).sqrt().mean() * 3**0.5
         height = (rest[:, 1] - bottom) / (top - bottom)
-        return cls(rig, of_joint, share, reach, height, (rest - middle) / size, _neighbours(rig))
+        neighbours = mean_of_neighbours(rig.faces.numpy(), len(rest)).astype(np.float32)
+        neighbours.sort_indices()  # sums are taken in this order
+        return cls(rig, of_joint, share, reach, height, (rest - middle) / size, neighbours)
 
     def axes(self, heads: Float[Tensor, "B J 3"]) -> Float[Tensor, "B P 3 3"]:
         """Rows: across, along and out of every part of resting bodies; unit vectors."""
@@ -122,13 +126,3 @@ def _part_of(joint: str) -> int:
 def _along(rig: Rig, heads: Tensor, name: str, side: str, rest: Tensor) -> Tensor:
     start, end = (heads[k] for k in joints_of(rig, name, side))
     return (rest - start) @ (end - start) / (end - start).square().sum()
-
-
-def _neighbours(rig: Rig) -> csr_array:
-    """Matrix that takes every vertex to the mean of its neighbours."""
-    V, faces = len(rig.weights), rig.faces
-    a, b = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
-    pairs = torch.unique(torch.cat([torch.stack([a, b]), torch.stack([b, a])], 1), dim=1)
-    count = torch.bincount(pairs[0], minlength=V).clamp_min(1)
-    values = (1.0 / count[pairs[0]].float()).numpy()
-    return csr_array((values, (pairs[0].numpy(), pairs[1].numpy())), shape=(V, V))

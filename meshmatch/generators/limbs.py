@@ -7,18 +7,20 @@ draws is part of what a seed means: changing it changes every training.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 
 from meshmatch.generators.rotations import DEGREE
 
 
+@dataclass(frozen=True)
 class Draw:
     """Shorthand for seeded draws of shape (B,)."""
 
-    def __init__(self, B: int, generator: torch.Generator) -> None:
-        self.B, self.generator = B, generator
+    B: int
+    generator: torch.Generator
 
     def normal(self, mean: float, deviation: float) -> torch.Tensor:
         return mean + deviation * torch.randn(self.B, generator=self.generator)
@@ -29,9 +31,12 @@ class Draw:
     def normal3(self, deviation: float) -> torch.Tensor:
         return deviation * DEGREE * torch.randn(self.B, 3, generator=self.generator)
 
-    def choice(self, weights: list[float], options: list[torch.Tensor]) -> torch.Tensor:
-        pick = torch.multinomial(torch.tensor(weights), self.B, True, generator=self.generator)
-        return torch.stack(options)[pick, torch.arange(self.B)]
+    def family(self, weights: Sequence[float]) -> torch.Tensor:
+        """Numbers that are drawn as often as their weights say."""
+        return torch.multinomial(torch.tensor(weights), self.B, True, generator=self.generator)
+
+    def choice(self, weights: Sequence[float], options: list[torch.Tensor]) -> torch.Tensor:
+        return torch.stack(options)[self.family(weights), torch.arange(self.B)]
 
 
 @dataclass(frozen=True)
@@ -59,8 +64,8 @@ def draw_arms(draw: Draw) -> tuple[torch.Tensor, torch.Tensor]:
 
     Folded arms come in pairs most of the time: they touch each other, which is what makes them hard.
     """
-    shares = torch.tensor([0.26, 0.15, 0.14, 0.16, 0.15, 0.1, 0.04])
-    left, right = (torch.multinomial(shares, draw.B, True, generator=draw.generator) for _ in range(2))
+    shares = [0.26, 0.15, 0.14, 0.16, 0.15, 0.1, 0.04]
+    left, right = (draw.family(shares) for _ in range(2))
     both = (left == FOLDED) & (draw.uniform(0, 1) < 0.75)
     return left, torch.where(both, FOLDED, right)
 
@@ -122,5 +127,4 @@ _LEG_FIELDS = ("hip_flexion", "hip_abduction", "hip_twist", "knee", "ankle")
 
 def with_legs(arms: Limbs, legs: Limbs) -> Limbs:
     """The arms of one draw with the legs of another."""
-    values = {name: getattr(legs if name in _LEG_FIELDS else arms, name) for name in arms.__dataclass_fields__}
-    return Limbs(**values)
+    return replace(arms, **{name: getattr(legs, name) for name in _LEG_FIELDS})

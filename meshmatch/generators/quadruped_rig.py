@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import TemplateError
+from meshmatch.geometry.triangles import edges_of
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import save_arrays
 
@@ -140,7 +141,7 @@ def save_rig(rig: AnimalRig, path: Path, **words: str) -> None:
 
 def mean_of_neighbours(faces: Int[Ints, "M 3"], count: int) -> csr_matrix:
     """Takes values of so many vertices to the mean of each one's neighbours."""
-    sides = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
+    sides = edges_of(faces).vertices
     a, b = np.concatenate([sides, sides[:, ::-1]]).T
     joined = coo_matrix((np.ones(len(a)), (a, b)), (count, count)).tocsr()
     return diags(1 / np.maximum(np.asarray(joined.sum(1)).reshape(-1), 1)) @ joined

@@ -67,3 +67,7 @@ def stick_figure(identities: int = 2) -> Rig:
         names=tuple(names),
         faces=(faces + 4 * torch.arange(J)[:, None, None]).flatten(0, 1),
     )
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)

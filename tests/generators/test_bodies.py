@@ -13,16 +13,12 @@ from meshmatch.generators.bodies import draw_identities, sample_bodies, sample_f
 from meshmatch.generators.limbs import FOLDED, Draw, draw_arms, draw_limbs, mirrored, with_legs
 from meshmatch.generators.rig import Rig, build_rig, forward_kinematics, load_rig, penetration, save_rig, skin
 from meshmatch.generators.rotations import rotation_between, rotation_from_vector
-from tests.generators.stick import stick_figure
+from tests.generators.stick import seeded, stick_figure
 
 
 @pytest.fixture(scope="module")
 def rig() -> Rig:
     return stick_figure(3)
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def degrees_between(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:

@@ -12,16 +12,12 @@ from meshmatch.generators.clothes import dressed, skirted
 from meshmatch.generators.figure import PARTS, Figure, joints_of, part
 from meshmatch.generators.proportions import BUILT, CHILD, PLAIN, SHARES, TOON, Style, draw_style, rounded, stretched
 from meshmatch.generators.rig import Rig, forward_kinematics
-from tests.generators.stick import stick_figure
+from tests.generators.stick import seeded, stick_figure
 
 
 @pytest.fixture(scope="module")
 def figure() -> Figure:
     return Figure.of(stick_figure(3))
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def resting(figure: Figure, B: int = 2) -> tuple[torch.Tensor, torch.Tensor]:

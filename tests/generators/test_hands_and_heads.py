@@ -20,12 +20,9 @@ from meshmatch.models.registry import load_model
 from meshmatch.training import aligner
 from meshmatch.training.recipes import recipe_for
 from meshmatch.training.train import train
+from tests.generators.stick import seeded
 
 needs_anny = pytest.mark.skipif(importlib.util.find_spec("anny") is None, reason="anny is not installed")
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def within(values: torch.Tensor, limits: tuple[float, float]) -> bool:

@@ -15,7 +15,7 @@ from meshmatch.generators.bodies import sample_bodies
 from meshmatch.generators.pose_files import GivenPoses, load_poses
 from meshmatch.generators.rig import Rig, forward_kinematics
 from meshmatch.shapes import input_files
-from tests.generators.stick import stick_figure
+from tests.generators.stick import seeded, stick_figure
 from tests.training.small import egg_template
 
 JOINTS = ("lowerarm01.L", "head", "root")
@@ -40,10 +40,6 @@ def write(path: Path, joints=JOINTS, vectors=VECTORS) -> Path:
 @pytest.fixture(scope="module")
 def rig() -> Rig:
     return stick_figure(3)
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".json", ".csv"])
