@@ -1,5 +1,8 @@
 """A tiny template, a source of bent eggs, and a network that learns from them in seconds."""
 
+from functools import cache
+from pathlib import Path
+
 import numpy as np
 import torch
 
@@ -7,8 +10,10 @@ from meshmatch.generators.generator import Source
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.network import NetworkConfig
+from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
+from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.template import Template
 from meshmatch.training.datasets import BatchDataset
 from meshmatch.training.losses import LossPoints
@@ -25,6 +30,7 @@ SCAN = ScanConfig(points=96, noise=0.012, outliers=0, partial=0)
 UPRIGHT = ScanConfig(points=96, noise=0, holes=0, outliers=0, partial=0, density=0, bumps=0, scale=0, upright=True)
 
 
+@cache
 def egg_template() -> Template:
     """An egg with three different axes, 162 vertices, 36 nodes."""
     ball = icosphere(2)
@@ -61,3 +67,19 @@ def small_data(
 
 def small_points(template: Template, kernel: Kernel = "smooth", model: Deformer | None = None) -> LossPoints:
     return build_loss_points(template, kernel, model or small_network(template))
+
+
+def registered_eggs(folder: Path, count: int) -> Path:
+    """So many registered eggs as files."""
+    rng, egg = np.random.default_rng(0), egg_template().shape
+    folder.mkdir()
+    for n in range(count):
+        save_shape(folder / f"egg{n}.ply", Shape(egg.verts @ (np.eye(3) + 0.1 * rng.normal(size=(3, 3))), egg.faces))
+    return folder
+
+
+def prepared_eggs(root: Path, count: int) -> Path:
+    """The same in the folder "in", prepared in the folder "out"."""
+    nodes = NodeConfig(strategy="uniform", K=36, radius=0.45, depth=0.05)
+    prepare(registered_eggs(root / "in", count), root / "out", PrepareConfig(nodes))
+    return root / "out"

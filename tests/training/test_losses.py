@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from meshmatch.fields.field import Field
-from meshmatch.fields.shape_functions import build_field
+from meshmatch.fields.shape_functions import FIELDS, FieldName, build_field
 from meshmatch.models.deformer import Deformer
 from meshmatch.templates.template import Template
 from meshmatch.training.datasets import Batch
 from meshmatch.training.losses import CorrespondenceLoss, LossPoints, distance
 from meshmatch.training.train import loss_vertices
-from tests.training.small import POINTS, UPRIGHT, egg_template, small_data, small_network, small_points
+from tests.training.small import NETWORK, POINTS, UPRIGHT, egg_template, small_data, small_network, small_points
 
 
 @pytest.fixture(scope="module")
@@ -101,11 +101,12 @@ def test_the_kernel_reaches_the_loss(egg: Template, points: LossPoints) -> None:
     assert not torch.allclose(points.moved(vectors), other.moved(vectors), atol=1e-3)
 
 
-def test_every_part_of_the_network_learns(egg: Template, points: LossPoints) -> None:
-    model = small_network(egg)
-    batch = small_data(egg, model)[0]
+@pytest.mark.parametrize("field", FIELDS)
+def test_every_part_of_the_network_learns(egg: Template, field: FieldName) -> None:
+    model = small_network(egg, replace(NETWORK, field=field))
+    batch, points = small_data(egg, model)[0], small_points(egg, model=model)
     found = CorrespondenceLoss()(model, batch, points, torch.Generator().manual_seed(0))
-    assert {"align", "correct", "blend", "error_align", "error_corrected"} <= found.keys()
+    assert {"volume", "arap", "align", "correct", "blend", "error_align", "error_corrected"} <= found.keys()
     found["total"].backward()
     still = {n for n, p in model.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0}
     # the last layer of a fresh residual block is zero: what stands before it learns from the second step on

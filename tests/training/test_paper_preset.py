@@ -16,8 +16,7 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.models.registry import load_model
 from meshmatch.models.trained import TrainedModel
-from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.files import load_shape
 from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.prepared_folder import ShapeSamples
@@ -26,7 +25,7 @@ from meshmatch.training import recipes
 from meshmatch.training.loop import TrainConfig, Trainer
 from meshmatch.training.losses import ChamferLoss
 from meshmatch.training.train import CardFacts, build_dataset, train_model
-from tests.training.small import POINTS, egg_template
+from tests.training.small import POINTS, egg_template, registered_eggs
 
 
 @dataclass(frozen=True)
@@ -48,12 +47,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def eggs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of registered eggs."""
-    folder = tmp_path_factory.mktemp("eggs")
-    egg = egg_template().shape
-    rng = np.random.default_rng(0)
-    for n in range(4):
-        save_shape(folder / f"egg{n}.ply", Shape(egg.verts @ (np.eye(3) + 0.1 * rng.normal(size=(3, 3))), egg.faces))
-    return folder
+    return registered_eggs(tmp_path_factory.mktemp("eggs") / "in", 4)
 
 
 @pytest.fixture(scope="module")

@@ -21,12 +21,11 @@ from meshmatch.implicit.training import train_implicit
 from meshmatch.locks import locked
 from meshmatch.models.registry import load_model, verify_model
 from meshmatch.models.trained import TrainedModel
-from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.prepared_folder import RegisteredShapes, read_registered
-from meshmatch.templates.template import Template, read_template, save_template
+from meshmatch.templates.template import Template, read_template
 from meshmatch.training.datasets import registered_source
 from meshmatch.training.lessons import template_of
 from meshmatch.training.loop import StepReport, TrainConfig
@@ -35,7 +34,7 @@ from meshmatch.training.recipes import Recipe, default, going_on, paper, people,
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.train import CardFacts, train, train_model
 from tests.generators.stick import stick_figure
-from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, egg_template, small_data, small_network
+from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, egg_template, prepared_eggs, small_data, small_network
 
 SMALL = Recipe(NETWORK, TrainConfig(steps=4, shapes=4, scans_per_shape=1, workers=0, warm_up=1), SCAN, "smooth")
 
@@ -43,16 +42,7 @@ SMALL = Recipe(NETWORK, TrainConfig(steps=4, shapes=4, scans_per_shape=1, worker
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of five registered eggs, prepared."""
-    root = tmp_path_factory.mktemp("eggs")
-    egg = egg_template().shape
-    rng = np.random.default_rng(0)
-    (root / "in").mkdir()
-    for n in range(5):
-        verts = egg.verts @ (np.eye(3) + 0.1 * rng.normal(size=(3, 3)))
-        save_shape(root / "in" / f"egg{n}.ply", Shape(verts, egg.faces))
-    nodes = NodeConfig(strategy="uniform", K=36, radius=0.45, depth=0.05)
-    prepare(root / "in", root / "out", PrepareConfig(nodes))
-    return root / "out"
+    return prepared_eggs(tmp_path_factory.mktemp("eggs"), 5)
 
 
 def test_nodes_with_radii_of_their_own_are_learned_and_fitted(prepared: Path, tmp_path: Path) -> None:
@@ -259,15 +249,8 @@ def test_bodies_do_not_go_with_a_folder(prepared: Path, tmp_path: Path) -> None:
 def test_the_presets_are_what_they_say() -> None:
     papers, usual = recipe_for(preset="paper"), recipe_for()
     assert (papers, usual) == (paper(), people())
-    assert (papers.network.encoder, papers.network.decoder, papers.kernel) == ("point", "node", "cubic")
     assert papers.network.align_basis == papers.network.corrections == 0
-    loss = papers.train.loss
-    assert isinstance(loss, CorrespondenceLoss)
-    assert (loss.reconstruction, loss.volume, loss.arap, loss.blend) == (1.0, 5e-3, 1e-2, 5e-3)
-    assert not loss.robust
-    assert (papers.train.shapes, papers.train.scans_per_shape, papers.train.rate) == (16, 1, 1e-3)
-    # 1,200 epochs of 1,000 shapes in batches of 16
-    assert papers.train.steps == 1_200_000 // 16
+    assert isinstance(papers.train.loss, CorrespondenceLoss) and not papers.train.loss.robust
     assert papers.scan == ScanConfig(3000, 0, 0, 0, 0, 0, 0, 0, upright=True, sphere=True)
     assert usual.network.encoder == "basis"
     assert usual.scan.noise > 0
@@ -340,9 +323,3 @@ def test_the_rig_is_built_once_and_kept(monkeypatch: pytest.MonkeyPatch, tmp_pat
     rigs.cached_rig(4, 0)
     rigs.cached_rig(3, 1)
     assert built == [3, 4, 3]
-
-
-def test_a_saved_template_is_read_by_file(tmp_path: Path) -> None:
-    egg = egg_template()
-    save_template(egg, tmp_path / "egg.safetensors")
-    assert read_template(tmp_path / "egg.safetensors").hash == egg.hash

@@ -12,11 +12,7 @@ import torch.distributed as dist
 from safetensors import safe_open
 
 from meshmatch.models.registry import verify_model
-from meshmatch.shapes.files import save_shape
-from meshmatch.shapes.shape import Shape
-from meshmatch.templates.make import NodeConfig
-from meshmatch.templates.prepare import PrepareConfig, prepare
-from tests.training.small import egg_template
+from tests.training.small import prepared_eggs
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -49,16 +45,7 @@ sys.exit(main(sys.argv[1:]))
 
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("eggs")
-    egg = egg_template().shape
-    rng = np.random.default_rng(0)
-    (root / "in").mkdir()
-    for n in range(3):
-        verts = egg.verts @ (np.eye(3) + 0.1 * rng.normal(size=(3, 3)))
-        save_shape(root / "in" / f"egg{n}.ply", Shape(verts, egg.faces))
-    nodes = NodeConfig(strategy="uniform", K=36, radius=0.45, depth=0.05)
-    prepare(root / "in", root / "out", PrepareConfig(nodes))
-    return root / "out"
+    return prepared_eggs(tmp_path_factory.mktemp("eggs"), 3)
 
 
 @pytest.mark.slow
