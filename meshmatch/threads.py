@@ -50,30 +50,60 @@ def thread_limit(count: int) -> Iterator[None]:
 
 
 @contextmanager
-def one_of(threads: threading.Semaphore) -> Iterator[None]:
-    """Take one of some threads for the block, in which `beside` takes those that are free at the moment."""
+def worker_slot(threads: threading.Semaphore) -> Iterator[None]:
+    """Take one of some threads for the block, in which `parallel_map` takes those that are free at the moment."""
     with threads:
-        _of_thread.shared = threads
+        before, _of_thread.shared = getattr(_of_thread, "shared", None), threads
         try:
             yield
         finally:
-            _of_thread.shared = None
+            _of_thread.shared = before
 
 
-def beside(function: Callable[..., Result], *arguments: Iterable[Any]) -> list[Result]:
-    """Results of a function, as of `map`, on free threads of the block of `one_of` that this thread is in, if any."""
-    from concurrent.futures import ThreadPoolExecutor
+def parallel_map(
+    function: Callable[..., Result],
+    *arguments: Iterable[Any],
+    threads: int | None = None,
+    stop: threading.Event | None = None,
+) -> list[Result]:
+    """Results of a function, as of `map`, by so many threads at once.
+
+    Without a number, by those that are free in the block of `worker_slot` that this thread is in, if any. An error ends
+    the work: calls that have not begun are dropped, and ``stop`` is set for the others, which may then raise
+    `CancelledError`.
+    """
+    from concurrent.futures import FIRST_EXCEPTION, CancelledError, ThreadPoolExecutor, wait
 
     calls = list(zip(*arguments, strict=True))
-    threads = getattr(_of_thread, "shared", None) or threading.Semaphore(0)
+    free = getattr(_of_thread, "shared", None) or threading.Semaphore(0)
     with ExitStack() as taken:
-        count = 1
-        while count < len(calls) and threads.acquire(blocking=False):
-            taken.callback(threads.release)
+        count = 1 if threads is None else min(threads, len(calls))
+        while threads is None and count < len(calls) and free.acquire(blocking=False):
+            taken.callback(free.release)
             count += 1
-        if count == 1:
+        if count <= 1:
             return [function(*call) for call in calls]
-        return list(taken.enter_context(ThreadPoolExecutor(count)).map(lambda call: function(*call), calls))
+        ended, pool = stop or threading.Event(), ThreadPoolExecutor(count)
+
+        def run(call: tuple[Any, ...]) -> Result:
+            if ended.is_set():
+                raise CancelledError
+            try:
+                return function(*call)
+            except BaseException:
+                ended.set()
+                raise
+
+        futures = [pool.submit(run, call) for call in calls]
+        try:
+            wait(futures, return_when=FIRST_EXCEPTION)
+        finally:
+            ended.set()  # also at Ctrl-C
+            pool.shutdown(cancel_futures=True)
+    errors = [error for future in futures if not future.cancelled() and (error := future.exception()) is not None]
+    for error in sorted(errors, key=lambda error: isinstance(error, CancelledError)):
+        raise error
+    return [future.result() for future in futures]
 
 
 def set_threads(count: int) -> None:

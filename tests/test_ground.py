@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures import CancelledError
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from meshmatch import errors
 from meshmatch.errors import InputError, MeshmatchError, OutputError
 from meshmatch.locks import locked
 from meshmatch.outputs import folder_on_success, replace_on_success
-from meshmatch.threads import beside, one_of, set_threads, thread_limit
+from meshmatch.threads import parallel_map, set_threads, thread_limit, worker_slot
 
 
 def test_error_has_a_line_and_a_hint() -> None:
@@ -294,12 +295,28 @@ def test_work_is_shared_by_threads_that_are_free() -> None:
     """Two calls wait for each other on two threads; results come in order; errors are handed on, and threads back."""
     meeting = threading.Barrier(2, timeout=10)
     threads = threading.Semaphore(2)
-    with one_of(threads):
-        assert sorted(set(beside(lambda n: (meeting.wait(), n)[1], range(4)))) == [0, 1, 2, 3]
-        assert beside(lambda n, m: n * m, range(5), range(5)) == [0, 1, 4, 9, 16]
+    with worker_slot(threads):
+        assert sorted(set(parallel_map(lambda n: (meeting.wait(), n)[1], range(4)))) == [0, 1, 2, 3]
+        assert parallel_map(lambda n, m: n * m, range(5), range(5)) == [0, 1, 4, 9, 16]
         with pytest.raises(ZeroDivisionError):
-            beside(lambda n: 1 // n, range(3))
+            parallel_map(lambda n: 1 // n, range(3))
         with threads:  # another has the second thread
-            assert set(beside(lambda _: threading.get_ident(), range(3))) == {threading.get_ident()}
-    assert set(beside(lambda _: threading.get_ident(), range(3))) == {threading.get_ident()}
+            assert set(parallel_map(lambda _: threading.get_ident(), range(3))) == {threading.get_ident()}
+    assert set(parallel_map(lambda _: threading.get_ident(), range(3))) == {threading.get_ident()}
     assert all(threads.acquire(blocking=False) for _ in range(2))
+
+
+def test_an_error_ends_the_work_and_tells_those_who_are_at_it() -> None:
+    stop, begun = threading.Event(), []
+
+    def work(number: int) -> int:
+        begun.append(number)
+        if number == 1:
+            raise KeyError(number)
+        assert stop.wait(10)
+        raise CancelledError
+
+    with pytest.raises(KeyError):
+        parallel_map(work, range(6), threads=2, stop=stop)
+    assert sorted(begun) == [0, 1]
+    assert parallel_map(abs, [-2, -1], threads=8) == [2, 1] and parallel_map(abs, [], threads=8) == []

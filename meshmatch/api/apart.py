@@ -24,7 +24,7 @@ from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.parts import Parts, apart, tries, without_parts
 from meshmatch.shapes.repair import NOT_TRUSTED, Repaired
 from meshmatch.shapes.shape import Shape
-from meshmatch.threads import beside
+from meshmatch.threads import parallel_map
 
 Loader = Callable[[], TrainedModel]
 _AS_WELL = 0.003  # what also reads so much worse (units of sqrt(area)) keeps what touches it, such as clothes
@@ -112,7 +112,7 @@ def _listed(numbers: Sequence[int]) -> str:
 def _readings(
     models: Sequence[Loader], shapes: Sequence[Shape], config: FitConfig, order: Iterable[Sequence[int]]
 ) -> Float[Floats, "M S"]:
-    samples = beside(category_samples, shapes, [config.seed] * len(shapes))
+    samples = parallel_map(category_samples, shapes, [config.seed] * len(shapes))
     found = np.full((len(models), len(shapes)), np.inf)
 
     def reading(row: int, number: int) -> float:
@@ -125,7 +125,7 @@ def _readings(
 
     for rows in order:
         at = [(row, number) for row in rows for number in range(len(shapes))]
-        for place, value in zip(at, beside(lambda at: reading(*at), at), strict=True):
+        for place, value in zip(at, parallel_map(lambda at: reading(*at), at), strict=True):
             found[place] = value
         if found.min() <= FAMILIAR:
             break

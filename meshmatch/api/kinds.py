@@ -26,7 +26,7 @@ from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
-from meshmatch.threads import beside
+from meshmatch.threads import parallel_map
 
 _PEOPLE = "human"
 _NEXT, _TOGETHER = ("quadruped",), 2  # asked after people, before the others; how many models at a time
@@ -74,7 +74,7 @@ def category_residuals(
     others where none of these is ``sure``: two at a time, animals first, until one is. Models of its kind are then asked
     about the other shapes, and the rest where they do not know them: but not about a part of something whose kind is known.
     """
-    samples = beside(category_samples, shapes, [config.seed for config in configs])
+    samples = parallel_map(category_samples, shapes, [config.seed for config in configs])
 
     def reading(model: Installed, number: int) -> float:
         try:
@@ -88,7 +88,7 @@ def category_residuals(
 
     def ask(rows: Iterable[int], numbers: Iterable[int]) -> None:
         at = [(row, number) for row in rows for number in numbers]
-        for place, value in zip(at, beside(lambda at: reading(models[at[0]], at[1]), at), strict=True):
+        for place, value in zip(at, parallel_map(lambda at: reading(models[at[0]], at[1]), at), strict=True):
             found[place] = value
 
     parts = [_is_part(shape, config) for shape, config in zip(shapes, configs, strict=True)]
@@ -236,7 +236,7 @@ def _classified(
         known, fit = classify(best.load(), shape, column[row], config, progress)
         return Classification(kind if known else None, best.card, fit)
 
-    return beside(tell, shapes, configs, readings.T)
+    return parallel_map(tell, shapes, configs, readings.T)
 
 
 def _refuse_unknown(

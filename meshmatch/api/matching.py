@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
-from concurrent.futures import FIRST_EXCEPTION, CancelledError, ThreadPoolExecutor, wait
+from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +29,7 @@ from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
-from meshmatch.threads import one_of, thread_limit
+from meshmatch.threads import parallel_map, thread_limit, worker_slot
 
 if TYPE_CHECKING:
     from meshmatch.api.apart import Alone
@@ -304,7 +304,7 @@ class Matcher:
             return [each for each, _ in found], [()] * len(clean), [begun for _, begun in found]
         from meshmatch.api.kinds import choose_model
 
-        with self._choosing, thread_limit(1), one_of(threading.Semaphore(self.threads)):
+        with self._choosing, thread_limit(1), worker_slot(threading.Semaphore(self.threads)):
             choice = choose_model(clean, configs, self._model, self.progress)
             self._model = choice.model
         begun = [_Begun(*each) for each in zip(choice.fits, choice.tried, strict=True)]
@@ -343,7 +343,7 @@ class Matcher:
         return configs
 
     def _fit_all(self, clean: Sequence[Repaired], configs: Sequence[FitConfig], begun: Sequence[_Begun]) -> list[Fit]:
-        stop, threads = threading.Event(), threading.Semaphore(self.threads)
+        stop, slots = threading.Event(), threading.Semaphore(self.threads)
         names = [part.shape.name for part in clean]
         labels = [f"{name} ({number + 1})" if names.count(name) > 1 else name for number, name in enumerate(names)]
 
@@ -354,29 +354,16 @@ class Matcher:
                 if self.progress is not None:
                     self.progress(stage, labels[number], share)
 
-            try:
-                with one_of(threads):
-                    here, config = clean[number], configs[number]
-                    found = begun[number].fit or Fitter(self.model, config, report).fit(here.shape)
-                    best = (found, here) if begun[number].tried else self._best(found, here, config, report)
-            except BaseException:
-                stop.set()
-                raise
+            with worker_slot(slots):
+                here, config = clean[number], configs[number]
+                found = begun[number].fit or Fitter(self.model, config, report).fit(here.shape)
+                best = (found, here) if begun[number].tried else self._best(found, here, config, report)
             return self._finished(*best, configs[number])
 
         # one fit alone may have all threads that were asked for; several have one each
         inner = self._asked_threads if len(clean) == 1 else 1
-        with thread_limit(inner), ThreadPoolExecutor(max(1, min(self.threads, len(clean)))) as pool:
-            futures = [pool.submit(one, number) for number in range(len(clean))]
-            try:
-                wait(futures, return_when=FIRST_EXCEPTION)
-            except BaseException:
-                stop.set()  # Ctrl-C: the fits end at their next report
-                raise
-        errors = [error for future in futures if (error := future.exception()) is not None]
-        for error in sorted(errors, key=lambda error: isinstance(error, CancelledError)):
-            raise error
-        return [future.result() for future in futures]
+        with thread_limit(inner):  # after an error, or Ctrl-C, the other fits end at their next report
+            return parallel_map(one, range(len(clean)), threads=self.threads, stop=stop)
 
     def _finished(self, fit: Fit, clean: Repaired, config: FitConfig) -> Fit:
         """The fit with its shape, and with what its user should know."""

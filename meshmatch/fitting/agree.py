@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +17,7 @@ from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree
 from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import parallel_map
 
 
 def agreed_fits(
@@ -46,8 +46,7 @@ def agreed_fits(
         known = None if landmarks is None else landmarks[number]
         return member_of(system, shapes[number], fits[number], config, how, known)
 
-    with ThreadPoolExecutor(threads) as pool:
-        members = list(pool.map(member, range(len(fits))))
+    members = parallel_map(member, range(len(fits)), threads=threads)
     refined = agree(system, members, threads)
     return [with_vectors(system, fit, vectors) for fit, vectors in zip(fits, refined, strict=True)]
 

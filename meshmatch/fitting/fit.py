@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
     from meshmatch.fitting.judge.features import FitFeatures
+    from meshmatch.fitting.judge.verdict import Judgement
+    from meshmatch.fitting.solve.system import NodeSystem
     from meshmatch.models.trained import TrainedModel
 
 
@@ -155,6 +157,25 @@ class Fit(Pickled):
                 f"the fit is of another template ({self.template_hash}, not {expected})",
                 "use the model that made the fit",
             )
+
+
+def judged_fit(judged: Judgement, system: NodeSystem, frame: Frame, vectors: Float[Floats, "K 3"], **about: Any) -> Fit:
+    """The fit that has these node vectors in the core ``frame``, as it is judged; the other attributes as `Fit`."""
+    return Fit(
+        frame=frame,
+        points=system.moved(vectors),
+        vectors=vectors,
+        resting=system.verts,
+        faces=system.faces,
+        verdict=judged.verdict,
+        reasons=judged.reasons,
+        trust=judged.trust,
+        signs=judged.features,
+        regularity=system.regularity(vectors),
+        up=axis_name(frame.rotation[1]),
+        front=axis_name(frame.rotation[2]),
+        **about,
+    )
 
 
 def facing_out(faces: Int[Ints, "F 3"], frame: Frame) -> Int[Ints, "F 3"]:

@@ -57,6 +57,16 @@ class Schedule:
         """Scale of the robust weight in a step, counted from 0."""
         return geometric_between(*self.scale, self._share(step))
 
+    def grown(
+        self, share: float, *, prior: tuple[float, float] = (1, 1), scale: tuple[float, float] = (1, 1)
+    ) -> Schedule:
+        """The same at a ``share`` (0..1) of the way to so many times the first and last ``prior`` and ``scale``."""
+        priors = zip(self.prior, prior, strict=True)
+        scales = zip(self.scale, scale, strict=True)
+        first, last = (geometric_between(value, times * value, share) for value, times in priors)
+        narrow, wide = (geometric_between(value, times * value, share) for value, times in scales)
+        return replace(self, prior=(first, last), scale=(narrow, wide))
+
     def _share(self, step: int) -> float:
         return step / max(self.steps - 1, 1)
 
@@ -81,22 +91,7 @@ class Pairing:
 class NodeRefineConfig(Pairing):
     """Schedule and pairing of the node refinement; lengths in units of sqrt(area). Set by hand."""
 
-    steps: int = 10
-    strain_first: float = 0.003  # weight of the prior in the first step
-    strain_last: float = 0.0001  # and in the last; it falls geometrically between them
-    scale_first: float = 0.1  # the same of the scale of the robust weight
-    scale_last: float = 0.03
-    damping: float = 1e-4  # weight of the present node vectors, for those that nothing else holds
-
-    @property
-    def schedule(self) -> Schedule:
-        """The same as the driver of the least squares takes it."""
-        return Schedule(
-            steps=self.steps,
-            prior=(self.strain_first, self.strain_last),
-            scale=(self.scale_first, self.scale_last),
-            damping=self.damping,
-        )
+    schedule: Schedule = field(default=Schedule(steps=10, prior=(0.003, 0.0001), scale=(0.1, 0.03)))
 
     def for_noise(self, roughness: float) -> NodeRefineConfig:
         """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`).
@@ -107,8 +102,7 @@ class NodeRefineConfig(Pairing):
         """
         return replace(
             self,
-            strain_last=geometric_between(self.strain_last, 10 * self.strain_last, roughness),
-            scale_last=geometric_between(self.scale_last, 2 * self.scale_last, roughness),
+            schedule=self.schedule.grown(roughness, prior=(1, 10), scale=(1, 2)),
             point_share=geometric_between(self.point_share, max(self.point_share, 1.0), roughness),
             back_points=round(geometric_between(self.back_points, 5 * self.back_points, roughness)),
             shared=max(self.shared, roughness),

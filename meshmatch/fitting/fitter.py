@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, off_torch
 from meshmatch.errors import OptionError
-from meshmatch.fitting.fit import Fit, axis_name
+from meshmatch.fitting.fit import Fit, judged_fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.features import uncovered_share
 from meshmatch.fitting.judge.reasons import Reason, Verdict
@@ -144,24 +144,16 @@ def may_show_part(shape: Shape, config: FitConfig) -> bool:
 
 
 def as_fit(found: Registration, partial: bool, began: float) -> Fit:
-    task, frame, points = found.task, found.core_frame, found.surface.points
-    judged = judge_registration(found, partial)
-    return Fit(
+    """The fit of a registration, judged."""
+    task, best = found.task, found.candidate
+    return judged_fit(
+        judge_registration(found, partial),
+        task.system,
+        found.core_frame,
+        best.vectors,
         template_hash=task.model.template.hash,
-        frame=frame,
-        points=points,
-        vectors=found.candidate.vectors,
-        resting=task.system.verts,
-        faces=task.system.faces,
-        residual=found.candidate.residual,
+        residual=best.residual,
         verts=task.shape.verts,
-        verdict=judged.verdict,
-        reasons=judged.reasons,
-        trust=judged.trust,
-        signs=judged.features,
-        regularity=task.system.regularity(found.candidate.vectors),
-        up=axis_name(frame.rotation[1]),
-        front=axis_name(frame.rotation[2]),
         seconds=time.monotonic() - began,
         seed=task.config.seed,
         partial=partial,

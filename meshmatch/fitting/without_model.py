@@ -6,11 +6,13 @@ import time
 
 import numpy as np
 
+from meshmatch.derived import derived
 from meshmatch.fields.shape_functions import build_field
-from meshmatch.fitting.fit import Fit, axis_name
+from meshmatch.fitting.fit import Fit, judged_fit
+from meshmatch.fitting.fitter import cap_verdict
 from meshmatch.fitting.judge.features import compute_features
 from meshmatch.fitting.judge.reasons import Reason
-from meshmatch.fitting.judge.verdict import LIMITS, judge
+from meshmatch.fitting.judge.verdict import judge
 from meshmatch.fitting.search.predictor import two_way_residual
 from meshmatch.fitting.search.task import take_samples
 from meshmatch.fitting.solve.system import NodeSystem
@@ -34,6 +36,7 @@ def template_of(shape: Shape, name: str, config: ViscousConfig) -> Template:
     return make_template(shape, name, nodes, low=low_mesh(shape, config.faces))
 
 
+@derived
 def viscous_system(template: Template) -> NodeSystem:
     """The least-squares system of a template without a model."""
     verts = template.shape.verts
@@ -51,30 +54,21 @@ def fit_viscously(template: Template, system: NodeSystem, shape: Shape, config: 
     (found,) = align(samples.first(_ALIGNED_BY), resting, "near")
     if found.residual > _TURNED:
         found = align(samples.first(_ALIGNED_BY), resting, "rigid")[0]
-    core = frame.compose(found.pose.frame)
     local = samples.to_local(found.pose).facing(system.surface(np.zeros((system.K, 3))))
     vectors = viscous_vectors(system, local, config)
-    points = system.moved(vectors)
     residual = two_way_residual(system, local, vectors)
     judged = judge(compute_features(system, vectors, local, residual, template.labels))
     unsure = Reason("unsupervised", "fitted without a trained model: surfaces that lie close need not correspond")
-    return Fit(
+    fit = judged_fit(
+        judged,
+        system,
+        frame.compose(found.pose.frame),
+        vectors,
         template_hash=template.hash,
-        frame=core,
-        points=points,
-        vectors=vectors,
-        resting=system.verts,
-        faces=system.faces,
         residual=residual,
         verts=shape.verts,
-        verdict="fair" if judged.verdict == "good" else judged.verdict,
-        reasons=(*judged.reasons, unsure),
-        trust=min(judged.trust, LIMITS.uninformative_trust),
-        signs=judged.features,
-        regularity=system.regularity(vectors),
-        up=axis_name(core.rotation[1]),
-        front=axis_name(core.rotation[2]),
         seconds=time.monotonic() - began,
         seed=config.seed,
         model=NO_MODEL,
     )
+    return cap_verdict(fit, [unsure])

@@ -12,7 +12,6 @@ reveal it: the small islands that such discontinuities cut off are searched agai
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from typing import Self, TypeVar
 
@@ -35,6 +34,7 @@ from meshmatch.geometry.triangles import (
 from meshmatch.maps.vertex_map import corners_of
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import parallel_map
 
 # By how much a neighbour whose normal points the other way (2 units) is further away than it is, in units of
 # sqrt(area): enough to separate the sides of a thin wall. A larger weight would move points along the surface to where
@@ -139,8 +139,7 @@ class Surface:
             else:
                 distance[part] = np.linalg.norm(points[part] - self.verts[vertex[part]], axis=1)
 
-        with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(answer, range(0, N, _CHUNK)))
+        parallel_map(answer, range(0, N, _CHUNK), threads=workers)
         return Footpoints(vertex, face, weights, distance)
 
     def _on_faces(self, points: Floats, vertex: Ints) -> tuple[Ints, Floats, Floats]:

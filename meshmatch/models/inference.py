@@ -22,7 +22,7 @@ from meshmatch.geometry.oriented import nearest, quick_tree
 from meshmatch.models.checkpoint import load_weights
 from meshmatch.models.network import POINT_SIZES, Network, NetworkConfig, weight_shapes
 from meshmatch.models.shared_weights import shared_weights
-from meshmatch.threads import beside
+from meshmatch.threads import parallel_map
 
 if TYPE_CHECKING:
     from meshmatch.models.deformer import Deformer
@@ -80,7 +80,7 @@ class NodeNetwork:
     def predict(self, clouds: Sequence[Float[Floats, "P 3"]]) -> Float[Floats, "B K 3"]:
         points = [np.asarray(cloud, np.float32) for cloud in clouds]
         vectors = self._decode(self._encode(points))
-        trees = beside(quick_tree, points) if self.config.corrections else []
+        trees = parallel_map(quick_tree, points) if self.config.corrections else []
         for _ in range(self.config.corrections):
             vectors = self._correct(vectors, points, trees)
         return vectors.astype(np.float64)
@@ -105,7 +105,7 @@ class NodeNetwork:
         if self.config.encoder == "point":
             return np.stack([self._encode_points(cloud) for cloud in clouds])
         basis = self.weights["encoder.basis"]
-        seen = beside(lambda cloud: 5 * (cloud[nearest(cloud, basis)] - basis), clouds)
+        seen = parallel_map(lambda cloud: 5 * (cloud[nearest(cloud, basis)] - basis), clouds)
         return self._residual_mlp("encoder.network", np.stack(seen).reshape(len(clouds), -1))
 
     def _encode_points(self, cloud: Float[Floats32, "P 3"]) -> Float[Floats32, " D"]:
@@ -136,7 +136,7 @@ class NodeNetwork:
         anchors, phi = self.weights["anchors"], self.weights["anchor_phi"]
         B, K, _ = vectors.shape
         moved = (phi @ vectors.transpose(1, 0, 2).reshape(K, -1)).reshape(len(phi), B, 3).transpose(1, 0, 2)
-        seen = np.stack(beside(_two_way_offsets, anchors + moved, clouds, trees))
+        seen = np.stack(parallel_map(_two_way_offsets, anchors + moved, clouds, trees))
         features = np.concatenate([10 * seen[..., :6], seen[..., 6:], 3 * moved], -1)
         change = self._residual_mlp("corrector", features.reshape(B, -1))
         return vectors + np.float32(0.1) * change.reshape(B, -1, 3)

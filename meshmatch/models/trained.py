@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from meshmatch.arrays import Float, Floats
+from meshmatch.derived import derived, remember
 from meshmatch.errors import ModelError
 from meshmatch.fields.shape_functions import ShapeFunctions, has_nodes, shape_functions
 from meshmatch.geometry.kernels import KERNELS
@@ -22,16 +21,12 @@ if TYPE_CHECKING:
     from meshmatch.fields.field import PointwiseField
     from meshmatch.models.deformer import Deformer
 
-P = ParamSpec("P")
-Derived = TypeVar("Derived")
-
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:
     """What fitting needs of a category.
 
     ``inference`` answers in arrays; `network` is the same network in torch, for training and searches by gradient.
-    ``derived`` holds what was computed from the model alone, see `once_per_model`.
 
     A model can be pickled, for processes of Python. One that `load_model` returned travels as its name or folder and its
     card: whoever unpickles it loads it there, once in each process (`ModelError` if it is missing there, or has other
@@ -41,8 +36,6 @@ class TrainedModel:
     card: ModelCard
     template: Template
     inference: Network
-    derived: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
-    deriving: Any = field(default_factory=threading.RLock, init=False, repr=False)
     load_again: Callable[[], TrainedModel] | None = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -53,7 +46,7 @@ class TrainedModel:
             weights = {name: value.numpy(force=True) for name, value in network.state_dict().items()}
             inference = NodeNetwork(network.config, weights)
         made = cls(card, template, inference)
-        made.derived[torch_network.__wrapped__, (), ()] = network  # type: ignore[attr-defined]
+        remember(torch_network, made, network)
         return made
 
     def __reduce__(self) -> tuple[Callable[..., TrainedModel], tuple[Any, ...]]:
@@ -90,26 +83,7 @@ class TrainedModel:
         return has_nodes(self.inference.config.field)
 
 
-def once_per_model(
-    derive: Callable[Concatenate[TrainedModel, P], Derived],
-) -> Callable[Concatenate[TrainedModel, P], Derived]:
-    """Let a function of a model (and of hashable arguments) compute once for each model, whatever threads ask for it.
-
-    The result lives as long as the model does.
-    """
-
-    @wraps(derive)
-    def once(model: TrainedModel, *args: P.args, **kwargs: P.kwargs) -> Derived:
-        key = (derive, args, tuple(sorted(kwargs.items())))
-        with model.deriving:
-            if key not in model.derived:
-                model.derived[key] = derive(model, *args, **kwargs)
-            return model.derived[key]
-
-    return once
-
-
-@once_per_model
+@derived
 def torch_network(model: TrainedModel, device: str = "cpu") -> Deformer:
     """The network of a model as torch has it, see `meshmatch.models.inference.in_torch`."""
     return in_torch(model.inference, model.template.K, device)

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+from meshmatch.derived import derived
 from meshmatch.shapes.sampling import Samples, sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -28,6 +29,7 @@ _HIDDEN = 0.1  # share of the area that must be hidden to be left out
 _SHOWN = 0.2  # share of the area that must be seen
 
 
+@derived
 def without_hidden(shape: Shape) -> Shape:
     """A mesh of several connected parts without the faces that no view from outside shows; any other shape as it is.
 

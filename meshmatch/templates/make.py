@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal, get_args
 
 import numpy as np
@@ -21,6 +20,7 @@ from scipy.sparse.linalg import eigsh
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, UInt8, UInts8
+from meshmatch.derived import derived
 from meshmatch.errors import OptionError, TemplateError
 from meshmatch.geometry.kernels import poorly_supported
 from meshmatch.shapes.decimate import Quality, decimate
@@ -283,7 +283,7 @@ def _geodesic_allowed(shape: Shape, radius: float, candidates: Float[Floats, "N 
     return allowed
 
 
-@lru_cache(maxsize=2)
+@derived
 def _near_pairs(shape: Shape, share: float) -> tuple[Int[Ints, " S"], UInt8[UInts8, "S bytes"]]:
     """Vertices spread over a shape, and which of them lie within a share of the diameter, along the surface: as bits."""
     graph = edge_graph(shape)

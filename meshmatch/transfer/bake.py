@@ -8,8 +8,8 @@ its texture coordinates: they are never interpolated across the source's seams. 
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import count
 from numbers import Integral
 
 import numpy as np
@@ -21,6 +21,7 @@ from meshmatch.shapes.appearance import Alpha, Appearance, Pixels
 from meshmatch.shapes.colors import bytes_of
 from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import parallel_map
 from meshmatch.transfer.surface_walk import PointWalker, SurfaceWalker
 from meshmatch.transfer.texel_colors import MaterialSampler, TexelLocator, images_of
 from meshmatch.transfer.texels import beside_another, faces_on, fill, grown
@@ -193,17 +194,19 @@ def _painted(
         total[3] /= len(steps)
         _store(pixels, at, total)
 
-    with ThreadPoolExecutor(options.workers) as pool:
+    def run(work: Callable[[Ints], None], chosen: Ints, done: float, share: float) -> None:
+        parts, finished = [chosen[k : k + _CHUNK] for k in range(0, len(chosen), _CHUNK)], count(1)
 
-        def run(work: Callable[[Ints], None], chosen: Ints, done: float, share: float) -> None:
-            parts = [chosen[k : k + _CHUNK] for k in range(0, len(chosen), _CHUNK)]
-            for count, _ in enumerate(pool.map(work, parts)):
-                progress(done + share * (count + 1) / len(parts))
+        def report(part: Ints) -> None:
+            work(part)
+            progress(done + share * next(finished) / len(parts))
 
-        run(first, np.flatnonzero(on >= 0), 0.0, 0.5)
-        if options.samples > 1:  # at seams, and where a texel covers much of the source's
-            several = coarse | beside_another(chart.reshape(size, size)).reshape(-1)
-            run(again, np.flatnonzero(several), 0.5, 0.45)
+        parallel_map(report, parts, threads=options.workers)
+
+    run(first, np.flatnonzero(on >= 0), 0.0, 0.5)
+    if options.samples > 1:  # at seams, and where a texel covers much of the source's
+        several = coarse | beside_another(chart.reshape(size, size)).reshape(-1)
+        run(again, np.flatnonzero(several), 0.5, 0.45)
     return pixels.reshape(size, size, 4), low
 
 

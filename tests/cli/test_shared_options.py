@@ -29,6 +29,7 @@ PAIR = {
 SHARED: list[tuple[tuple[str, ...], dict[str, Any], dict[str, Any]]] = [
     *((("--refine", name), {"refine": name}, {"refine": name}) for name in ("none", "latent")),
     *((("--up", axis), {"up": axis.lower()}, {"up": axis.lower()}) for axis in ("x", "-z", "Y")),
+    *((("--mirror", word), {"mirror": word}, {"mirror": word}) for word in ("auto", "no")),
     (("--front", "-y"), {"front": "-y"}, {"front": "-y"}),
     (("--seed", "7"), {"seed": 7}, {"seed": 7}),
     (("--partial",), {"partial": "yes"}, {"partial": "yes"}),

@@ -1,6 +1,7 @@
 """A model of eggs that nobody trained: small, quick, and with everything that fitting asks of a model."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from tests.models.small_model import small_card
 from tests.training.small import NETWORK, bent_eggs, egg_template, small_network
 
 
+@cache
 def egg_model(kernel: Kernel = "smooth", network: NetworkConfig = NETWORK) -> TrainedModel:
     template = egg_template()
     card = small_card(

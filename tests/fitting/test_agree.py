@@ -11,26 +11,15 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.search.task import Landmarks
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree, likeness, log_stretch, mean_log, stretch_of
-from meshmatch.fitting.solve.system import NodeSystem, node_system
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from tests.conftest import some_fit
-from tests.fitting.eggs import egg_model
 
 TURNS = Rotation.random(4, random_state=np.random.default_rng(0)).as_matrix()
-
-
-@pytest.fixture(scope="module")
-def model() -> TrainedModel:
-    return egg_model()
-
-
-@pytest.fixture(scope="module")
-def system(model: TrainedModel) -> NodeSystem:
-    return node_system(model)
 
 
 def stretches(*factors: float) -> np.ndarray:
@@ -59,6 +48,11 @@ def test_a_collapsed_point_has_a_finite_mean() -> None:
     assert np.isfinite(mean_stretch([np.zeros((1, 3, 3)), stretches(1, 1, 1)[:1]])).all()
 
 
+def agreeing(steps: int, prior: float = 1e-4, momentum: float = 0.6, **settings: float) -> AgreeConfig:
+    schedule = replace(AgreeConfig.schedule, steps=steps, prior=(prior, prior), momentum=momentum)
+    return AgreeConfig(schedule=schedule, **settings)
+
+
 def scan_of(system: NodeSystem) -> OrientedPoints:
     """The resting egg itself."""
     samples = sample_surface(Shape(system.verts, system.faces), 1500, np.random.default_rng(0))
@@ -76,7 +70,7 @@ def slid(system: NodeSystem, nodes: np.ndarray, turn: float) -> np.ndarray:
 
 
 def test_two_that_slid_apart_come_closer(system: NodeSystem, model: TrainedModel) -> None:
-    scan, nodes, config = scan_of(system), model.template.nodes, AgreeConfig(steps=6, prior=0.01)
+    scan, nodes, config = scan_of(system), model.template.nodes, agreeing(6, 0.01)
     apart = [slid(system, nodes, 0.15), slid(system, nodes, -0.15)]
     nearer = agree(system, [Member(samples=scan, vectors=each, config=config) for each in apart])
 
@@ -110,7 +104,7 @@ def test_a_thick_and_a_thin_one_keep_their_stretch(system: NodeSystem, model: Tr
     vectors = [np.zeros_like(nodes), nodes * [0.5, 0, 0.5]]
 
     def apart(alike: float) -> float:
-        config = AgreeConfig(steps=6, prior=1.0, alike=alike)
+        config = agreeing(6, 1.0, alike=alike)
         members = [
             Member(samples=each, vectors=start, config=config)
             for each, start in zip((scan, thick), vectors, strict=True)
@@ -126,7 +120,7 @@ def test_landmarks_hold(system: NodeSystem, model: TrainedModel) -> None:
     scan, start = scan_of(system), slid(system, model.template.nodes, 0.1)
     at = np.array([3, 40])
     places = system.moved(start)[at] + [0.15, 0.0, 0.0]
-    config = AgreeConfig(steps=3)
+    config = agreeing(3)
 
     def missed(known: Landmarks | None) -> float:
         moved = system.moved(agree(system, [Member(samples=scan, vectors=start, config=config, landmarks=known)])[0])
@@ -145,7 +139,7 @@ def test_fits_agree_in_their_own_frames(system: NodeSystem, model: TrainedModel)
     vectors = [slid(system, model.template.nodes, turn) for turn in (0.15, -0.15)]
     fits = [fit_of(system, each) for each in vectors]
     shape = Shape(fits[0].frame.undo(system.verts), system.faces)
-    how = AgreeConfig(steps=6, prior=0.01)
+    how = agreeing(6, 0.01)
     agreed = agreed_fits(model, [shape, shape], fits, FitConfig(samples=1500), how=how)
     before, after = (np.linalg.norm(a.points - b.points, axis=1).mean() for a, b in (fits, agreed))
     assert after < before
@@ -174,7 +168,7 @@ def test_the_card_says_how_stiff(system: NodeSystem, model: TrainedModel) -> Non
         return agreed_fits(which, [shape, shape], fits, FitConfig(samples=1500), how=how)[0].points
 
     plain = AgreeConfig()
-    assert np.array_equal(points(soft), points(model, replace(plain, prior=0.25 * plain.prior)))
+    assert np.array_equal(points(soft), points(model, agreeing(8, 0.25e-4)))
     assert np.array_equal(points(model), points(model, plain))
     assert not np.array_equal(points(soft), points(model))
 
@@ -184,8 +178,8 @@ def test_momentum_goes_further_in_as_many_steps(model: TrainedModel, system: Nod
     apart = [slid(system, nodes, amount) for amount in (0.1, -0.1)]
 
     def left(momentum: float) -> float:
-        config = AgreeConfig(steps=3, prior=0.01, momentum=momentum)
+        config = agreeing(3, 0.01, momentum)
         found = agree(system, [Member(samples=scan, vectors=each, config=config) for each in apart])
         return float(np.abs(found[0] - found[1]).mean())
 
-    assert left(AgreeConfig().momentum) < 0.97 * left(0.0)
+    assert left(AgreeConfig().schedule.momentum) < 0.97 * left(0.0)

@@ -18,14 +18,8 @@ from meshmatch.geometry.frames import Frame
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
 from tests.conftest import some_fit
-from tests.fitting.eggs import egg_model
 
 HALF = np.array([0.5, 0.5])
-
-
-@pytest.fixture(scope="module")
-def model() -> TrainedModel:
-    return egg_model()
 
 
 def about(axis: str, degrees: float) -> np.ndarray:

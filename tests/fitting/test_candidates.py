@@ -20,7 +20,7 @@ from meshmatch.fitting.search.refinement import (
     has_common_axes,
 )
 from meshmatch.fitting.search.task import FitTask
-from meshmatch.fitting.solve.system import NodeSystem, node_system
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
@@ -28,11 +28,6 @@ from meshmatch.shapes.shape import Shape
 from tests.fitting.eggs import egg_model, scan_of
 
 STILL = RigidPose.identity()
-
-
-@pytest.fixture(scope="module")
-def system() -> NodeSystem:
-    return node_system(egg_model())
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from meshmatch.fitting.search.candidates import estimate_scale, isolated_points
 from meshmatch.fitting.search.predictor import Candidate, two_way_residual
 from meshmatch.fitting.solve.agreement import AgreeConfig
 from meshmatch.fitting.solve.nodes import refine_nodes
-from meshmatch.fitting.solve.system import NodeSystem, node_system
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.solve.terms import PairTerm
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
@@ -23,11 +23,6 @@ from meshmatch.shapes.shape import Shape
 from tests.fitting.eggs import egg_model
 
 STILL = RigidPose.identity()
-
-
-@pytest.fixture(scope="module")
-def system() -> NodeSystem:
-    return node_system(egg_model())
 
 
 def cloud_of(system: NodeSystem, P: int, noise: float = 0.0, strays: int = 0) -> OrientedPoints:
@@ -173,13 +168,13 @@ def test_noise_makes_a_cloud_rough_and_its_fit_stiff(system: NodeSystem) -> None
     assert clean < 0.05 < some < much <= 1.0
     assert Shape(system.verts, system.faces).roughness == 0.0
     config = FitConfig()
-    assert config.for_noise(clean).nodes.strain_last == pytest.approx(config.nodes.strain_last, rel=0.15)
+    assert config.for_noise(clean).nodes.schedule.prior == pytest.approx(config.nodes.schedule.prior, rel=0.15)
     stiff = config.for_noise(1.0)
-    assert stiff.nodes.strain_last == pytest.approx(10 * config.nodes.strain_last)
-    assert stiff.nodes.scale_last > config.nodes.scale_last and stiff.samples > config.samples
+    assert stiff.nodes.schedule.prior == pytest.approx((0.003, 0.001))
+    assert stiff.nodes.schedule.scale == pytest.approx((0.1, 0.06)) and stiff.samples > config.samples
     assert config.for_noise(0.0) is config
     agree = AgreeConfig()
-    assert agree.for_noise(1.0).prior == pytest.approx(80 * agree.prior)
+    assert agree.for_noise(1.0).schedule.prior == pytest.approx((0.008, 0.008))
     assert (stiff.nodes.shared, agree.for_noise(1.0).shared, agree.for_noise(0.25).shared) == (1.0, 1.0, 0.25)
     assert agree.for_noise(0.0) == agree
 
@@ -195,7 +190,7 @@ def test_fits_of_rough_clouds_are_suited_to_them(system: NodeSystem, monkeypatch
     paired: list[int] = []
 
     def refined(system, scan, vectors, config, fixed):
-        asked.append(config.strain_last)
+        asked.append(config.schedule.prior[1])
         return refine_nodes(system, scan, vectors, config, fixed)
 
     quadratic = PairTerm.quadratic
@@ -210,10 +205,10 @@ def test_fits_of_rough_clouds_are_suited_to_them(system: NodeSystem, monkeypatch
     for cloud in clouds:
         asked.clear()
         fits.append(replace(Fitter(egg_model(), config).fit(cloud), verdict="good"))
-        expected = config.nodes.strain_last * 10**cloud.roughness
+        expected = config.nodes.schedule.prior[1] * 10**cloud.roughness
         assert asked and asked == pytest.approx([expected] * len(asked))
     assert clouds[1].roughness > clouds[0].roughness + 0.3
     monkeypatch.setattr(PairTerm, "quadratic", paired_again)
-    how = AgreeConfig(steps=1, back_points=100)
+    how = AgreeConfig(schedule=replace(AgreeConfig.schedule, steps=1), back_points=100)
     agreed_fits(egg_model(), clouds, fits, config, how=how)
     assert paired == [round(100 * (1 + cloud.roughness)) for cloud in clouds]

@@ -13,18 +13,13 @@ from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.judge.features import area_share, visible_vertices
 from meshmatch.fitting.search.candidates import completed
 from meshmatch.fitting.search.predictor import Candidate
-from meshmatch.fitting.solve.system import NodeSystem, node_system
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from tests.fitting.eggs import egg_model, scan_of
-
-
-@pytest.fixture(scope="module")
-def system() -> NodeSystem:
-    return node_system(egg_model())
 
 
 def above(system: NodeSystem, height: float) -> OrientedPoints:

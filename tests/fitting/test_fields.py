@@ -73,17 +73,6 @@ def test_it_learns(field: str) -> None:
     assert held_out_error(model, held_out, points) < 0.97 * before
 
 
-@pytest.mark.parametrize("field", FIELDS)
-def test_every_part_of_the_network_learns(field: str) -> None:
-    egg = egg_template()
-    model = small_network(egg, config_of(field))
-    batch = small_data(egg, model)[0]
-    terms = CorrespondenceLoss()(model, batch, small_points(egg, model=model), torch.Generator())
-    assert {"volume", "arap", "blend", "correct", "align"} < set(terms)
-    terms["total"].backward()
-    assert [name for name, weight in model.named_parameters() if weight.grad is None] == []
-
-
 def test_what_has_no_weight_is_not_computed(monkeypatch: pytest.MonkeyPatch, pointwise: TrainedModel) -> None:
     monkeypatch.setattr("meshmatch.fields.field.value_and_jacobian", None)
     egg, model = pointwise.template, pointwise.network

@@ -1,6 +1,5 @@
 """Shapes that are the mirror image of what a model knows: found, said, and matched all the same."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,6 @@ from scipy.spatial import cKDTree
 import meshmatch
 from meshmatch.api.inputs import as_model
 from meshmatch.api.interpolation import InterpolationOptions, interpolate
-from meshmatch.cli import main
 from meshmatch.errors import OptionError
 from meshmatch.fitting import fitter
 from meshmatch.fitting.fit import Fit
@@ -63,6 +61,7 @@ def test_the_mirror_image_is_fitted_in_its_place(one_sided: None) -> None:
     assert volume(dense) > 0
 
 
+@pytest.mark.slow
 def test_a_shape_and_its_mirror_image_are_matched(one_sided: None) -> None:
     dancer = meshmatch.load_shape(DANCER)
     image = Shape(dancer.verts * [-1, 1, 1], dancer.faces[:, ::-1], "image")
@@ -100,19 +99,9 @@ def test_words_for_the_mirror() -> None:
         FitConfig(mirror="yes")  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_without_correspondence_near_is_all_that_is_known() -> None:
     model = as_model("human")
     blind = TrainedModel(replace(model.card, correspondence=False), model.template, model.inference)
     fit = meshmatch.register(DANCER, model=blind)
     assert (fit.verdict, [reason.code for reason in fit.reasons]) == ("fair", ["unsupervised"])
-
-
-def test_the_command_tries_the_mirror_image_if_asked(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(fitter, "mirror_of", lambda model: None)
-    words = ["register", str(DANCER), "-o", str(tmp_path / "fit.ply"), "--model", "human", "--json"]
-    for mirror, codes in (("auto", ["its mirror image fits nearly as well"]), ("no", [])):
-        assert main([*words, "--mirror", mirror]) == 0
-        reasons = json.loads(capsys.readouterr().out)["reasons"]
-        assert [reason.split(":")[0] for reason in reasons] == codes

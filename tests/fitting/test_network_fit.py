@@ -15,17 +15,7 @@ from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints, with_normals
 from meshmatch.models.trained import TrainedModel
-from tests.fitting.eggs import bent_egg, egg_model, gentle_vectors, scan_of
-
-
-@pytest.fixture(scope="module")
-def model() -> TrainedModel:
-    return egg_model()
-
-
-@pytest.fixture(scope="module")
-def system(model: TrainedModel) -> NodeSystem:
-    return node_system(model)
+from tests.fitting.eggs import bent_egg, gentle_vectors, scan_of
 
 
 @pytest.fixture(scope="module")

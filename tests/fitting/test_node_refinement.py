@@ -9,26 +9,16 @@ from scipy.spatial.transform import Rotation
 from meshmatch.fitting.fit_config import NodeRefineConfig
 from meshmatch.fitting.search.predictor import two_way_residual
 from meshmatch.fitting.solve.nodes import refine_nodes
-from meshmatch.fitting.solve.priors import nearest_rotations
-from meshmatch.fitting.solve.system import NodeSystem, node_system
+from meshmatch.fitting.solve.priors import nearest_rotations, signed_svd
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.solve.terms import PairTerm, robust_weight
 from meshmatch.geometry.oriented import OrientedPoints, with_normals
 from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
-from tests.fitting.eggs import egg_model, gentle_vectors, scan_of
+from tests.fitting.eggs import gentle_vectors, scan_of
 
 CONFIG = NodeRefineConfig()
-
-
-@pytest.fixture(scope="module")
-def model() -> TrainedModel:
-    return egg_model()
-
-
-@pytest.fixture(scope="module")
-def system(model: TrainedModel) -> NodeSystem:
-    return node_system(model)
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +53,13 @@ def test_the_nearest_rotation_is_the_one_that_was_applied() -> None:
     anything = nearest_rotations(rng.normal(size=(20, 3, 3)), start)  # mirrored ones too
     assert np.allclose(np.linalg.det(anything), 1)
     assert np.allclose(anything @ anything.transpose(0, 2, 1), np.eye(3))
+
+
+def test_signed_singular_values_are_those_of_a_rotation() -> None:
+    F = np.random.default_rng(0).normal(size=(50, 3, 3))
+    U, sizes, Vh = signed_svd(F)
+    assert np.allclose((U * sizes[:, None]) @ Vh, F) and np.allclose(np.linalg.det(U @ Vh), 1)
+    assert np.array_equal(sizes[:, 2] < 0, np.linalg.det(F) < 0)
 
 
 def test_nearest_rotations_are_those_of_singular_values() -> None:
@@ -196,7 +193,7 @@ def test_each_step_lowers_the_energy_that_it_is_given(
 
     monkeypatch.setattr(NodeSystem, "solve", watched)
     refine_nodes(system, scan, np.zeros((system.K, 3)), CONFIG)
-    assert len(energies) == CONFIG.steps
+    assert len(energies) == CONFIG.schedule.steps
     assert all(after <= before for before, after in energies)
     assert energies[0][1] < energies[0][0]
 
@@ -246,9 +243,9 @@ def test_of_a_part_only_what_is_near_it_is_pulled(system: NodeSystem, scan: Orie
 
 
 def test_no_steps_change_nothing(system: NodeSystem, scan: OrientedPoints) -> None:
-    assert np.array_equal(
-        refine_nodes(system, scan, np.ones((system.K, 3)), replace(CONFIG, steps=0)), np.ones((system.K, 3))
-    )
+    none = replace(CONFIG, schedule=replace(CONFIG.schedule, steps=0))
+    ones = np.ones((system.K, 3))
+    assert np.array_equal(refine_nodes(system, scan, ones, none), ones)
 
 
 def test_samples_of_weight_zero_do_not_pull(system: NodeSystem, scan: OrientedPoints, truth: np.ndarray) -> None:

@@ -17,14 +17,9 @@ from meshmatch.fitting.search.frames import (
 )
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.models.trained import TrainedModel
-from tests.fitting.eggs import bent_egg, egg_model, scan_of
+from tests.fitting.eggs import bent_egg, scan_of
 
 AXES = [sign * axis for axis in np.eye(3) for sign in (1, -1)]
-
-
-@pytest.fixture(scope="module")
-def model() -> TrainedModel:
-    return egg_model()
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.search.discontinuities import discontinuous_share, neighbours
 from meshmatch.fitting.search.predictor import one_way_residual, two_way_residual
 from meshmatch.fitting.search.task import take_samples, without_interior, without_outliers
-from meshmatch.fitting.solve.system import NodeSystem, node_system
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.files import load_shape
@@ -24,11 +24,6 @@ from tests.fitting.eggs import egg_model, scan_of
 
 NO_FACES = np.empty((0, 3), np.int64)
 FEW = FitConfig(variants=2, finalists=1, careful=1)
-
-
-@pytest.fixture(scope="module")
-def system() -> NodeSystem:
-    return node_system(egg_model())
 
 
 def body(P: int, seed: int = 0) -> np.ndarray:

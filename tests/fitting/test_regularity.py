@@ -1,6 +1,7 @@
 """How regular fits are: folds are counted and opened, and fits that agree keep their faces."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +18,10 @@ from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
 from meshmatch.templates.location import bundled_folder
 from tests.conftest import some_fit
-from tests.fitting.eggs import egg_model, scan_of
+from tests.fitting.eggs import scan_of
 
 SCAPE = tuple(f"scape/mesh{number}" for number in ("000", "010", "020", "030", "040"))
 REAL = (*SCAPE, "faust/tr_reg_000", "faust/tr_reg_011")
-
-
-@pytest.fixture(scope="module")
-def model() -> TrainedModel:
-    return egg_model()
-
-
-@pytest.fixture(scope="module")
-def system(model: TrainedModel) -> NodeSystem:
-    return node_system(model)
 
 
 def pushed_in(model: TrainedModel, depth: float) -> np.ndarray:
@@ -93,7 +84,9 @@ def test_what_all_fits_have_in_common_hardly_drifts(system: NodeSystem, model: T
     start = 0.1 * nodes * [1.0, -1.0, 1.0]
 
     def drifted(drift: float) -> float:
-        members = [Member(samples=scan, vectors=start, config=AgreeConfig(steps=8, prior=0.01, drift=drift))] * 2
+        schedule = replace(AgreeConfig.schedule, prior=(0.01, 0.01))
+        config = AgreeConfig(schedule=schedule, drift=drift)
+        members = [Member(samples=scan, vectors=start, config=config)] * 2
         found = agree(system, members)[0]
         return float(np.abs(system.deformation_gradient(found) - system.deformation_gradient(start)).mean())
 

@@ -2,7 +2,6 @@
 
 import pickle
 from dataclasses import fields, replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ from meshmatch.fitting.judge.features import (
     subtract_in_quadrature,
     uncut_share,
 )
-from meshmatch.fitting.judge.joints import knees_forward, nearest_rotation
+from meshmatch.fitting.judge.joints import knees_forward
 from meshmatch.fitting.judge.reasons import Reason
 from meshmatch.fitting.judge.verdict import LIMITS, Judgement, judge, judge_with_allowance
 from meshmatch.fitting.search.discontinuities import discontinuous_share, neighbours
@@ -127,7 +126,6 @@ def test_reasons_are_sentences_with_codes() -> None:
     assert "unsure" not in {reason.code for reason in judge(replace(SOUND, residual=0.05)).reasons}
 
 
-@cache
 def system() -> NodeSystem:
     return node_system(egg_model())
 
@@ -207,6 +205,7 @@ def test_a_shortened_template_is_not_torn() -> None:
     assert compute_features(system(), short, pressed, 0.02, labels()).discontinuous < 0.005
 
 
+@pytest.mark.slow
 def test_the_network_reads_what_it_knows_alike_and_a_box_in_many_ways() -> None:
     matcher = Matcher("human", threads=1)
     known = matcher.fit(load_shape(bundled_folder() / "samples" / "dancer.ply")).signs
@@ -346,14 +345,6 @@ def test_a_knee_bends_forward_by_so_many_degrees(bend: float) -> None:
     assert (low_points < 0).any()
     assert found == 0 if bend <= 0 else 0.4 * bend < found < 1.1 * bend
     assert knees_forward(system(), vectors, template) == 0  # an egg has no knees
-
-
-def test_the_nearest_rotation_is_a_rotation_and_its_own_nearest() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(5):
-        rotation = nearest_rotation(rng.normal(size=(3, 3)))
-        assert rotation @ rotation.T == pytest.approx(np.eye(3)) and np.linalg.det(rotation) == pytest.approx(1)
-        assert nearest_rotation(rotation * 1.3) == pytest.approx(rotation)
 
 
 def test_pieces_beside_the_template_are_astray() -> None:

@@ -11,13 +11,14 @@ from typing import Protocol
 
 import numpy as np
 
+from meshmatch.derived import derived
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.reasons import Verdict
 from meshmatch.fitting.search.frames import frames_to_try, scan_frame
 from meshmatch.fitting.search.predictor import Predictor, best_first
 from meshmatch.fitting.search.task import without_outliers
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.models.trained import TrainedModel, once_per_model
+from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -58,7 +59,7 @@ def category_residual(model: TrainedModel, shape: Shape, samples: OrientedPoints
     return predictor.fit(placed, best.pose, draws=1).residual
 
 
-@once_per_model
+@derived
 def has_limbs(model: TrainedModel) -> bool:
     """Whether a model's template is far from round: 36 pi V^2 / A^3 is 1 for a ball. Cones to the center close its holes."""
     shape = model.template.shape

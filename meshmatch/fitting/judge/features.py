@@ -19,9 +19,10 @@ from meshmatch.fitting.judge.calibration import CALIBRATION
 from meshmatch.fitting.search.discontinuities import discontinuous_share, neighbours
 from meshmatch.fitting.search.predictor import USUAL_SPREAD, two_way_residual, weighted_mean
 from meshmatch.fitting.search.visibility import area_share, visible_vertices
+from meshmatch.fitting.solve.agreement import log_stretch
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.geometry.symmetric import entries_of, logarithm, matrices_of
+from meshmatch.geometry.triangles import edge_lengths, edges_of
 from meshmatch.shapes.sampling import Samples, sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -33,8 +34,6 @@ _TEAR_SAMPLES = 4096  # enough to see tears
 _SHORTEST = 0.2  # what is shortened more is torn
 _EVEN = 0.2  # a stretch that varies less says no more
 _LEAST_SPREAD = 0.01  # less of it says no more
-_MIN_SQUARE = 1e-6  # of a stretch: a logarithm must stay finite
-_WEIGHTS, _OFFSET = CALIBRATION.weights, CALIBRATION.offset
 # Residual (units of sqrt(area)) of even a right fit of a figure built of many solids, which no skin follows: the likeliest
 # one, given right fits and upside-down ones of robots, and fits of solids and of furniture in pieces, that are not those of
 # docs/results.md. Between so many parts of equal area and so many, set by hand, it grows to that.
@@ -111,7 +110,8 @@ class FitFeatures:
     @property
     def p_correct(self) -> float:
         """Probability (0..1) that the fit is right."""
-        return float(1 / (1 + np.exp(_OFFSET + np.dot(_WEIGHTS, self.values()) + _ALONE * sum(self.alone))))
+        logit = CALIBRATION.offset + np.dot(CALIBRATION.weights, self.values()) + _ALONE * sum(self.alone)
+        return float(1 / (1 + np.exp(logit)))
 
 
 def compute_features(
@@ -133,7 +133,7 @@ def compute_features(
     gap, nearest = cKDTree(surface.points).query(local.points)
     some = local.first(_TEAR_SAMPLES)
     gradient = system.deformation_gradient(vectors)
-    stretches = matrices_of(0.5 * logarithm(entries_of(gradient.transpose(0, 2, 1) @ gradient), _MIN_SQUARE))
+    stretches = log_stretch(gradient)
     flipped = (surface.normals[nearest] * local.normals).sum(1) < 0
     return FitFeatures(
         residual=residual,
@@ -192,11 +192,11 @@ def uncut_share(
     shape (their middles, core frame): there the template goes on, and nothing was cut off.
     """
     shown, faces = visible_vertices(system, local, vectors), system.faces
-    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    border = np.unique(sides[shown[sides[:, 0]] != shown[sides[:, 1]]], axis=0)
+    sides = edges_of(faces).vertices
+    border = sides[shown[sides[:, 0]] != shown[sides[:, 1]]]
     if not len(border) or not len(edges):
         return 0.0
-    length = np.linalg.norm(system.verts[border[:, 0]] - system.verts[border[:, 1]], axis=1)
+    length = edge_lengths(system.verts, border)
     middles = system.surface(vectors).points[border].mean(1)
     return float(length[cKDTree(edges).query(middles)[0] > _CUT].sum() / length.sum())
 

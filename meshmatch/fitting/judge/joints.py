@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
+from meshmatch.fitting.solve.priors import signed_svd
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.templates.template import Template
 
@@ -20,14 +21,10 @@ def knees_forward(system: NodeSystem, vectors: Float[Floats, "K 3"], template: T
     for above, below in _KNEES:
         if above not in names or below not in names:
             continue
-        thigh, shin = (gradient[labels == names.index(name)] for name in (above, below))
-        if len(thigh) and len(shin):
-            direction = nearest_rotation(thigh.mean(0)).T @ nearest_rotation(shin.mean(0)) @ _DOWN
+        parts = [gradient[labels == names.index(name)] for name in (above, below)]
+        if all(map(len, parts)):
+            left, _, right = signed_svd(np.stack([part.mean(0) for part in parts]))
+            thigh, shin = left @ right  # the rotations nearest to both
+            direction = thigh.T @ shin @ _DOWN
             most = max(most, float(np.degrees(np.arcsin(np.clip(direction[_FRONT], -1, 1)))))
     return most
-
-
-def nearest_rotation(matrix: Float[Floats, "3 3"]) -> Float[Floats, "3 3"]:
-    """The rotation nearest to a matrix (least squares)."""
-    left, _, right = np.linalg.svd(matrix)
-    return np.asarray(left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right)

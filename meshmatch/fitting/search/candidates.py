@@ -39,7 +39,7 @@ from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.progress import Progress
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
-from meshmatch.threads import beside
+from meshmatch.threads import parallel_map
 
 STAGE = "fitting as a part"
 
@@ -243,7 +243,7 @@ def _fitted_again(task: FitTask, candidates: Sequence[Candidate]) -> list[Candid
     """New fits of the samples, completed by the last fits; how much of these was visible is the new share."""
     system, starts, shares = task.system, [], []
     placed = [candidate.local(task.samples) for candidate in candidates]
-    shown = beside(
+    shown = parallel_map(
         lambda local, each: visible_vertices(system, local.first(SETTINGS.coarse_samples), each.vectors),
         placed,
         candidates,
@@ -263,7 +263,7 @@ def _fitted_again(task: FitTask, candidates: Sequence[Candidate]) -> list[Candid
         moved = replace(fit, pose=pose, share=share)
         return replace(moved, residual=one_way_residual(system, moved.local(task.samples), fit.vectors))
 
-    return beside(measured, candidates, again, shares)
+    return parallel_map(measured, candidates, again, shares)
 
 
 def completed(

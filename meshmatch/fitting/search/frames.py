@@ -12,11 +12,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats
+from meshmatch.derived import derived
 from meshmatch.fitting.fit_config import FitConfig, axis_of
 from meshmatch.geometry.frames import Frame, RigidPose
 from meshmatch.geometry.oriented import OrientedPoints, nearest
 from meshmatch.models.network import Network
-from meshmatch.models.trained import TrainedModel, once_per_model
+from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.normalise import ALIGNS, align
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import SCALES, template_radius, template_samples, unit_frame
@@ -70,7 +71,7 @@ def aligned_frames(model: TrainedModel, samples: OrientedPoints) -> list[RigidPo
     return [each.pose for each in align(samples, _template_samples(model), how, _ALIGNED)]
 
 
-@once_per_model
+@derived
 def _template_samples(model: TrainedModel) -> OrientedPoints:
     return template_samples(model.template)
 

@@ -7,11 +7,12 @@ import torch
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats
+from meshmatch.derived import derived
 from meshmatch.fields.field import Field, PointField, arap_energy, volume_energy
 from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.fit_config import LatentRefineConfig
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.models.trained import TrainedModel, once_per_model, torch_network
+from meshmatch.models.trained import TrainedModel, torch_network
 from meshmatch.progress import Progress
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.template import template_radius
@@ -94,7 +95,7 @@ def refine_code(
     return best_vectors.double().cpu().numpy()
 
 
-@once_per_model
+@derived
 def _on_template(model: TrainedModel, P: int, device: str) -> tuple[torch.Tensor, PointField]:
     """Template points (P, 3) and the field there."""
     verts = model.template.shape.verts

@@ -16,15 +16,16 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
+from meshmatch.derived import derived
 from meshmatch.errors import TemplateError
 from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints, nearest_unsigned, with_normals
 from meshmatch.models.network import Network
-from meshmatch.models.trained import TrainedModel, once_per_model
+from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.sampling import sample_surface
-from meshmatch.threads import beside
+from meshmatch.threads import parallel_map
 
 # How many points the network sees of tilted copies, in turn: thin samples tip it either way where it is in doubt.
 _VARIANT_POINTS = (700, 1400)
@@ -93,7 +94,7 @@ class Mirror:
         return self.exchange @ vectors * _FLIP
 
 
-@once_per_model
+@derived
 def mirror_of(model: TrainedModel) -> Mirror | None:
     """The mirror of a model's template; None where it is not symmetric, or its field has no nodes."""
     template = model.template
@@ -166,7 +167,7 @@ class Predictor:
         def measured(start: tuple[OrientedPoints, RigidPose], pose: RigidPose, vectors: Floats) -> Candidate:
             return Candidate(pose, vectors, measure(self.system, start[0].to_local(pose), vectors))
 
-        return beside(measured, starts, poses, means)
+        return parallel_map(measured, starts, poses, means)
 
     def fit(
         self, samples: OrientedPoints, pose: RigidPose, rounds: int = 2, draws: int = 2, measure: Residual | None = None
@@ -186,7 +187,9 @@ class Predictor:
         which is ``pose``. There are ``count`` tilts with a standard deviation of ``degrees`` about each axis.
         """
         found = self._readings(local, count, degrees)
-        return beside(lambda vectors: Candidate(pose, vectors, two_way_residual(self.system, coarse, vectors)), found)
+        return parallel_map(
+            lambda vectors: Candidate(pose, vectors, two_way_residual(self.system, coarse, vectors)), found
+        )
 
     def spread(self, local: OrientedPoints, vectors: Float[Floats, "K 3"], at: Bool[Bools, " V"]) -> float:
         """How far a fit lies from what the network reads in tilted copies of the samples: the mean over some vertices of
@@ -220,7 +223,7 @@ class Predictor:
         return [self.network.rotate_rows(vectors, tilt) for vectors, tilt in zip(found, tilts, strict=True)]
 
 
-@once_per_model
+@derived
 def reads_alike(model: TrainedModel) -> bool:
     """Whether a model reads copies of its resting template much the same; if not, a spread says nothing of a fit."""
     predictor = Predictor.of(model, np.random.default_rng(_SPREAD_SEED))

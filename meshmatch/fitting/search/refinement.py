@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -39,7 +38,7 @@ from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
-from meshmatch.threads import beside
+from meshmatch.threads import parallel_map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,20 +159,7 @@ REFINEMENTS: dict[fit_config.Refine, Refinement] = {
 }
 
 
-class Comparison(Protocol):
-    """How interpretations are refined and told apart."""
-
-    def refined(self, candidate: Candidate, in_full: bool) -> Candidate:
-        """An interpretation after all steps of its refinement, or after a few."""
-
-    def score(self, candidate: Candidate, in_full: bool) -> float:
-        """How well an interpretation fits that was refined in full, or a little; lower is better."""
-
-    def vertices(self, candidate: Candidate) -> Float[Floats, "V 3"]:
-        """Where an interpretation has the template's vertices, in one frame for all."""
-
-
-def choose(candidates: Sequence[Candidate], count: int, comparison: Comparison, progress: Progress) -> Candidate:
+def choose(candidates: Sequence[Candidate], count: int, comparison: WholeComparison, progress: Progress) -> Candidate:
     """The best of several interpretations (best first), refined; at most ``count`` that are unlike each other are tried."""
     finalists: list[Candidate] = []
     known: list[Floats] = []
@@ -185,12 +171,12 @@ def choose(candidates: Sequence[Candidate], count: int, comparison: Comparison, 
     if len(finalists) > 1:
         finalists = _screened(finalists, comparison, progress)
     progress(0.6)
-    refined = beside(lambda candidate: comparison.refined(candidate, in_full=True), finalists)
+    refined = parallel_map(lambda candidate: comparison.refined(candidate, in_full=True), finalists)
     progress(1.0)
     return min(refined, key=lambda each: comparison.score(each, True)) if len(refined) > 1 else refined[0]
 
 
-def _screened(candidates: list[Candidate], comparison: Comparison, progress: Progress) -> list[Candidate]:
+def _screened(candidates: list[Candidate], comparison: WholeComparison, progress: Progress) -> list[Candidate]:
     """Those of several interpretations that a few steps neither bring together nor leave far behind, best first."""
 
     def tried(candidate: Candidate) -> tuple[float, Candidate, Floats]:
@@ -198,7 +184,7 @@ def _screened(candidates: list[Candidate], comparison: Comparison, progress: Pro
         return comparison.score(found, False), candidate, comparison.vertices(found)
 
     progress(0.0)
-    rough = sorted(beside(tried, candidates), key=lambda entry: entry[0])
+    rough = sorted(parallel_map(tried, candidates), key=lambda entry: entry[0])
     kept: list[tuple[Candidate, Floats]] = []
     for score, candidate, verts in rough:
         if score <= SETTINGS.screening_margin * rough[0][0] and all(differ(verts, other) for _, other in kept):
@@ -207,7 +193,7 @@ def _screened(candidates: list[Candidate], comparison: Comparison, progress: Pro
 
 
 class WholeComparison:
-    """How interpretations of a whole are refined and told apart."""
+    """How interpretations of a whole are refined and told apart: ``in_full`` by all steps, or by a few that screen them."""
 
     def __init__(self, task: FitTask, candidates: list[Candidate], roughness: float | None = None) -> None:
         self.task, self._candidates = task, candidates
@@ -223,6 +209,7 @@ class WholeComparison:
             self._landmarks = task.landmarks[0], task.frame.apply(task.landmarks[1])
 
     def refined(self, candidate: Candidate, in_full: bool) -> Candidate:
+        """An interpretation after its refinement."""
         task = self.task
         if in_full:
             candidate = averaged(task.system, candidate, self._candidates)
@@ -237,9 +224,12 @@ class WholeComparison:
     def schedule(self, in_full: bool) -> fit_config.NodeRefineConfig:
         """All steps, or a few of the same schedule: they tell which interpretations the surface agrees with."""
         config = self.task.config
-        return config.nodes if in_full else replace(config.nodes, steps=config.screening)
+        if in_full:
+            return config.nodes
+        return replace(config.nodes, schedule=replace(config.nodes.schedule, steps=config.screening))
 
     def score(self, candidate: Candidate, in_full: bool) -> float:
+        """How well a refined interpretation fits; lower is better."""
         scorer = self.scorers[in_full]
         residual = scorer.score(candidate.local(scorer.samples), candidate)
         cost = replace(candidate, residual=residual).cost
@@ -257,6 +247,7 @@ class WholeComparison:
         return SETTINGS.spread_cost * min(spread, USUAL_SPREAD)
 
     def vertices(self, candidate: Candidate) -> Float[Floats, "V 3"]:
+        """Where an interpretation has the template's vertices, in one frame for all."""
         moved = self.task.system.moved(candidate.vectors)
         return candidate.pose.to_world(moved) / np.sqrt(candidate.share)
 

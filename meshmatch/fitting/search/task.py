@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from meshmatch.derived import derived
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.search.frames import scan_frame
 from meshmatch.fitting.search.predictor import Candidate, Predictor
@@ -25,8 +25,6 @@ from meshmatch.shapes.shape import Shape
 
 # How much further than its neighbours from theirs an outlier is from its own, see `outlier_points`. Set by hand.
 _OUTLIER_RATIO = 1.3
-_CLEAN: WeakKeyDictionary[Shape, Shape | None] = WeakKeyDictionary()
-_SHOWN: WeakKeyDictionary[Shape, Shape | None] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -126,29 +124,22 @@ class Registration:
         return self.task.system.surface(self.candidate.vectors)
 
 
+@derived
 def without_outliers(shape: Shape) -> Shape:
-    """A cloud without the points that lie apart from their neighbours (found once); any other shape as it is.
+    """A cloud without the points that lie apart from their neighbours; any other shape as it is.
 
     An outlier among neighbours bends their normals and turns the signs of whole regions, and it counts as surface.
     """
     if not shape.is_cloud:
         return shape
-    if shape not in _CLEAN:
-        kept = ~outlier_points(shape.verts, _OUTLIER_RATIO)
-        weights = None if shape.weights is None else shape.weights[kept]
-        clean = None if kept.all() else Shape(shape.verts[kept], shape.faces, shape.name, weights=weights)
-        _CLEAN[shape] = clean  # None, for the shape itself would never be forgotten
-    return _CLEAN[shape] or shape
+    kept = ~outlier_points(shape.verts, _OUTLIER_RATIO)
+    weights = None if shape.weights is None else shape.weights[kept]
+    return shape if kept.all() else Shape(shape.verts[kept], shape.faces, shape.name, weights=weights)
 
 
 def without_interior(shape: Shape, system: NodeSystem) -> Shape:
-    """A mesh without what cannot be seen from outside (found once), where the template has nothing of the kind."""
-    if not system.shows_all:
-        return shape
-    if shape not in _SHOWN:
-        shown = without_hidden(shape)
-        _SHOWN[shape] = None if shown is shape else shown
-    return _SHOWN[shape] or shape
+    """A mesh without what cannot be seen from outside, where the template has nothing of the kind."""
+    return without_hidden(shape) if system.shows_all else shape
 
 
 def take_samples(

@@ -13,7 +13,7 @@ differ, the more each keeps the stretch that it had alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from meshmatch.fitting.fit_config import Pairing, Schedule, geometric_between
 from meshmatch.fitting.solve.driver import Problem, minimise_together
 from meshmatch.fitting.solve.priors import Prior, RotatedReference
 from meshmatch.fitting.solve.system import NodeSystem
-from meshmatch.fitting.solve.terms import Landmarks, LandmarkTerm, PairTerm, Term
+from meshmatch.fitting.solve.terms import Landmarks, terms_of
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.symmetric import entries_of, exponential, logarithm, matrices_of
 from meshmatch.models.trained import TrainedModel
@@ -38,44 +38,32 @@ class AgreeConfig(Pairing):
     clothes.
     """
 
-    steps: int = 8
-    prior: float = 0.0001  # weight of the common stretch
-    scale: float = 0.05  # of the robust weight (units of sqrt(area))
-    momentum: float = 0.6  # how far each step goes on along the last: what slides along the surface has far to go
+    # The prior is the common stretch. What slides along the surface has far to go, hence the momentum.
+    schedule: Schedule = field(default=Schedule(steps=8, prior=(1e-4, 1e-4), scale=(0.05, 0.05), momentum=0.6))
     drift: float = 0.4  # how far the common stretch follows the fits as they move, against where they began
     alike: float = 0.4  # two whose logarithms of stretch lie so far apart (median) follow their mean half way
     point_share: float = 0.01
     pair_normals: float = 0.012
     back_points: int = 8000
-    damping: float = 1e-4
-
-    @property
-    def schedule(self) -> Schedule:
-        """The same as the driver of the least squares takes it."""
-        return Schedule(
-            steps=self.steps,
-            prior=(self.prior, self.prior),
-            scale=(self.scale, self.scale),
-            damping=self.damping,
-            momentum=self.momentum,
-        )
 
     @classmethod
     def for_model(cls, model: TrainedModel) -> AgreeConfig:
         """As stiff as the model's card says."""
-        return cls(prior=cls.prior * model.card.stiffness)
+        stiff = model.card.stiffness
+        return cls(schedule=cls.schedule.grown(1, prior=(stiff, stiff)))
 
     @classmethod
     def for_collection(cls, model: TrainedModel) -> AgreeConfig:
         """The same for many shapes, whose mean hardly moves: they come to it later than a pair meets half way."""
-        return replace(cls.for_model(model), steps=12)
+        own = cls.for_model(model)
+        return replace(own, schedule=replace(own.schedule, steps=12))
 
     def for_noise(self, roughness: float) -> AgreeConfig:
         """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): all samples, shared, a stiffer template."""
+        schedule = self.schedule.grown(roughness, prior=(80, 80))
         return replace(
             self,
-            prior=geometric_between(self.prior, 80 * self.prior, roughness),
-            momentum=self.momentum * (1 - roughness),
+            schedule=replace(schedule, momentum=schedule.momentum * (1 - roughness)),
             alike=self.alike / max(1 - roughness, 1e-9),  # noise stretches too
             point_share=geometric_between(self.point_share, max(self.point_share, 3.0), roughness),
             pair_normals=geometric_between(self.pair_normals, 5 * self.pair_normals, roughness),
@@ -96,9 +84,7 @@ class Member:
 
     def problem(self, system: NodeSystem) -> Problem:
         """The least squares of this fit."""
-        terms: list[Term] = [PairTerm(self.samples, self.config, self.partial)]
-        if self.landmarks is not None:
-            terms.append(LandmarkTerm(self.landmarks, self.config.landmark_weight))
+        terms = terms_of(self.samples, self.config, self.landmarks, self.partial)
         return Problem(system=system, terms=terms, schedule=self.config.schedule)
 
 

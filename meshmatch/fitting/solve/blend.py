@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fitting.fit_config import Schedule
 from meshmatch.fitting.solve.driver import Problem, minimise
-from meshmatch.fitting.solve.priors import FixedGradient, RotatedReference
+from meshmatch.fitting.solve.priors import FixedGradient, RotatedReference, signed_svd
 from meshmatch.fitting.solve.system import NodeSystem
 
 _MIN_STRETCH = 1e-3  # smaller ones count as this: a logarithm must stay finite
@@ -68,10 +68,7 @@ def polar(F: Float[Floats, "N 3 3"]) -> tuple[Float[Floats, "N 3 3"], Float[Floa
 
     Where F turns space inside out the smallest stretch would be negative; it counts as a very small one.
     """
-    U, sizes, Vh = np.linalg.svd(F)
-    flip = np.where(np.linalg.det(U @ Vh) < 0, -1.0, 1.0)
-    U[:, :, 2] *= flip[:, None]
-    sizes[:, 2] *= flip
+    U, sizes, Vh = signed_svd(F)
     logs = np.log(np.maximum(sizes, _MIN_STRETCH))
     return U @ Vh, (Vh.transpose(0, 2, 1) * logs[:, None, :]) @ Vh
 

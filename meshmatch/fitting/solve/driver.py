@@ -9,7 +9,6 @@ model and interpolation differ only in what they hand over.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +18,7 @@ from meshmatch.fitting.fit_config import Schedule
 from meshmatch.fitting.solve.priors import Prior
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.solve.terms import Quadratic, Term
+from meshmatch.threads import parallel_map
 
 JointPrior = Callable[[Sequence[Float[Floats, "G 3 3"]]], Sequence[Prior]]
 """From the current deformation gradients of several fits to the prior of each in the next step."""
@@ -72,11 +72,9 @@ def minimise_together(
 ) -> list[Float[Floats, "K 3"]]:
     """Node vectors of several fits after as many steps as the first has, so many fits beside each other."""
     now = before = list(vectors)
-    with ThreadPoolExecutor(threads) as pool:
-        run = pool.map if threads > 1 else map
-        for number in range(problems[0].schedule.steps):
-            starts = [each.start(*path) for each, *path in zip(problems, now, before, strict=True)]
-            gradients = [each.system.deformation_gradient(start) for each, start in zip(problems, starts, strict=True)]
-            steps = [number] * len(problems)
-            before, now = now, list(run(Problem.step, problems, steps, starts, gradients, joint_prior(gradients)))
+    for number in range(problems[0].schedule.steps):
+        starts = [each.start(*path) for each, *path in zip(problems, now, before, strict=True)]
+        gradients = [each.system.deformation_gradient(start) for each, start in zip(problems, starts, strict=True)]
+        steps, priors = [number] * len(problems), joint_prior(gradients)
+        before, now = now, parallel_map(Problem.step, problems, steps, starts, gradients, priors, threads=threads)
     return now

@@ -12,7 +12,7 @@ from meshmatch.fitting.fit_config import NodeRefineConfig
 from meshmatch.fitting.solve.driver import Problem, minimise
 from meshmatch.fitting.solve.priors import RotatedReference
 from meshmatch.fitting.solve.system import NodeSystem
-from meshmatch.fitting.solve.terms import Landmarks, LandmarkTerm, PairTerm, Term
+from meshmatch.fitting.solve.terms import Landmarks, terms_of
 from meshmatch.geometry.oriented import OrientedPoints
 
 
@@ -27,8 +27,6 @@ def refine_nodes(
 
     Deformation gradients of the vectors to start from are the prior. Landmarks are pairs that the fit holds.
     """
-    terms: list[Term] = [PairTerm(samples, config)]
-    if landmarks is not None:
-        terms.append(LandmarkTerm(landmarks, config.landmark_weight))
     prior = RotatedReference(system.deformation_gradient(vectors))
-    return minimise(Problem(system=system, terms=terms, schedule=config.schedule), prior, vectors)
+    problem = Problem(system=system, terms=terms_of(samples, config, landmarks), schedule=config.schedule)
+    return minimise(problem, prior, vectors)

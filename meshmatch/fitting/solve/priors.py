@@ -97,6 +97,17 @@ def nearest_rotations(F: Float[Floats, "G 3 3"], start: Float[Floats, "G 3 3"]) 
     return R
 
 
+def signed_svd(
+    F: Float[Floats, "N 3 3"],
+) -> tuple[Float[Floats, "N 3 3"], Float[Floats, "N 3"], Float[Floats, "N 3 3"]]:
+    """U, s and V^T of singular values with U V^T a rotation: where F turns space inside out the smallest s is negative."""
+    U, sizes, Vh = np.linalg.svd(F)
+    side = np.where(np.linalg.det(U @ Vh) < 0, -1.0, 1.0)
+    U[:, :, 2] *= side[:, None]
+    sizes[:, 2] *= side
+    return U, sizes, Vh
+
+
 def _cofactors(X: Float[Floats, "9 G"]) -> Float[Floats, "9 G"]:
     a, b, c, d, e, f, g, h, i = X
     rows = (e * i - f * h, f * g - d * i, d * h - e * g, c * h - b * i, a * i - c * g, b * g - a * h)

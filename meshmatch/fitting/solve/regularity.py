@@ -13,6 +13,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from meshmatch.arrays import Float, Floats
+from meshmatch.fitting.solve.priors import signed_svd
 
 _THICK = 0.1  # what is folded is opened until its smallest stretch is so much, or until nothing is folded
 _NEARLY = 0.3  # a determinant from which on no vertex is near to folding
@@ -83,8 +84,5 @@ class Unfolding:
 
 def opened(F: Float[Floats, "N 3 3"]) -> Float[Floats, "N 3 3"]:
     """The nearest matrices whose stretches are at least `_THICK`, and whose determinants are therefore positive."""
-    U, stretches, Vh = np.linalg.svd(F)
-    side = np.where(np.linalg.det(U @ Vh) < 0, -1.0, 1.0)
-    U[:, :, 2] *= side[:, None]
-    stretches[:, 2] *= side
+    U, stretches, Vh = signed_svd(F)
     return (U * np.maximum(stretches, _THICK)[:, None, :]) @ Vh

@@ -11,9 +11,7 @@ the whole matrix.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from threading import RLock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,11 +20,12 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.derived import derived
 from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.solve.regularity import Regularity, Unfolding
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import triangle_vectors
-from meshmatch.models.trained import TrainedModel, once_per_model
+from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.outside import without_hidden
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
@@ -64,35 +63,24 @@ class NodeSystem:
             self.K = field.K
             self.phi = field.phi.astype(np.float64)
         self._gradient_count = min(gradient_points, len(self.verts))
-        self._made: dict[str, Any] = {}
-        self._making = RLock()
-
-    def _once(self, name: str, make: Callable[[], Any]) -> Any:
-        """What solving needs and moving does not is made when it is first asked for, by one thread."""
-        with self._making:
-            if name not in self._made:
-                self._made[name] = make()
-            return self._made[name]
 
     @property
+    @derived
     def gradient_points(self) -> Int[Ints, " G"]:
-        return self._once("gradient points", lambda: farthest_points(self.verts, self._gradient_count))
+        return farthest_points(self.verts, self._gradient_count)
 
     @property
+    @derived
     def equations(self) -> Equations:
-        field = self.field
-        assert isinstance(field, ShapeFunctions)
-        return self._once("equations", lambda: Equations.of(self.phi, field.gradient_at(self.gradient_points)))
+        assert isinstance(self.field, ShapeFunctions)
+        return Equations.of(self.phi, self.field.gradient_at(self.gradient_points))
 
     @property
+    @derived
     def shows_all(self) -> bool:
         """Whether all of the resting template can be seen from outside; the chambers of a heart cannot."""
-
-        def compare() -> bool:
-            resting = Shape(self.verts, self.faces)
-            return without_hidden(resting) is resting
-
-        return self._once("shows all", compare)
+        resting = Shape(self.verts, self.faces)
+        return without_hidden(resting) is resting
 
     def moved(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3"]:
         """Template vertices under node vectors, or under whatever rows the field reads."""
@@ -110,9 +98,13 @@ class NodeSystem:
 
     def unfolded(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "K 3"]:
         """Node vectors near the given ones under which no vertex is folded, or fewer; see `Unfolding`."""
-        field = self.field
-        assert isinstance(field, ShapeFunctions)
-        return self._once("unfolding", lambda: Unfolding(field.phi, field.gradient))(vectors)
+        return self._unfolding(vectors)
+
+    @property
+    @derived
+    def _unfolding(self) -> Unfolding:
+        assert isinstance(self.field, ShapeFunctions)
+        return Unfolding(self.field.phi, self.field.gradient)
 
     def surface(self, vectors: Float[Floats, "K 3"]) -> OrientedPoints:
         """Template vertices under node vectors, with their normals."""
@@ -180,7 +172,7 @@ class Equations:
         return cls(gradient=gradient, pairs=pairs, gradient_pairs=summed, order=order, band=band, place=place)
 
 
-@once_per_model
+@derived
 def node_system(model: TrainedModel) -> NodeSystem:
     """The least-squares system of a model's template and field."""
     shape = model.template.shape

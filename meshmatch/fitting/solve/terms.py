@@ -74,6 +74,14 @@ class LandmarkTerm:
         return weights, pulls
 
 
+def terms_of(
+    samples: OrientedPoints, config: Pairing, landmarks: Landmarks | None = None, one_sided: bool = False
+) -> list[Term]:
+    """What pulls the template onto samples in the core frame, and to landmarks where there are any."""
+    pairs = PairTerm(samples, config, one_sided)
+    return [pairs] if landmarks is None else [pairs, LandmarkTerm(landmarks, config.landmark_weight)]
+
+
 def _nearest_pairs(
     system: NodeSystem, samples: OrientedPoints, surface: OrientedPoints, scale: float, config: Pairing, one_sided: bool
 ) -> Quadratic:

@@ -7,7 +7,7 @@ registration of surfaces).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from meshmatch.fitting.fit_config import Pairing, Schedule
 from meshmatch.fitting.solve.driver import Problem, minimise
 from meshmatch.fitting.solve.priors import ViscousGradient
 from meshmatch.fitting.solve.system import NodeSystem
-from meshmatch.fitting.solve.terms import PairTerm
+from meshmatch.fitting.solve.terms import terms_of
 from meshmatch.geometry.oriented import OrientedPoints
 
 
@@ -28,31 +28,16 @@ class ViscousConfig(Pairing):
     radius: float = 0.085
     faces: int = 10_000  # of a template
     samples: int = 16_000  # of a shape
-    steps: int = 24
-    strain_first: float = 1e-3
-    strain_last: float = 1e-6
-    scale_first: float = 0.1  # of the robust weight
-    scale_last: float = 0.02
+    schedule: Schedule = field(default=Schedule(steps=24, prior=(1e-3, 1e-6), scale=(0.1, 0.02), damping=1e-6))
     point_share: float = 0.01
     pair_normals: float = 0.012  # of normals in the search for pairs
     back_points: int = 8000
     near: int = 5  # gradient points, itself included, whose gradients are averaged
-    damping: float = 1e-6
     seed: int = 0
-
-    @property
-    def schedule(self) -> Schedule:
-        """The same as the driver of the least squares takes it."""
-        return Schedule(
-            steps=self.steps,
-            prior=(self.strain_first, self.strain_last),
-            scale=(self.scale_first, self.scale_last),
-            damping=self.damping,
-        )
 
 
 def viscous_vectors(system: NodeSystem, samples: OrientedPoints, config: ViscousConfig) -> Float[Floats, "K 3"]:
     """Node vectors that move the template onto the shape of the samples, which stands as it does."""
     prior = ViscousGradient.over(system.verts[system.gradient_points], config.near)
-    problem = Problem(system=system, terms=[PairTerm(samples, config)], schedule=config.schedule)
+    problem = Problem(system=system, terms=terms_of(samples, config), schedule=config.schedule)
     return minimise(problem, prior, np.zeros((system.K, 3)))
