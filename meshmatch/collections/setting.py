@@ -152,16 +152,24 @@ class Setting:
         return digest_of(self.template_hash, json.dumps(self.choices(), sort_keys=True))
 
 
-@lru_cache(maxsize=4)
 def template_at(store: Store, file: str = TEMPLATE) -> Template:
-    """A template of a collection, read once in each process."""
+    """A template of a collection, read once in each process, and again when it has changed."""
+    return _template(store, file, store.changed(file))
+
+
+@lru_cache(maxsize=4)
+def _template(store: Store, file: str, changed: int) -> Template:
     with store.reading(file) as path:
         return load_template(path)
 
 
-@lru_cache(maxsize=64)
 def finished_fit(store: Store, name: str) -> tuple[Fit, Places]:
     """A finished fit, and where the shape's vertices belong; some are kept in memory. Errors as `load_fit`."""
+    return _finished(store, name, store.changed(f"{FITS}/{name}{SUFFIX}"))
+
+
+@lru_cache(maxsize=64)
+def _finished(store: Store, name: str, changed: int) -> tuple[Fit, Places]:
     with store.reading(f"{FITS}/{name}{SUFFIX}") as path:
         found = load_fit(path, template_at(store))
     if found.places is None:
@@ -170,6 +178,6 @@ def finished_fit(store: Store, name: str) -> tuple[Fit, Places]:
 
 
 def forget() -> None:
-    """Read templates and fits again, for they may have changed."""
-    template_at.cache_clear()
-    finished_fit.cache_clear()
+    """Read templates and fits again, for remote ones may have changed."""
+    _template.cache_clear()
+    _finished.cache_clear()

@@ -95,6 +95,11 @@ class Store:
         files, root = _filesystem(self.location)
         return bool(files.exists(f"{root}/{name}"))
 
+    def changed(self, name: str) -> int:
+        """When a file here changed last, in nanoseconds; 0 for one that is remote or missing."""
+        path = Path(self.location, name)
+        return 0 if self.remote or not path.is_file() else path.stat().st_mtime_ns
+
     def names(self, folder: str = "") -> list[str]:
         """All files in a folder and below it, sorted, relative to the folder; those whose names begin with a dot are not
         seen."""
