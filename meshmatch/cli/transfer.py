@@ -67,7 +67,7 @@ def transfer_color(
         from meshmatch.shapes.colors import light, seen
 
         if given is None:
-            shown = compose_values((a, b), (seen(here), seen(light(result.data))))
+            shown = compose_values((a, b), [seen(each)[:, :3] for each in (here, light(result.data))])
         else:
             title = given.names[0] if given.names else str(values and values.stem)
             title += "" if columns == 1 else f" (the first of {columns} numbers)"
