@@ -46,7 +46,7 @@ OWNERS = {
     "pydantic": {"models"},
     "pymeshlab": {"shapes"},
     "rich": {"experiments", "cli"},
-    "robust_laplacian": {"templates", "maps"},
+    "robust_laplacian": {"templates", "fitting", "maps"},
     "safetensors": {"collections", "templates", "generators", "models", "training"},
     "scipy": {
         *(

@@ -18,6 +18,7 @@ from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.classify import classify
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.judge.category import BELONGS, FAMILIAR, STRANGE, SURE, category_residual, category_samples
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
@@ -96,6 +97,17 @@ def find_alone(
     notes = [note for note in clean[chosen].notes if not note.endswith(NOT_TRUSTED)]
     rest = replace(clean[chosen], notes=(left_out_words(parts, left_out), *notes), left_out=left_out)
     return Alone(rest, found[:, chosen], int(found[:, chosen].argmin()), fit)
+
+
+def fit_of_parts(
+    model: TrainedModel, clean: Repaired, config: FitConfig, progress: ProgressCallback | None
+) -> tuple[Fit, Repaired] | None:
+    """A fit of some parts of a shape whose fit as a whole is poor, and these parts; None where that is poor too."""
+    alone = find_alone([lambda: model], clean.original, config, progress=progress)
+    if alone is None:
+        return None
+    fit = alone.usable_fit(config) or Fitter(model, config, progress).fit(alone.clean.shape)
+    return None if fit.verdict == "poor" else (fit, alone.clean)
 
 
 def left_out_words(parts: Parts, numbers: Sequence[int]) -> str:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from meshmatch.arrays import Int, Ints, off_torch
 from meshmatch.errors import InputError, ModelError, OptionError
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fitter import landmark_places
 from meshmatch.shapes.cloud import on_a_line
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
@@ -15,11 +21,17 @@ from meshmatch.shapes.shape import Shape
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
 
+LandmarkPairs = tuple[ArrayLike, ArrayLike]
+"""Corresponding points: vertices of the source (N,), vertices of the target (N,)."""
 MINIMUM_FACES = 50
 MINIMUM_POINTS = 100
 
 THREADS = 2
 """Unless said otherwise: the two shapes of a match are fitted beside each other, each on one thread."""
+
+
+class UnknownKindsError(InputError):
+    """No installed model knows any of the shapes."""
 
 
 def as_model(model: TrainedModel | str | Path) -> TrainedModel:
@@ -86,3 +98,28 @@ def check_config(config: object) -> None:
     if not isinstance(config, FitConfig):
         hint = 'such as meshmatch.FitConfig(up="y")'
         raise OptionError(f"a config is a FitConfig, not {type(config).__name__}", hint)
+
+
+def configs_for(config: FitConfig | Sequence[FitConfig], count: int) -> list[FitConfig]:
+    """One configuration for each of ``count`` shapes (`OptionError` for another number of them)."""
+    configs = list(config) if isinstance(config, Sequence) else [config] * count
+    if len(configs) != count:
+        raise OptionError(f"{count} shapes need one FitConfig, or {count} of them, not {len(configs)}")
+    for each in configs:
+        check_config(each)
+    return configs
+
+
+def landmark_vertices(
+    clean: Sequence[Repaired], landmarks: Sequence[ArrayLike], configs: Sequence[FitConfig] = ()
+) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
+    """Known pairs as arrays of vertices.
+
+    `OptionError` where a shape has no such vertex, or where ``configs`` do not refine nodes, which landmarks pull.
+    """
+    for each in configs:
+        if not each.moves_nodes:
+            hint = "leave out the landmarks, or choose nodes"
+            raise OptionError(f"landmarks need refine='nodes', not {each.refine!r}", hint)
+    landmark_places(clean, landmarks)
+    return np.asarray(off_torch(landmarks[0])), np.asarray(off_torch(landmarks[1]))

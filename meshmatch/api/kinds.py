@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from meshmatch.api.apart import find_alone
-from meshmatch.api.inputs import as_model, refuse_far_parts
+from meshmatch.api.inputs import UnknownKindsError, as_model, refuse_far_parts
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, MeshmatchError, ModelError, OptionError
 from meshmatch.fitting.classify import classify
@@ -246,7 +246,8 @@ def _refuse_unknown(
         if each.kind is None and not shape.is_cloud and not may_show_part(shape, config):
             names = ", ".join(sorted({model.card.category for model in models}))
             problem = f"{shape.name} does not look like anything that the installed models know: {names}"
-            raise InputError(problem, _NONE)
+            error = UnknownKindsError if all(other.kind is None for other in found) else InputError
+            raise error(problem, _NONE)
 
 
 def other_kind(model: TrainedModel, shape: Shape, config: FitConfig) -> str | None:

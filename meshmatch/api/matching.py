@@ -8,34 +8,38 @@ from collections.abc import Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from meshmatch.api.inputs import as_model, check_config, checked_threads, refuse_far_parts, usable, validated
+from meshmatch.api.direct import match_without_model
+from meshmatch.api.inputs import (
+    LandmarkPairs,
+    UnknownKindsError,
+    as_model,
+    check_config,
+    checked_threads,
+    configs_for,
+    landmark_vertices,
+    refuse_far_parts,
+    usable,
+    validated,
+)
 from meshmatch.api.results import MatchResult, map_of_fits, shape_of
-from meshmatch.arrays import off_torch
 from meshmatch.errors import OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fitter import Fitter, check_landmarks, fits_with_landmarks, landmark_places
+from meshmatch.fitting.fitter import Fitter, check_landmarks, fits_with_landmarks
 from meshmatch.maps.build import judged_by_pairs
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.models.registry import AUTO
+from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map, thread_limit, worker_slot
-
-if TYPE_CHECKING:
-    from meshmatch.api.apart import Alone
-
-LandmarkPairs = tuple[ArrayLike, ArrayLike]
-"""Corresponding points: vertices of the source (N,), vertices of the target (N,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +60,8 @@ class Matcher:
     Parameters
     ----------
     model
-        Name in the registry, model folder, or what `load_model` returned; with "auto" the first shapes decide.
+        Name in the registry, model folder, or what `load_model` returned; with "auto" the first shapes decide; with "none"
+        two shapes are matched to each other directly, without a model.
     config
         How all shapes are fitted.
     threads
@@ -86,7 +91,8 @@ class Matcher:
         progress: ProgressCallback | None = None,
     ) -> None:
         self._auto = model == AUTO if isinstance(model, str) else False
-        self._model = None if self._auto else as_model(model)
+        self._direct = model == NO_MODEL if isinstance(model, str) else False
+        self._model = None if self._auto or self._direct else as_model(model)
         self._choosing = threading.Lock()
         self.config = FitConfig() if config is None else config
         check_config(self.config)
@@ -101,11 +107,14 @@ class Matcher:
         self.__dict__.update(state, _choosing=threading.Lock())
 
     def __repr__(self) -> str:
-        return f"Matcher({self._model.card.name if self._model else AUTO!r})"
+        return f"Matcher({self._model.card.name if self._model else NO_MODEL if self._direct else AUTO!r})"
 
     @property
     def model(self) -> TrainedModel:
         """The model; `OptionError` before the first shapes have decided."""
+        if self._direct:
+            hint = "match two shapes, or fit a collection (`meshmatch fit --model none`); or name a model"
+            raise OptionError("one shape alone has no fit without a model", hint)
         if self._model is None:
             raise OptionError("no model is chosen yet: the first shape decides", "fit a shape first, or name the model")
         return self._model
@@ -153,7 +162,7 @@ class Matcher:
             As for `fit`.
         """
         clean = [usable(shape) for shape in as_shapes(shapes)]
-        configs = self._configs(config, len(clean))
+        configs = configs_for(config or self.config, len(clean))
         clean, kinds, begun = self._choose(clean, configs)
         fits = self._fit_all(clean, configs, begun)
         return [replace(fit, notes=(*kind, *fit.notes)) for kind, fit in zip(kinds, fits, strict=True)]
@@ -267,21 +276,21 @@ class Matcher:
         """
         began = time.monotonic()
         clean = [usable(as_shape(source, "source")), usable(as_shape(target, "target"))]
-        configs = self._configs(config, 2)
-        clean, kinds, begun = self._choose(clean, configs)
+        configs = configs_for(config or self.config, 2)
+        if self._direct:
+            return match_without_model(clean, configs, landmarks, self.threads, self.progress)
+        try:
+            clean, kinds, begun = self._choose(clean, configs)
+        except UnknownKindsError:
+            return match_without_model(clean, configs, landmarks, self.threads, self.progress, unknown=True)
         if landmarks is not None:
-            for each in configs:
-                if not each.moves_nodes:
-                    hint = "leave out the landmarks, or choose nodes"
-                    raise OptionError(f"landmarks need refine='nodes', not {each.refine!r}", hint)
             check_landmarks(self.model)
-            landmark_places(clean, landmarks)  # before the long work
+            pairs = landmark_vertices(clean, landmarks, configs)  # before the long work
         with thread_limit(1):
             fits = self._fit_all(clean, configs, begun)
             known = None
             if landmarks is not None:
                 clean = [shape_of(fit) for fit in fits]
-                pairs = np.asarray(off_torch(landmarks[0])), np.asarray(off_torch(landmarks[1]))
                 pulled, known = fits_with_landmarks(self.model, clean, fits, pairs, configs)
                 fits = [self._finished(*each) for each in zip(pulled, clean, configs, strict=True)]
             before = fits[0], fits[1]
@@ -312,15 +321,14 @@ class Matcher:
 
     def _near(self, clean: Repaired, config: FitConfig) -> tuple[Repaired, _Begun]:
         """A shape; of one with parts far apart those that the model knows, with a fit if that took one, or `InputError`."""
-        if clean.far_parts and (alone := self._alone(clean, config, self.progress)) is not None:
-            return alone.clean, _Begun(alone.usable_fit(config), True)
+        if clean.far_parts:
+            from meshmatch.api.apart import find_alone
+
+            alone = find_alone([lambda: self.model], clean.original, config, progress=self.progress)
+            if alone is not None:
+                return alone.clean, _Begun(alone.usable_fit(config), True)
         refuse_far_parts(clean)
         return clean, _Begun()
-
-    def _alone(self, clean: Repaired, config: FitConfig, progress: ProgressCallback | None) -> Alone | None:
-        from meshmatch.api.apart import find_alone
-
-        return find_alone([lambda: self.model], clean.original, config, progress=progress)
 
     def _best(
         self, whole: Fit, clean: Repaired, config: FitConfig, progress: ProgressCallback | None = None
@@ -328,19 +336,9 @@ class Matcher:
         """The fit of a shape, or where that is poor the better one of some of its parts; and what it is a fit of."""
         if whole.verdict != "poor":
             return whole, clean
-        if (alone := self._alone(clean, config, progress)) is None:
-            return whole, clean
-        fit = alone.usable_fit(config) or Fitter(self.model, config, progress).fit(alone.clean.shape)
-        return (whole, clean) if fit.verdict == "poor" else (fit, alone.clean)
+        from meshmatch.api.apart import fit_of_parts
 
-    def _configs(self, config: FitConfig | Sequence[FitConfig] | None, count: int) -> list[FitConfig]:
-        config = self.config if config is None else config
-        configs = list(config) if isinstance(config, Sequence) else [config] * count
-        if len(configs) != count:
-            raise OptionError(f"{count} shapes need one FitConfig, or {count} of them, not {len(configs)}")
-        for each in configs:
-            check_config(each)
-        return configs
+        return fit_of_parts(self.model, clean, config, progress) or (whole, clean)
 
     def _fit_all(self, clean: Sequence[Repaired], configs: Sequence[FitConfig], begun: Sequence[_Begun]) -> list[Fit]:
         stop, slots = threading.Event(), threading.Semaphore(self.threads)
@@ -378,6 +376,8 @@ class Matcher:
         config: FitConfig | None = None,
         known: list[tuple[np.ndarray, np.ndarray]] | None = None,
     ) -> tuple[Fit, Fit]:
+        if all(fit.model == NO_MODEL for fit in fits):
+            return fits  # they are of one template, and of two shapes alone
         for fit in fits:
             if fit.template_hash != self.model.template.hash:
                 wrong = f"this fit is of another template ({fit.template_hash}, not {self.model.template.hash})"
@@ -406,13 +406,13 @@ def match(
     Parameters
     ----------
     source
-        A mesh or point cloud of the model's category, in any unit, orientation and resolution: a path, a `Shape`, an
+        A mesh or point cloud, in any unit, orientation and resolution: a path, a `Shape`, an
         (N, 3) array, a pair (vertices, faces), or a mesh of another library.
     target
         The same, for the shape it is matched to.
     model
         Name in the registry, model folder, or what `load_model` returned; "auto" chooses the installed model for this
-        kind of shape.
+        kind of shape, and where none knows either shape they are matched directly, as with "none".
     config
         How shapes are fitted; a pair holds one for the source and one for the target, which may differ in their axes.
     landmarks

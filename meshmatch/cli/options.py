@@ -155,8 +155,8 @@ class FitOptions:
     model: str = Option(
         AUTO,
         metavar="NAME",
-        help="A model's name (see `meshmatch models list`), a model folder, or auto: the installed model that knows "
-        "the shapes.",
+        help="A model's name (see `meshmatch models list`), a model folder, auto: the installed model that knows the "
+        "shapes, or none: two shapes are matched directly.",
     )
     only: list[str] | None = Option(
         None,

@@ -42,6 +42,7 @@ AMPLIFIED = 50.0
 ship it is at most 22; above 1 / sqrt(`MINIMUM_EIGENVALUE`), 1,000, nodes are refused anyway."""
 _MAX_CONDITION = 1e13
 _BLOCK = 4096
+_FLAT = 1e-3
 
 
 def has_nodes(name: FieldName) -> bool:
@@ -127,6 +128,23 @@ def build_field(points: ArrayLike, nodes: ArrayLike, radius: ArrayLike, kernel: 
     return ShapeFunctions(values, lambda some: _gradient(points[some], nodes, radii, kernel))
 
 
+def build_surface_field(
+    points: Float[Floats, "P 3"],
+    nodes: Float[Floats, "K 3"],
+    radii: Float[Floats, " K"],
+    pairs: tuple[Int[Ints, " N"], Int[Ints, " N"]],
+) -> ShapeFunctions:
+    """Moving least squares in which a node moves only some of the points within its radius: those of ``pairs``.
+
+    Pairs are of a point and a node, sorted by point, at least one for each point. So the two sides of a thin sheet, or
+    two limbs that touch, can have nodes of their own. These may lie in a plane: moment matrices are regularised by
+    `_FLAT` of their weight, so that across it the field is nearly constant. Rows of ``phi`` sum to one nearly.
+    """
+    fit = _LocalFits.of(points, nodes, radii, "smooth", pairs, _FLAT)
+    values = csr_matrix((fit.weight * fit.along, (fit.at, fit.of_node)), (len(points), len(nodes)))
+    return ShapeFunctions(values, _gradient_of(fit, len(points), len(nodes)))
+
+
 def _positions(values: ArrayLike, what: str) -> Float[Floats, "N 3"]:
     """A copy of positions; `InputError` for anything but finite numbers in three columns."""
     found = as_numbers(values, what, finite=True)
@@ -150,16 +168,25 @@ class _LocalFits:
 
     @classmethod
     def of(
-        cls, points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radii: Float[Floats, " K"], kernel: Kernel
+        cls,
+        points: Float[Floats, "P 3"],
+        nodes: Float[Floats, "K 3"],
+        radii: Float[Floats, " K"],
+        kernel: Kernel,
+        pairs: tuple[Int[Ints, " N"], Int[Ints, " N"]] | None = None,
+        flat: float = 0.0,
     ) -> _LocalFits:
-        at, of_node = support_pairs(points, nodes, radii)
+        at, of_node = support_pairs(points, nodes, radii) if pairs is None else pairs
         offset = points[at] - nodes[of_node]
         weight, slope = KERNELS[kernel](np.linalg.norm(offset, axis=1), radii[of_node])
         scale = support_scale(at, of_node, radii, len(points))[at]
         basis = np.concatenate([np.ones((len(at), 1)), -offset / scale[:, None]], 1)
-        moment = _summed(at, len(points)) @ (weight[:, None] * _outer(basis))
-        _check_support(moment.reshape(-1, 4, 4))
-        return cls(at, of_node, offset, weight, slope, scale, basis, np.linalg.inv(moment.reshape(-1, 4, 4)))
+        moment = (_summed(at, len(points)) @ (weight[:, None] * _outer(basis))).reshape(-1, 4, 4)
+        if flat:
+            moment += flat * moment[:, :1, :1] * np.diag([0.0, 1.0, 1.0, 1.0])
+        else:
+            _check_support(moment)
+        return cls(at, of_node, offset, weight, slope, scale, basis, np.linalg.inv(moment))
 
     @property
     def along(self) -> Float[Floats, " N"]:
@@ -180,8 +207,11 @@ def _gradient(
     points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radii: Float[Floats, " K"], kernel: Kernel
 ) -> Any:
     """The gradient of moving least squares (3 P, K)."""
-    fit = _LocalFits.of(points, nodes, radii, kernel)
-    at, weight, inverse, P = fit.at, fit.weight, fit.inverse, len(points)
+    return _gradient_of(_LocalFits.of(points, nodes, radii, kernel), len(points), len(nodes))
+
+
+def _gradient_of(fit: _LocalFits, P: int, K: int) -> Any:
+    at, weight, inverse = fit.at, fit.weight, fit.inverse
     sums, outer, along, constant = _summed(at, P), _outer(fit.basis), fit.along, inverse[:, 0]
     slope_vector = fit.slope[:, None] * fit.offset  # dw/dx
     solved = (inverse[at] @ fit.basis[..., None])[..., 0]  # M^-1 p(q_i)
@@ -194,7 +224,7 @@ def _gradient(
         )
     rows = 3 * at[:, None] + np.arange(3)
     columns = np.broadcast_to(fit.of_node[:, None], rows.shape)
-    return csr_matrix((gradient.astype(np.float32).ravel(), (rows.ravel(), columns.ravel())), (3 * P, len(nodes)))
+    return csr_matrix((gradient.astype(np.float32).ravel(), (rows.ravel(), columns.ravel())), (3 * P, K))
 
 
 def _check_support(moment: Float[Floats, "P 4 4"]) -> None:

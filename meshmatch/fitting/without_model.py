@@ -17,14 +17,13 @@ from meshmatch.fitting.search.predictor import two_way_residual
 from meshmatch.fitting.search.task import take_samples
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.solve.viscous import ViscousConfig, viscous_vectors
+from meshmatch.models.registry import NO_MODEL
 from meshmatch.shapes.normalise import align
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, low_mesh, make_template
 from meshmatch.templates.template import Template
 
-NO_MODEL = "none"
-"""In place of a model's name."""
 _ALIGNED_BY = 2400  # samples
 # With a residual beyond this (units of sqrt(area)) a shape does not stand as the template does: it is turned.
 _TURNED = 0.12

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 CARD, WEIGHTS, TEMPLATE = "card.json", "weights.safetensors", "template.safetensors"
 HOME_VARIABLE = "MESHMATCH_HOME"
 AUTO = "auto"
+NO_MODEL = "none"
+"""In place of a model's name: shapes are registered without one."""
 """In place of a model's name: the shapes decide which of the installed models fits them."""
 _ELSEWHERE = f"try again, or set {HOME_VARIABLE} to a folder of yours"
 _loading = threading.Lock()
@@ -93,8 +95,8 @@ def locate_model(name: str | Path) -> Path:
 
 
 def check_model(name: str | Path) -> None:
-    """`ModelError` if a model is neither ``auto`` nor the name or the folder of one with a template of vertices."""
-    if name != AUTO:
+    """`ModelError` if a model is neither ``auto`` or ``none`` nor the name or folder of one with a template of vertices."""
+    if name not in (AUTO, NO_MODEL):
         _refuse_implicit(locate_model(name))
 
 

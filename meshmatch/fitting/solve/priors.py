@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Float, Floats, Int, Ints
 
 _MAX_ITERATIONS = 20  # of Newton's: five are the rule, and convergence is quadratic
 
@@ -62,9 +62,17 @@ class ViscousGradient:
     @classmethod
     def over(cls, points: Float[Floats, "G 3"], count: int) -> ViscousGradient:
         """For gradient points on the resting template: each mean is over ``count`` of them, itself included."""
-        near = cKDTree(points).query(points, count)[1]
-        rows = np.repeat(np.arange(len(points)), count)
-        return cls(csr_matrix((np.full(near.size, 1 / count), (rows, near.reshape(-1))), (len(points),) * 2))
+        return cls._of_neighbours(cKDTree(points).query(points, count)[1])
+
+    @classmethod
+    def by_distance(cls, distances: Float[Floats, "G G"], count: int) -> ViscousGradient:
+        """The same, by distances between gradient points, such as those along the surface."""
+        return cls._of_neighbours(np.argsort(distances, axis=1, kind="stable")[:, :count])
+
+    @classmethod
+    def _of_neighbours(cls, near: Int[Ints, "G N"]) -> ViscousGradient:
+        rows = np.repeat(np.arange(len(near)), near.shape[1])
+        return cls(csr_matrix((np.full(near.size, 1 / near.shape[1]), (rows, near.reshape(-1))), (len(near),) * 2))
 
     def targets(self, F: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
         return np.asarray(self.mean @ F.reshape(-1, 9)).reshape(-1, 3, 3)

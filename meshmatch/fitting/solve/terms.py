@@ -60,6 +60,19 @@ class PairTerm:
 
 
 @dataclass(frozen=True, eq=False)
+class GoalTerm:
+    """Each template vertex is pulled to a point of its own (V, 3), core frame, robustly: where a proposal takes it."""
+
+    goals: Float[Floats, "V 3"]
+
+    def quadratic(self, system: NodeSystem, vectors: Float[Floats, "K 3"], scale: float) -> Quadratic:
+        area = vertex_areas(system.verts, system.faces)
+        weight = area / area.sum() * robust_weight(system.moved(vectors) - self.goals, scale)
+        weights = weight[:, None] * np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])
+        return weights, weight[:, None] * self.goals
+
+
+@dataclass(frozen=True, eq=False)
 class LandmarkTerm:
     """Template vertices (N,) that are pulled to positions (N, 3) in the core frame, each with the same weight."""
 

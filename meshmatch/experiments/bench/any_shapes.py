@@ -1,0 +1,188 @@
+"""Two shapes of any kind, matched without a model: hand-picked points of the SHREC'07 classes, and no pair left out.
+
+Every ordered pair of six shapes of each class. The error is the mean distance along the target's edges between where the
+keypoints of the source arrive and the target's own, in units of sqrt(area), times 100: the best of the symmetries that the
+class has. Those are in its ``symmetry.txt``; where there is none, as of chairs, they are the turns and reflections of
+its keypoints that most of its shapes have.
+
+Bearings, cups and mechanical parts can turn in themselves, so that only their verdicts count.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from functools import cache, partial
+from itertools import permutations
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial.transform import Rotation
+from typer import Option
+
+from meshmatch.api.matching import Matcher
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.experiments import runner
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.shapes.files import load_shape
+from meshmatch.templates.make import edge_graph
+
+CLASSES = (
+    *("ant", "armadillo", "bird", "bust", "fish", "fourleg", "glasses", "hand", "human", "octopus", "plier", "teddy"),
+    *("chair", "plane", "table"),
+)
+TURNING = ("bearing", "cup", "mech")
+SHAPES = 6  # of each class
+OFF = 10.0
+_ALIKE, _MEAN_ALIKE = 0.4, 0.2  # of the keypoints' spread: how far a symmetry may miss them
+_COLUMNS = {"class": "class", "pairs": "pairs:d", "mean": "mean:.1f", "median": "median:.1f", "under 10": "under:.0%"}
+_COLUMNS |= {
+    "good": "good:d",
+    "good over 10": "good_over:d",
+    "worst": "worst",
+    "error": "worst_error:.1f",
+    "CPU s": "cpu:.1f",
+}
+
+
+def folder_of(name: str, data: Path) -> Path:
+    """Where the shapes of a class are."""
+    return data / name if name in ("chair", "plane", "table") else data / "shrec07" / name
+
+
+def shapes_of(folder: Path) -> list[str]:
+    """Names of the first shapes of a class."""
+    return sorted((file.stem for file in folder.glob("*.ply")), key=int)[:SHAPES]
+
+
+@cache
+def keypoints_of(folder: Path, shape: str) -> Int[Ints, " N"]:
+    return np.load(folder / f"{shape}.keypoints.npy", allow_pickle=False).astype(np.int64)
+
+
+@cache
+def distances(folder: Path, shape: str) -> Float[Floats, "N V"]:
+    """From each keypoint to all vertices, along edges, in units of sqrt(area)."""
+    mesh = load_shape(folder / f"{shape}.ply")
+    found = dijkstra(edge_graph(mesh), directed=False, indices=keypoints_of(folder, shape)) / np.sqrt(mesh.area)
+    return np.where(np.isfinite(found), found, found[np.isfinite(found)].max())
+
+
+def symmetries(folder: Path) -> list[Int[Ints, " N"]]:
+    """Permutations of the keypoints that a class allows, the identity first."""
+    count = len(keypoints_of(folder, shapes_of(folder)[0]))
+    plain = np.arange(count)
+    if not (folder / "symmetry.txt").exists():
+        return [plain, *_of_positions(folder)]
+    lines = (folder / "symmetry.txt").read_text().splitlines()
+    orbits = [np.array(line.split(), np.int64) for line in lines if line.strip()]
+    swapped = plain.copy()
+    for a, b in (orbit for orbit in orbits if len(orbit) == 2):
+        swapped[[a, b]] = b, a
+    rings = [orbit for orbit in orbits if len(orbit) > 2]
+    if not rings:
+        return [plain, swapped]
+    found = []
+    for start in range(len(rings[0])):
+        for step in (1, -1):
+            turned = plain.copy()
+            for ring in rings:
+                turned[ring] = ring[(start + step * np.arange(len(ring))) % len(ring)]
+            found.append(turned)
+    return found
+
+
+def _of_positions(folder: Path) -> list[Int[Ints, " N"]]:
+    """Turns and reflections in the axes of the files that bring keypoints onto keypoints, in half of the shapes."""
+    octahedral = Rotation.create_group("O").as_matrix()
+    motions = [sign * turn for turn in octahedral for sign in (1, -1)]
+    votes: Counter[tuple[int, ...]] = Counter()
+    names = shapes_of(folder)
+    for name in names:
+        points = load_shape(folder / f"{name}.ply").verts[keypoints_of(folder, name)]
+        points = points - points.mean(0)
+        points /= np.sqrt(np.square(points).sum(1).mean())
+        own = set()
+        for motion in motions:
+            apart = np.linalg.norm((points @ motion.T)[:, None] - points, axis=2)
+            rows, columns = linear_sum_assignment(apart)
+            missed = apart[rows, columns]
+            if missed.max() < _ALIKE and missed.mean() < _MEAN_ALIKE:
+                own.add(tuple(columns.tolist()))
+        votes.update(own)
+    identity = tuple(range(len(keypoints_of(folder, names[0]))))
+    return [np.array(each) for each, count in votes.items() if 2 * count >= len(names) and each != identity]
+
+
+def error_of(folder: Path, target: str, vertices: Int[Ints, " N"]) -> float:
+    """Mean distance of where keypoints arrive from where they belong, times 100; the best of the symmetries."""
+    known = distances(folder, target)
+    return min(float(100 * known[each, vertices].mean()) for each in symmetries(folder))
+
+
+def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[str, Any]:
+    """Error, verdict and cost of one pair."""
+    source, target = (load_shape(folder / f"{name}.ply") for name in pair)
+    began = time.process_time()
+    result = Matcher(model, FitConfig(seed=seed), threads=1).match(source, target)
+    spent = time.process_time() - began
+    arrived = result.map.index[keypoints_of(folder, pair[0])]
+    return {
+        "pair": " to ".join(pair),
+        "error": error_of(folder, pair[1], arrived),
+        "verdict": result.map.verdict,
+        "trust": result.target_fit.trust,
+        "ambiguous": any("ambiguous" in reason for reason in result.map.reasons),
+        "cpu": spent,
+    }
+
+
+def row_of(name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The row of a class."""
+    errors = np.array([each["error"] for each in found])
+    good = np.array([each["verdict"] == "good" for each in found])
+    worst = int(errors.argmax())
+    return {
+        "class": name,
+        "pairs": len(found),
+        "mean": float(errors.mean()),
+        "median": float(np.median(errors)),
+        "under": float((errors < OFF).mean()),
+        "good": int(good.sum()),
+        "good_over": int((good & (errors > OFF)).sum()),
+        "worst": found[worst]["pair"],
+        "worst_error": float(errors[worst]),
+        "cpu": float(np.mean([each["cpu"] for each in found])),
+    }
+
+
+@runner.command
+def main(
+    classes: Annotated[str, Option(help="names, with commas between them; or all")] = "all",
+    limit_pairs: runner.LimitPairs = None,
+    model: runner.Model = "none",
+    seed: runner.Seed = 0,
+    data: runner.Data = runner.DATA,
+    work: runner.Work = None,
+) -> runner.Report:
+    names = CLASSES if classes == "all" else runner.names_of(classes, (*CLASSES, *TURNING), "class")
+    rows, everything = [], []
+    for name in names:
+        folder = folder_of(name, data)
+        pairs = runner.spread(list(permutations(shapes_of(folder), 2)), limit_pairs)
+        asked = {"model": model, "seed": seed}
+        found = [
+            runner.at_work(work, f"{name}-{'-'.join(pair)}", asked, partial(measure, folder, pair, model, seed))
+            for pair in runner.track(pairs, name)
+        ]
+        rows.append(row_of(name, found))
+        everything += found
+    total = row_of("all", everything)
+    return runner.Report(
+        {"rows": [*rows, total], "pairs": everything},
+        [runner.table("Keypoints, x100 of sqrt(area)", [*rows, total], _COLUMNS)],
+    )

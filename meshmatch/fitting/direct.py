@@ -1,0 +1,368 @@
+"""Two shapes registered to each other without a model: one of them is the template of both.
+
+Proposals of where the vertices of the source belong on the target (`meshmatch.fitting.search.proposals`) are fitted on few
+nodes, the best of these on more, and the energy of the fits decides. What comes out are two fits of one template, as of a
+model: the source as it is, and the source moved onto the target.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.fitting.fit import Fit, axis_name
+from meshmatch.fitting.fit_config import NodeRefineConfig, Schedule
+from meshmatch.fitting.judge.direct import DirectFeatures, judge_direct
+from meshmatch.fitting.judge.reasons import Reason, Verdict
+from meshmatch.fitting.search.discontinuities import Pairs, neighbours
+from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh
+from meshmatch.fitting.search.proposals import (
+    Proposal,
+    differ,
+    extremity_proposals,
+    rigid_proposals,
+    spectral_proposals,
+)
+from meshmatch.fitting.solve.driver import Problem, minimise
+from meshmatch.fitting.solve.priors import Prior, RotatedReference, ViscousGradient
+from meshmatch.fitting.solve.regularity import Regularity
+from meshmatch.fitting.solve.surface_nodes import SurfaceNodes
+from meshmatch.fitting.solve.system import NodeSystem
+from meshmatch.fitting.solve.terms import GoalTerm, LandmarkTerm, PairTerm, Term
+from meshmatch.geometry.frames import Frame, kabsch
+from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.models.registry import NO_MODEL
+from meshmatch.progress import Progress, ProgressCallback
+from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.shape import Shape
+from meshmatch.threads import beside
+
+KnownPairs = tuple[Float[Floats, "N 3"], Float[Floats, "N 3"]]
+"""Positions on the source and on the target that belong together."""
+_KNOWN_WEIGHT = 0.05  # of each known pair; all other pairs together have about 1
+_NEAR = 3  # vertices of the coarse mesh by which one of the fine mesh moves
+
+
+def _pairs(steps: int, prior: tuple[float, float], scale: tuple[float, float], back: int) -> NodeRefineConfig:
+    return NodeRefineConfig(
+        steps=steps,
+        strain_first=prior[0],
+        strain_last=prior[1],
+        scale_first=scale[0],
+        scale_last=scale[1],
+        damping=1e-6,
+        point_share=0.1,
+        back_points=back,
+    )
+
+
+_COARSE_NODES = SurfaceNodes(K=120, radius=0.2, gradient_points=400)
+_FINE_NODES = SurfaceNodes(K=320, radius=0.13)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DirectConfig:
+    """How two shapes are matched without a model; lengths in units of sqrt(area). Set by hand on 30 pairs of 15 kinds.
+
+    Attributes
+    ----------
+    coarse, fine : triangles of the thinned meshes that are fitted first and last
+    samples, few, fewer : points of the target: for the last fits, for the better coarse ones, and for all
+    coarse_nodes, fine_nodes : nodes of both meshes
+    first, second, third, last : least squares of all proposals, of the better ones, of the best on the fine mesh, and of the
+        one that is taken
+    better, best : how many proposals are fitted a second, and a third time
+    unlike : share of vertices by which these differ at least
+    close : energy by which fits are about as good as the best
+    seed : of all random numbers
+    """
+
+    coarse: int = 2400
+    fine: int = 6000
+    samples: int = 8000
+    few: int = 2500
+    fewer: int = 1200
+    coarse_nodes: SurfaceNodes = _COARSE_NODES
+    fine_nodes: SurfaceNodes = _FINE_NODES
+    first: NodeRefineConfig = field(default_factory=lambda: _pairs(4, (3e-3, 1e-3), (0.12, 0.07), 1200))
+    second: NodeRefineConfig = field(default_factory=lambda: _pairs(8, (1e-3, 1e-4), (0.1, 0.03), 1500))
+    third: NodeRefineConfig = field(default_factory=lambda: _pairs(8, (3e-4, 1e-4), (0.06, 0.02), 4000))
+    last: NodeRefineConfig = field(default_factory=lambda: _pairs(6, (1e-4, 3e-5), (0.03, 0.02), 4000))
+    better: int = 16
+    best: int = 6
+    unlike: float = 0.03
+    close: float = 0.003
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """A thinned source, its least squares, and the prior by which its parts may stretch."""
+
+    mesh: ThinMesh
+    system: NodeSystem
+    viscous: ViscousGradient
+    known: tuple[LandmarkTerm, ...]
+
+    @classmethod
+    def of(cls, mesh: ThinMesh, nodes: SurfaceNodes, known: KnownPairs | None, seed: int) -> _Level:
+        terms: tuple[LandmarkTerm, ...] = ()
+        if known is not None:
+            nearest = cKDTree(mesh.verts).query(known[0])[1]
+            terms = (LandmarkTerm((nearest, known[1]), _KNOWN_WEIGHT),)
+        return cls(mesh, *nodes.system(mesh.shape, mesh.graph, seed), terms)
+
+    def features(
+        self, samples: OrientedPoints, vectors: Float[Floats, "K 3"], pairs: Pairs | None = None
+    ) -> DirectFeatures:
+        """Of node vectors; how far known pairs are missed counts as a residual."""
+        found = DirectFeatures.of(self.system, samples, vectors, pairs)
+        for term in self.known:
+            at, goal = term.landmarks
+            off = np.linalg.norm(self.system.moved(vectors)[at] - goal, axis=1).mean()
+            found = replace(found, residual=found.residual + float(off))
+        return found
+
+    @property
+    def rigid(self) -> Prior:
+        """As rigid as possible, about the shape as it is."""
+        return RotatedReference(np.tile(np.eye(3), (len(self.system.gradient_points), 1, 1)))
+
+    def onto(self, goals: Float[Floats, "V 3"], schedule: Schedule) -> Float[Floats, "K 3"]:
+        """Node vectors that bring each vertex near a goal of its own, as rigidly as possible."""
+        problem = Problem(system=self.system, terms=[GoalTerm(goals), *self.known], schedule=schedule)
+        return minimise(problem, self.rigid, np.zeros((self.system.K, 3)))
+
+    def refined(
+        self,
+        samples: OrientedPoints,
+        vectors: Float[Floats, "K 3"],
+        config: NodeRefineConfig,
+        prior: Prior | None = None,
+    ) -> Float[Floats, "K 3"]:
+        """Node vectors after pairing with the samples of the target."""
+        facing = samples.facing(self.system.surface(vectors))
+        terms: list[Term] = [PairTerm(facing, config), *self.known]
+        problem = Problem(system=self.system, terms=terms, schedule=config.schedule)
+        return minimise(problem, prior or self.rigid, vectors)
+
+
+_ONTO = Schedule(steps=6, prior=(3e-2, 1e-3), scale=(1.0, 0.15), damping=1e-6)
+_ONTO_AGAIN = Schedule(steps=4, prior=(1e-3, 3e-4), scale=(1.0, 0.15), damping=1e-6)
+
+
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """Node vectors of one proposal, where they take the vertices, and how well."""
+
+    proposal: Proposal
+    vectors: Float[Floats, "K 3"]
+    moved: Float[Floats, "V 3"]
+    features: DirectFeatures
+
+
+@dataclass(frozen=True, eq=False)
+class DirectMatch:
+    """Two fits of one template: the source as it is, and the source moved onto the target.
+
+    Node vectors of the second fit are in the target's own orientation, before its core frame is turned to the source's.
+    ``tried`` are the features of the fits that were compared in the end, best first, each with what it began from.
+    """
+
+    source: Fit
+    target: Fit
+    tried: tuple[tuple[str, DirectFeatures], ...]
+
+
+def match_directly(
+    source: Shape,
+    target: Shape,
+    config: DirectConfig | None = None,
+    known: KnownPairs | None = None,
+    progress: ProgressCallback | None = None,
+) -> DirectMatch:
+    """Register a repaired shape to another one, without a model.
+
+    Parameters
+    ----------
+    source, target
+        Meshes, or clouds whose points lie on a surface; in any size and orientation.
+    config
+        How hard the search is.
+    known
+        Positions (N, 3) on the source and (N, 3) on the target, in their files' coordinates, that belong together.
+    progress
+        Called with the stage, the name of the source, and the share that is done.
+
+    Returns
+    -------
+    DirectMatch
+        Two fits of one template, with the verdict on the second.
+
+    Raises
+    ------
+    InputError
+        A shape without area, or a cloud whose points lie on no surface.
+    """
+    config, began = config or DirectConfig(), time.monotonic()
+    report = Progress(progress, source.name).stage("matching without a model")
+    frames = sqrt_area_frame(source), sqrt_area_frame(target)
+    shapes = [Shape(frame.apply(each.verts), each.faces) for frame, each in zip(frames, (source, target), strict=True)]
+    if known is not None:
+        known = frames[0].apply(known[0]), frames[1].apply(known[1])
+    coarse = beside(ThinMesh.of, shapes, [config.coarse] * 2)
+    report(0.05)
+    proposals = _proposals(coarse, report.between(0.05, 0.4))
+    samples = sample_surface(shapes[1], config.samples, np.random.default_rng(config.seed))
+    level = _Level.of(coarse[0], config.coarse_nodes, known, config.seed)
+    tried = _screened(level, proposals, samples, config, report.between(0.4, 0.75))
+    fine = _Level.of(ThinMesh.of(shapes[0], config.fine), config.fine_nodes, known, config.seed)
+    finished = _finished(level, fine, tried, samples, config, report.between(0.75, 0.9))
+    best, vectors, leads = _decided(fine, finished, samples, config)
+    judged = judge_direct(best.features, leads)
+    first, second = _fits(fine, frames, (source, target), vectors, best.features.residual, judged, config.seed)
+    seconds = time.monotonic() - began
+    compared = tuple((each.proposal.kind, each.features) for each in finished)
+    report(1.0)
+    return DirectMatch(replace(first, seconds=seconds), replace(second, seconds=seconds), compared)
+
+
+def _proposals(meshes: Sequence[ThinMesh], report: Progress) -> list[Proposal]:
+    source, target = (Intrinsic(mesh) for mesh in meshes)
+    found = rigid_proposals(*meshes)
+    for number, make in enumerate((extremity_proposals, spectral_proposals)):
+        found += make(source, target)
+        report((number + 1) / 3)
+    return found
+
+
+def _screened(
+    level: _Level, proposals: list[Proposal], samples: OrientedPoints, config: DirectConfig, report: Progress
+) -> list[_Tried]:
+    """Proposals fitted on few nodes: all for a few steps, then those that look better; no two alike, best first."""
+    done = 0
+
+    def fit(proposal: Proposal, some: OrientedPoints, vectors: Floats, how: NodeRefineConfig) -> _Tried:
+        nonlocal done
+        vectors = level.refined(some, vectors, how)
+        features = level.features(some, vectors)
+        done += 1
+        report(min(done / (len(proposals) + config.better), 1.0))
+        return _Tried(proposal, vectors, level.system.moved(vectors), features)
+
+    fewer, few = samples.first(config.fewer), samples.first(config.few)
+    first = beside(lambda each: fit(each, fewer, level.onto(each.points, _ONTO), config.first), proposals)
+    better = _distinct(first, config.better, config.unlike)
+    return beside(lambda each: fit(each.proposal, few, each.vectors, config.second), better)
+
+
+def _finished(
+    level: _Level, fine: _Level, tried: list[_Tried], samples: OrientedPoints, config: DirectConfig, report: Progress
+) -> list[_Tried]:
+    """The best fits on the fine mesh, best first."""
+    distance, near = cKDTree(level.mesh.verts).query(fine.mesh.verts, _NEAR)
+    weights = 1 / (distance + 1e-3)
+    weights /= weights.sum(1, keepdims=True)
+    pairs = neighbours(samples)
+    chosen = _distinct(tried, config.best, config.unlike)
+
+    def fit(each: _Tried) -> _Tried:
+        shift = (weights[..., None] * (each.moved - level.mesh.verts)[near]).sum(1)
+        vectors = fine.refined(samples, fine.onto(fine.mesh.verts + shift, _ONTO_AGAIN), config.third)
+        features = fine.features(samples, vectors, pairs)
+        report(0.9)
+        return _Tried(each.proposal, vectors, fine.system.moved(vectors), features)
+
+    return sorted(beside(fit, chosen), key=lambda each: each.features.energy)
+
+
+def _decided(
+    fine: _Level, finished: list[_Tried], samples: OrientedPoints, config: DirectConfig
+) -> tuple[_Tried, Float[Floats, "K 3"], list[float]]:
+    """The best fit, its last node vectors, and how much higher the energies of the others are that differ from it.
+
+    Fits that are about as good as the best one are compared after the last refinement, which lets them stretch.
+    """
+    limit = finished[0].features.energy + config.close
+    close = [each for each in finished if each.features.energy <= limit]
+    pairs = neighbours(samples)
+
+    def last(each: _Tried) -> tuple[float, Floats]:
+        vectors = fine.refined(samples, each.vectors, config.last, fine.viscous)
+        return fine.features(samples, vectors, pairs).energy, vectors
+
+    ends = beside(last, close)
+    energies = [energy for energy, _ in ends]
+    chosen = int(np.argmin(energies))
+    best = close[chosen]
+    leads = [
+        energies[k] - energies[chosen] if k < len(close) else each.features.energy - best.features.energy
+        for k, each in enumerate(finished)
+        if differ(each.moved, best.moved) > config.unlike
+    ]
+    return best, ends[chosen][1], leads
+
+
+def _distinct(tried: list[_Tried], count: int, unlike: float) -> list[_Tried]:
+    """The best of the fits, no two of which are alike."""
+    kept: list[_Tried] = []
+    for each in sorted(tried, key=lambda each: each.features.energy):
+        if len(kept) < count and all(differ(each.moved, other.moved) > unlike for other in kept):
+            kept.append(each)
+    return kept
+
+
+def _fits(
+    level: _Level,
+    frames: tuple[Frame, Frame],
+    shapes: tuple[Shape, Shape],
+    vectors: Float[Floats, "K 3"],
+    residual: float,
+    judged: tuple[Verdict, float, tuple[Reason, ...]],
+    seed: int,
+) -> tuple[Fit, Fit]:
+    """The source as the template, unmoved, and the template moved onto the target, whose core frame is turned to the
+    source's."""
+    system, (verdict, trust, reasons) = level.system, judged
+    still, moved = np.zeros((system.K, 3)), system.moved(vectors)
+    turn = kabsch(system.verts, moved)
+    core = frames[1].compose(turn.frame)
+    source = Fit(
+        template_hash=level.mesh.shape.hash,
+        frame=frames[0],
+        points=system.verts,
+        vectors=still,
+        resting=system.verts,
+        faces=system.faces,
+        residual=0.0,
+        verts=shapes[0].verts,
+        verdict="good",
+        reasons=(),
+        up="+y",
+        front="+z",
+        seconds=0.0,
+        seed=seed,
+        model=NO_MODEL,
+        regularity=Regularity(),
+    )
+    target = replace(
+        source,
+        frame=core,
+        points=turn.to_local(moved),
+        vectors=vectors,
+        residual=residual,
+        verts=shapes[1].verts,
+        verdict=verdict,
+        reasons=reasons,
+        trust=trust,
+        regularity=system.regularity(vectors),
+        up=axis_name(core.rotation[1]),
+        front=axis_name(core.rotation[2]),
+    )
+    return source, target

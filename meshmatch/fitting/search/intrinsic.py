@@ -1,0 +1,190 @@
+"""A shape as the search without a model sees it: thinned, with what does not change when it bends.
+
+Distances along the surface, eigenfunctions of the Laplacian, and extremities: the ends of limbs, fins, legs and handles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import robust_laplacian
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.linalg import eigsh
+from scipy.spatial import cKDTree
+
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.geometry.triangles import edge_lengths, edges_of, vertex_areas, vertex_normals
+from meshmatch.shapes.sampling import farthest_points, triangulate_cloud
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.make import low_mesh
+
+_FUNCTIONS = 50  # eigenfunctions
+_LANDMARKS = 300  # vertices, evenly spread, that stand for all
+_PROFILE = 12  # distances at which the area around an extremity is asked
+# Of the diameter along the surface: an extremity is a maximum of the mean distance that stands out by so much from the
+# way to a higher one, and lies so far from the others. At most so many are told apart.
+_PERSISTENCE, _APART, _MOST = 0.04, 0.08, 14
+_TOO_MANY = 3  # times as many vertices as asked: the shape is in crumbs, and is thinned as a cloud
+
+
+@dataclass(frozen=True, eq=False)
+class ThinMesh:
+    """A shape with about as many triangles as are asked, on some of its own vertices.
+
+    Attributes
+    ----------
+    kept : (V,) which vertices of the shape these are
+    verts, faces : the thinned mesh, in the frame of the shape
+    """
+
+    kept: Int[Ints, " V"]
+    verts: Float[Floats, "V 3"]
+    faces: Int[Ints, "F 3"]
+
+    @classmethod
+    def of(cls, shape: Shape, faces: int) -> ThinMesh:
+        """`InputError` for a cloud whose points lie on no surface."""
+        kept, corners = low_mesh(shape, faces)
+        used, renumbered = np.unique(corners, return_inverse=True)
+        if len(used) > _TOO_MANY * faces:
+            cloud = Shape(shape.verts, np.empty((0, 3), np.int64), shape.name)
+            kept, corners = triangulate_cloud(cloud, faces)
+            used, renumbered = np.unique(corners, return_inverse=True)
+        kept = kept[used]
+        return cls(kept, np.asarray(shape.verts)[kept], renumbered.reshape(-1, 3).astype(np.int64))
+
+    @cached_property
+    def shape(self) -> Shape:
+        return Shape(self.verts, self.faces)
+
+    @cached_property
+    def normals(self) -> Float[Floats, "V 3"]:
+        return vertex_normals(self.verts, self.faces)
+
+    @cached_property
+    def areas(self) -> Float[Floats, " V"]:
+        """Share of the surface around each vertex."""
+        areas = vertex_areas(self.verts, self.faces)
+        return areas / areas.sum()
+
+    @cached_property
+    def graph(self) -> csr_matrix:
+        """Edge lengths; separate parts are joined where they are nearest, so that every distance is finite."""
+        edges = edges_of(self.faces).vertices.astype(np.int64)
+        length = edge_lengths(self.verts, edges)
+        part = connected_components(coo_matrix((length, edges.T), (len(self.verts),) * 2), directed=False)[1]
+        bridges = _bridges(self.verts, part)
+        edges = np.concatenate([edges, bridges])
+        length = np.maximum(edge_lengths(self.verts, edges), 1e-9)
+        graph = coo_matrix((length, edges.T), (len(self.verts),) * 2).tocsr()
+        return graph + graph.T
+
+
+def _bridges(verts: Float[Floats, "V 3"], part: Int[Ints, " V"]) -> Int[Ints, "N 2"]:
+    """Pairs of vertices that join all parts: each part, from the largest on, with the nearest of those before it."""
+    found = []
+    order = np.argsort(-np.bincount(part), kind="stable")
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    rank = rank[part]
+    for number in range(1, len(order)):
+        here, before = np.flatnonzero(rank == number), np.flatnonzero(rank < number)
+        distance, nearest = cKDTree(verts[before]).query(verts[here])
+        closest = int(distance.argmin())
+        found.append((here[closest], before[nearest[closest]]))
+    return np.array(found, np.int64).reshape(-1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Intrinsic:
+    """What does not change when a shape bends, on a thin mesh.
+
+    Lengths along the surface are shares of the ``diameter``.
+    """
+
+    mesh: ThinMesh
+
+    @cached_property
+    def _lengths(self) -> Float[Floats, "V V"]:
+        return np.asarray(dijkstra(self.mesh.graph, directed=False))
+
+    @cached_property
+    def distances(self) -> Float[Floats, "V V"]:
+        """Between all vertices, along edges."""
+        return self._lengths / self._lengths.max()
+
+    @cached_property
+    def functions(self) -> Float[Floats, "V K"]:
+        """The first eigenfunctions of the Laplacian."""
+        mesh, V = self.mesh, len(self.mesh.verts)
+        stiffness, mass = robust_laplacian.mesh_laplacian(mesh.verts, mesh.faces)
+        start = np.random.default_rng(0).standard_normal(V)
+        return np.asarray(eigsh(stiffness, min(_FUNCTIONS, V - 2), mass, sigma=-1e-8, v0=start)[1])
+
+    @cached_property
+    def landmarks(self) -> Int[Ints, " L"]:
+        """Vertices that are evenly spread, and stand for all where that suffices."""
+        return farthest_points(self.mesh.verts, min(_LANDMARKS, len(self.mesh.verts)))
+
+    @cached_property
+    def eccentricity(self) -> Float[Floats, " V"]:
+        """Mean distance from all of the surface: small in the middle, large at extremities."""
+        return self.distances @ self.mesh.areas
+
+    @cached_property
+    def extremities(self) -> Int[Ints, " T"]:
+        """The vertices furthest out, those first that stand out most: maxima of the eccentricity by their persistence."""
+        chosen: list[int] = []
+        for persistence, vertex in _persistent_maxima(self.eccentricity, self.mesh.graph):
+            if persistence < _PERSISTENCE or len(chosen) == _MOST:
+                break
+            if all(self.distances[vertex, other] > _APART for other in chosen):
+                chosen.append(vertex)
+        return np.array(chosen, np.int64)
+
+    @cached_property
+    def profiles(self) -> Float[Floats, "T R"]:
+        """Share of the surface within growing distances of each extremity: a thin limb has little nearby."""
+        radii = np.linspace(0.05, 1, _PROFILE)
+        within = self.distances[self.extremities][:, :, None] < radii
+        return np.einsum("tvr,v->tr", within.astype(np.float64), self.mesh.areas)
+
+    @cached_property
+    def limbs(self) -> tuple[Float[Floats, " T"], Float[Floats, "V T"]]:
+        """How far each extremity lies from the middle, and how far each vertex lies along the way there: from 0 in the
+        middle, or on another limb, to 1 at the end, whatever the length of the limb (Gromov's product).
+        """
+        middle, ends = int(self.eccentricity.argmin()), self.extremities
+        reach = self.distances[middle, ends]
+        along = 0.5 * (self.distances[middle][:, None] + reach - self.distances[:, ends])
+        return reach, along / reach
+
+
+def _persistent_maxima(height: Float[Floats, " V"], graph: csr_matrix) -> list[tuple[float, int]]:
+    """Maxima of a function on a graph and how far each stands above the pass to a higher one; the highest persistence
+    first. By joining vertices from the highest down (a merge tree).
+    """
+    parent, peak = np.full(len(height), -1), np.arange(len(height))
+
+    def root(vertex: int) -> int:
+        while parent[vertex] != vertex:
+            parent[vertex] = parent[parent[vertex]]
+            vertex = int(parent[vertex])
+        return vertex
+
+    found = [(float(np.ptp(height)), int(height.argmax()))]
+    for vertex in np.argsort(-height, kind="stable").tolist():
+        parent[vertex] = vertex
+        around = graph.indices[graph.indptr[vertex] : graph.indptr[vertex + 1]]
+        roots = sorted(
+            {root(int(other)) for other in around if parent[other] >= 0} - {vertex}, key=lambda r: -height[peak[r]]
+        )
+        if roots:
+            parent[vertex] = roots[0]
+        for lower in roots[1:]:
+            found.append((float(height[peak[lower]] - height[vertex]), int(peak[lower])))
+            parent[lower] = roots[0]
+    return sorted(found, reverse=True)

@@ -1,0 +1,357 @@
+"""Guesses of where the vertices of one shape belong on another, made without a model, and not yet fitted.
+
+Rigid and affine motions; maps between eigenfunctions of the Laplacian (functional maps, Ovsjanikov et al. 2012, refined by
+ZoomOut, Melzi et al. 2019); and maps that send extremities to extremities. Each kind is right for some shapes and wrong
+for others: a fit of each decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh
+from meshmatch.geometry.frames import kabsch
+from meshmatch.geometry.oriented import with_normals
+from meshmatch.geometry.triangles import triangle_vectors
+
+Kind = Literal["rigid", "affine", "spectral", "extremities"]
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """Where the vertices of the source's thin mesh (V,) may belong.
+
+    Attributes
+    ----------
+    kind : what it was made by
+    points : (V, 3) positions, in the frame of the target
+    """
+
+    kind: Kind
+    points: Float[Floats, "V 3"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProposalSettings:
+    """How many guesses are made, and how. Set by hand on 30 pairs of 15 kinds of shapes; lengths in units of sqrt(area).
+
+    Attributes
+    ----------
+    rigid : rigid motions that are kept, each with an affine one
+    closest_point_steps, affine_steps : steps of closest points of each
+    turned : degrees by which two of them differ
+    normal_weight : of normals in the search for closest points
+    scale : of the robust weight of closest points
+    cap : distance from which on a point counts as far
+    signs : eigenfunctions whose signs, and whose order, are tried in all ways
+    compared : how many of these are refined to ``functions``, from ``first_functions``
+    functions, first_functions, more : eigenfunctions of a map in the end and after the first steps, and how many are added
+        in each step
+    maps : maps of each kind that are kept
+    beam, assignments : partial assignments of extremities that are kept, and complete ones that are compared
+    climbs : of these, how many are improved by exchanging two extremities at a time
+    skipped : cost of an extremity without counterpart
+    same : share of vertices by which two maps differ at least, where two vertices ``apart`` differ
+    facing : how much the share of triangles that keep their orientation counts, against the error of distances
+    """
+
+    rigid: int = 10
+    closest_point_steps: int = 6
+    affine_steps: int = 10
+    turned: float = 20.0
+    normal_weight: float = 0.15
+    scale: float = 0.1
+    cap: float = 0.2
+    signs: int = 5
+    compared: int = 32
+    first_functions: int = 14
+    functions: int = 40
+    more: int = 5
+    maps: int = 16
+    beam: int = 400
+    assignments: int = 60
+    climbs: int = 6
+    skipped: float = 0.12
+    same: float = 0.02
+    apart: float = 0.1
+    facing: float = 0.1
+
+
+SETTINGS = ProposalSettings()
+
+
+def rigid_proposals(source: ThinMesh, target: ThinMesh) -> list[Proposal]:
+    """The best rigid motions from 48 starts by iterative closest points, and an affine one from each."""
+    middles = source.areas @ source.verts, target.areas @ target.verts
+    cloud = _Closest(source.verts - middles[0], source.normals, target.verts - middles[1], target.normals)
+    turns = Rotation.create_group("O").as_matrix()
+    axes = [_principal_axes(mesh) for mesh in (source, target)]
+    starts = [*turns, *(axes[1] @ turn @ axes[0].T for turn in turns)]
+    found = [cloud.motion(start, np.zeros(3), SETTINGS.closest_point_steps) for start in starts]
+    chosen: list[tuple[Floats, Floats]] = []
+    limit = np.cos(np.radians(SETTINGS.turned))
+    for turn, shift in sorted(found, key=lambda motion: cloud.residual(*motion)):
+        if all((np.trace(turn.T @ other) - 1) / 2 < limit for other, _ in chosen):
+            chosen.append((turn, shift))
+    proposals = []
+    for motion in chosen[: SETTINGS.rigid]:
+        proposals.append(Proposal("rigid", cloud.moved(*motion)[0] + middles[1]))
+        matrix, shift = cloud.motion(*motion, SETTINGS.affine_steps, affine=True)
+        if np.linalg.det(matrix) > 0.1:
+            proposals.append(Proposal("affine", cloud.moved(matrix, shift)[0] + middles[1]))
+    return proposals
+
+
+def _principal_axes(mesh: ThinMesh) -> Float[Floats, "3 3"]:
+    axes = np.linalg.eigh(np.cov(mesh.verts.T, aweights=mesh.areas))[1]
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    return axes
+
+
+class _Closest:
+    """Iterative closest points between two thin meshes, both ways, with robust weights."""
+
+    _SOME = 200  # points of each mesh that look for their closest
+
+    def __init__(self, points: Floats, normals: Floats, onto: Floats, onto_normals: Floats) -> None:
+        self._points, self._normals, self._onto = points, normals, onto
+        self._features = with_normals(onto, onto_normals, SETTINGS.normal_weight)
+        self._tree = cKDTree(self._features)
+        self._few = np.linspace(0, len(points) - 1, min(self._SOME, len(points))).astype(np.int64)
+        self._few_onto = np.linspace(0, len(onto) - 1, min(self._SOME, len(onto))).astype(np.int64)
+
+    def moved(self, matrix: Float[Floats, "3 3"], shift: Float[Floats, " 3"]) -> tuple[Floats, Floats]:
+        """Points and unit normals under an affine motion."""
+        normals = self._normals @ np.linalg.inv(matrix)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        return self._points @ matrix.T + shift, normals
+
+    def _pairs(self, matrix: Floats, shift: Floats) -> tuple[Ints, Floats, Ints, Floats]:
+        features = with_normals(*self.moved(matrix, shift), SETTINGS.normal_weight)
+        there, forth = self._tree.query(features[self._few])
+        back, home = cKDTree(features).query(self._features[self._few_onto])
+        return forth, there, home, back
+
+    def residual(self, matrix: Floats, shift: Floats) -> float:
+        """Mean capped distance both ways, normals included."""
+        _, there, _, back = self._pairs(matrix, shift)
+        return float(np.minimum(there, SETTINGS.cap).mean() + np.minimum(back, SETTINGS.cap).mean())
+
+    def motion(self, matrix: Floats, shift: Floats, steps: int, affine: bool = False) -> tuple[Floats, Floats]:
+        """A rigid or an affine motion after some steps from another one."""
+        for _ in range(steps):
+            forth, _, home, _ = self._pairs(matrix, shift)
+            source = np.concatenate([self._points[self._few], self._points[home]])
+            goal = np.concatenate([self._onto[forth], self._onto[self._few_onto]])
+            off = np.square(source @ matrix.T + shift - goal).sum(1)
+            weights = 1 / np.square(1 + off / SETTINGS.scale**2)
+            if affine:
+                matrix, shift = _affine(source, goal, weights, matrix)
+            else:
+                pose = kabsch(source, goal, weights)
+                matrix, shift = pose.rotation, pose.center
+        return matrix, shift
+
+
+def _affine(source: Floats, goal: Floats, weights: Floats, near: Floats) -> tuple[Floats, Floats]:
+    """The affine motion of weighted least squares, held near the rotation in ``near`` where points do not say."""
+    U, _, Vh = np.linalg.svd(near)
+    lifted = np.hstack([source, np.ones((len(source), 1))])
+    held = np.diag([1e-3, 1e-3, 1e-3, 0]) * weights.sum()
+    wanted = np.vstack([(U @ Vh).T, np.zeros(3)])
+    weighted = weights[:, None] * lifted
+    found = np.linalg.solve(lifted.T @ weighted + held, weighted.T @ goal + held @ wanted)
+    return found[:3].T, found[3]
+
+
+def spectral_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
+    """Maps by eigenfunctions, whose signs and order nobody knows: all are tried and refined, the most isometric kept."""
+    at, onto = source.landmarks, target.landmarks
+    own, theirs = source.functions[at], target.functions[onto]
+    last = min(SETTINGS.functions, own.shape[1], theirs.shape[1])
+    first = min(SETTINGS.first_functions, last)
+    count = min(SETTINGS.signs, first - 1)
+    found = []
+    for order in _near_orders(count):
+        for signs in product((1.0, -1.0), repeat=count):
+            C = np.zeros((count + 1, count + 1))
+            C[0, 0] = 1.0
+            C[np.arange(1, count + 1), 1 + np.array(order)] = signs
+            C, nearest = _zoomed(C, own, theirs, first, SETTINGS.more)
+            found.append((_distance_error(source, target, at, onto[nearest]), C))
+    found.sort(key=lambda each: each[0])
+    maps = []
+    for _, C in found[: SETTINGS.compared]:
+        C, _ = _zoomed(C, own, theirs, last, SETTINGS.more)
+        vertex = _nearest(source.functions[:, :last] @ C.T, target.functions[:, :last])
+        maps.append((_distance_error(source, target, at, vertex[at]), vertex))
+    return _kept("spectral", source, target, maps)
+
+
+def _near_orders(count: int) -> list[tuple[int, ...]]:
+    """The order of eigenfunctions as it is, and with two neighbours exchanged."""
+    plain = tuple(range(count))
+    swapped = [(*plain[:k], plain[k + 1], plain[k], *plain[k + 2 :]) for k in range(count - 1)]
+    return [plain, *swapped]
+
+
+def _zoomed(C: Floats, own: Floats, theirs: Floats, last: int, more: int) -> tuple[Floats, Ints]:
+    """ZoomOut: the map of a functional map gives one of more functions, until there are ``last``; and the nearest rows."""
+    size = len(C)
+    while True:
+        nearest = _nearest(own[:, :size] @ C.T, theirs[:, :size])
+        if size >= last:
+            return C, nearest
+        size = min(size + more, last)
+        C = np.asarray(np.linalg.lstsq(own[:, :size], theirs[nearest, :size], rcond=None)[0].T, np.float64)
+
+
+def _nearest(points: Floats, among: Floats) -> Ints:
+    """The nearest row for each point, all compared with all: these spaces have too many dimensions for a tree."""
+    return (points @ among.T - 0.5 * np.square(among).sum(1)).argmax(1)
+
+
+def _distance_error(source: Intrinsic, target: Intrinsic, at: Ints, vertex: Ints) -> float:
+    """Mean change of the distances between landmarks ``at``, which go to ``vertex``."""
+    change = source.distances[np.ix_(at, at)] - target.distances[np.ix_(vertex, vertex)]
+    return float(np.abs(change).mean())
+
+
+def _facing(source: Intrinsic, target: Intrinsic, vertex: Int[Ints, " V"]) -> float:
+    """Share of the mapped area that keeps its orientation, less the share that loses it: -1 for a mirrored map."""
+    mesh = target.mesh
+    turned = triangle_vectors(mesh.verts[vertex], source.mesh.faces)
+    along = (turned * mesh.normals[vertex][source.mesh.faces].sum(1)).sum(1)
+    area = np.linalg.norm(turned, axis=1)
+    return float((area * np.sign(along)).sum() / max(area.sum(), 1e-12))
+
+
+def extremity_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
+    """Maps that send extremities to extremities, chosen by how far these lie from each other, and by how far the ways from
+    the middle to two of them are one: lengths of limbs may differ. A beam search; then two are exchanged while that helps.
+    """
+    if min(len(source.extremities), len(target.extremities)) < 2:
+        return []
+    judge = _Assignments(source, target)
+    best = sorted(judge.candidates(), key=judge.cost)[: SETTINGS.climbs]
+    for start in best:
+        judge.climb(start)
+    found = sorted(judge.judged.values(), key=lambda each: each[0])
+    kept = _distinct(target, [vertex for _, facing, vertex in found if facing > 0])
+    maps = []
+    for vertex in kept:
+        smooth = _smoothed(source, target, vertex)
+        for each in (smooth, vertex):
+            error = _distance_error(source, target, source.landmarks, each[source.landmarks])
+            maps.append((error - SETTINGS.facing * _facing(source, target, each), each))
+    return _kept("extremities", source, target, maps)
+
+
+Assignment = tuple[int, ...]
+"""For each extremity of the source that of the target, or -1."""
+
+
+class _Assignments:
+    """Assignments of the extremities of two shapes, and what each costs."""
+
+    def __init__(self, source: Intrinsic, target: Intrinsic) -> None:
+        self._source, self._target = source, target
+        (reach, along), (reach_to, along_to) = source.limbs, target.limbs
+        ends, ends_to = source.extremities, target.extremities
+        self._counts = len(ends), len(ends_to)
+        profiles = np.abs(source.profiles[:, None] - target.profiles[None]).mean(2)
+        self._single = 0.5 * (profiles + 0.3 * np.abs(reach[:, None] - reach_to))
+        apart = source.distances[np.ix_(ends, ends)], target.distances[np.ix_(ends_to, ends_to)]
+        shared = along[ends] * reach, along_to[ends_to] * reach_to
+        of_pairs = [np.abs(a[:, :, None, None] - b) for a, b in (apart, shared)]
+        self._double = 0.5 * of_pairs[0] + 2.0 * of_pairs[1]  # of i, k and of j, l that they go to
+        self._along = np.column_stack([along, source.eccentricity]), np.column_stack([along_to, target.eccentricity])
+        self.judged: dict[Assignment, tuple[float, float, Ints]] = {}
+
+    def candidates(self) -> list[Assignment]:
+        """The best assignments of a beam search, extremities in the order in which they stand out."""
+        beam: list[tuple[float, Assignment]] = [(0.0, ())]
+        for i in range(self._counts[0]):
+            longer = []
+            for cost, sofar in beam:
+                longer.append((cost + SETTINGS.skipped, (*sofar, -1)))
+                known = [(k, other) for k, other in enumerate(sofar) if other >= 0]
+                for j in set(range(self._counts[1])).difference(sofar):
+                    pairs = sum(self._double[i, k, j, other] for k, other in known) / max(len(known), 1)
+                    longer.append((cost + self._single[i, j] + pairs, (*sofar, j)))
+            beam = sorted(longer)[: SETTINGS.beam]
+        found = [each for _, each in beam[: SETTINGS.assignments]]
+        return [each for each in found if sum(j >= 0 for j in each) >= 2]
+
+    def cost(self, assignment: Assignment) -> float:
+        """How far the map of an assignment is from an isometry that keeps the orientation."""
+        if assignment not in self.judged:
+            pairs = [(i, j) for i, j in enumerate(assignment) if j >= 0]
+            own, theirs = ([each[k] for each in pairs] + [count] for k, count in enumerate(self._counts))
+            vertex = _nearest(self._along[0][:, own], self._along[1][:, theirs])
+            some = self._source.landmarks[::2]
+            error = _distance_error(self._source, self._target, some, vertex[some])
+            facing = _facing(self._source, self._target, vertex)
+            left = min(self._counts) - len(pairs)
+            cost = error - SETTINGS.facing * facing + 0.2 * SETTINGS.skipped * left
+            self.judged[assignment] = cost, facing, vertex
+        return self.judged[assignment][0]
+
+    def climb(self, assignment: Assignment) -> None:
+        """Exchange two extremities at a time while that lowers the cost."""
+        while True:
+            best = min(self._exchanged(assignment), key=self.cost, default=assignment)
+            if self.cost(best) >= self.cost(assignment):
+                return
+            assignment = best
+
+    @staticmethod
+    def _exchanged(assignment: Assignment) -> Sequence[Assignment]:
+        found = []
+        for i in range(len(assignment)):
+            for j in range(i):
+                if assignment[i] != assignment[j]:
+                    other = list(assignment)
+                    other[i], other[j] = other[j], other[i]
+                    found.append(tuple(other))
+        return found
+
+
+def _smoothed(source: Intrinsic, target: Intrinsic, vertex: Int[Ints, " V"]) -> Int[Ints, " V"]:
+    """The map after ZoomOut from a few functions."""
+    at, last = source.landmarks, min(30, source.functions.shape[1], target.functions.shape[1])
+    own, size = source.functions[at], min(8, last)
+    C = np.asarray(np.linalg.lstsq(own[:, :size], target.functions[vertex[at], :size], rcond=None)[0].T, np.float64)
+    C, _ = _zoomed(C, own, target.functions[target.landmarks], last, 6)
+    return _nearest(source.functions[:, :last] @ C.T, target.functions[:, :last])
+
+
+def _kept(kind: Kind, source: Intrinsic, target: Intrinsic, maps: list[tuple[float, Ints]]) -> list[Proposal]:
+    """The best of some maps, no two of them alike; those that turn most triangles over are dropped."""
+    best = [vertex for _, vertex in sorted(maps, key=lambda each: each[0])]
+    chosen = [vertex for vertex in _distinct(target, best) if _facing(source, target, vertex) >= 0]
+    return [Proposal(kind, target.mesh.verts[vertex]) for vertex in chosen]
+
+
+def _distinct(target: Intrinsic, maps: Sequence[Ints]) -> list[Ints]:
+    """Maps that differ from all before them in more than a few vertices; so many as settings say."""
+    verts, kept = target.mesh.verts, list[Ints]()
+    for vertex in maps:
+        if len(kept) == SETTINGS.maps:
+            break
+        if all(differ(verts[vertex], verts[other]) > SETTINGS.same for other in kept):
+            kept.append(vertex)
+    return kept
+
+
+def differ(points: Float[Floats, "V 3"], others: Float[Floats, "V 3"]) -> float:
+    """Share (0..1) of vertices that lie in clearly other places."""
+    return float((np.linalg.norm(points - others, axis=1) > SETTINGS.apart).mean())

@@ -1,0 +1,61 @@
+"""Errors of maps of any shapes: the best of a class's symmetries, from its file or from its keypoints."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from meshmatch.experiments.bench import any_shapes
+from meshmatch.experiments.bench.any_shapes import error_of, keypoints_of, row_of, symmetries
+from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.shape import Shape
+
+CORNERS = 8
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Boxes of three lengths: corners are keypoints."""
+    for number in range(1, 5):
+        box = trimesh.creation.box((1.0 + 0.1 * number, 0.6, 0.3)).subdivide()
+        save_shape(tmp_path / f"{number}.ply", Shape(np.asarray(box.vertices), np.asarray(box.faces)))
+        np.save(tmp_path / f"{number}.keypoints.npy", np.arange(CORNERS))
+    return tmp_path
+
+
+def test_symmetries_of_a_box_are_its_turns_and_reflections(folder: Path) -> None:
+    found = symmetries(folder)
+    assert len(found) == 8 and np.array_equal(found[0], np.arange(CORNERS))
+    assert len({tuple(each) for each in found}) == 8
+    exact = keypoints_of(folder, "2")
+    for each in found:
+        assert error_of(folder, "2", exact[each]) == 0
+
+
+def test_pairs_of_a_file_are_swapped_together_and_rings_turn_together(folder: Path) -> None:
+    (folder / "symmetry.txt").write_text("0 1\n2 3\n")
+    plain, swapped = symmetries(folder)
+    assert swapped.tolist() == [1, 0, 3, 2, 4, 5, 6, 7] and plain.tolist() == list(range(8))
+    (folder / "symmetry.txt").write_text("0 1 2\n5 6 7\n")
+    rings = {tuple(each.tolist()) for each in symmetries(folder)}
+    assert len(rings) == 6 and (1, 2, 0, 3, 4, 6, 7, 5) in rings and (0, 2, 1, 3, 4, 5, 7, 6) in rings
+
+
+def test_the_error_is_along_the_surface_in_units_of_its_size(folder: Path) -> None:
+    (folder / "symmetry.txt").write_text("")
+    wrong = keypoints_of(folder, "1").copy()
+    lengths = any_shapes.distances(folder, "1")
+    wrong[0] = int(lengths[0].argmax())
+    assert error_of(folder, "1", wrong) == pytest.approx(100 * lengths[0].max() / CORNERS)
+
+
+def test_a_row_counts_every_pair_and_names_the_worst() -> None:
+    found = [
+        {"pair": "a to b", "error": 4.0, "verdict": "good", "cpu": 1.0},
+        {"pair": "b to a", "error": 20.0, "verdict": "good", "cpu": 3.0},
+        {"pair": "a to c", "error": 6.0, "verdict": "fair", "cpu": 2.0},
+    ]
+    row = row_of("box", found)
+    assert (row["pairs"], row["mean"], row["median"], row["worst"]) == (3, 10.0, 6.0, "b to a")
+    assert row["under"] == pytest.approx(2 / 3) and (row["good"], row["good_over"]) == (2, 1)

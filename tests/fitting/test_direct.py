@@ -1,0 +1,185 @@
+"""Two shapes matched without a model: proposals, nodes on the shape itself, the energy that decides."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from meshmatch.fitting.direct import DirectConfig, match_directly
+from meshmatch.fitting.judge.direct import DirectFeatures, judge_direct
+from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh
+from meshmatch.fitting.search.proposals import extremity_proposals, rigid_proposals, spectral_proposals
+from meshmatch.fitting.solve.driver import minimise
+from meshmatch.fitting.solve.surface_nodes import SurfaceNodes
+from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.shape import Shape
+
+QUICK = DirectConfig(coarse=900, fine=1800, samples=2500, few=1000, fewer=600, better=6, best=3)
+# limbs of a creature: where they point, how long and how wide they are
+LIMBS = (
+    ((1, 0.2, 0), 1.2, 0.04),
+    ((-1, 0.2, 0.1), 0.9, 0.04),
+    ((0.2, 1, 0), 1.5, 0.03),
+    ((0, -0.4, 1), 0.7, 0.05),
+    ((0.1, -1, -0.5), 0.5, 0.06),
+)
+
+
+def creature(fineness: int = 4) -> Shape:
+    """A ball with limbs of different lengths."""
+    ball = trimesh.creation.icosphere(subdivisions=fineness)
+    way = np.asarray(ball.vertices)
+    radius = np.full(len(way), 0.5)
+    for direction, length, width in LIMBS:
+        unit = np.array(direction) / np.linalg.norm(direction)
+        radius += length * np.exp(-(1 - way @ unit) / width)
+    return frame_applied(Shape(way * radius[:, None], np.asarray(ball.faces), "creature"))
+
+
+def frame_applied(shape: Shape) -> Shape:
+    return Shape(sqrt_area_frame(shape).apply(shape.verts), shape.faces, shape.name)
+
+
+def bent(shape: Shape, turn: Rotation, size: float = 1.0) -> Shape:
+    """Another pose of the same vertices: its upper half twisted and bent; turned, and in another unit."""
+    x, y, z = shape.verts.T
+    angle = 0.8 * y
+    verts = np.stack([x * np.cos(angle) + z * np.sin(angle) + 0.3 * y**2, y, z * np.cos(angle) - x * np.sin(angle)], 1)
+    return Shape(size * turn.apply(verts), shape.faces, "bent")
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[Shape, Shape]:
+    source = creature(3)
+    return source, bent(source, Rotation.from_euler("xyz", (70, 130, -40), degrees=True), 250.0)
+
+
+@pytest.fixture(scope="module")
+def thin() -> ThinMesh:
+    return ThinMesh.of(creature(), 900)
+
+
+def test_extremities_are_the_ends_of_limbs_and_limbs_run_from_zero_to_one(thin: ThinMesh) -> None:
+    surface = Intrinsic(thin)
+    ends = thin.verts[surface.extremities]
+    tips = np.array([np.array(way) / np.linalg.norm(way) for way, *_ in LIMBS])
+    own = (ends / np.linalg.norm(ends, axis=1, keepdims=True)) @ tips.T
+    assert len(ends) == len(LIMBS) and sorted(own.argmax(1)) == list(range(len(LIMBS)))
+    assert own.max(1).min() > 0.95
+    reach, along = surface.limbs
+    assert np.allclose(along[surface.extremities, np.arange(len(ends))], 1) and along.min() > -1e-9
+    assert (reach > 0.2).all()
+    assert np.isfinite(surface.distances).all() and surface.distances.max() == 1
+
+
+def test_distances_bridge_separate_parts() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    verts = np.concatenate([ball.vertices, ball.vertices + np.array([3, 0, 0]), ball.vertices + np.array([6, 0, 0])])
+    faces = np.concatenate([ball.faces + k * len(ball.vertices) for k in range(3)])
+    surface = Intrinsic(ThinMesh.of(Shape(verts, faces), 10_000))
+    assert np.isfinite(surface.distances).all()
+    assert np.allclose(surface.distances, surface.distances.T)
+
+
+@pytest.mark.parametrize("make", [extremity_proposals, spectral_proposals])
+def test_a_map_of_the_surface_is_among_the_proposals(make: Any, pair: tuple[Shape, Shape]) -> None:
+    meshes = [ThinMesh.of(frame_applied(shape), 900) for shape in pair]
+    found = make(*(Intrinsic(mesh) for mesh in meshes))
+    true = frame_applied(pair[1]).verts[meshes[0].kept]
+    errors = [np.linalg.norm(each.points - true, axis=1).mean() for each in found]
+    assert min(errors) < 0.08
+
+
+def test_a_turned_copy_is_found_by_a_rigid_motion(thin: ThinMesh) -> None:
+    turn = Rotation.from_euler("xyz", (100, 20, 200), degrees=True)
+    copy = ThinMesh(thin.kept, turn.apply(thin.verts), thin.faces)
+    best = rigid_proposals(thin, copy)[0]
+    assert best.kind == "rigid" and np.abs(best.points - copy.verts).max() < 0.02
+
+
+def test_nodes_move_one_side_of_a_thin_sheet(thin: ThinMesh) -> None:
+    sheet = trimesh.creation.box((1, 1, 0.01)).subdivide_loop(0)
+    for _ in range(4):
+        sheet = sheet.subdivide()
+    shape = Shape(np.asarray(sheet.vertices), np.asarray(sheet.faces))
+    mesh = ThinMesh.of(shape, 10_000)
+    system, prior = SurfaceNodes(K=150, radius=0.13, least=4).system(mesh.shape, mesh.graph)
+    assert np.allclose(np.asarray(system.phi.sum(1)), 1)
+    turn = Rotation.from_rotvec([0.2, 0.1, 0.3])
+    top = mesh.verts[:, 2] > 0
+    inside = (np.abs(mesh.verts[:, :2]) < 0.25).all(1)
+    # a node that moves vertices of the top far from the rim moves none of the bottom there
+    moved = np.asarray((system.phi != 0).todense())
+    shared = moved[top & inside].any(0) & moved[~top & inside].any(0)
+    assert not shared.any()
+    alike = np.tile(turn.as_matrix(), (len(system.gradient_points), 1, 1))
+    assert np.allclose(prior.targets(alike), alike)
+
+
+def test_energy_prefers_what_is_near_unstretched_and_whole() -> None:
+    best = DirectFeatures(residual=0.02, stretch=0.4, discontinuous=0.0)
+    for name, worse in (("residual", 0.03), ("stretch", 0.8), ("discontinuous", 0.1)):
+        assert replace(best, **{name: worse}).energy > best.energy
+
+
+def test_equal_fits_are_ambiguous_and_distant_ones_are_not() -> None:
+    best = DirectFeatures(residual=0.012, stretch=0.2)
+    alone = judge_direct(best, [])
+    assert alone[0] == "good" and not alone[2]
+    verdict, _, reasons = judge_direct(best, [0.0, 0.0, 0.04])
+    assert verdict == "fair" and reasons[0].code == "ambiguous" and "3 different" in reasons[0]
+    trusts = [judge_direct(replace(best, residual=value), [])[1] for value in (0.01, 0.02, 0.04, 0.08)]
+    assert trusts == sorted(trusts, reverse=True)
+    assert judge_direct(replace(best, residual=0.08), [])[0] == "poor"
+
+
+def test_a_bent_turned_and_scaled_shape_is_found(pair: tuple[Shape, Shape]) -> None:
+    source, target = pair
+    shown: list[float] = []
+    found = match_directly(source, target, QUICK, progress=lambda stage, name, share: shown.append(share))
+    assert found.target.frame.scale == pytest.approx(sqrt_area_frame(target).scale)
+    at = ThinMesh.of(frame_applied(source), QUICK.fine).kept
+    error = np.linalg.norm(found.target.points_in_file - target.verts[at], axis=1) / found.target.frame.scale
+    assert error.mean() < 0.02 and found.target.verdict != "poor"
+    assert np.allclose(found.source.points_in_file, source.verts[at])
+    assert found.source.template_hash == found.target.template_hash and shown == sorted(shown)
+    energies = [features.energy for _, features in found.tried]
+    assert energies == sorted(energies) and len(energies) > 1
+    again = match_directly(source, target, QUICK)
+    assert np.array_equal(again.target.points, found.target.points)
+
+
+def test_known_pairs_settle_what_symmetry_leaves_open() -> None:
+    box = trimesh.creation.box((1.0, 0.7, 0.4))
+    for _ in range(4):
+        box = box.subdivide()
+    shape = Shape(np.asarray(box.vertices), np.asarray(box.faces), "box")
+    plain = match_directly(shape, shape, QUICK)
+    assert any(reason.code == "ambiguous" for reason in plain.target.reasons)
+    half = Rotation.from_euler("z", 180, degrees=True)
+    corners = np.array(shape.verts[:8])
+    known = corners, half.apply(corners)
+    found = match_directly(shape, shape, QUICK, known)
+    at = ThinMesh.of(frame_applied(shape), QUICK.fine).kept
+    off = np.linalg.norm(found.target.points_in_file - half.apply(np.array(shape.verts[at])), axis=1)
+    assert off.mean() < 0.03
+    assert not any(reason.code == "ambiguous" for reason in found.target.reasons)
+
+
+def test_goals_are_reached_by_vectors(thin: ThinMesh) -> None:
+    from meshmatch.fitting.fit_config import Schedule
+    from meshmatch.fitting.solve.driver import Problem
+    from meshmatch.fitting.solve.priors import RotatedReference
+    from meshmatch.fitting.solve.terms import GoalTerm
+
+    system, _ = SurfaceNodes(K=60, radius=0.3, gradient_points=100).system(thin.shape, thin.graph)
+    goals = Rotation.from_rotvec([0, 1.5, 0]).apply(thin.verts) + 0.1
+    prior = RotatedReference(np.tile(np.eye(3), (len(system.gradient_points), 1, 1)))
+    schedule = Schedule(steps=10, prior=(1e-2, 1e-3), scale=(1.0, 1.0))
+    vectors = minimise(
+        Problem(system=system, terms=[GoalTerm(goals)], schedule=schedule), prior, np.zeros((system.K, 3))
+    )
+    assert np.linalg.norm(system.moved(vectors) - goals, axis=1).mean() < 0.01
