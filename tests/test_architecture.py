@@ -37,6 +37,7 @@ OWNERS = {
     "distributed": {"collections"},
     "embreex": {"render"},
     "fast_simplification": {"shapes"},
+    "filelock": {"locks"},
     "fsspec": {"collections"},
     "jaxtyping": {"arrays"},
     "matplotlib": {"render"},

@@ -232,7 +232,7 @@ def test_a_lock_ends_with_its_owner(tmp_path: Path) -> None:
                 os.kill(child, 0)  # the forked one is still there
         finally:
             os.kill(child, signal.SIGKILL)
-    with pytest.raises(OutputError, match="cannot write"), locked(tmp_path / "no" / "lock", "busy", ""):
+    with pytest.raises(OutputError, match="cannot write"), locked(path / "lock", "busy", ""):
         pytest.fail("there is no such folder")
 
 
