@@ -36,16 +36,6 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
 
 
-@pytest.fixture(scope="session", autouse=True)
-def shared_files(run_folder: Path) -> Iterator[None]:
-    """Tests leave nothing in their user's cache: what loads a model here shares its weights in the folder of the run."""
-    from meshmatch.models import shared_weights
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shared_weights, "shared_file", lambda name: run_folder / "weights" / f"{name}.float32")
-        yield
-
-
 @contextmanager
 def remembering(folder: Path) -> Iterator[Callable[..., Any]]:
     """Fit no shape with the same model and choices twice: `folder` keeps the fits, for other tests and processes.

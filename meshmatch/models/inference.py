@@ -21,7 +21,6 @@ from meshmatch.fields.shape_functions import has_nodes
 from meshmatch.geometry.oriented import nearest, quick_tree
 from meshmatch.models.checkpoint import load_weights
 from meshmatch.models.network import POINT_SIZES, Network, NetworkConfig, weight_shapes
-from meshmatch.models.shared_weights import shared_weights
 from meshmatch.threads import parallel_map
 
 if TYPE_CHECKING:
@@ -30,17 +29,13 @@ if TYPE_CHECKING:
 _EPSILON = np.float32(1e-5)  # of layer and batch norms, as in torch
 
 
-def load_network(path: str | Path, config: NetworkConfig, K: int, shared_as: tuple[str, str] | None = None) -> Network:
+def load_network(path: str | Path, config: NetworkConfig, K: int) -> Network:
     """A network for K nodes with the weights of a file, in evaluation mode. A pointwise one needs torch.
 
-    With ``shared_as``, name and sha256 of the file, processes share the weights (`models.shared_weights`). `ModelError` if
-    the file is damaged, or holds the weights of another network.
+    `ModelError` if the file is damaged, or holds the weights of another network.
     """
     if has_nodes(config.field):
-        shapes = weight_shapes(config, K)
-        if shared_as is None:
-            return NodeNetwork(config, load_weights(path, shapes))
-        return NodeNetwork(config, shared_weights(*shared_as, shapes, lambda: load_weights(path, shapes)))
+        return NodeNetwork(config, load_weights(path, weight_shapes(config, K)))
     with needs("torch", "train"):
         from meshmatch.models.deformer import blank_deformer, with_weights
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import shutil
 import threading
-from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import lru_cache, partial
@@ -141,7 +140,7 @@ def check_weights(folder: Path, card: ModelCard | ImplicitCard) -> None:
 
 
 def load_model(name: str | Path = "human") -> TrainedModel:
-    """Load a model; processes share the weights of a model of the registry.
+    """Load a model.
 
     Parameters
     ----------
@@ -170,9 +169,8 @@ def load_model(name: str | Path = "human") -> TrainedModel:
     from meshmatch.models.trained import trained_model  # torch
 
     folder, card = find_model(name)
-    shared_as = folder.name if _is_registered(folder) else None
-    again = partial(_unpickled, shared_as or os.path.abspath(folder), card)
-    return trained_model(card, folder / TEMPLATE, folder / WEIGHTS, shared_as, again)
+    known_as = folder.name if _is_registered(folder) else os.path.abspath(folder)
+    return trained_model(card, folder / TEMPLATE, folder / WEIGHTS, partial(_unpickled, known_as, card))
 
 
 def load_once(name: str | Path) -> TrainedModel:
@@ -265,13 +263,9 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
 
 def remove_model(name: str) -> None:
     """Remove one of the user's own models: `ModelError` if there is no such model, `OutputError` if it cannot be done."""
-    from meshmatch.models.shared_weights import shared_file
-
     folder = _registered(name)
     if folder.parent == built_in_folder():
         raise ModelError(f"{name} is a built-in model and cannot be removed", "only models that you added can be")
-    with suppress(OSError):  # of no use to anybody, and replaced if it stays
-        shared_file(name).unlink(missing_ok=True)
     with changing(user_folder(), _ELSEWHERE):
         try:
             if folder.is_symlink():

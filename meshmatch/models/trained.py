@@ -90,16 +90,11 @@ def torch_network(model: TrainedModel, device: str = "cpu") -> Deformer:
 
 
 def trained_model(
-    card: ModelCard,
-    template_file: Path,
-    weights_file: Path,
-    shared_as: str | None = None,
-    load_again: Callable[[], TrainedModel] | None = None,
+    card: ModelCard, template_file: Path, weights_file: Path, load_again: Callable[[], TrainedModel] | None = None
 ) -> TrainedModel:
     """The model of a card, from files that are safe to read; `meshmatch.models.registry.load_model` finds them.
 
-    Processes share the weights under the name ``shared_as``, where there is one. ``load_again`` is what a pickle of the
-    model holds, a function that survives it.
+    ``load_again`` is what a pickle of the model holds, a function that survives it.
 
     `ModelError` for a kernel that is not known here, weights that are not those of the card's network, or a template that
     is not the one the model was trained with; `TemplateError` if its file is damaged.
@@ -112,8 +107,7 @@ def trained_model(
     if card.field["kernel"] not in KERNELS:
         problem = f"model {card.name} has the kernel {card.field['kernel']!r}, not {' or '.join(KERNELS)}"
         raise ModelError(problem, "it may need a newer meshmatch: update it")
-    shared = None if shared_as is None else (shared_as, card.weights_sha256)
-    network = load_network(weights_file, NetworkConfig.from_dict(card.network), template.K, shared)
+    network = load_network(weights_file, NetworkConfig.from_dict(card.network), template.K)
     made = TrainedModel(card, template, network)
     object.__setattr__(made, "load_again", load_again)
     return made
