@@ -12,7 +12,7 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.build import judged_by_pairs
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.repair import Repaired
-from meshmatch.threads import one_of, thread_limit
+from meshmatch.threads import thread_limit, worker_slot
 
 _UNKNOWN = "no installed model knows these shapes: they were matched directly"
 _UNUSED = "up, front and partial have no meaning without a model, and were not used"
@@ -38,7 +38,7 @@ def match_without_model(
     pairs = None if landmarks is None else landmark_vertices(clean, landmarks)
     known = None if pairs is None else (source.original.verts[pairs[0]], target.original.verts[pairs[1]])
     config = direct.DirectConfig(seed=configs[0].seed)
-    with thread_limit(1), one_of(threading.Semaphore(threads)):
+    with thread_limit(1), worker_slot(threading.Semaphore(threads)):
         found = direct.match_directly(source.shape, target.shape, config, known, progress)
         fits = replace(found.source, repaired=source), replace(found.target, repaired=target)
         mapped = map_of_fits(fits, fits, threads)

@@ -41,7 +41,7 @@ from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
-from meshmatch.threads import beside
+from meshmatch.threads import parallel_map
 
 KnownPairs = tuple[Float[Floats, "N 3"], Float[Floats, "N 3"]]
 """Positions on the source and on the target that belong together."""
@@ -50,16 +50,8 @@ _NEAR = 3  # vertices of the coarse mesh by which one of the fine mesh moves
 
 
 def _pairs(steps: int, prior: tuple[float, float], scale: tuple[float, float], back: int) -> NodeRefineConfig:
-    return NodeRefineConfig(
-        steps=steps,
-        strain_first=prior[0],
-        strain_last=prior[1],
-        scale_first=scale[0],
-        scale_last=scale[1],
-        damping=1e-6,
-        point_share=0.1,
-        back_points=back,
-    )
+    schedule = Schedule(steps=steps, prior=prior, scale=scale, damping=1e-6)
+    return NodeRefineConfig(schedule=schedule, point_share=0.1, back_points=back)
 
 
 _COARSE_NODES = SurfaceNodes(K=120, radius=0.2, gradient_points=400)
@@ -216,7 +208,7 @@ def match_directly(
     shapes = [Shape(frame.apply(each.verts), each.faces) for frame, each in zip(frames, (source, target), strict=True)]
     if known is not None:
         known = frames[0].apply(known[0]), frames[1].apply(known[1])
-    coarse = beside(ThinMesh.of, shapes, [config.coarse] * 2)
+    coarse = parallel_map(ThinMesh.of, shapes, [config.coarse] * 2)
     report(0.05)
     proposals = _proposals(coarse, report.between(0.05, 0.4))
     samples = sample_surface(shapes[1], config.samples, np.random.default_rng(config.seed))
@@ -257,9 +249,9 @@ def _screened(
         return _Tried(proposal, vectors, level.system.moved(vectors), features)
 
     fewer, few = samples.first(config.fewer), samples.first(config.few)
-    first = beside(lambda each: fit(each, fewer, level.onto(each.points, _ONTO), config.first), proposals)
+    first = parallel_map(lambda each: fit(each, fewer, level.onto(each.points, _ONTO), config.first), proposals)
     better = _distinct(first, config.better, config.unlike)
-    return beside(lambda each: fit(each.proposal, few, each.vectors, config.second), better)
+    return parallel_map(lambda each: fit(each.proposal, few, each.vectors, config.second), better)
 
 
 def _finished(
@@ -279,7 +271,7 @@ def _finished(
         report(0.9)
         return _Tried(each.proposal, vectors, fine.system.moved(vectors), features)
 
-    return sorted(beside(fit, chosen), key=lambda each: each.features.energy)
+    return sorted(parallel_map(fit, chosen), key=lambda each: each.features.energy)
 
 
 def _decided(
@@ -297,7 +289,7 @@ def _decided(
         vectors = fine.refined(samples, each.vectors, config.last, fine.viscous)
         return fine.features(samples, vectors, pairs).energy, vectors
 
-    ends = beside(last, close)
+    ends = parallel_map(last, close)
     energies = [energy for energy, _ in ends]
     chosen = int(np.argmin(energies))
     best = close[chosen]

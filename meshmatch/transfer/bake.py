@@ -85,7 +85,7 @@ class BakeOptions:
             ("workers", 1, 4096, "one for each core is enough"),
         ):
             value = getattr(self, name)
-            if not isinstance(value, Integral) or not low <= value <= high:
+            if not isinstance(value, Integral) or not low <= int(value) <= high:
                 raise OptionError(f"{name} must be an integer from {low} to {high}, not {value!r}", hint)
         if self.padding > self.size // 4:
             problem = f"padding of {self.padding} texels is not possible with {self.size}"

@@ -250,6 +250,12 @@ LINES = {
 """The lines of figure 6: whose model, by which method, after how many steps."""
 
 
+def _with_steps(how: LatentRefineConfig | NodeRefineConfig, steps: int) -> LatentRefineConfig | NodeRefineConfig:
+    if isinstance(how, LatentRefineConfig):
+        return replace(how, steps=steps)
+    return replace(how, schedule=replace(how.schedule, steps=steps))
+
+
 def descend(
     models: Mapping[Run, TrainedModel],
     setting: Setting,
@@ -272,10 +278,10 @@ def descend(
         how = refinement_of(run, method, measure)
         assert how is not None
         errors, seconds = [], []
-        refined(model, starts[0], replace(how, steps=1), measure.seed)  # what is made once is no step's
+        refined(model, starts[0], _with_steps(how, 1), measure.seed)  # what is made once is no step's
         for steps in counts:
             began = time.process_time()
-            changed: Refinement = replace(how, steps=steps) if steps else None
+            changed: Refinement = _with_steps(how, steps) if steps else None
             rows = [refined(model, start, changed, measure.seed) for start in starts]
             seconds.append(round((time.process_time() - began) / bodies, 4))
             off = [

@@ -107,7 +107,7 @@ def look_arrays(look: Appearance, shape: Shape, part: Drawn) -> tuple[Arrays, di
     if look.textured or len(look.materials) > 1:
         light = colors_of_vertices(shape, look, shape, VertexMap.identity(shape))
     else:
-        light = look.materials[0].factor * (np.ones((shape.V, 4)) if look.colors is None else look.colors)
+        light = np.asarray(look.materials[0].factor) * (np.ones((shape.V, 4)) if look.colors is None else look.colors)
     return {"paint": scaled(to_srgb(light[part.vertex, :3]), np.uint8)}, None
 
 
