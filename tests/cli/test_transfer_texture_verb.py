@@ -176,7 +176,7 @@ def test_doubt_is_kept_filled_or_left_blank(run: Run, pair: Path) -> None:
     kept = run(*call("--json", map="doubt.npz"))
     record = json.loads(well(kept).out)
     assert record["low_confidence_share"] == pytest.approx(share, abs=0.08)
-    assert "has less confidence than 0.3: kept as it is" in kept.err
+    assert "has less confidence than 0.3: kept" in kept.err
     top = np.array([[0.0, 0.0, 1.0]])
     was = seen("out.glb", top)
 
