@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from meshmatch.api.interpolation import Interpolation as Interpolation
     from meshmatch.api.interpolation import InterpolationOptions as InterpolationOptions
     from meshmatch.api.interpolation import interpolate as interpolate
-    from meshmatch.api.matching import Matcher as Matcher
+    from meshmatch.api.matcher import Matcher as Matcher
     from meshmatch.api.matching import match as match
     from meshmatch.api.matching import register as register
     from meshmatch.api.pictures import picture as picture
@@ -40,10 +40,9 @@ if TYPE_CHECKING:
     from meshmatch.fitting.fit_config import FitConfig as FitConfig
     from meshmatch.geometry.frames import Frame as Frame
     from meshmatch.implicit.codes import fit_implicit as fit_implicit
-    from meshmatch.implicit.model import ImplicitFit as ImplicitFit
+    from meshmatch.implicit.fit import ImplicitFit as ImplicitFit
     from meshmatch.implicit.model import ImplicitModel as ImplicitModel
     from meshmatch.implicit.model import load_implicit as load_implicit
-    from meshmatch.implicit.sequence import implicit_sequence as implicit_sequence
     from meshmatch.implicit.training import train_implicit as train_implicit
     from meshmatch.maps.files import load_map as load_map
     from meshmatch.maps.files import save_map as save_map
@@ -56,52 +55,35 @@ if TYPE_CHECKING:
     from meshmatch.training.train import train as train
     from meshmatch.transfer.bake import BakeOptions as BakeOptions
 
-_HOMES = {
-    "Atlas": "meshmatch.collections.atlas",
-    "BakeOptions": "meshmatch.transfer.bake",
-    "Collection": "meshmatch.collections.collection",
-    "ConfidenceRule": "meshmatch.api.results",
-    "Fit": "meshmatch.fitting.fit",
-    "FitConfig": "meshmatch.fitting.fit_config",
-    "Frame": "meshmatch.geometry.frames",
-    "ImplicitFit": "meshmatch.implicit.model",
-    "ImplicitModel": "meshmatch.implicit.model",
-    "Interpolation": "meshmatch.api.interpolation",
-    "InterpolationOptions": "meshmatch.api.interpolation",
-    "MatchResult": "meshmatch.api.results",
-    "Matcher": "meshmatch.api.matching",
-    "MeshmatchError": "meshmatch.errors",
-    "MeshmatchWarning": "meshmatch.errors",
-    "Shape": "meshmatch.shapes.shape",
-    "TexturedResult": "meshmatch.api.texture",
-    "Transferred": "meshmatch.api.results",
-    "VertexMap": "meshmatch.maps.vertex_map",
-    "evaluate": "meshmatch.api.results",
-    "find_maps": "meshmatch.api.transfer",
-    "fit_implicit": "meshmatch.implicit.codes",
-    "implicit_sequence": "meshmatch.implicit.sequence",
-    "interpolate": "meshmatch.api.interpolation",
-    "load_implicit": "meshmatch.implicit.model",
-    "load_map": "meshmatch.maps.files",
-    "load_model": "meshmatch.models.registry",
-    "load_shape": "meshmatch.shapes.files",
-    "match": "meshmatch.api.matching",
-    "measure_atlas": "meshmatch.collections.measures",
-    "picture": "meshmatch.api.pictures",
-    "prepare": "meshmatch.templates.prepare",
-    "register": "meshmatch.api.matching",
-    "save_map": "meshmatch.maps.files",
-    "save_shape": "meshmatch.shapes.files",
-    "train": "meshmatch.training.train",
-    "train_implicit": "meshmatch.implicit.training",
-    "transfer_colors": "meshmatch.api.transfer",
-    "transfer_labels": "meshmatch.api.transfer",
-    "transfer_landmarks": "meshmatch.api.transfer",
-    "transfer_texture": "meshmatch.api.texture",
-    "transfer_values": "meshmatch.api.transfer",
-    "transfer_weights": "meshmatch.api.transfer",
-    "view": "meshmatch.api.pictures",
+_NAMES = {
+    "api.interpolation": "Interpolation InterpolationOptions interpolate",
+    "api.matcher": "Matcher",
+    "api.matching": "match register",
+    "api.pictures": "picture view",
+    "api.results": "ConfidenceRule MatchResult Transferred evaluate",
+    "api.texture": "TexturedResult transfer_texture",
+    "api.transfer": "find_maps transfer_colors transfer_labels transfer_landmarks transfer_values transfer_weights",
+    "collections.atlas": "Atlas",
+    "collections.collection": "Collection",
+    "collections.measures": "measure_atlas",
+    "errors": "MeshmatchError MeshmatchWarning",
+    "fitting.fit": "Fit",
+    "fitting.fit_config": "FitConfig",
+    "geometry.frames": "Frame",
+    "implicit.codes": "fit_implicit",
+    "implicit.fit": "ImplicitFit",
+    "implicit.model": "ImplicitModel load_implicit",
+    "implicit.training": "train_implicit",
+    "maps.files": "load_map save_map",
+    "maps.vertex_map": "VertexMap",
+    "models.registry": "load_model",
+    "shapes.files": "load_shape save_shape",
+    "shapes.shape": "Shape",
+    "templates.prepare": "prepare",
+    "training.train": "train",
+    "transfer.bake": "BakeOptions",
 }
+_HOMES = {name: f"meshmatch.{module}" for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = ["__version__", *sorted(_HOMES)]  # noqa: PLE0604  (names come from __getattr__)
 

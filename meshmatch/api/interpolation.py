@@ -8,11 +8,12 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
+from meshmatch.api.matching import matcher_for
 from meshmatch.api.results import shape_of
 from meshmatch.arrays import Brief
 from meshmatch.errors import OptionError
@@ -28,6 +29,11 @@ from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shapes, save_shape
 from meshmatch.shapes.shape import Floats, Shape
 from meshmatch.threads import thread_limit
+
+if TYPE_CHECKING:
+    from meshmatch.api.implicit import ImplicitMatcher
+    from meshmatch.implicit.fit import ImplicitFit
+    from meshmatch.implicit.model import ImplicitModel
 
 Mesh = Literal["source", "template"]
 Place = Literal["auto", "files", "source"]
@@ -53,6 +59,8 @@ class InterpolationOptions:
         What is blended: the rotation and stretch of the "field" everywhere, or the network's "codes".
     place
         Where the shapes lie, see `Interpolation`; "auto" is "files" where their sizes differ by less than a half.
+    resolution
+        Of an implicit model's surfaces: cells along each side of the cube, an even number from 8 to 512.
 
     Raises
     ------
@@ -71,6 +79,7 @@ class InterpolationOptions:
     mesh: Mesh = "source"
     way: Way = "field"
     place: Place = "auto"
+    resolution: int = 64
 
     def __post_init__(self) -> None:
         for name in ("start", "stop"):
@@ -87,22 +96,26 @@ class InterpolationOptions:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A shape of a sequence, at 0 the source, at 1 the target; ``rotation`` (3, 3) leads to the axes of the template."""
+    """A shape of a sequence, at 0 the source, at 1 the target; ``rotation`` (3, 3) leads to the axes of the template. An
+    implicit model knows neither that nor a deviation.
+    """
 
     time: float
     shape: Shape
-    deviation: Deviation
-    rotation: np.ndarray
+    deviation: Deviation | None = None
+    rotation: np.ndarray | None = None
 
     @property
     def record(self) -> dict[str, float]:
-        """Time and deviations, for JSON."""
+        """Time and deviations, or the number of vertices where shapes share none, for JSON."""
+        if self.deviation is None:
+            return {"time": round(self.time, 9), "vertices": self.shape.V}
         return {"time": round(self.time, 9)} | {key: round(value, 6) for key, value in asdict(self.deviation).items()}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Interpolation(Brief):
-    """A sequence of shapes with the same vertices and faces.
+    """A sequence of shapes with the same vertices and faces; by an implicit model, each has its own.
 
     Attributes
     ----------
@@ -116,7 +129,8 @@ class Interpolation(Brief):
         From where the first file has the shape to where the last has it ("files"), or all in the frame and unit of the
         first ("source").
     to_target
-        Mean distance of the moved vertices at time 1 to the last shape's surface, in units of sqrt(area).
+        Mean distance of the moved vertices at time 1 to the last shape's surface, in units of sqrt(area); None by an
+        implicit model.
     seconds
         Wall time.
     notes
@@ -130,10 +144,10 @@ class Interpolation(Brief):
     """
 
     steps: tuple[Step, ...]
-    fits: tuple[Fit, ...]
+    fits: tuple[Fit | ImplicitFit, ...]
     times: tuple[float, ...]
     place: Place
-    to_target: float
+    to_target: float | None
     seconds: float
     notes: tuple[str, ...]
 
@@ -143,7 +157,7 @@ def interpolate(
     frames: int = 9,
     *,
     options: InterpolationOptions | None = None,
-    model: str | Path | TrainedModel = AUTO,
+    model: str | Path | TrainedModel | ImplicitModel = AUTO,
     config: FitConfig | Sequence[FitConfig] | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
@@ -185,13 +199,16 @@ def interpolate(
     """
     began = time.monotonic()
     options = options or InterpolationOptions()
-    shapes = as_shapes(shapes)
+    matcher = matcher_for(model, None, threads, progress)
+    if isinstance(matcher, Matcher):
+        shapes = as_shapes(shapes)
     for count, what in ((len(shapes), "two shapes to go between"), (frames, "two shapes to make")):
         if not isinstance(count, Integral):
             raise OptionError(f"the number of shapes to make must be an integer, not {count!r}", "give 2 or more")
         if count < 2:
             raise OptionError(f"a sequence needs at least {what}, not {count}", "give two or more")
-    matcher = Matcher(model, None, threads, progress)
+    if not isinstance(matcher, Matcher):
+        return _surfaces(matcher, shapes, frames, options, config)
     fits = matcher.fit_all(shapes, config)
     notes = tuple(dict.fromkeys(note for fit in fits for note in fit.notes))
     with thread_limit(1):
@@ -203,6 +220,35 @@ def interpolate(
     return Interpolation(
         steps, tuple(fits), tuple(blend.times.tolist()), place, distance, time.monotonic() - began, notes
     )
+
+
+def _surfaces(
+    matcher: ImplicitMatcher,
+    shapes: Sequence[ShapeLike],
+    frames: int,
+    options: InterpolationOptions,
+    config: FitConfig | Sequence[FitConfig] | None,
+) -> Interpolation:
+    """By the codes of an implicit model: each shape has a surface of its own."""
+    from meshmatch.api.implicit import refuse_changed
+    from meshmatch.implicit.model import check_resolution
+
+    began = time.monotonic()
+    refuse_changed(options, ("start", "stop", "resolution"))
+    check_resolution(options.resolution)
+    if len(shapes) != 2:
+        raise OptionError("an implicit model passes no shapes on the way", "give two shapes")
+    moments = np.linspace(options.start, options.stop, frames).tolist()
+    fits = matcher.fit_all(shapes, config)
+    steps = []
+    for number, moment in enumerate(moments):
+        with thread_limit(1):
+            blended = matcher.model.blend(fits[0], fits[1], moment)
+            steps.append(Step(moment, matcher.model.surface(blended, options.resolution)))
+        if matcher.progress is not None:
+            matcher.progress("surfaces", "sequence", (number + 1) / frames)
+    notes = (*fits[0].notes, *fits[1].notes)
+    return Interpolation(tuple(steps), tuple(fits), (0.0, 1.0), "files", None, time.monotonic() - began, notes)
 
 
 def _steps(

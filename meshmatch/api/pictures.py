@@ -212,9 +212,10 @@ def _rotations(
     source: ShapeLike, maps: MapPair, up: str | None, front: str | None
 ) -> tuple[Floats | None, Floats | None]:
     """How the shapes stand: as they were fitted, if well; else the source as the user or its format says."""
-    if maps.match is not None and maps.forward.verdict != "poor":
+    first, second = maps.rotations
+    if first is not None and second is not None and maps.forward.verdict != "poor":
         # The frame of a fit follows the trunk; what stands is to stay on its ground.
-        pairs = zip((maps.source, maps.target), maps.match.rotations, strict=True)
+        pairs = (maps.source, first), (maps.target, second)
         first, second = (facing_alike(shape, shape.verts, shape.verts @ turn.T) for shape, turn in pairs)
         return first, second
     if up is not None or front is not None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +26,9 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.low_confidence import LowConfidence
 from meshmatch.transfer.mapped_mesh import invert_map
+
+if TYPE_CHECKING:
+    from meshmatch.implicit.fit import ImplicitFit
 
 T = TypeVar("T")
 
@@ -59,20 +62,23 @@ class MatchResult:
     """
 
     map: VertexMap
-    source_fit: Fit
-    target_fit: Fit
+    source_fit: Fit | ImplicitFit
+    target_fit: Fit | ImplicitFit
     seconds: float
     notes: tuple[str, ...]
-    before_agreement: tuple[Fit, Fit]
+    before_agreement: tuple[Fit | ImplicitFit, Fit | ImplicitFit]
     threads: int = 1
 
     def __repr__(self) -> str:
         return f"MatchResult({self.map!r}, {self.seconds:.1f} s, {len(self.notes)} notes)"
 
     @property
-    def rotations(self) -> tuple[Floats, Floats]:
-        """(3, 3) of source and target: from their files into the orientation of the template, for pictures."""
-        return self.source_fit.frame.turn, self.target_fit.frame.turn
+    def rotations(self) -> tuple[Floats | None, Floats | None]:
+        """(3, 3) of source and target: from their files into the orientation of the template, for pictures; an implicit
+        model knows none that is upright.
+        """
+        known = isinstance(self.source_fit, Fit)
+        return (self.source_fit.frame.turn, self.target_fit.frame.turn) if known else (None, None)
 
     def backward(self) -> VertexMap:
         """The map from target to source, made from the same fits: it pulls values from the source to the target.
@@ -118,12 +124,21 @@ class MapPair(Brief):
             return invert_map(self.forward, self.source, self.target, self.threads)
 
 
-def map_of_fits(fits: tuple[Fit, Fit], before: tuple[Fit, Fit], threads: int) -> VertexMap:
+def map_of_fits(
+    fits: tuple[Fit | ImplicitFit, Fit | ImplicitFit], before: tuple[Fit | ImplicitFit, Fit | ImplicitFit], threads: int
+) -> VertexMap:
     """The map from the shape of the first fit to that of the second. `OptionError` where the fits are of different
     templates, or do not know their shapes.
     """
-    source, target = (Places.of(shape_of(fit), fit, own, threads) for fit, own in zip(fits, before, strict=True))
-    return build_map(source, target, threads)
+    first, second = fits
+    if not isinstance(first, Fit) and not isinstance(second, Fit):
+        assert first.owner and first.source and second.source
+        return first.owner.match(first, second, first.source, second.source)
+    places = []
+    for fit, own in zip(fits, before, strict=True):
+        assert isinstance(fit, Fit) and isinstance(own, Fit)
+        places.append(Places.of(shape_of(fit), fit, own, threads))
+    return build_map(*places, threads)
 
 
 def shape_of(fit: Fit) -> Repaired:

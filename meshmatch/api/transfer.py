@@ -33,7 +33,7 @@ from meshmatch.transfer.low_confidence import LowConfidence, replace_low_labels,
 from meshmatch.transfer.vertex_files import SkinWeights, checked_colors, light_of, load_weights, weights_of
 
 if TYPE_CHECKING:
-    from meshmatch.api.matching import Matcher
+    from meshmatch.api.matcher import Matcher
 
 MapLike: TypeAlias = (
     "MatchResult | MapPair | VertexMap | str | Path | Matcher | Callable[[Shape, Shape], MatchResult | MapPair] | None"
@@ -76,7 +76,7 @@ def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> Ma
     if callable(found):
         found = found(source, target)
     elif not isinstance(found, VertexMap | MatchResult | MapPair):
-        from meshmatch.api.matching import Matcher
+        from meshmatch.api.matcher import Matcher
 
         matcher = Matcher() if found is None else found
         if not isinstance(matcher, Matcher):

@@ -8,16 +8,15 @@ from typer import Argument, Option
 
 import meshmatch
 from meshmatch.cli import words
-from meshmatch.cli.options import FitOptions, RunOptions, check_outputs, grouped, optional, output_option, refuse_given
+from meshmatch.cli.options import FitOptions, Options, RunOptions, check_outputs, grouped, optional, output_option
 from meshmatch.cli.words import Console, Json, print_json
-from meshmatch.errors import OptionError, needs
-from meshmatch.models.registry import check_model, implicit_folder
+from meshmatch.errors import OptionError
+from meshmatch.models.registry import check_model
 from meshmatch.outputs import folder_on_success, replace_on_success
-from meshmatch.threads import thread_limit
 
 
 @dataclass(frozen=True)
-class SequenceOptions:
+class SequenceOptions(Options):
     """What the shapes between two shapes are."""
 
     frames: int = Option(9, "--frames", "-n", min=2, max=1000, help="Number of shapes.")
@@ -66,7 +65,7 @@ def interpolate(
     """
     from meshmatch.api import interpolation
 
-    how.check()
+    how.check(not_implicit=["through", "mesh", "blend", "place", "plot"])
     suffix = "" if output.is_dir() else output.suffix.lower()
     if suffix not in ("", *_WRITERS):
         hint = "give a name without a suffix for a folder (see --format), or one that ends in .png or .html"
@@ -74,11 +73,11 @@ def interpolate(
     files = [source, *(sequence.through or []), target]
     check_outputs(files, output, chart=sequence.plot)
     options = interpolation.InterpolationOptions(
-        sequence.start, sequence.stop, sequence.mesh, sequence.blend, sequence.place
+        sequence.start, sequence.stop, sequence.mesh, sequence.blend, sequence.place, sequence.resolution
     )
-    if implicit_folder(how.model) is not None:
-        _interpolate_implicit(source, target, output, sequence, how, run)
-        return
+    if how.implicit and suffix in (".html", ".htm"):
+        hint = "give a name without a suffix for a folder, or one that ends in .png"
+        raise OptionError(f"{output.name}: surfaces of an implicit model share no vertices, as a page needs", hint)
     console = Console(run.quiet)
     # What cannot be written, a mistyped model and broken files are told before the long work.
     with (replace_on_success if suffix else folder_on_success)(output) as temporary:
@@ -100,60 +99,18 @@ def interpolate(
         else:
             interpolation.save_folder(temporary, result, sequence.format)
     _tell(console, result, files, sequence.place)
+    what = "surfaces" if how.implicit else f"shapes of {result.steps[0].shape.V} vertices"
     console.say(
-        f"wrote {output}: {sequence.frames} shapes of {result.steps[0].shape.V} vertices, from time "
-        f"{sequence.start:g} to {sequence.stop:g} ({result.seconds:.1f} s)"
+        f"wrote {output}: {sequence.frames} {what}, from time {sequence.start:g} to {sequence.stop:g} "
+        f"({result.seconds:.1f} s)"
     )
     if sequence.plot is not None:
         console.say(f"drew {sequence.plot}: how well each shape keeps volume and distances")
     if run.json:
-        chosen = {"mesh": sequence.mesh, "blend": sequence.blend}
+        chosen = {} if how.implicit else {"mesh": sequence.mesh, "blend": sequence.blend}
         print_json(
             {"output": output, "plot": sequence.plot} | _record(result, files) | chosen | how.record(result.fits[0])
         )
-
-
-def _interpolate_implicit(
-    source: Path, target: Path, output: Path, sequence: SequenceOptions, how: FitOptions, run: RunOptions
-) -> None:
-    """By the codes of an implicit model: each shape has a surface of its own."""
-    refuse_given(how, ("model", "seed"), "an implicit model")
-    refuse_given(sequence, ("frames", "start", "stop", "format", "resolution"), "an implicit model")
-    strip = not output.is_dir() and output.suffix.lower() == ".png"
-    if not strip and output.suffix and not output.is_dir():
-        hint = "give a name without a suffix for a folder, or one that ends in .png"
-        raise OptionError(
-            f"{output.name}: a page needs shapes that share vertices, and the surfaces of an implicit model do not",
-            hint,
-        )
-    with needs("torch", "implicit"):
-        from meshmatch.implicit.sequence import implicit_sequence, save_implicit_sequence
-    console = Console(run.quiet)
-    written = replace_on_success if strip else folder_on_success
-    with written(output) as temporary, thread_limit(1):  # tensors are small
-        with console.progress() as progress:
-            result = implicit_sequence(
-                how.model, source, target, sequence.frames, times=(sequence.start, sequence.stop),
-                resolution=sequence.resolution, seed=how.seed, progress=progress,
-            )  # fmt: skip
-        for fit in result.fits:
-            words.refuse_poor(run.strict, fit.verdict, fit.reasons)
-        if strip:
-            from meshmatch.render.figures import Panel
-            from meshmatch.render.picture import render_shapes
-
-            pairs = zip(result.times, result.shapes, strict=True)
-            render_shapes([Panel(shape, label=f"{time:.3g}") for time, shape in pairs], temporary)
-        else:
-            save_implicit_sequence(temporary, result, sequence.format)
-    for file, fit in zip((source, target), result.fits, strict=True):
-        words.tell_verdict(console, fit.verdict, fit.reasons, f"the fit of {file.name}")
-    console.say(f"wrote {output}: {sequence.frames} surfaces, from time {sequence.start:g} to {sequence.stop:g}")
-    if run.json:
-        files = source.name, target.name
-        fits = [words.implicit_record(*each) for each in zip(files, result.fits, strict=True)]
-        counts = {"vertices": [shape.V for shape in result.shapes], "model": how.model, "seed": how.seed}
-        print_json({"output": output, "times": result.times, "fits": fits} | counts)
 
 
 def _draw_strip(path: Path, result: "meshmatch.Interpolation", met: dict[float, str]) -> None:
@@ -172,8 +129,10 @@ def _write_page(path: Path, result: "meshmatch.Interpolation", met: dict[float, 
 
     shapes = [step.shape for step in result.steps]
     times = [step.time for step in result.steps]
+    rotation = result.steps[0].rotation
+    assert rotation is not None
     title = " → ".join(met.values())
-    write_motion(path, shapes, times, rotation=result.steps[0].rotation, met=met, title=title)
+    write_motion(path, shapes, times, rotation=rotation, met=met, title=title)
 
 
 _WRITERS = {".png": _draw_strip, ".html": _write_page, ".htm": _write_page}
@@ -183,10 +142,11 @@ def _plot(path: Path, result: "meshmatch.Interpolation", met: dict[float, str]) 
     from meshmatch.render.charts import draw_lines
 
     times = [step.time for step in result.steps]
+    deviations = [step.deviation for step in result.steps if step.deviation is not None]
     marks = {time: name for time, name in met.items() if times[0] <= time <= times[-1]}
     lines = {
-        "volume: |det F - det S|": (times, [step.deviation.volume for step in result.steps]),
-        "rigidity: |F'F - S'S|": (times, [step.deviation.arap for step in result.steps]),
+        "volume: |det F - det S|": (times, [each.volume for each in deviations]),
+        "rigidity: |F'F - S'S|": (times, [each.arap for each in deviations]),
     }
     xlabel = "time (S is the stretch that the shapes themselves have)"
     draw_lines(lines, path, xlabel, "mean deviation over the surface", marks)
@@ -199,10 +159,13 @@ def _tell(console: Console, result: "meshmatch.Interpolation", files: list[Path]
         words.tell_verdict(console, fit.verdict, fit.reasons, f"the fit of {file.name}")
     if asked == "auto" and result.place == "source":
         console.say(f"the files differ much in size: all shapes are in the place and unit of {files[0].name}")
-    worst = max(result.steps, key=lambda step: step.deviation.arap)
+    deviations = [step.deviation for step in result.steps if step.deviation is not None]
+    if result.to_target is None or not deviations:
+        return
+    worst = max(deviations, key=lambda each: each.arap)
     console.say(
         f"at time 1 the mesh is {100 * result.to_target:.2f} % of {files[-1].name}'s size (the root of its area) away "
-        f"from it; volume is off by {worst.deviation.volume:.3f} and rigidity by {worst.deviation.arap:.3f} at most"
+        f"from it; volume is off by {worst.volume:.3f} and rigidity by {worst.arap:.3f} at most"
     )
 
 
@@ -210,8 +173,8 @@ def _record(result: "meshmatch.Interpolation", files: list[Path]) -> Json:
     shapes = []
     for file, time, fit in zip(files, result.times, result.fits, strict=True):
         about = words.fit_record(str(file), fit)
-        del about["residual"], about["seconds"], about["seed"]
         shapes.append(about | {"time": round(time, 9)})
-    record: Json = {"shapes": shapes, "place": result.place, "vertices": result.steps[0].shape.V}
-    record |= {"frames": [step.record for step in result.steps], "distance_to_target": round(result.to_target, 6)}
+    record: Json = {"shapes": shapes, "place": result.place, "frames": [step.record for step in result.steps]}
+    if result.to_target is not None:
+        record |= {"vertices": result.steps[0].shape.V, "distance_to_target": round(result.to_target, 6)}
     return record | {"notes": result.notes, "seconds": round(result.seconds, 3)}

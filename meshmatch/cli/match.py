@@ -7,21 +7,11 @@ from typer import Argument, Option
 
 import meshmatch
 from meshmatch.cli import options, words
-from meshmatch.cli.options import (
-    FitOptions,
-    PairOptions,
-    RunOptions,
-    check_outputs,
-    grouped,
-    optional,
-    output_option,
-    refuse_given,
-)
+from meshmatch.cli.options import FitOptions, PairOptions, RunOptions, check_outputs, grouped, optional, output_option
 from meshmatch.cli.words import Console, print_json, print_rows
-from meshmatch.errors import OptionError, needs
-from meshmatch.models.registry import check_model, implicit_folder
+from meshmatch.errors import OptionError
+from meshmatch.models.registry import check_model
 from meshmatch.outputs import replace_on_success
-from meshmatch.threads import thread_limit
 
 if TYPE_CHECKING:
     from meshmatch.maps.evaluate import Evaluation
@@ -50,9 +40,6 @@ def match(
     how.check()
     check_suffix(output)
     check_outputs([source, target, how.known_pairs], output, picture=picture)
-    if implicit_folder(how.model) is not None:
-        _match_implicit(source, target, output, how, run, picture)
-        return
     console, names = Console(run.quiet), words.names_of([source, target])
     # What cannot be written, a mistyped model and broken files are told before the long work.
     with replace_on_success(output) as temporary:
@@ -86,41 +73,6 @@ def match(
         )
 
 
-def _match_implicit(
-    source: Path, target: Path, output: Path, how: PairOptions, run: RunOptions, picture: Path | None
-) -> None:
-    """Through the template of an implicit model; both shapes must stand as those of its training did."""
-    refuse_given(how, ("model", "seed"), "an implicit model")
-    with needs("torch", "implicit"):
-        from meshmatch.implicit.codes import fit_implicit
-        from meshmatch.implicit.model import load_implicit
-        from meshmatch.implicit.samples import read_source
-    console, names = Console(run.quiet), words.names_of([source, target])
-    with replace_on_success(output) as temporary, thread_limit(1):  # tensors are small
-        model = load_implicit(how.model)
-        (first, given_a), (second, given_b) = read_source(source), read_source(target)
-        shapes = first, second
-        with console.progress() as progress:
-            a, b = (fit_implicit(model, each, seed=how.seed, progress=progress) for each in (given_a, given_b))
-        found = model.match(a, b, *shapes)
-        words.refuse_poor(run.strict, found.verdict, found.reasons, "the map")
-        meshmatch.save_map(temporary, found)
-    if picture is not None:
-        from meshmatch.render.compose import compose_match
-
-        compose_match(*shapes, found).named(names).render(picture)
-    words.tell_verdict(console, found.verdict, found.reasons, "the map")
-    console.say(
-        f"wrote {output}: for each of the {found.source_vertices} vertices of {names[0]} its vertex of {names[1]}"
-    )
-    if picture is not None:
-        console.say(f"drew {picture}: corresponding points in one color")
-    if run.json:
-        fits = {"fits": [words.implicit_record(*each) for each in zip(names, (a, b), strict=True)]}
-        about = fits | {"model": how.model, "seed": how.seed}
-        print_json({"output": output, "picture": picture} | words.map_record(found, names) | about)
-
-
 @grouped
 def register(
     *,
@@ -139,28 +91,27 @@ def register(
     shapes have the same vertices and triangles in the same order. With more than one thread, results may differ in
     the last bits.
     """
+    from meshmatch.api.matching import matcher_for
     from meshmatch.shapes.files import check_suffix
 
-    how.check()
+    how.check(not_implicit=["dense"])
     check_suffix(output)
     check_outputs([shape], output, picture=picture)
-    if implicit_folder(how.model) is not None:
-        _register_implicit(shape, output, how, run, dense, picture)
-        return
     console = Console(run.quiet)
     with replace_on_success(output) as temporary:
         check_model(how.model)
         (loaded,) = how.load(shape)
-        matcher = meshmatch.Matcher(how.model, how.configs()[0], run.threads)
+        matcher = matcher_for(how.model, how.configs()[0], run.threads)
         with console.progress() as matcher.progress:
             fit = matcher.fit(loaded)
         words.refuse_poor(run.strict, fit.verdict, fit.reasons)
-        fitted = matcher.dense(fit) if dense else meshmatch.Shape(fit.points_in_file, fit.faces, output.stem)
+        plain = meshmatch.Shape(fit.points_in_file, fit.faces, output.stem)
+        fitted = matcher.dense(fit) if dense else plain  # type: ignore[arg-type]
         meshmatch.save_shape(temporary, fitted)
     if picture is not None:
         from meshmatch.render.compose import compose_fit
 
-        compose_fit(loaded, fitted, fit.frame.turn).render(picture)
+        compose_fit(loaded, fitted, None if how.implicit else fit.frame.turn).render(picture)
     console.say(*fit.notes)
     console.say(f"fitted the template of {fit.model} to {loaded.name}: {words.fit_words(fit)}")
     words.tell_verdict(console, fit.verdict, fit.reasons)
@@ -170,40 +121,6 @@ def register(
     if run.json:
         record = {"output": output, "picture": picture, "vertices": fitted.V, "faces": fitted.F, "dense": dense}
         print_json(record | how.record(fit) | words.fit_record(loaded.name, fit) | {"notes": list(fit.notes)})
-
-
-def _register_implicit(
-    shape: Path, output: Path, how: FitOptions, run: RunOptions, dense: bool, picture: Path | None
-) -> None:
-    """The template's surface of an implicit model, moved onto the shape."""
-    refuse_given(how, ("model", "seed"), "an implicit model")
-    if dense:
-        raise OptionError("--dense does not go with an implicit model", "leave it out")
-    with needs("torch", "implicit"):
-        from meshmatch.implicit.codes import fit_implicit
-        from meshmatch.implicit.model import load_implicit
-        from meshmatch.implicit.samples import read_source
-    console = Console(run.quiet)
-    with replace_on_success(output) as temporary, thread_limit(1):  # tensors are small
-        model = load_implicit(how.model)
-        loaded, given = read_source(shape)
-        with console.progress() as progress:
-            fit = fit_implicit(model, given, seed=how.seed, progress=progress)
-        words.refuse_poor(run.strict, fit.verdict, fit.reasons)
-        fitted = model.register(fit)
-        meshmatch.save_shape(temporary, fitted)
-    if picture is not None:
-        from meshmatch.render.compose import compose_fit
-
-        compose_fit(loaded, fitted).render(picture)
-    console.say(f"fitted the template of {model.card.name} to {loaded.name}: {fit.verdict} fit")
-    words.tell_verdict(console, fit.verdict, fit.reasons)
-    console.say(f"wrote {output}: {fitted.V} vertices, {fitted.F} faces")
-    if picture is not None:
-        console.say(f"drew {picture}: the template over the shape, and their distance")
-    if run.json:
-        record = {"output": output, "picture": picture, "vertices": fitted.V, "faces": fitted.F}
-        print_json(record | words.implicit_record(loaded.name, fit) | {"model": how.model, "seed": how.seed})
 
 
 def evaluate(

@@ -10,9 +10,8 @@ import typer
 from meshmatch.cli import options
 from meshmatch.cli.words import Console, print_json, print_rows, print_text
 from meshmatch.errors import ModelError
-from meshmatch.models import card as cards
 from meshmatch.models import registry
-from meshmatch.models.implicit_card import ImplicitCard, implicit_card_to_json
+from meshmatch.models.card import card_to_json
 
 models = typer.Typer(
     help="List, show, add, remove and verify trained models.", no_args_is_help=True, rich_markup_mode=None
@@ -59,8 +58,7 @@ def show(name: Name) -> None:
 
     It names template, data, licence, recipe, time, errors and hashes.
     """
-    card = registry.read_any_card(registry.locate_model(name))
-    print_text(implicit_card_to_json(card) if isinstance(card, ImplicitCard) else cards.card_to_json(card))
+    print_text(card_to_json(registry.read_any_card(registry.locate_model(name))))
 
 
 @models.command()

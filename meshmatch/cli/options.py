@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
-from typer import Argument, Option
+from typer import Argument, Context, Option
 
 import meshmatch
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit_config import Refine
-from meshmatch.models.registry import AUTO
+from meshmatch.models.registry import AUTO, implicit_folder
 from meshmatch.outputs import replace_on_success
 
 if TYPE_CHECKING:
@@ -71,15 +71,6 @@ def check_axes(up: Axis | None, front: Axis | None) -> None:
     """Refuse up and front along one axis (`OptionError`)."""
     if up is not None and front is not None and up[-1] == front[-1]:
         raise OptionError(f"up ({up}) and front ({front}) lie along one axis", "choose two different axes")
-
-
-def refuse_given(group: Any, allowed: Container[str], what: str) -> None:
-    """Refuse options of a group that are not as by default and not allowed (`OptionError`)."""
-    for each in fields(group):
-        default = getattr(each.default, "default", each.default)
-        if each.name not in allowed and getattr(group, each.name) != default:
-            said = getattr(each.default, "param_decls", None) or (f"--{each.name.replace('_', '-')}",)
-            raise OptionError(f"{said[0].split('/')[0]} does not go with {what}", "leave it out")
 
 
 def check_truth(truth: Path | None, points: tuple[Path, Path] | None) -> bool:
@@ -148,8 +139,21 @@ def load_truth(
     return np.arange(source.V), column
 
 
+class Options:
+    """A group of options."""
+
+    given: Mapping[str, str] = {}
+    """Names of all options and arguments of the verb that stand on the command line, and their spelling there."""
+
+    def refuse(self, names: Iterable[str], what: str, hint: str = "leave it out") -> None:
+        """Refuse options that were given and do not go with something (`OptionError`)."""
+        for name in names:
+            if name in self.given:
+                raise OptionError(f"{self.given[name]} does not go with {what}", hint)
+
+
 @dataclass(frozen=True)
-class FitOptions:
+class FitOptions(Options):
     """How a template is fitted."""
 
     model: str = Option(
@@ -203,16 +207,32 @@ class FitOptions:
         """Up and front of all shapes, or of each."""
         return ((self.up, self.front),)
 
+    @property
+    def implicit(self) -> bool:
+        """Whether the model is an implicit one."""
+        return implicit_folder(self.model) is not None
+
     def load(self, *paths: Path) -> list[meshmatch.Shape]:
-        """Shapes; of scenes that have meshes of the chosen names, with weight on these alone."""
+        """Shapes; of scenes that have meshes of the chosen names, with weight on these alone. For an implicit model also
+        samples.
+        """
+        if self.implicit:
+            from meshmatch.implicit.samples import load_source
+
+            return [load_source(path) for path in paths]
         from meshmatch.shapes.files import load_shapes
 
         return load_shapes(paths, only=self.only or (), without=self.without or ())
 
-    def check(self) -> None:
-        """Refuse up and front along one axis (`OptionError`), before anything is loaded."""
+    def check(self, not_implicit: Iterable[str] = ()) -> None:
+        """Refuse what does not go together (`OptionError`), before anything is loaded; ``not_implicit`` are options of the
+        verb that an implicit model does not obey, beside all of this group but the seed.
+        """
         for up, front in self.axes:
             check_axes(up, front)
+        if self.implicit:
+            own = {each.name for each in fields(self)} - {"model", "seed"}
+            self.refuse([*sorted(own), *not_implicit], "an implicit model")
 
     def configs(self) -> tuple[meshmatch.FitConfig, ...]:
         """The same for the library, one for each of `axes`."""
@@ -222,10 +242,10 @@ class FitOptions:
         plain = FitConfig(refine=self.refine, seed=self.seed, partial=partial, mirror=self.mirror, device=self.device)
         return tuple(replace(plain, up=up, front=front) for up, front in self.axes)
 
-    def record(self, fit: meshmatch.Fit) -> dict[str, str | int]:
+    def record(self, fit: meshmatch.Fit | meshmatch.ImplicitFit) -> dict[str, Any]:
         """For --json; a fit knows which model was chosen."""
         model = fit.model if self.model == AUTO else self.model
-        return {"model": model, "refine": self.refine, "seed": self.seed}
+        return {"model": model, "seed": self.seed} | ({} if self.implicit else {"refine": self.refine})
 
 
 @dataclass(frozen=True)
@@ -260,17 +280,9 @@ class PairOptions(FitOptions):
                 progress=report,
             )  # fmt: skip
 
-    @property
-    def given(self) -> list[str]:
-        """The options that only matching can obey, as far as they were given."""
-        names = ["up", "front", "source_up", "source_front", "target_up", "target_front", "partial", "mirror"]
-        names += ["only", "without"]
-        found = [f"--{name.replace('_', '-')}" for name in names if getattr(self, name) is not None]
-        return [*found, *(["--landmarks"] if self.known_pairs is not None else [])]
-
 
 @dataclass(frozen=True)
-class RunOptions:
+class RunOptions(Options):
     """How a verb that takes long behaves."""
 
     strict: bool = Option(False, "--strict", help="Write nothing and exit with status 1 if a fit or map is poor.")
@@ -280,7 +292,7 @@ class RunOptions:
 
 
 @dataclass(frozen=True)
-class RuleOptions:
+class RuleOptions(Options):
     """What is written where the map is not to be trusted."""
 
     fill: bool = Option(False, "--fill", help="Replace values of low confidence by those of their neighbours.")
@@ -309,11 +321,18 @@ def grouped(verb: Callable[..., None]) -> Callable[..., None]:
             options.append(parameter.replace(name=each.name, default=each.default, annotation=inside[each.name]))
 
     @wraps(verb)
-    def called(**given: Any) -> None:
+    def called(context: Context, **values: Any) -> None:
+        given = {
+            str(each.name): each.opts[0]
+            for each in context.command.params
+            if each.name and getattr(context.get_parameter_source(each.name), "name", "") == "COMMANDLINE"
+        }
         for name, group in groups.items():
-            given[name] = group(**{each.name: given.pop(each.name) for each in fields(group)})
-        verb(**given)
+            values[name] = group(**{each.name: values.pop(each.name) for each in fields(group)})
+            object.__setattr__(values[name], "given", given)
+        verb(**values)
 
+    options.append(inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=Context))
     called.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     called.__annotations__ = {each.name: each.annotation for each in options}
     return called

@@ -1,30 +1,38 @@
 """``meshmatch train``: a model that is learned from shapes."""
 
 import os
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from typer import Option
 
-from meshmatch.cli.options import Json, Quiet, Seed, Threads, check_writable, grouped, optional, output_option
-from meshmatch.cli.train_implicit import draw_reports, train_shapes
+from meshmatch.cli.options import Json, Options, Quiet, Seed, Threads, check_writable, grouped, optional, output_option
 from meshmatch.cli.words import Console, print_json
 from meshmatch.errors import OptionError, needs
-from meshmatch.models.card import read_card
-from meshmatch.models.registry import CARD
+from meshmatch.models.card import ModelCard
+from meshmatch.models.registry import read_any_card
 from meshmatch.threads import set_threads
 
 if TYPE_CHECKING:
     from meshmatch.generators.bodies import Bodies
     from meshmatch.generators.kinds import Kind
+    from meshmatch.implicit.network import Deformation
     from meshmatch.models.trained import TrainedModel
     from meshmatch.templates.prepared_folder import RegisteredShapes
     from meshmatch.training.loop import StepReport
 
+_ENERGIES = ("volume", "arap", "blend")
+_IMPLICIT = (
+    *("implicit", "preset", "shapes", "field", "rate", *_ENERGIES, "name", "category", "licence", "steps"),
+    *("minutes", "workers", "threads", "seed", "picture", "fresh"),
+)
+
 
 @dataclass(frozen=True)
-class TrainOptions:
+class TrainOptions(Options):
     """What is learned, and how."""
 
     template: str | None = optional(
@@ -134,29 +142,19 @@ def train(
     continues exactly from the checkpoint. On several GPUs: `torchrun --nproc-per-node N -m meshmatch train ...`.
     """
     with needs("torch", "train"):
-        from meshmatch.training import train as training
-        from meshmatch.training.recipes import going_on, recipe_for
+        from meshmatch.training.train import CHECKPOINT
 
     set_threads(how.threads)
-    if how.implicit:
-        train_shapes(output, how, json, Console(quiet))
-        return
     if how.picture is not None:
         from meshmatch.render.charts import check_chart
 
         check_chart(how.picture)
-    if how.picture is not None and how.picture.resolve().parent != output.resolve():  # which is not made yet
-        check_writable(how.picture)
+        if how.picture.resolve().parent != output.resolve():  # which is not made yet
+            check_writable(how.picture)
     first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs one speaks
     console = Console(quiet or not first)
-    settings = (
-        "field", "volume", "arap", "blend", "rate", "points", "steps", "minutes", "bf16", "workers", "threads", "seed",
-    )  # fmt: skip
-    fitted, start = _fits(how, console)
-    recipe = going_on(start) if start and fitted else recipe_for(how.shapes, how.preset, how.unsupervised, how.kind)
-    recipe = recipe.changed(**{name: getattr(how, name) for name in settings})
-    facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, start or how.start)
-    if not how.fresh and (output / training.CHECKPOINT).is_file():
+    steps, learn = (_implicit if how.implicit else _by_template)(output, how, console)
+    if not how.fresh and (output / CHECKPOINT).is_file():
         console.say(f"going on from the checkpoint in {output}; --fresh starts anew")
     reports: list[StepReport] = []
 
@@ -166,13 +164,53 @@ def train(
             console.say(f"{now.words} ({now.seconds:.0f} s)")
 
     with console.progress() as progress:
-        training.train(
-            output, shapes=fitted or how.shapes, kind=_generated(how), recipe=recipe, facts=facts, resume=not how.fresh,
-            progress=progress, report=report,
-        )  # fmt: skip
+        learn(resume=not how.fresh, progress=progress, report=report)
     if first:
-        draw_reports(console, how.picture, reports)
-        _summary(console, output, recipe.train.steps, how.picture, json)
+        if how.picture is not None:
+            _draw(console, how.picture, reports)
+        _summary(console, output, steps, how.picture, json)
+
+
+def _by_template(output: Path, how: TrainOptions, console: Console) -> tuple[int, Callable[..., Any]]:
+    """The steps of a training that deforms a template of vertices, and what runs it."""
+    from meshmatch.training import train as training
+    from meshmatch.training.recipes import going_on, recipe_for
+
+    settings = (
+        "field", "volume", "arap", "blend", "rate", "points", "steps", "minutes", "bf16", "workers", "threads", "seed",
+    )  # fmt: skip
+    fitted, start = _fits(how, console)
+    recipe = going_on(start) if start and fitted else recipe_for(how.shapes, how.preset, how.unsupervised, how.kind)
+    recipe = recipe.changed(**{name: getattr(how, name) for name in settings})
+    facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, start or how.start)
+    shapes, kind = fitted or how.shapes, _generated(how)
+    return recipe.train.steps, partial(training.train, output, shapes=shapes, kind=kind, recipe=recipe, facts=facts)
+
+
+def _implicit(output: Path, how: TrainOptions, console: Console) -> tuple[int, Callable[..., Any]]:
+    """The same of an implicit model."""
+    how.refuse(sorted({each.name for each in fields(how)}.difference(_IMPLICIT)), "--implicit")
+    if how.shapes is None or how.field == "rbf":
+        raise OptionError("--implicit needs --shapes, and the field mls or pointwise", "give a folder of shapes")
+    published = how.preset == "paper"
+    field: Deformation = "mls" if how.field == "mls" or not (how.field or published) else "pointwise"
+    if field == "pointwise":  # DIF-Net's deformation: these are energies of the other
+        how.refuse(_ENERGIES, f"--implicit {'--field pointwise' if how.field else '--preset paper'}")
+    with needs("torch", "implicit"):
+        from meshmatch.implicit.network import ImplicitConfig
+        from meshmatch.implicit.training import AS_PUBLISHED, DIF_NET, TRAINING, train_implicit
+        from meshmatch.training.train import CardFacts
+    usual = AS_PUBLISHED if published else TRAINING
+    loss, chosen = (
+        {name: value for name in names if (value := getattr(how, name)) is not None}
+        for names in (_ENERGIES, ("rate", "steps", "workers"))
+    )
+    training = replace(
+        usual, minutes=how.minutes, threads=how.threads, seed=how.seed, loss=replace(usual.loss, **loss), **chosen
+    )
+    config = replace(DIF_NET if published else ImplicitConfig(), field=field)
+    facts = CardFacts(how.name or "", how.category or "", "", how.licence)
+    return training.steps, partial(train_implicit, output, how.shapes, config=config, training=training, facts=facts)
 
 
 def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None, TrainedModel | None]":
@@ -187,7 +225,7 @@ def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None
     if how.preset != "default" or how.unsupervised:
         name = "--unsupervised" if how.unsupervised else f"--preset {how.preset}"
         raise OptionError(f"{name} does not go with fits", "training on fits continues the model that made them")
-    _refuse(how, ("template", "poses", "characters", "identities", "bodies"), "generated shapes, not with fits")
+    how.refuse(("template", "poses", "characters", "identities", "bodies"), "fits, but with generated shapes")
     collection = Collection(how.shapes)
     found = collection.to_learn()
     start = as_model(how.start or collection.model)
@@ -208,19 +246,26 @@ def _generated(how: TrainOptions) -> "Kind | Bodies | None":
         if how.shapes is not None and all(each is None for each in (how.kind, known, how.characters, how.bodies)):
             return None
         return Bodies(how.template, how.identities or Bodies.identities, known, how.characters, how.bodies)
-    _refuse(how, ("template", "poses", "characters", "bodies"), f"human bodies, not with --kind {how.kind}")
+    how.refuse(("template", "poses", "characters", "bodies"), f"--kind {how.kind}, but with human bodies")
     return Kind(str(how.kind), how.identities or Kind.identities)
 
 
-def _refuse(how: TrainOptions, names: tuple[str, ...], use: str) -> None:
-    """`OptionError` if an option of some names is given, which goes with another use of the command."""
-    for name in names:
-        if getattr(how, name) is not None:
-            raise OptionError(f"--{name} goes with {use}", f"leave out --{name}")
+def _draw(console: Console, picture: Path, reports: "list[StepReport]") -> None:
+    """The losses of a run."""
+    if not reports:
+        console.say(f"{picture} was not drawn: the run ended before its first report")
+        return
+    from meshmatch.render.charts import draw_losses
+
+    names = dict.fromkeys(name for now in reports for name in now.terms)
+    terms = {name: [now.terms.get(name, float("nan")) for now in reports] for name in names}
+    known = {now.step: now.validation for now in reports if now.validation is not None}
+    draw_losses(picture, [now.step for now in reports], terms, known)
+    console.say(f"drew {picture}: the losses over the steps")
 
 
 def _summary(console: Console, output: Path, steps: int, picture: Path | None, json: bool) -> None:
-    card = read_card(output / CARD)
+    card = read_any_card(output)
     console.say(
         f"wrote model {card.name}, learned from {card.data}, to {output} after step {card.steps}; use it with "
         f"--model {output}, or add it: meshmatch models add {output}"
@@ -229,4 +274,5 @@ def _summary(console: Console, output: Path, steps: int, picture: Path | None, j
         console.say(f"unfinished: step {card.steps:,} of {steps:,}; the same command goes on")
     if json:
         record = {"output": output, "picture": picture, "model": card.name, "steps": card.steps}
-        print_json(record | {"training_minutes": card.training_minutes, "metrics": card.metrics})
+        found = {"metrics": card.metrics} if isinstance(card, ModelCard) else {"shapes": len(card.shapes)}
+        print_json(record | {"training_minutes": card.training_minutes} | found)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from typer import Argument, Option
 
@@ -14,7 +14,6 @@ import meshmatch
 from meshmatch.cli import words
 from meshmatch.cli.options import PAIRS_HELP, PairOptions, RunOptions, check_outputs
 from meshmatch.cli.words import Console, Json, print_json
-from meshmatch.errors import OptionError
 from meshmatch.models.registry import check_model
 from meshmatch.outputs import replace_on_success
 
@@ -32,6 +31,10 @@ Picture = Annotated[Path | None, Option(metavar="PNG", help="Draw both shapes wi
 class MapOptions(PairOptions):
     """A map from a file, or how the shapes are matched."""
 
+    for_matching: ClassVar[tuple[str, ...]] = (
+        *("up", "front", "source_up", "source_front", "target_up", "target_front"),
+        *("partial", "mirror", "only", "without", "known_pairs"),
+    )
     map: Path | None = Option(
         None,
         "--map",
@@ -52,9 +55,7 @@ class MapOptionsWithPairs(MapOptions):
 class ViewMapOptions(MapOptions):
     """The same for the viewer, where the axes also say how a shape stands."""
 
-    @property
-    def given(self) -> list[str]:
-        return [name for name in super().given if name not in ("--up", "--front")]
+    for_matching = MapOptions.for_matching[2:]
 
 
 @dataclass
@@ -80,9 +81,9 @@ class Transfer:
         """
         files = files or [self.output]
         self.options.check()
-        if self.options.map is not None and self.options.given:
-            problem = f"{self.options.given[0]} controls matching, but --map supplies the map"
-            raise OptionError(problem, "leave one of them out")
+        if self.options.map is not None:
+            hint = "it controls matching, but --map supplies the map: leave one of them out"
+            self.options.refuse(self.options.for_matching, "--map", hint)
         check_outputs([self.source, self.target, self.options.map, read], *files, picture=self.picture)
         with ExitStack() as claims:  # the first is renamed last: it names the others
             temporary = [claims.enter_context(replace_on_success(file)) for file in files]

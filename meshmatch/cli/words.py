@@ -188,9 +188,9 @@ def why(reasons: Sequence[str]) -> str:
     return "; ".join(reasons) or "no reason was given"
 
 
-def fit_words(fit: meshmatch.Fit) -> str:
-    """The verdict and the axes."""
-    return f"{fit.verdict} fit, up {fit.up}, front {fit.front}"
+def fit_words(fit: meshmatch.Fit | meshmatch.ImplicitFit) -> str:
+    """The verdict, and the axes where the model knows them."""
+    return f"{fit.verdict} fit" + (f", up {fit.up}, front {fit.front}" if isinstance(fit, meshmatch.Fit) else "")
 
 
 def tell_match(console: Console, result: meshmatch.MatchResult, names: Sequence[str]) -> None:
@@ -200,17 +200,14 @@ def tell_match(console: Console, result: meshmatch.MatchResult, names: Sequence[
         console.say(f"{name}: {fit_words(fit)}")
 
 
-def implicit_record(name: str, fit: meshmatch.ImplicitFit) -> Json:
-    """What an implicit model found of one shape; what is not known is null."""
-    numbers = {key: getattr(fit, key) for key in ("residual", "missed", "invented")}
-    known = {key: None if math.isnan(value) else round(value, 4) for key, value in numbers.items()}
-    return {"shape": name, "verdict": fit.verdict, "reasons": list(fit.reasons)} | known
-
-
-def fit_record(name: str, fit: meshmatch.Fit) -> Json:
-    """A fit for --json."""
-    record = {"shape": name, "verdict": fit.verdict, "reasons": fit.reasons, "trust": round(fit.trust, 4)}
-    record["residual"] = float(fit.residual)
+def fit_record(name: str, fit: meshmatch.Fit | meshmatch.ImplicitFit) -> Json:
+    """A fit for --json; what an implicit model does not know is null."""
+    record: Json = {"shape": name, "verdict": fit.verdict, "reasons": fit.reasons}
+    if not isinstance(fit, meshmatch.Fit):
+        numbers = {key: getattr(fit, key) for key in ("residual", "missed", "invented")}
+        record |= {key: None if math.isnan(value) else round(value, 4) for key, value in numbers.items()}
+        return record | {"seconds": round(fit.seconds, 3), "seed": fit.seed}
+    record |= {"trust": round(fit.trust, 4), "residual": float(fit.residual)}
     record |= {"left_out_parts": fit.left_out[:_MOST_PARTS]} if fit.left_out else {}
     if fit.regularity is not None:
         record["regularity"] = {name: round(value, 5) for name, value in asdict(fit.regularity).items()}

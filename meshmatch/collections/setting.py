@@ -10,7 +10,7 @@ from functools import lru_cache
 from typing import Any
 
 from meshmatch.api.inputs import as_model, validated
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.collections.fit_files import StoredFit, load_fit
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError

@@ -1,28 +1,35 @@
 """The code of a shape that no training saw: found by gradient descent on its samples, the network as it is.
 
 As for the shapes of the training (an auto-decoder), there is no encoder. The descent begins with the code of the training
-whose distances fit the samples best.
+whose distances fit the samples best. Codes know one orientation: a shape that stands otherwise than those of the training is
+turned first, by the rotation of the cube that lets some shape of the training fit it best.
 """
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
+from itertools import permutations, product
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from meshmatch.arrays import Float
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
-from meshmatch.implicit.model import ImplicitFit, ImplicitModel, percent_of_side
+from meshmatch.geometry.frames import Frame
+from meshmatch.implicit.fit import ImplicitFit
+from meshmatch.implicit.model import ImplicitModel, percent_of_side
 from meshmatch.implicit.objective import PUBLISHED, ImplicitLoss
-from meshmatch.implicit.samples import is_samples, samples_of
-from meshmatch.models.implicit_card import ImplicitCard
+from meshmatch.implicit.samples import load_source, samples_of
+from meshmatch.models.card import ImplicitCard
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
 
 _SAMPLES, _POINTS, _FEW = 8192, 1024, 512  # of the shape, in a step, and to choose where to begin
 _RATE = 1e-2  # of codes of length 1
+_ASKED, _SHOWN = 32, 256  # codes of the training that are asked about a turn, and samples that are shown to them
+_CLEARLY = 0.6  # a shape is turned if it then fits so much better; set by hand
 _THIN, _ENOUGH = 0.02, 100  # nearer than this, samples are taken for the surface if there are so many
 
 
@@ -36,8 +43,9 @@ def fit_implicit(
     model
         The model.
     shape
-        A mesh, a cloud, or the path of one or of ``.npz`` samples (the page on formats), oriented as the shapes of the
-        training were. Of meshes that are not watertight only the surface is known, as of clouds.
+        A mesh, a cloud, or the path of one or of ``.npz`` samples (the page on formats). It is turned by quarter turns if it
+        clearly stands otherwise than the shapes of the training, which ``notes`` then say. Of meshes that are not watertight
+        only the surface is known, as of clouds.
     steps
         Of the search.
     seed
@@ -63,11 +71,17 @@ def fit_implicit(
     """
     if steps < 1:
         raise OptionError(f"a latent code cannot be found in {steps} steps", "200 are usual")
-    source = Path(shape) if is_samples(shape) else as_shape(shape)  # type: ignore[arg-type]
-    name = Path(source).stem if isinstance(source, str | Path) else source.name or "shape"
+    began = time.monotonic()
+    source = load_source(shape) if isinstance(shape, str | Path) else as_shape(shape)
+    name = source.name or "shape"
     rng = np.random.default_rng(seed)
     frame, found = samples_of(source, _SAMPLES, rng, closed=False)
     rows, half = torch.from_numpy(found), _SAMPLES // 2
+    turn = best_turn(model, rows[:: _SAMPLES // _SHOWN])
+    notes: tuple[str, ...] = ()
+    if not np.array_equal(turn, np.eye(3)):
+        frame, rows = Frame(frame.scale, turn, frame.center), _turned(rows, turn)
+        notes = (f"{name}: turned, it stands otherwise than the shapes of the training: {_axes(turn)}",)
     network, loss, rate = model.network, loss_of(model.card), _RATE * model.network.config.length
     generator = torch.Generator().manual_seed(seed)
     code = nearest_code(model, rows[:: _SAMPLES // _FEW]).clone().requires_grad_(True)
@@ -86,11 +100,12 @@ def fit_implicit(
         on = rows[:half]
         away = network.distance(on[None, :, :3], code[None])[0][0] - on[:, 3]
     fit = ImplicitFit(name, code.detach(), frame, percent_of_side(float(away.abs().mean())))
+    fit = replace(fit, owner=model, source=source, seed=seed, notes=notes)
     surface = on[on[:, 3].abs() < _THIN, :3].double().numpy()
-    if len(surface) < _ENOUGH:
-        return fit
-    missed, invented = model.shares(fit, surface, seed)
-    return replace(fit, missed=missed, invented=invented)
+    if len(surface) >= _ENOUGH:
+        missed, invented = model.shares(fit, surface, seed)
+        fit = replace(fit, missed=missed, invented=invented)
+    return replace(fit, seconds=time.monotonic() - began)
 
 
 def loss_of(card: ImplicitCard) -> ImplicitLoss:
@@ -99,11 +114,47 @@ def loss_of(card: ImplicitCard) -> ImplicitLoss:
     return PUBLISHED if isinstance(known, dict) and known.get("published") is True else ImplicitLoss()
 
 
-@torch.no_grad()
 def nearest_code(model: ImplicitModel, rows: Float[torch.Tensor, "P 7"]) -> Float[torch.Tensor, " D"]:
     """The code of the training that fits samples best."""
-    network, known = model.network, rows[rows[:, 3].isfinite()]
-    errors = [
-        (network.distance(known[None, :, :3], code[None])[0][0] - known[:, 3]).abs().mean() for code in network.codes
-    ]
-    return network.codes[int(torch.stack(errors).argmin())].detach()
+    return model.network.codes[int(_errors(model, rows, model.network.codes).argmin())].detach()
+
+
+def best_turn(model: ImplicitModel, rows: Float[torch.Tensor, "P 7"]) -> Float[Floats, "3 3"]:
+    """The rotation of the cube onto itself after which a code of the training fits samples best; none unless clearly."""
+    codes = model.network.codes
+    some = codes[torch.linspace(0, len(codes) - 1, min(_ASKED, len(codes))).round().long()]
+    errors = [float(_errors(model, _turned(rows, turn), some).min()) for turn in TURNS]
+    best = int(np.argmin(errors))
+    return TURNS[best] if errors[best] < _CLEARLY * errors[0] else TURNS[0]
+
+
+def _cube_turns() -> list[Float[Floats, "3 3"]]:
+    """The 24 rotations of a cube onto itself, first the one that changes nothing."""
+    signed = (
+        np.diag(signs)[:, list(axes)] for axes in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)
+    )
+    return [matrix for matrix in signed if np.linalg.det(matrix) > 0]
+
+
+TURNS = _cube_turns()
+
+
+def _axes(turn: Float[Floats, "3 3"]) -> str:
+    """Which axes of the file become x, y and z."""
+    rows = ("-+"[int(row.sum() > 0)] + "xyz"[int(np.abs(row).argmax())] for row in turn)
+    return ", ".join(f"{one} for {axis}" for one, axis in zip(rows, "xyz", strict=True))
+
+
+def _turned(rows: Float[torch.Tensor, "P 7"], turn: Float[Floats, "3 3"]) -> Float[torch.Tensor, "P 7"]:
+    R = torch.from_numpy(turn).to(rows)
+    return torch.cat([rows[:, :3] @ R.T, rows[:, 3:4], rows[:, 4:] @ R.T], 1)
+
+
+@torch.no_grad()
+def _errors(
+    model: ImplicitModel, rows: Float[torch.Tensor, "P 7"], codes: Float[torch.Tensor, "S D"]
+) -> Float[torch.Tensor, " S"]:
+    """Mean difference between the distances of samples and those by each of some codes."""
+    known = rows[rows[:, 3].isfinite()]
+    said = (model.network.distance(known[None, :, :3], code[None])[0][0] for code in codes)
+    return torch.stack([(each - known[:, 3]).abs().mean() for each in said])

@@ -12,16 +12,18 @@ import numpy as np
 import torch
 from scipy.ndimage import zoom
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, ModelError, OptionError, needs
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.kernels import KERNELS
+from meshmatch.implicit.fit import REACH, ImplicitFit
 from meshmatch.implicit.network import Deformation, ImplicitConfig, ImplicitNetwork
 from meshmatch.implicit.samples import FILLED
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.card import ImplicitCard, read_implicit_card
 from meshmatch.models.checkpoint import load_weights
-from meshmatch.models.implicit_card import ImplicitCard, read_implicit_card
 from meshmatch.models.registry import WEIGHTS, check_weights, locate_model
 from meshmatch.models.tensor_file import read_header
 from meshmatch.shapes.sampling import sample_surface
@@ -30,73 +32,10 @@ from meshmatch.shapes.shape import Shape
 _AT_ONCE = 8192  # points
 _DOUBTED = 0.2  # distance on the template, in the cube, from which a match has no confidence; set by hand
 _NORMAL = 0.2  # chosen among 0.05 to 0.2 on generated furniture
-_FAIR, _POOR = 2.0, 5.0  # residuals above which a shape is so; set by hand
-_FAIR_SHARE, _POOR_SHARE = 0.03, 0.1  # shares without counterpart above which a shape is so; set by hand
-_REACH = 4.0  # % of the longest side: what is further from the other surface has no counterpart; set by hand
 _NEWTON, _ONTO, _STEP = 12, 3, 0.1  # steps back to a shape, steps onto its surface, and their longest
 _COARSE = 48  # resolution of the surface that a fit is judged by
 _MOST = {"code": 1024, "width": 2048, "depth": 16, "inner": 512, "layers": 16, "maker": 4096}  # that a card may ask for
 _LONGEST = 100.0  # code at first
-
-
-@dataclass(frozen=True, eq=False)
-class ImplicitFit:
-    """A shape as a model has it.
-
-    Attributes
-    ----------
-    name
-        Of the shape.
-    code
-        (D,).
-    frame
-        From the shape's file into the cube from -1 to 1.
-    residual
-        Mean distance that the model gives points of the shape's surface, % of the longest side; NaN is not known.
-    missed
-        Share of these points that the model's surface comes nowhere near.
-    invented
-        Share of the model's surface that is nowhere near the shape.
-
-    Examples
-    --------
-    >>> chair = meshmatch.load_implicit("chair-model").known("chair-17")
-    >>> chair.code  # (D,)
-    >>> chair.verdict, chair.residual
-    """
-
-    name: str
-    code: Float[torch.Tensor, " D"]
-    frame: Frame
-    residual: float = math.nan
-    missed: float = math.nan
-    invented: float = math.nan
-
-    @property
-    def verdict(self) -> str:
-        """Good, fair or poor by the residual and both shares, whichever is worst."""
-        grades = [grade for grade, _ in self._graded]
-        return ("good", "fair", "poor")[max(grades)] if grades else "unknown"
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """Why it is not good."""
-        return tuple(words for grade, words in self._graded if grade)
-
-    @property
-    def _graded(self) -> list[tuple[int, str]]:
-        """What is known, from 0 (good) to 2 (poor), in words."""
-        reach = f"over {_REACH:g} % of the longest side"
-        away = f"the model's surface is {self.residual:.1f} % of the longest side away from {self.name}"
-        missed = f"{self.missed:.0%} of {self.name} is {reach} from the model's surface"
-        invented = f"{self.invented:.0%} of the model's surface is {reach} from {self.name}"
-        shares = (_FAIR_SHARE, _POOR_SHARE)
-        found = (
-            (self.residual, _FAIR, _POOR, away),
-            (self.missed, *shares, missed),
-            (self.invented, *shares, invented),
-        )
-        return [(int(value > fair) + int(value > poor), words) for value, fair, poor, words in found if value == value]
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +83,8 @@ class ImplicitModel:
             raise OptionError(f"the model knows no shape {name!r}", f"its {len(names)} shapes: {some}, ...")
         number = names.index(name)
         scale, *center = self.card.frames[number]
-        return ImplicitFit(name, self.network.codes[number].detach(), Frame(scale, np.eye(3), np.array(center)))
+        frame = Frame(scale, np.eye(3), np.array(center))
+        return ImplicitFit(name, self.network.codes[number].detach(), frame, owner=self)
 
     def blend(self, a: ImplicitFit, b: ImplicitFit, time: float) -> ImplicitFit:
         """The shape on the way from one to another.
@@ -165,8 +105,10 @@ class ImplicitModel:
         """
         scale = a.frame.scale ** (1 - time) * b.frame.scale**time
         center = (1 - time) * a.frame.center + time * b.frame.center
+        turn = Rotation.from_matrix(b.frame.rotation @ a.frame.rotation.T).as_rotvec()
+        rotation = Rotation.from_rotvec(time * turn).as_matrix() @ a.frame.rotation
         code = (1 - time) * a.code + time * b.code
-        return ImplicitFit(f"{a.name}-{b.name}-{time:g}", code, Frame(scale, np.eye(3), center))
+        return ImplicitFit(f"{a.name}-{b.name}-{time:g}", code, Frame(scale, rotation, center), owner=self)
 
     @torch.no_grad()
     def distance(
@@ -234,7 +176,10 @@ class ImplicitModel:
         signed = not (
             source.is_cloud or target.is_cloud
         )  # the normals of a cloud are estimated, and may face either way
-        normals = [shape.vertex_normals if signed else np.zeros((shape.V, 3)) for shape in (source, target)]
+        normals = [
+            shape.vertex_normals @ fit.frame.rotation.T if signed else np.zeros((shape.V, 3))
+            for shape, fit in ((source, a), (target, b))
+        ]
         index = nearest_on_template(*places, *normals)
         apart = np.linalg.norm(places[0] - places[1][index], axis=1)
         grades = ("good", "unknown", "fair", "poor")
@@ -361,7 +306,7 @@ class ImplicitModel:
         except ModelError:
             return 1.0, 0.0
         surface, spacing = shape.frame.apply(surface), cKDTree(points).query(points, 2)[0][:, 1]
-        reach = max(2 * FILLED * _REACH / 100, 3 * float(np.median(spacing)))
+        reach = max(2 * FILLED * REACH / 100, 3 * float(np.median(spacing)))
         far = [cKDTree(b).query(a)[0] > reach for a, b in ((points, surface), (surface, points))]
         return float(far[0].mean()), float(far[1].mean())
 

@@ -7,9 +7,8 @@ cube from -1 to 1; none is turned.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeGuard
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -62,6 +61,22 @@ def read_implicit_samples(folder: str | Path, seed: int = 0) -> ImplicitSamples:
     return ImplicitSamples(names, frames, np.stack(rows))
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class SampledShape(Shape):
+    """The points of ``.npz`` samples as a cloud, in their order; with their distances, or normals of length 1."""
+
+    distances: Float[Floats, " N"] = field(kw_only=True)
+    normals: Float[Floats, "N 3"] = field(kw_only=True)
+
+
+def load_source(file: str | Path) -> Shape:
+    """The shape of a file; of ``.npz`` samples a `SampledShape`."""
+    if Path(file).suffix.lower() != ".npz":
+        return load_shape(file)
+    points, distances, normals = _arrays(Path(file))
+    return SampledShape(points, np.empty((0, 3), np.int64), Path(file).name, distances=distances, normals=normals)
+
+
 def samples_of(
     source: Shape | str | Path, N: int, rng: np.random.Generator, closed: bool = True
 ) -> tuple[Frame, Float[Floats32, "N 7"]]:
@@ -69,11 +84,11 @@ def samples_of(
 
     Where it need not be ``closed``, a mesh with holes is taken as a cloud with normals. `InputError` as above.
     """
-    if is_samples(source):
-        points, distances, normals = _arrays(Path(source))
+    shape = source if isinstance(source, Shape) else load_source(source)
+    if isinstance(shape, SampledShape):
+        points, distances, normals = shape.verts, shape.distances, shape.normals
         solid = False
     else:
-        shape = source if isinstance(source, Shape) else load_shape(source)
         solid = not shape.is_cloud and shape.invalid is None and is_watertight(shape.faces)
         if closed and not (solid or shape.is_cloud):
             raise InputError(
@@ -88,35 +103,19 @@ def samples_of(
         points, distances, normals = drawn.points, np.zeros(0), drawn.normals
     inside = points[distances < 0] if len(distances) else points
     if len(inside) < 4:
-        what = f"{_name(source)} has {len(inside)} points of the shape; four are needed"
+        what = f"{shape.name or 'the shape'} has {len(inside)} points of the shape; four are needed"
         raise InputError(what, "distances are negative inside")
     low, high = inside.min(0), inside.max(0)
     frame = Frame(float((high - low).max()) / (2 * FILLED), np.eye(3), (low + high) / 2)
     with np.errstate(over="ignore"):
         points, distances = frame.apply(points), distances / frame.scale
     if not all((np.abs(each) < _BEYOND).all() for each in (points, distances)):
-        raise InputError(f"{_name(source)} has points far beyond the shape", "leave these points out")
+        raise InputError(f"{shape.name or 'the shape'} has points far beyond the shape", "leave these points out")
     if len(distances):
         rows = _nearer_first(points, distances, N, rng)
     else:
         rows = free_and_surface(points, normals, N, rng) if solid else off_surface(points, normals, N, rng)
     return frame, rows.astype(np.float32)
-
-
-def is_samples(source: Shape | str | Path) -> TypeGuard[str | Path]:
-    """Whether this is the path of `.npz` samples."""
-    return isinstance(source, str | Path) and Path(source).suffix.lower() == ".npz"
-
-
-def read_source(file: Path) -> tuple[Shape, Shape | Path]:
-    """The shape of a file, of `.npz` samples their points in order, and what its code is found from: all that is known."""
-    if is_samples(file):
-        return Shape(_arrays(file)[0], np.empty((0, 3), np.int64), file.name), file
-    return (shape := load_shape(file)), shape
-
-
-def _name(source: Shape | str | Path) -> str:
-    return source.name or "the shape" if isinstance(source, Shape) else Path(source).name
 
 
 def _arrays(file: Path) -> tuple[Floats, Floats, Floats]:

@@ -16,10 +16,10 @@ from meshmatch.implicit.network import ImplicitConfig, ImplicitNetwork
 from meshmatch.implicit.objective import PUBLISHED, ImplicitBatch, ImplicitLoss
 from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
 from meshmatch.implicit.space import CUBE_RADIUS, cube_nodes
-from meshmatch.models.card import check_name
+from meshmatch.models.card import IMPLICIT, ImplicitCard, check_name, write_card
 from meshmatch.models.checkpoint import save_weights
-from meshmatch.models.implicit_card import IMPLICIT, ImplicitCard, write_implicit_card
 from meshmatch.models.registry import WEIGHTS
+from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.training.alone import CHECKPOINT, alone
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
@@ -75,6 +75,7 @@ def train_implicit(
     facts: CardFacts | None = None,
     resume: bool = True,
     report: Callable[[StepReport], None] | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Path:
     """Learn a folder of shapes as one deformed template (`ImplicitModel`), or go on from the checkpoint, exactly.
 
@@ -96,6 +97,8 @@ def train_implicit(
         Go on from a checkpoint if there is one.
     report
         Called with losses and validation.
+    progress
+        As in `match`.
 
     Returns
     -------
@@ -133,7 +136,14 @@ def train_implicit(
     trainer = Trainer(network, None, replace(training, shapes=min(training.shapes, len(shapes.names))))
     if resume and checkpoint.is_file():
         trainer.load(checkpoint)
-    trainer.run(ImplicitDataset(shapes, trainer.config), checkpoint, report)
+
+    def both(now: StepReport) -> None:
+        if report is not None:
+            report(now)
+        if progress is not None:
+            progress(now.words, "training", now.step / now.steps)
+
+    trainer.run(ImplicitDataset(shapes, trainer.config), checkpoint, both)
     trainer.close()
     if trainer.rank == 0:
         (output / IMPLICIT).unlink(missing_ok=True)
@@ -145,5 +155,5 @@ def train_implicit(
             training_minutes=round(trainer.seconds / 60, 1), weights_sha256=digest,
             created=datetime.date.today().isoformat(),
         )  # fmt: skip
-        write_implicit_card(card, output)
+        write_card(card, output / IMPLICIT)
     return output

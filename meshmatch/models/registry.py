@@ -17,8 +17,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from meshmatch.errors import MeshmatchError, ModelError, OutputError
-from meshmatch.models.card import ModelCard, check_name, is_name, read_card
-from meshmatch.models.implicit_card import IMPLICIT, ImplicitCard, is_implicit, read_implicit_card
+from meshmatch.models.card import (
+    IMPLICIT,
+    ImplicitCard,
+    ModelCard,
+    check_name,
+    is_implicit,
+    is_name,
+    read_card,
+    read_implicit_card,
+)
 from meshmatch.models.tensor_file import is_whole, read_header
 from meshmatch.models.unfinished import changing, copy_for, needs_settling, put, settle
 from meshmatch.outputs import as_path, home_folder
@@ -94,18 +102,18 @@ def locate_model(name: str | Path) -> Path:
 
 
 def check_model(name: str | Path) -> None:
-    """`ModelError` if a model is neither ``auto`` or ``none`` nor the name or folder of one with a template of vertices."""
+    """`ModelError` if a model is neither ``auto`` or ``none`` nor the name or the folder of one."""
     if name not in (AUTO, NO_MODEL):
-        _refuse_implicit(locate_model(name))
+        locate_model(name)
 
 
 def implicit_folder(name: str | Path) -> Path | None:
     """The folder of an implicit model, given by its name or its folder; None if it is anything else."""
     try:
-        folder = locate_model(name)
+        folder = None if name in (AUTO, NO_MODEL) else locate_model(name)
     except ModelError:
         return None
-    return folder if is_implicit(folder) else None
+    return folder if folder is not None and is_implicit(folder) else None
 
 
 def read_any_card(folder: Path) -> ModelCard | ImplicitCard:
@@ -119,7 +127,9 @@ def find_model(name: str | Path) -> tuple[Path, ModelCard]:
     `ModelError` if there is no such model, or it is damaged.
     """
     folder = locate_model(name)
-    _refuse_implicit(folder)
+    if is_implicit(folder):
+        hint = "it goes with `match`, `register` and `interpolate`, or in Python with `load_implicit`"
+        raise ModelError(f"{folder.name} is an implicit model, which has no template of vertices", hint)
     card = read_card(folder / CARD)
     for part in (TEMPLATE, WEIGHTS):
         read_header(folder / part)
@@ -295,12 +305,6 @@ def _registered(name: str) -> Path:
 
 def _is_registered(folder: Path) -> bool:
     return folder.parent in (built_in_folder(), user_folder()) and not folder.name.startswith(".")
-
-
-def _refuse_implicit(folder: Path) -> None:
-    if is_implicit(folder):
-        hint = "it goes with `match`, `register` and `interpolate`, or in Python with `load_implicit`"
-        raise ModelError(f"{folder.name} is an implicit model, which has no template of vertices", hint)
 
 
 def _expanded(path: str | Path) -> Path:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import meshmatch
-from meshmatch.api import apart, matching
+from meshmatch.api import apart, matcher
 from meshmatch.api.apart import find_alone
 from meshmatch.api.inputs import as_model, usable
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.shapes.parts import Parts
@@ -128,9 +128,7 @@ def test_only_a_poor_fit_of_the_whole_gives_way_to_a_better_one(
 ) -> None:
     asked = reads({BODY.V: 3.7})
     scene = together("scan.ply", BODY, floor(BODY))
-    monkeypatch.setattr(
-        matching.Fitter, "fit", lambda self, shape: a_fit(whole if shape.V == scene.V else alone, shape)
-    )
+    monkeypatch.setattr(matcher.Fitter, "fit", lambda self, shape: a_fit(whole if shape.V == scene.V else alone, shape))
     fit = Matcher("human").fit(scene)
     assert fit.left_out == (() if kept == "whole" else (1,))
     assert any("left out 1 of 2 parts" in note for note in fit.notes) is (kept != "whole")
@@ -142,7 +140,7 @@ def test_only_a_poor_fit_of_the_whole_gives_way_to_a_better_one(
 def test_parts_far_apart_are_tried_before_they_are_refused(reads: Reads, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = together("scan.ply", BODY, chair(beside(BODY, 3.0)))
     assert usable(scene).far_parts
-    monkeypatch.setattr(matching.Fitter, "fit", lambda self, shape: a_fit("good", shape))
+    monkeypatch.setattr(matcher.Fitter, "fit", lambda self, shape: a_fit("good", shape))
     reads({BODY.V: 3.7})
     assert len(Matcher("human").fit(scene).left_out) == 6
     reads({})

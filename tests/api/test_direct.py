@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import meshmatch
 from meshmatch.api import kinds
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.cli.app import app
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting import direct

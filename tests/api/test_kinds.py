@@ -10,10 +10,10 @@ import pytest
 import trimesh
 
 import meshmatch
-from meshmatch.api import kinds, matching
+from meshmatch.api import kinds, matcher
 from meshmatch.api.inputs import as_model, validated
 from meshmatch.api.kinds import Installed
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.errors import InputError, ModelError, OptionError
 from meshmatch.fitting import classify
 from meshmatch.fitting.fit_config import FitConfig, Partial
@@ -135,7 +135,7 @@ def test_what_reads_strangely_is_of_the_kind_that_fits_it(monkeypatch: pytest.Mo
     assert choose(strange) == ("human", ["robot 5.5 5.6 7: human"])
     unrefined = kinds.choose_model([validated(strange)], [FitConfig(refine="none")])
     assert (unrefined.model.card.name, unrefined.fits) == ("human", [None])  # a refined fit is not what was asked for
-    monkeypatch.setattr(matching, "Fitter", None)  # what told the kind is not fitted again
+    monkeypatch.setattr(matcher, "Fitter", None)  # what told the kind is not fitted again
     fit = Matcher().fit(strange)
     assert fit.verdict == "good" and fit.repaired is not None
     for words in ("robot 7 7.1 7.2", "robot 7 7.1 5.5"):  # too strange; and no animal

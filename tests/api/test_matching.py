@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import meshmatch
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.api.results import MatchResult
 from meshmatch.errors import MeshmatchError, OptionError
 from meshmatch.fitting.fitter import Fitter

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.api.results import MatchResult
 from meshmatch.collections.collection import Collection
 from meshmatch.errors import ModelError

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from meshmatch.api import matching
-from meshmatch.api.inputs import as_model
+from meshmatch.api.inputs import as_model, validated
 from meshmatch.api.results import MatchResult
 from meshmatch.cli import main
 from meshmatch.fitting.fit import Fit
@@ -35,6 +35,21 @@ class Answer:
 
 
 Run = Callable[..., Answer]
+
+
+def well(answer: Answer) -> Answer:
+    """The same answer, of a command that went well."""
+    assert answer.status == 0, answer.err
+    return answer
+
+
+def refused(answer: Answer, words: str, folder: Path, before: set[str]) -> None:
+    """An error in a line, a hint, status 1, and nothing new in the folder."""
+    assert answer.status == 1, answer.err
+    assert [line.partition(":")[0] for line in answer.err.splitlines()] == ["error", "hint"], answer.err
+    assert words in answer.err
+    assert answer.out == ""
+    assert {path.name for path in folder.iterdir()} == before
 
 
 @pytest.fixture
@@ -99,7 +114,7 @@ class FakeMatching:
         self.called = {"shape": shape, "config": matcher.config, "threads": matcher.threads}
         if matcher.progress is not None:
             matcher.progress("orientation", "a.ply", 0.5)
-        notes = tuple(f"{shape.name}: {note}" for note in matching.validated(shape).notes)
+        notes = tuple(f"{shape.name}: {note}" for note in validated(shape).notes)
         return [replace(self.make_fit(shape, self.verdict, self.reasons), notes=notes)]
 
 

@@ -11,7 +11,7 @@ from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
-from tests.cli.conftest import Run
+from tests.cli.conftest import Run, refused
 
 V = 642
 
@@ -90,15 +90,6 @@ def test_seed_chooses_the_pairs_of_the_distortion(run: Run, files: tuple[Path, .
     assert values[0] == values[2] != values[1]
 
 
-@pytest.mark.parametrize("unit", ["cm", "x100"])
-def test_curve(run: Run, files: tuple[Path, ...], tmp_path: Path, unit: str) -> None:
-    truth = write_truth(tmp_path, "column")
-    answer = run("evaluate", *files, *truth, "--curve", tmp_path / "curve.png", "--unit", unit)
-    assert answer.status == 0
-    with Image.open(tmp_path / "curve.png") as picture:
-        assert len(picture.convert("RGB").getcolors(10**6)) > 10
-
-
 def test_units_draw_different_curves(run: Run, files: tuple[Path, ...], tmp_path: Path) -> None:
     truth = write_truth(tmp_path, "column")
     for unit in ("cm", "x100"):
@@ -109,25 +100,29 @@ def test_units_draw_different_curves(run: Run, files: tuple[Path, ...], tmp_path
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--truth", "short.txt"], "3 entries"),
-        (["--truth", "none.txt"], "none.txt"),
-        (["--truth", "wide.txt"], "not 1 a line"),
-        (["--truth", "outside.txt"], "outside"),
-        (["--curve", "c.png"], "needs ground truth"),
-        (["--truth", "short.txt", "--points", "short.txt", "short.txt"], "choose one"),
+        ("--truth short.txt", "3 entries"),
+        ("--truth none.txt", "none.txt"),
+        ("--truth wide.txt", "not 1 a line"),
+        ("--truth outside.txt", "not among the 642 vertices"),
+        ("--truth short.txt --points short.txt short.txt", "choose one"),
+        ("--curve c.png", "needs ground truth"),
+        ("--truth t.csv --curve c.jpg", "c.jpg"),
+        ("--truth t.csv --curve nowhere/c.png", "there is no folder"),
+        ("--picture e.png", "needs ground truth"),
+        ("--truth t.csv --picture e.jpg", "is a PNG"),
+        ("--truth t.csv --picture no/e.png", "there is no folder"),
+        ("--truth t.csv --picture e.png --curve e.png", "an output of this command"),
     ],
 )
-def test_what_cannot_be_is_told(
-    run: Run, files: tuple[Path, ...], tmp_path: Path, words: list[str], told: str, monkeypatch: pytest.MonkeyPatch
+def test_what_cannot_be_is_told_before_the_work(
+    run: Run, files: tuple[Path, ...], tmp_path: Path, words: str, told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("short.txt").write_text("0\n1\n2\n")
     Path("wide.txt").write_text("0 1 2\n")
     Path("outside.txt").write_text("0 642\n")
-    answer = run("evaluate", *files, *words)
-    assert answer.status == 1
-    assert answer.out == ""
-    assert told in answer.err or "not among the 642 vertices" in answer.err
+    write_truth(tmp_path, "pairs")
+    refused(run("evaluate", *files, *words.split()), told, tmp_path, {path.name for path in tmp_path.iterdir()})
 
 
 def test_a_map_of_other_shapes_is_refused(run: Run, files: tuple[Path, ...], tmp_path: Path, torus: Shape) -> None:
@@ -135,20 +130,6 @@ def test_a_map_of_other_shapes_is_refused(run: Run, files: tuple[Path, ...], tmp
     answer = run("evaluate", files[0], tmp_path / "t.ply", files[2])
     assert answer.status == 1
     assert "runs the wrong way" in answer.err
-
-
-@pytest.mark.parametrize("name", ["curve.jpg", "nowhere/curve.png"])
-def test_a_curve_that_cannot_be_is_told_before_the_work(
-    run: Run, files: tuple[Path, ...], tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def work(*_: object, **__: object) -> None:
-        pytest.fail("it began")
-
-    monkeypatch.setattr("meshmatch.maps.evaluate.evaluate_map", work)
-    truth = write_truth(tmp_path, "pairs")
-    answer = run("evaluate", *files, *truth, "--curve", tmp_path / name)
-    assert answer.status == 1
-    assert "error: " in answer.err
 
 
 @pytest.mark.parametrize("unit", ["cm", "x100"])
@@ -174,19 +155,3 @@ def test_the_errors_as_heat_on_both_shapes(
     red = (pixels[..., 0] > pixels[..., 2] + 60) & (pixels[..., 1] < 120)
     assert red.sum() > 500  # the vertices that were thrown to another place
     assert ("cm" if unit == "cm" else "sqrt(area)") in legends[0].title
-
-
-def test_a_picture_of_errors_needs_the_truth_and_a_place(run: Run, files: tuple[Path, ...], tmp_path: Path) -> None:
-    truth = write_truth(tmp_path, "column")
-    before = sorted(path.name for path in tmp_path.iterdir())
-    for words, told in (
-        (["--picture", tmp_path / "e.png"], "needs ground truth"),
-        ([*truth, "--picture", tmp_path / "e.jpg"], "is a PNG"),
-        ([*truth, "--picture", tmp_path / "no" / "e.png"], "no folder"),
-        ([*truth, "--picture", tmp_path / "e.png", "--curve", tmp_path / "e.png"], "an output of this command"),
-    ):
-        answer = run("evaluate", *files, *words)
-        assert answer.status == 1
-        assert told in answer.err
-        assert answer.out == ""
-    assert sorted(path.name for path in tmp_path.iterdir()) == before

@@ -17,7 +17,7 @@ from meshmatch.implicit import training
 from meshmatch.implicit.codes import fit_implicit, loss_of
 from meshmatch.implicit.model import load_implicit
 from meshmatch.implicit.training import AS_PUBLISHED, train_implicit
-from meshmatch.models.implicit_card import IMPLICIT, is_implicit, read_implicit_card
+from meshmatch.models.card import IMPLICIT, is_implicit, read_implicit_card
 from meshmatch.training.train import CHECKPOINT
 from tests.implicit.boxes import TRAIN, box, box_sdf, boxes, config
 
@@ -104,6 +104,7 @@ def test_a_folder_is_needed(tmp_path: Path, capsys: Capture) -> None:
     assert "needs --shapes" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_surfaces_between_two_files(model: Path, folder: Path, tmp_path: Path, capsys: Capture) -> None:
     a, b = (meshmatch.load_shape(folder / f"box{k}.ply") for k in (0, 1))
     far = meshmatch.Shape(10 + 2 * b.verts, b.faces)  # another place and unit
@@ -112,24 +113,23 @@ def test_surfaces_between_two_files(model: Path, folder: Path, tmp_path: Path, c
     words = ["interpolate", *files, "--model", str(model), "-n", "3", "--resolution", "32", "--json"]
     assert main([*words, "-o", str(tmp_path / "way")]) == 0
     record = json.loads(capsys.readouterr().out)
-    assert record["times"] == [0, 0.5, 1]
-    assert max(fit["residual"] for fit in record["fits"]) < 4
+    assert [frame["time"] for frame in record["frames"]] == [0, 0.5, 1]
+    assert max(fit["residual"] for fit in record["shapes"]) < 4
     frames = json.loads((tmp_path / "way" / "frames.json").read_text())["frames"]
     shapes = [meshmatch.load_shape(tmp_path / "way" / frame["file"]) for frame in frames]
-    assert [shape.V for shape in shapes] == record["vertices"]
+    assert [shape.V for shape in shapes] == [frame["vertices"] for frame in record["frames"]]
     assert all(is_watertight(shape.faces) for shape in shapes)
     for shape, truth in ((shapes[0], a), (shapes[2], far)):
         assert np.abs(shape.bounds - truth.bounds).max() < 0.3 * truth.diagonal
     assert a.bounds.mean() < shapes[1].bounds.mean() < far.bounds.mean()
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Codes after a few steps."""
-    monkeypatch.setattr("meshmatch.implicit.sequence.fit_implicit", partial(fit_implicit, steps=5))
+    monkeypatch.setattr("meshmatch.api.implicit.fit_implicit", partial(fit_implicit, steps=5))
 
 
-@pytest.mark.usefixtures("short")
 def test_surfaces_in_a_row(model: Path, folder: Path, tmp_path: Path) -> None:
     files = [str(folder / f"box{k}.ply") for k in (0, 1)]
     words = ["interpolate", *files, "--model", str(model), "-n", "2", "--resolution", "16"]
@@ -209,7 +209,7 @@ def test_the_registry_knows_implicit_models(
     capsys.readouterr()
     assert main(["models", "verify", "human"]) == 0  # the others are there as before
     with pytest.raises(meshmatch.MeshmatchError, match="implicit model"):
-        meshmatch.match(*files, model=name)
+        meshmatch.Matcher(name)
     weights = tmp_path / "home" / "models" / name / "weights.safetensors"
     weights.write_bytes(weights.read_bytes()[:-4] + b"gone")
     capsys.readouterr()
@@ -238,13 +238,19 @@ def test_options_that_mean_nothing_there_are_refused(
     assert not (tmp_path / name).exists()
 
 
-@pytest.mark.usefixtures("short")
 def test_the_library_does_the_same(model: Path, folder: Path) -> None:
     loaded = meshmatch.load_implicit(model)
-    result = meshmatch.implicit_sequence(loaded, folder / "box0.ply", folder / "box1.ply", 2, resolution=16)
-    assert [fit.name for fit in result.fits] == ["box0.ply", "box1.ply"]
-    with pytest.raises(meshmatch.MeshmatchError, match="no sequence"):
-        meshmatch.implicit_sequence(loaded, folder / "box0.ply", folder / "box1.ply", 1)
+    files = folder / "box0.ply", folder / "box1.ply"
+    result = meshmatch.match(*files, model=loaded, config=meshmatch.FitConfig(seed=1))
+    assert result.source_fit.seed == 1
+    assert result.backward().source_vertices == result.map.target_vertices
+    fit = meshmatch.register(files[0], model=loaded)
+    assert np.array_equal(fit.points_in_file, loaded.register(fit).verts)
+    for wrong in ({"landmarks": ([0], [0])}, {"config": meshmatch.FitConfig(up="y")}):
+        with pytest.raises(meshmatch.MeshmatchError, match="implicit model"):
+            meshmatch.match(*files, model=loaded, **wrong)
+    sequence = meshmatch.interpolate(files, 2, model=loaded, options=meshmatch.InterpolationOptions(resolution=16))
+    assert [step.time for step in sequence.steps] == [0, 1]
     assert is_implicit(model)
     assert not is_implicit(folder)
     assert training.TRAINING.steps > 1

@@ -187,6 +187,7 @@ def test_strict_wants_fits_that_are_not_poor(run: Run, eggs: Path, tmp_path: Pat
     assert out.is_dir()
 
 
+@pytest.mark.slow
 def test_the_samples(run: Run, tmp_path: Path) -> None:
     """With the model that ships: volume and distances are kept, the dancer's own mesh arrives at the climber."""
     samples = bundled_folder() / "samples"

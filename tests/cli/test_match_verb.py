@@ -11,13 +11,11 @@ import pytest
 from PIL import Image
 
 from meshmatch.api import matching
-from meshmatch.errors import InputError, OutputError
-from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.errors import OutputError
 from meshmatch.maps.files import load_map
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import Template
 from tests.cli.conftest import FakeMatching, Run, fake_fit
 from tests.models.small_model import small_card
@@ -47,37 +45,6 @@ def test_match_says_what_it_did(run: Run, two: tuple[Path, Path], stub: FakeMatc
         assert words in said
 
 
-def test_match_defaults(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
-    run("match", *two, "-o", two[0].with_name("map.npy"))
-    called = dict(stub.called)
-    del called["progress"]
-    rest = {"model": "auto", "landmarks": None, "threads": 2, "config": (FitConfig(), FitConfig())}
-    assert called == rest | {"source": "a.ply", "target": "b.ply"}
-
-
-@pytest.mark.parametrize(
-    "words", [["--refine", "much"], ["--up", "w"], ["--front", "forward"], ["--seed", "-1"], ["--threads", "0"]]
-)
-def test_match_refuses_values_that_do_not_exist(
-    run: Run, two: tuple[Path, Path], stub: FakeMatching, words: list[str]
-) -> None:
-    output = two[0].with_name("map.npy")
-    assert run("match", *two, "-o", output, *words).status == 2
-    assert not output.exists()
-
-
-def test_match_hands_on_the_device(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
-    run("match", *two, "-o", two[0].with_name("map.npy"), "--device", "cuda")
-    assert [config.device for config in stub.called["config"]] == ["cuda", "cuda"]
-
-
-def test_match_reads_landmarks(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
-    file = two[0].with_name("pairs.txt")
-    file.write_text("source target\n0 10\n5 11  # the nose\n")
-    run("match", *two, "-o", two[0].with_name("map.npy"), "--landmarks", file)
-    assert [list(side) for side in stub.called["landmarks"]] == [[0, 5], [10, 11]]
-
-
 def test_match_json_is_one_line_of_data(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     stub.verdict, stub.reasons = "fair", ("a hand is far",)
     output = two[0].with_name("map.npy")
@@ -96,95 +63,6 @@ def test_match_json_is_one_line_of_data(run: Run, two: tuple[Path, Path], stub: 
     assert record["fits"][0]["regularity"] == {"inverted": 0.001, "volume": 0.25}
 
 
-def test_quiet_is_silent(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
-    answer = run("match", *two, "-o", two[0].with_name("map.npy"), "--quiet")
-    assert (answer.status, answer.out, answer.err) == (0, "", "")
-
-
-def test_a_poor_fit_warns_even_when_quiet(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
-    stub.verdict, stub.reasons = "poor", ("an arm is missing",)
-    output = two[0].with_name("map.npy")
-    answer = run("match", *two, "-o", output, "-q")
-    assert answer.status == 0
-    assert answer.err == "warning: the map is poor: an arm is missing\n"
-    assert output.exists()
-
-
-@pytest.mark.parametrize(("verb", "output"), [("match", "map.npy"), ("register", "fitted.ply")])
-def test_strict_makes_a_poor_fit_an_error(
-    run: Run, two: tuple[Path, Path], stub: FakeMatching, verb: str, output: str
-) -> None:
-    stub.verdict, stub.reasons = "poor", ("an arm is missing",)
-    words = [*two][: 2 if verb == "match" else 1]
-    answer = run(verb, *words, "-o", two[0].with_name(output), "--strict")
-    assert answer.status == 1
-    assert "an arm is missing" in answer.err
-    assert sorted(path.name for path in two[0].parent.iterdir()) == ["a.ply", "b.ply"]
-
-
-@pytest.mark.parametrize(("verb", "output"), [("match", "map.npy"), ("register", "fitted.ply")])
-@pytest.mark.parametrize("verdict", ["good", "fair"])
-def test_strict_lets_other_fits_pass(
-    run: Run, two: tuple[Path, Path], stub: FakeMatching, verb: str, output: str, verdict: str
-) -> None:
-    stub.verdict, stub.reasons = verdict, ("so so",)
-    words = [*two][: 2 if verb == "match" else 1]
-    answer = run(verb, *words, "-o", two[0].with_name(output), "--strict")
-    assert answer.status == 0
-    assert ("note: so so" in answer.err) == (verdict == "fair")
-    assert two[0].with_name(output).exists()
-
-
-@pytest.mark.parametrize("verb", ["match", "register"])
-@pytest.mark.parametrize(
-    ("output", "words"),
-    [("out.bad", "suffix"), ("nowhere/out{}", "no folder"), ("", "folder")],
-    ids=["suffix", "missing folder", "a folder"],
-)
-def test_an_output_that_cannot_be_is_told_before_the_work(
-    run: Run, two: tuple[Path, Path], stub: FakeMatching, verb: str, output: str, words: str
-) -> None:
-    suffix = ".npy" if verb == "match" else ".ply"
-    path = two[0].parent / output.format(suffix)
-    if not output:
-        path = two[0].parent / f"folder{suffix}"
-        path.mkdir()
-    answer = run(verb, *[*two][: 2 if verb == "match" else 1], "-o", path)
-    assert answer.status == 1
-    assert "error: " in answer.err
-    assert stub.called == {}
-
-
-@pytest.mark.parametrize("error", [InputError("a bad file"), KeyboardInterrupt()])
-def test_a_failure_leaves_what_was_there(
-    run: Run, two: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, error: BaseException
-) -> None:
-    def failing(*_: object, **__: object) -> None:
-        raise error
-
-    monkeypatch.setattr(matching, "match", failing)
-    output = two[0].with_name("map.npy")
-    output.write_bytes(b"old")
-    assert run("match", *two, "-o", output).status == (1 if isinstance(error, InputError) else 130)
-    assert output.read_bytes() == b"old"
-    assert len(list(output.parent.iterdir())) == 3
-
-
-@pytest.mark.parametrize(("verb", "output"), [("match", "map.npy"), ("register", "fitted.ply")])
-def test_a_model_is_named_or_shown(
-    run: Run, two: tuple[Path, Path], stub: FakeMatching, verb: str, output: str
-) -> None:
-    words = (verb, *[*two][: 2 if verb == "match" else 1], "-o", two[0].with_name(output))
-    folder = bundled_folder() / "models" / "human"
-    assert run(*words, "--model", folder).status == 0
-    assert verb == "register" or stub.called["model"] == str(folder)
-    stub.called = {}
-    answer = run(*words, "--model", "humna")
-    assert answer.status == 1
-    assert "did you mean human?" in answer.err
-    assert stub.called == {}
-
-
 def test_match_draws_a_picture(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     picture, output = two[0].with_name("both.png"), two[0].with_name("map.npy")
     answer = run("match", *two, "-o", output, "--picture", picture, "--json")
@@ -196,54 +74,6 @@ def test_match_draws_a_picture(run: Run, two: tuple[Path, Path], stub: FakeMatch
         assert image.size[0] > 1.3 * image.size[1]  # side by side
     assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 1000  # and in colors
     assert output.exists()
-
-
-def test_a_picture_that_fails_costs_no_map(
-    run: Run, two: tuple[Path, Path], stub: FakeMatching, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def failing(*_: object, **__: object) -> None:
-        raise OutputError("the disk is full")
-
-    monkeypatch.setattr("meshmatch.render.compose.compose_match", failing)
-    output = two[0].with_name("map.npy")
-    assert run("match", *two, "-o", output, "--picture", two[0].with_name("both.png")).status == 1
-    assert sorted(path.name for path in two[0].parent.iterdir()) == ["a.ply", "b.ply", "map.npy"]
-
-
-@pytest.mark.parametrize("name", ["both.jpg", "nowhere/both.png", "map.npy", "a.png"])
-def test_a_picture_that_cannot_be_is_told_before_the_work(
-    run: Run, two: tuple[Path, Path], stub: FakeMatching, name: str
-) -> None:
-    two[0].with_name("a.png").mkdir()
-    words = ("-o", two[0].with_name("map.npy"), "--picture", two[0].parent / name)
-    answer = run("match", *two, *words)
-    assert answer.status == 1
-    assert Path(name).name in answer.err
-    assert stub.called == {}
-    assert not two[0].with_name("map.npy").exists()
-
-
-def test_an_input_is_never_overwritten(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
-    cloud = two[0].with_name("cloud.npy")
-    np.save(cloud, np.eye(3))
-    before = cloud.read_bytes(), two[0].read_bytes()
-    indirect = cloud.parent / ".." / cloud.parent.name / cloud.name
-    for words in (("match", cloud, two[1], "-o", indirect), ("register", two[0], "-o", two[0])):
-        answer = run(*words)
-        assert answer.status == 1
-        assert "is an input of this command" in answer.err
-    assert stub.called == {}
-    assert (cloud.read_bytes(), two[0].read_bytes()) == before
-
-
-def test_files_of_one_name_are_told_apart(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
-    other = two[0].parent / "other" / "a.ply"
-    other.parent.mkdir()
-    other.write_bytes(two[1].read_bytes())
-    answer = run("match", two[0], other, "-o", two[0].with_name("map.npy"), "--json")
-    assert f"of {two[0]} its vertex of {other}" in answer.err
-    record = json.loads(answer.out)
-    assert (record["source"], record["target"]) == (str(two[0]), str(other))
 
 
 def test_a_real_ctrl_c_in_the_long_work(run: Run, two: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -294,16 +124,6 @@ def test_register_draws_the_template_over_the_shape(
     words = ("register", two[0], "-o", two[0].with_name("second.ply"), "--picture", picture)
     assert run(*words).status == 1
     assert two[0].with_name("second.ply").exists()
-
-
-@pytest.mark.parametrize("name", ["p.jpg", "nowhere/p.png", "fitted.ply", "a.ply"])
-def test_a_picture_that_register_cannot_write_is_told_before_the_work(
-    run: Run, two: tuple[Path, Path], stub: FakeMatching, name: str
-) -> None:
-    words = ("register", two[0], "-o", two[0].with_name("fitted.ply"), "--picture", two[0].parent / name)
-    assert run(*words).status == 1
-    assert stub.called == {}
-    assert not two[0].with_name("fitted.ply").exists()
 
 
 def test_register_json(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from meshmatch.errors import InputError
 from meshmatch.render import compose
 from meshmatch.render.picture import Panel
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.prepared_folder import read_registered
+from meshmatch.templates.make import NodeConfig
+from meshmatch.templates.prepare import PrepareConfig
 from meshmatch.templates.template import load_template
 from tests.cli.conftest import Answer, Run
-from tests.templates.test_sides import LEFT, hook
 
 # A sphere of area 1 has a radius of 0.28: a few nodes with a wide reach support it.
 FEW = ("--nodes", "60", "--radius", "0.3")
@@ -63,11 +64,10 @@ def test_too_few_and_too_many_nodes_are_refused(run: Run, folder: Path, tmp_path
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("strategy", ["spectral", "geodesic", "uniform"])
 def test_one_shape_becomes_a_template(
-    run: Run, two: tuple[Path, Path], tmp_path: Path, strategy: str, pictures: list[tuple[Sequence[Panel], Path]]
+    run: Run, two: tuple[Path, Path], tmp_path: Path, pictures: list[tuple[Sequence[Panel], Path]]
 ) -> None:
-    record = made(run("prepare", two[0], "-o", tmp_path / "out", "--strategy", strategy, *FEW, "--json"))
+    record = made(run("prepare", two[0], "-o", tmp_path / "out", *FEW, "--json"))
     template = load_template(tmp_path / "out" / "template.safetensors")
     assert record["template_hash"] == template.hash
     assert record["nodes"] == template.K >= 60
@@ -119,46 +119,20 @@ def test_labels_follow_their_vertices_through_repair(run: Run, sphere: Shape, tm
     assert np.array_equal(template.labels[clear], height[clear] > 0)
 
 
-def test_a_folder_of_registered_shapes(run: Run, folder: Path, tmp_path: Path) -> None:
-    record = made(run("prepare", folder, "-o", tmp_path / "out", *FEW, "--json"))
-    assert record["registered"] == 3
-    assert record["shapes"] == ["egg0.ply", "egg1.ply", "egg2.ply"]
-    template = load_template(tmp_path / "out" / "template.safetensors")
-    assert read_registered(tmp_path / "out", template).shape == (3, 642, 3)
-    assert len(list((tmp_path / "out" / "normalised").iterdir())) == 3
+def test_options_reach_the_config(run: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    heard: list[PrepareConfig] = []
 
+    def stop(shapes: Path, output: Path, config: PrepareConfig, progress: object) -> None:
+        heard.append(config)
+        raise InputError("far enough")
 
-def test_shapes_that_are_not_registered_are_prepared_all_the_same(
-    run: Run, folder: Path, torus: Shape, tmp_path: Path
-) -> None:
-    save_shape(folder / "other.ply", torus)
-    (folder / "broken.ply").write_bytes(b"ply\n")
-    answer = run("prepare", folder, "-o", tmp_path / "out", *FEW, "--align", "none", "--json")
-    record = made(answer)
-    assert record["registered"] == 0
-    assert any("broken.ply" in note for note in record["notes"])  # type: ignore[attr-defined]
-    assert "broken.ply" in answer.err
-
-
-def test_the_template_of_a_folder_can_be_chosen(run: Run, folder: Path, tmp_path: Path) -> None:
-    hashes = [
-        made(run("prepare", folder, "-o", tmp_path / f"out{n}", *FEW, "--json", *words))["template_hash"]
-        for n, words in enumerate([(), ("--template", folder / "egg0.ply"), ("--template", folder / "egg2.ply")])
-    ]
-    assert hashes[0] == hashes[1] != hashes[2]
-
-
-def test_options_of_the_nodes_reach_them(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
-    def hash_with(*words: str) -> object:
-        return made(run("prepare", two[0], "-o", tmp_path / "out", *FEW, "--json", *words))["template_hash"]
-
-    first = hash_with()
-    assert hash_with() == first
-    assert hash_with("--seed", "1") != first
-    assert hash_with("--nodes", "70") != first
-    assert hash_with("--radius", "0.35") != first
-    assert hash_with("--faces", "600") != first
-    assert load_template(tmp_path / "out" / "template.safetensors").shape.F <= 600
+    monkeypatch.setattr("meshmatch.templates.prepare.prepare", stop)
+    words = "--strategy uniform --nodes 70 --radius 0.35 --grow-radii --seed 1 --faces 600 --decimate meshlab"
+    words += " --template egg1 --align near --scale sphere --mirror no --landmarks .tip.npy"
+    assert run("prepare", folder, "-o", tmp_path / "out").status == 1
+    assert run("prepare", folder, "-o", tmp_path / "out", *words.split()).status == 1
+    nodes = NodeConfig("uniform", 70, 0.35, seed=1, grow=True)
+    assert heard == [PrepareConfig(), PrepareConfig(nodes, 600, "meshlab", "egg1", "near", "sphere", "no", ".tip.npy")]
 
 
 @pytest.mark.parametrize(
@@ -191,21 +165,3 @@ def test_an_output_folder_that_cannot_be(run: Run, two: tuple[Path, Path]) -> No
 def test_quiet(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
     answer = run("prepare", two[0], "-o", tmp_path / "out", *FEW, "--quiet")
     assert (answer.status, answer.out, answer.err) == (0, "", "")
-
-
-def test_mirror_images_are_found_and_said_unless_forbidden(run: Run, tmp_path: Path) -> None:
-    shapes = tmp_path / "hooks"
-    shapes.mkdir()
-    for number, left in enumerate(LEFT):
-        shape = hook(number, left)
-        order = np.random.default_rng(number).permutation(shape.F)  # not registered
-        save_shape(shapes / f"{number}.ply", Shape(shape.verts, shape.faces[order]))
-    usual = (*FEW, "--faces", "500", "--template", "0", "--json")
-    answer = run("prepare", shapes, "-o", tmp_path / "out", *usual)
-    assert made(answer)["mirrored"] == ["1.ply", "4.ply"]
-    assert "2 of 6 shapes are mirror images of the others, and were mirrored: 1.ply, 4.ply" in answer.err
-    answer = run("prepare", shapes, "-o", tmp_path / "as_given", *usual, "--mirror", "no")
-    assert made(answer)["mirrored"] == []
-    assert "mirror images" not in answer.err
-    answer = run("prepare", shapes, "-o", tmp_path / "none", *usual, "--mirror", "yes")
-    assert answer.status == 2

@@ -165,16 +165,20 @@ def test_a_training_starts_from_a_model(run: Run, stub: Recorder, tmp_path: Path
     assert "human" in answer.err
 
 
-def test_a_preset_has_its_template(run: Run, stub: Recorder, tmp_path: Path) -> None:
-    run("train", "-o", tmp_path / "mine", "--preset", "paper")
-    assert stub.bodies[0] == "human-T-300"
-    run("train", "-o", tmp_path / "mine", "--preset", "paper", "--template", "human-A")
-    assert stub.bodies[0] == "human-A"
-
-
-def test_identities(run: Run, stub: Recorder, tmp_path: Path) -> None:
-    run("train", "-o", tmp_path / "mine", "--identities", "10", "--seed", "3")
-    assert stub.bodies == ("human-T", 10, 3)
+@pytest.mark.parametrize(
+    ("words", "bodies"),
+    [
+        (["--preset", "paper"], ("human-T-300", 4096, 0)),
+        (["--preset", "paper", "--template", "human-A"], ("human-A", 4096, 0)),
+        (["--identities", "10", "--seed", "3"], ("human-T", 10, 3)),
+        (["--kind", "human", "--identities", "10"], ("human-T", 10, 0)),
+    ],
+)
+def test_which_people_are_made(
+    run: Run, stub: Recorder, tmp_path: Path, words: list[str], bodies: tuple[str, int, int]
+) -> None:
+    assert run("train", "-o", tmp_path / "mine", *words).status == 0
+    assert stub.bodies == bodies
 
 
 def test_a_kind_is_generated(run: Run, stub: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,12 +197,6 @@ def test_a_kind_is_generated(run: Run, stub: Recorder, tmp_path: Path, monkeypat
     run("train", "-o", tmp_path / "mine", "--kind", "head", "--identities", 7)
     assert asked == [(1024, 3), (7, 0)]
     assert stub.bodies == ()
-
-
-def test_people_are_the_kind_that_needs_no_name(run: Run, stub: Recorder, tmp_path: Path) -> None:
-    run("train", "-o", tmp_path / "mine", "--kind", "human", "--identities", 10)
-    assert stub.bodies == ("human-T", 10, 0)
-    assert stub.called["recipe"] == recipe_for()
 
 
 def test_poses_of_a_file_are_mixed_in(run: Run, stub: Recorder, tmp_path: Path) -> None:
@@ -257,9 +255,11 @@ def test_of_several_processes_one_speaks(
         (["--poses", "dance.bvh"], 1, "dance.bvh"),
         (["--pose-share", "1.5"], 2, "--pose-share"),
         (["--kind", "cat"], 2, "cat"),
-        (["--kind", "hand", "--template", "human-A"], 1, "--template goes with human bodies"),
-        (["--kind", "hand", "--characters", "0.5"], 1, "--characters goes with human bodies"),
-        (["--kind", "hand", "--bodies", "5"], 1, "--bodies goes with human bodies"),
+        (["--kind", "hand", "--template", "human-A"], 1, "--template does not go with --kind hand"),
+        (["--kind", "hand", "--characters", "0.5"], 1, "--characters does not go with --kind hand"),
+        (["--kind", "hand", "--bodies", "5"], 1, "--bodies does not go with --kind hand"),
+        (["--picture", "l.jpg"], 1, "l.jpg"),
+        (["--picture", "nowhere/l.png"], 1, "there is no folder"),
         (["--bodies", "20001"], 1, "must be from 0 to 20,000"),
         (["--kind", "human", "--shapes", "nowhere"], 1, "do not go with a folder"),
     ],
@@ -301,9 +301,3 @@ def test_a_run_without_a_report_has_no_picture(
     answer = run("train", "-o", tmp_path / "mine", "--picture", tmp_path / "l.png")
     assert "was not drawn" in answer.err
     assert not (tmp_path / "l.png").exists()
-
-
-@pytest.mark.parametrize("name", ["l.jpg", "nowhere/l.png"])
-def test_a_picture_of_losses_that_cannot_be(run: Run, stub: Recorder, tmp_path: Path, name: str) -> None:
-    assert run("train", "-o", tmp_path / "mine", "--picture", tmp_path / name).status == 1
-    assert stub.called == {}

@@ -16,8 +16,8 @@ from meshmatch.render.picture import Look
 from meshmatch.render.scales import Scale, Swatches
 from meshmatch.shapes.colors import UNKNOWN, label_colors
 from meshmatch.shapes.files import load_shape, save_shape
-from tests.cli.conftest import FakeMatching, Run, fake_fit
-from tests.cli.test_transfer_verbs import call, pair, well  # noqa: F401  (pair is a fixture)
+from tests.cli.conftest import FakeMatching, Run, fake_fit, well
+from tests.cli.test_transfer_verbs import call, pair  # noqa: F401  (pair is a fixture)
 from tests.shapes.painted import encoded, quarters, write_square_obj
 
 VERBS = ("transfer-color", "transfer-labels", "transfer-weights", "transfer-landmarks")
@@ -123,59 +123,6 @@ def test_a_texture_on_both(run: Run, pair: Path, drawn: Drawn) -> None:  # noqa:
     well(run(*words, "-o", "out.ply", "--picture", "p.png"))
     assert drawn.panels[1].appearance is not None
     assert not drawn.panels[1].appearance.textured
-
-
-@pytest.mark.parametrize("verb", VERBS)
-@pytest.mark.parametrize(
-    ("picture", "told"),
-    [
-        ("p.jpg", "a picture is a PNG"),
-        ("nowhere/p.png", "there is no folder"),
-        ("here.png", "it is a folder"),
-        ("in.png", "an input of this command"),
-    ],
-)
-def test_a_picture_that_cannot_be_is_told_before_the_work(
-    run: Run,
-    pair: Path,  # noqa: F811
-    monkeypatch: pytest.MonkeyPatch,
-    verb: str,
-    picture: str,
-    told: str,
-) -> None:
-    Path("here.png").mkdir()
-    Path("in.png").write_bytes(Path("ab.npz").read_bytes())
-
-    def begun(*_: object, **__: object) -> None:
-        raise AssertionError("the work began")
-
-    monkeypatch.setattr("meshmatch.cli.transfer_options.Transfer.__call__", begun)
-    before = sorted(path.name for path in pair.iterdir())
-    answer = run(*call(verb, "--picture", picture, map="in.png"))
-    assert answer.status == 1
-    assert told in answer.err
-    assert len(answer.err.splitlines()) == 2
-    assert sorted(path.name for path in pair.iterdir()) == before
-
-
-@pytest.mark.parametrize("verb", VERBS)
-def test_a_picture_that_fails_costs_no_output(
-    run: Run,
-    pair: Path,  # noqa: F811
-    monkeypatch: pytest.MonkeyPatch,
-    verb: str,
-) -> None:
-    from meshmatch.errors import OutputError
-
-    def failing(*_: object, **__: object) -> None:
-        raise OutputError("the disk is full")
-
-    monkeypatch.setattr(compose, "render_shapes", failing)
-    before = {path.name for path in pair.iterdir()}
-    assert run(*call(verb, "--picture", "p.png")).status == 1
-    new = {path.name for path in pair.iterdir()} - before
-    assert len(new) == 1
-    assert next(iter(new)).startswith("out.")
 
 
 def test_after_a_match_shapes_are_turned_as_their_fits_say(

@@ -1,7 +1,6 @@
 """transfer-texture through the program's only door. Maps are made by construction; the last test alone matches."""
 
 import json
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from meshmatch.shapes.textured_files import load_appearance, save_textured
 from meshmatch.templates.location import bundled_folder
 from meshmatch.transfer.texels import faces_on
 from meshmatch.transfer.unwrap import unwrapped
-from tests.cli.conftest import Answer, Run
+from tests.cli.conftest import Run, refused, well
 from tests.conftest import icosphere
 from tests.shapes.painted import FACES, encoded, quarters, write_gltf, write_square_obj
 from tests.transfer.known import split
@@ -58,11 +57,6 @@ def call(*more: str | Path, target: str = "b.ply", out: str = "out.glb", map: st
 
 def map_str(words: tuple[str | Path, ...]) -> list[str]:
     return [str(word) for word in words]
-
-
-def well(answer: Answer) -> Answer:
-    assert answer.status == 0, answer.err
-    return answer
 
 
 def seen(path: str, at: np.ndarray) -> np.ndarray:
@@ -250,16 +244,6 @@ def test_the_same_words_give_the_same_bytes(run: Run, pair: Path) -> None:
 # What can be wrong
 
 
-def refused(answer: Answer, words: str, folder: Path, before: set[str]) -> None:
-    """One line, a hint, status 1, and nothing new in the folder."""
-    lines = answer.err.strip().splitlines()
-    assert answer.status == 1, answer.err
-    assert [line.partition(":")[0] for line in lines] == ["error", "hint"], answer.err
-    assert words in answer.err
-    assert answer.out == ""
-    assert {path.name for path in folder.iterdir()} == before
-
-
 def plain_source() -> None:
     save_shape("a.glb", icosphere(2))
 
@@ -288,101 +272,56 @@ def wild_coordinates() -> None:
     save_textured("a.glb", Textured(ball.verts, ball.faces, uv), picture())
 
 
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [
-        (plain_source, "a.glb has no texture and no vertex colors: there is nothing to transfer"),
-        (damaged_source, "a.glb"),
-        (damaged_image, "damaged image"),
-        (wild_coordinates, "texture coordinates of 1 faces are out of range"),
-    ],
-)
-def test_sources_that_cannot_be_used(run: Run, pair: Path, no_fit: None, spoil: Callable[[], None], words: str) -> None:
-    spoil()
-    before = {path.name for path in pair.iterdir()}
-    refused(run(*call(map=None)), words, pair, before)
+def nothing() -> None:
+    pass
 
 
-def test_a_missing_image_beside_an_obj(run: Run, pair: Path, no_fit: None) -> None:
-    missing_image()
-    before = {path.name for path in pair.iterdir()}
-    answer = run("transfer-texture", "a.obj", "b.ply", "-o", "out.glb", *SMALL)
-    refused(answer, "a.obj needs the image skin.png of its material paint, which is not there", pair, before)
-
-
-@pytest.mark.parametrize(
-    ("words", "what"),
-    [
-        (("--size", "8"), "16 to 8192 texels"),
-        (("--size", "9000"), "16 to 8192 texels"),
-        (("--samples", "0"), "1 to 8 samples"),
-        (("--padding", "33"), "padding of 33 texels"),
-        (("--blank", "purple"), "--blank purple"),
-        (("--blank", "2,0,0"), "a color has 3 or 4 numbers within 0..1"),
-        (("--blank", "0", "--fill"), "contradict each other"),
-        (("--up", "y", "--front", "y"), "lie along one axis"),
-        (("--image", "gone.png"), "there is no file gone.png"),
-        (("--image", "b.ply"), "b.ply cannot be read as an image"),
-        (("--uv", "keep"), "b.ply has no texture coordinates to keep"),
-        (("--model", "nobody"), "nobody"),
-    ],
-)
-def test_choices_that_cannot_be(run: Run, pair: Path, no_fit: None, words: tuple[str, ...], what: str) -> None:
-    refused(run(*call(*words, map=None)), what, pair, {path.name for path in pair.iterdir()})
-
-
-def test_axes_and_a_map_do_not_go_together(run: Run, pair: Path) -> None:
-    refused(run(*call("--up", "y")), "--up is for matching", pair, {path.name for path in pair.iterdir()})
-
-
-@pytest.mark.parametrize(
-    ("out", "what"),
-    [
-        ("out.stl", "cannot write a texture as .stl"),
-        ("out", "cannot write a texture as (no suffix)"),
-        ("a.glb", "is an input of this command"),
-        ("gone/out.glb", "there is no folder gone"),
-    ],
-)
-def test_outputs_that_cannot_be(run: Run, pair: Path, no_fit: None, out: str, what: str) -> None:
-    refused(run(*call(out=out, map=None)), what, pair, {path.name for path in pair.iterdir()})
-
-
-def test_the_companions_of_an_obj_replace_no_input(run: Run, pair: Path, no_fit: None) -> None:
-    Path("skin.png").write_bytes(png_bytes(picture()))
-    answer = run(*call("--image", "skin.png", out="skin.obj", map=None))
-    refused(answer, "cannot write skin.png: it is an input", pair, {path.name for path in pair.iterdir()})
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
-def test_a_folder_that_may_not_be_written(run: Run, pair: Path, no_fit: None) -> None:
-    (pair / "locked").mkdir(mode=0o500)
-    refused(run(*call(out="locked/out.glb", map=None)), "cannot write", pair, {p.name for p in pair.iterdir()})
-
-
-def test_a_companion_that_cannot_be_written_stops_all(run: Run, pair: Path, no_fit: None) -> None:
-    (pair / "out.png").mkdir()
-    answer = run(*call(out="out.obj", map=None))
-    refused(answer, "cannot write out.png: it is a folder", pair, {path.name for path in pair.iterdir()})
-
-
-def test_clouds_have_no_surface(run: Run, pair: Path, no_fit: None) -> None:
+def a_cloud() -> None:
     np.save("b.npy", load_shape("b.ply").verts)
-    answer = run(*call("--uv", "keep", target="b.npy", out="out.ply", map=None))
-    refused(answer, "b.npy gets vertex colors", pair, {path.name for path in pair.iterdir()})
-    answer = run(*call("--uv", "keep", out="out.ply", map=None))
-    refused(answer, "end the output in .glb or .obj", pair, {path.name for path in pair.iterdir()})
 
 
-def test_maps_that_do_not_fit(run: Run, pair: Path) -> None:
-    a, b = load_shape("a.glb"), load_shape("b.ply")
-    save_map("ba.npz", VertexMap.between(b, a, np.zeros(b.V, int)))
-    save_map("other.npz", VertexMap.between(icosphere(1), b, np.zeros(42, int)))
-    before = {path.name for path in pair.iterdir()}
-    refused(run(*call(map="ba.npz")), "runs the wrong way", pair, before)
-    refused(run(*call(map="other.npz")), "made for another source", pair, before)
-    gone = run(*call(map="gone.npz"))
-    assert gone.status == 1 and gone.err.startswith("error: there is no file gone.npz")
+@pytest.mark.parametrize(
+    ("spoil", "words", "told"),
+    [
+        (plain_source, call(map=None), "a.glb has no texture and no vertex colors: there is nothing to transfer"),
+        (damaged_source, call(map=None), "a.glb"),
+        (damaged_image, call(map=None), "damaged image"),
+        (wild_coordinates, call(map=None), "texture coordinates of 1 faces are out of range"),
+        (
+            missing_image,
+            ["transfer-texture", "a.obj", "b.ply", "-o", "out.glb"],
+            "a.obj needs the image skin.png of its material paint, which is not there",
+        ),
+        *(
+            (nothing, call(*words.split(), map=None), told)
+            for words, told in (
+                ("--size 8", "16 to 8192 texels"),
+                ("--size 9000", "16 to 8192 texels"),
+                ("--samples 0", "1 to 8 samples"),
+                ("--padding 33", "padding of 33 texels"),
+                ("--blank purple", "--blank purple"),
+                ("--blank 2,0,0", "a color has 3 or 4 numbers within 0..1"),
+                ("--blank 0 --fill", "contradict each other"),
+                ("--image gone.png", "there is no file gone.png"),
+                ("--image b.ply", "b.ply cannot be read as an image"),
+                ("--uv keep", "b.ply has no texture coordinates to keep"),
+            )
+        ),
+        (
+            lambda: Path("skin.png").write_bytes(png_bytes(picture())),
+            call("--image", "skin.png", out="skin.obj", map=None),
+            "cannot write skin.png: it is an input",
+        ),
+        (lambda: Path("out.png").mkdir(), call(out="out.obj", map=None), "cannot write out.png: it is a folder"),
+        (a_cloud, call("--uv", "keep", target="b.npy", out="out.ply", map=None), "b.npy gets vertex colors"),
+        (nothing, call("--uv", "keep", out="out.ply", map=None), "end the output in .glb or .obj"),
+    ],
+)
+def test_what_cannot_be_is_told_before_the_work(
+    run: Run, pair: Path, no_fit: None, spoil: Callable[[], object], words: list[str], told: str
+) -> None:
+    spoil()
+    refused(run(*words), told, pair, {path.name for path in pair.iterdir()})
 
 
 def test_a_full_disk_leaves_nothing(run: Run, pair: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,9 +5,7 @@ Maps are made by construction; the last test alone matches.
 
 import csv
 import json
-import os
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +16,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
-from tests.cli.conftest import Answer, FakeMatching, Run
+from tests.cli.conftest import FakeMatching, Run, refused, well
 from tests.conftest import icosphere
 from tests.transfer.known import split
 from tests.transfer.skinned import write_skinned_glb
@@ -54,23 +52,6 @@ def call(verb: str, *more: str | Path, map: str | None = "ab.npz", out: str = ""
     if noun in data and f"--{noun}" not in more:
         words += [f"--{noun}", data[noun]]
     return [*words, *([] if map is None else ["--map", map]), *more]
-
-
-def well(answer: Answer) -> Answer:
-    assert answer.status == 0, answer.err
-    return answer
-
-
-def refused(answer: Answer, words: str, folder: Path, before: set[str]) -> None:
-    """One line, a hint, status 1, and nothing new in the folder."""
-    lines = answer.err.strip().splitlines()
-    assert answer.status == 1, answer.err
-    assert len(lines) == 2, answer.err
-    assert lines[0].startswith("error: ")
-    assert words in lines[0] + lines[1]
-    assert lines[1].startswith("hint: ")
-    assert answer.out == ""
-    assert {path.name for path in folder.iterdir()} == before
 
 
 @pytest.mark.parametrize("out", ["out.ply", "out.glb", "out.obj", "out.off", "out.npy", "out.csv"])
@@ -359,71 +340,6 @@ def test_landmarks_off_the_surface_are_mentioned(run: Run, pair: Path) -> None:
     assert "the nearest point of the surface was taken" in answer.err
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".npz", ".csv", ".txt", ".mat", ".json"])
-def test_every_kind_of_map(run: Run, pair: Path, suffix: str) -> None:
-    a, b = load_shape("a.ply"), load_shape("b.ply")
-    save_map(f"m{suffix}", VertexMap.between(a, b, np.arange(a.V)))
-    well(run(*call("transfer-color", "--values", "values.npy", map=f"m{suffix}", out="v.npy")))
-    assert np.abs(np.load("v.npy") - b.verts).max() < 1e-6
-
-
-def unfit_map(pair: Path) -> dict[str, str]:
-    """Maps that cannot be used, by name, and what is said of each."""
-    a, b = load_shape("a.ply"), load_shape("b.ply")
-    c = Shape(a.verts * 2, a.faces, "c.ply")
-    save_map("backwards.npz", VertexMap.between(b, a, np.arange(b.V) % a.V))
-    save_map("backwards.npy", VertexMap.between(b, a, np.arange(b.V) % a.V))
-    save_map("other.npz", VertexMap.between(c, b, np.arange(a.V)))
-    save_map("target.npz", VertexMap.between(a, c, np.arange(a.V)))
-    np.save("short.npy", np.arange(7))
-    np.save("high.npy", np.arange(a.V) + b.V)
-    Path("broken.npz").write_bytes(b"PK")
-    return {
-        "backwards.npz": "backwards.npz runs the wrong way: from b.ply to a.ply",
-        "backwards.npy": "backwards.npy runs the wrong way: from b.ply to a.ply",
-        "other.npz": "other.npz was made for another source: c.ply",
-        "target.npz": "target.npz was made for another target: c.ply of 162 vertices, but b.ply has 642",
-        "short.npy": "short.npy was made for another source",
-        "high.npy": "high.npy: the map a.ply -> b.ply: vertex 161",
-        "broken.npz": "broken.npz does not hold arrays",
-        "gone.npz": "there is no file gone.npz",
-        "map.xyz": "'.xyz' is not a format for maps",
-    }
-
-
-@pytest.mark.parametrize("verb", VERBS)
-def test_unfit_maps_are_refused_by_every_verb(run: Run, pair: Path, verb: str) -> None:
-    cases = unfit_map(pair)
-    before = {path.name for path in pair.iterdir()}
-    for name, words in cases.items():
-        answer = run(*call(verb, map=name))
-        if name == "gone.npz":
-            assert answer.status == 1 and words in answer.err
-            continue
-        refused(answer, words, pair, before)
-
-
-@pytest.mark.parametrize("verb", VERBS)
-def test_poor_maps_are_written_with_a_warning_or_not_at_all(run: Run, pair: Path, verb: str) -> None:
-    a, b = load_shape("a.ply"), load_shape("b.ply")
-    found = VertexMap.between(a, b, np.arange(a.V), verdict="poor", reasons=("it lies elsewhere",))
-    save_map("ab.npz", found)
-    before = {path.name for path in pair.iterdir()}
-    refused(run(*call(verb, "--strict")), "it lies elsewhere", pair, before)
-    answer = well(run(*call(verb)))
-    assert "warning: the map is poor: it lies elsewhere" in answer.err
-    save_map("ab.npz", replace(found, verdict="fair"))
-    answer = well(run(*call(verb, "--strict")))
-    assert "note: it lies elsewhere" in answer.err
-
-
-@pytest.mark.parametrize("verb", VERBS)
-def test_quiet_says_nothing(run: Run, pair: Path, verb: str) -> None:
-    answer = well(run(*call(verb, "--quiet")))
-    assert (answer.out, answer.err) == ("", "")
-    assert (pair / call(verb)[4]).is_file()
-
-
 def missing(name: str) -> Callable[[Path], object]:
     return lambda folder: (folder / name).unlink()
 
@@ -484,13 +400,8 @@ WRONG: dict[str, tuple[list[str | Path], Callable[[Path], object], str]] = {
     "over the source": (call("transfer-color", out="a.ply"), nothing, "is an input of this command"),
     "over the weights": (call("transfer-weights", out="weights.npz"), nothing, "is an input of this command"),
     "over the landmarks": (call("transfer-landmarks", out="marks.csv"), nothing, "is an input of this command"),
-    "no folder": (call("transfer-color", out="no/c.ply"), nothing, "there is no folder no"),
     "no source": (call("transfer-color"), missing("a.ply"), "there is no file a.ply"),
     "no target": (call("transfer-color"), missing("b.ply"), "there is no file b.ply"),
-    "up with a map": (call("transfer-color", "--up", "y"), nothing, "--up is for matching"),
-    "front with a map": (call("transfer-labels", "--front", "y"), nothing, "--front is for matching"),
-    "one axis": (call("transfer-color", "--up", "y", "--front", "-y", map=None), nothing, "along one axis"),
-    "no model": (call("transfer-color", "--model", "humann", map=None), nothing, "humann"),
 }
 
 
@@ -500,19 +411,6 @@ def test_what_cannot_be_is_told_in_a_line(run: Run, pair: Path, case: str) -> No
     prepare(pair)
     before = {path.name for path in pair.iterdir()}
     refused(run(*words), message, pair, before)
-
-
-@pytest.mark.parametrize("verb", VERBS)
-def test_an_output_that_cannot_be_written(run: Run, pair: Path, verb: str) -> None:
-    folder = pair / "locked"
-    folder.mkdir()
-    folder.chmod(0o500)
-    name = str(call(verb)[4])
-    if os.access(folder, os.W_OK):  # root writes everywhere: a file is no folder for anybody
-        folder.rmdir()
-        folder.write_text("")
-    before = {path.name for path in pair.iterdir()}
-    refused(run(*call(verb, out=f"locked/{name}")), "cannot write", pair, before)
 
 
 @pytest.mark.parametrize("verb", VERBS)

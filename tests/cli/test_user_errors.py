@@ -13,7 +13,7 @@ import pytest
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
-from tests.cli.conftest import Answer, Run
+from tests.cli.conftest import Run, refused
 
 
 @pytest.fixture(autouse=True)
@@ -78,17 +78,6 @@ BAD_FILES = {
 }
 
 
-def check(answer: Answer, told: str, folder: Path, before: list[str]) -> None:
-    lines = answer.err.splitlines()
-    assert answer.status == 1, answer.err
-    assert answer.out == ""
-    assert lines[0].startswith("error: ")
-    assert told in lines[0]
-    assert lines[1].startswith("hint: ")
-    assert len(lines) == 2
-    assert sorted(os.listdir(folder)) == before
-
-
 @pytest.mark.parametrize("side", ["source", "target", "register"])
 @pytest.mark.parametrize("kind", BAD_FILES)
 def test_bad_files(run: Run, two: tuple[Path, Path], tmp_path: Path, kind: str, side: str) -> None:
@@ -96,13 +85,13 @@ def test_bad_files(run: Run, two: tuple[Path, Path], tmp_path: Path, kind: str, 
     bad = tmp_path / name
     if make is not None:
         make(bad)
-    before = sorted(os.listdir(tmp_path))
+    before = set(os.listdir(tmp_path))
     words = {
         "source": ("match", bad, two[1], "-o", tmp_path / "map.npy"),
         "target": ("match", two[0], bad, "-o", tmp_path / "map.npy"),
         "register": ("register", bad, "-o", tmp_path / "fitted.obj"),
     }[side]
-    check(run(*words), told, tmp_path, before)
+    refused(run(*words), told, tmp_path, before)
 
 
 def test_a_few_bad_vertices_are_no_error(run: Run, two: tuple[Path, Path], tmp_path: Path, sphere: Shape) -> None:
@@ -123,17 +112,6 @@ def test_a_mistyped_file_is_guessed(run: Run, two: tuple[Path, Path], tmp_path: 
     assert f"did you mean {tmp_path / 'dancer.ply'}?" in answer.err
 
 
-@pytest.mark.parametrize("name", ["humna", "../human", "Human", "", "human/", "/no/such/folder"])
-@pytest.mark.parametrize("verb", ["match", "register"])
-def test_models_that_do_not_exist(run: Run, two: tuple[Path, Path], tmp_path: Path, name: str, verb: str) -> None:
-    before = sorted(os.listdir(tmp_path))
-    output = tmp_path / ("map.npy" if verb == "match" else "fitted.ply")
-    answer = run(verb, *two[: 2 if verb == "match" else 1], "-o", output, "--model", name)
-    check(answer, "model", tmp_path, before)
-    if name == "humna":
-        assert "did you mean human?" in answer.err
-
-
 def test_a_damaged_model(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
     model = tmp_path / "model"
     model.mkdir()
@@ -143,18 +121,9 @@ def test_a_damaged_model(run: Run, two: tuple[Path, Path], tmp_path: Path) -> No
     data = bytearray(weights.read_bytes())
     data[-1] ^= 1
     weights.write_bytes(data)
-    before = sorted(os.listdir(tmp_path))
+    before = set(os.listdir(tmp_path))
     answer = run("match", *two, "-o", tmp_path / "map.npy", "--model", model)
-    check(answer, "are not those of its card", tmp_path, before)
-
-
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_without_permission(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
-    closed = tmp_path / "closed"
-    closed.mkdir(mode=0o500)
-    answer = run("match", *two, "-o", closed / "map.npy")
-    assert answer.status == 1
-    assert f"cannot write {closed / 'map.npy'}" in answer.err
+    refused(answer, "are not those of its card", tmp_path, before)
 
 
 def test_a_folder_that_refuses_files(
@@ -165,11 +134,11 @@ def test_a_folder_that_refuses_files(
     def refused(self: Path, *_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied", str(self))
 
-    before = sorted(os.listdir(tmp_path))
+    before = set(os.listdir(tmp_path))
     with monkeypatch.context() as patch:
         patch.setattr(Path, "touch", refused)
         answer = run("match", *two, "-o", tmp_path / "map.npy")
-    check(answer, "Permission denied", tmp_path, before)
+    refused(answer, "Permission denied", tmp_path, before)
 
 
 @pytest.mark.parametrize(
@@ -178,23 +147,16 @@ def test_a_folder_that_refuses_files(
 )
 def test_landmarks_that_are_none(run: Run, two: tuple[Path, Path], tmp_path: Path, text: str, told: str) -> None:
     (tmp_path / "pairs.txt").write_text(text)
-    before = sorted(os.listdir(tmp_path))
+    before = set(os.listdir(tmp_path))
     answer = run("match", *two, "-o", tmp_path / "map.npy", "--landmarks", tmp_path / "pairs.txt")
-    check(answer, told, tmp_path, before)
-
-
-def test_both_axes_the_same(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
-    before = sorted(os.listdir(tmp_path))
-    for words in (("match", *two, "-o", tmp_path / "map.npy"), ("register", two[0], "-o", tmp_path / "f.ply")):
-        answer = run(*words, "--up", "y", "--front", "-y")
-        check(answer, "lie along one axis", tmp_path, before)
+    refused(answer, told, tmp_path, before)
 
 
 def test_a_truth_on_a_cloud_needs_faces(run: Run, tmp_path: Path, sphere: Shape) -> None:
     np.save(tmp_path / "cloud.npy", sphere.verts)
     save_shape(tmp_path / "ball.ply", sphere)
     np.savetxt(tmp_path / "map.txt", np.arange(642), fmt="%d")
-    before = sorted(os.listdir(tmp_path))
+    before = set(os.listdir(tmp_path))
     words = (tmp_path / "map.txt", tmp_path / "ball.ply", tmp_path / "cloud.npy")
     answer = run("evaluate", *words, "--truth", tmp_path / "map.txt")
-    check(answer, "cloud", tmp_path, before)
+    refused(answer, "cloud", tmp_path, before)

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from meshmatch.api import matching
-from meshmatch.errors import InputError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps import MAP_SUFFIXES
@@ -201,67 +199,3 @@ def test_vertex_colors_are_shown_where_the_materials_are_missing(run: Run, known
         answer = run("view", source, known[1], "--map", known[2], "-o", page)
         assert answer.status == 0 and missing in answer.err
         assert words_of(page)["look"] == {"kind": "colors", "side": "source"}
-
-
-def test_a_map_the_wrong_way_round_or_of_others_is_refused(run: Run, known: tuple[Path, Path, Path]) -> None:
-    a, b, path = known
-    page = a.with_name("page.html")
-    answer = run("view", b, a, "--map", path, "-o", page)
-    assert answer.status == 1
-    assert "runs the wrong way" in answer.err
-    answer = run("view", a, a, "--map", path, "-o", page)
-    assert answer.status == 1
-    assert "made for another target" in answer.err
-    assert not page.exists()
-
-
-@pytest.mark.parametrize("name", ["page.png", "page", "nowhere/page.html", "a.ply", "folder.html"])
-def test_an_output_that_cannot_be_is_told_before_the_work(
-    run: Run, two: tuple[Path, Path], stub: FakeMatching, name: str
-) -> None:
-    two[0].with_name("folder.html").mkdir()
-    before = sorted(path.name for path in two[0].parent.iterdir())
-    answer = run("view", *two, "-o", two[0].parent / name)
-    assert answer.status == 1
-    assert "error: " in answer.err
-    assert stub.called == {}
-    assert sorted(path.name for path in two[0].parent.iterdir()) == before
-
-
-def test_an_input_is_never_overwritten(run: Run, known: tuple[Path, Path, Path]) -> None:
-    page = known[0].with_name("map.html")
-    page.write_bytes(known[2].read_bytes())
-    answer = run("view", *known[:2], "--map", page, "-o", page)
-    assert answer.status == 1
-    assert "is an input of this command" in answer.err
-    assert page.read_bytes() == known[2].read_bytes()
-
-
-def test_a_mistyped_model_is_told_before_the_work(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
-    answer = run("view", *two, "-o", two[0].with_name("page.html"), "--model", "humna")
-    assert answer.status == 1
-    assert "did you mean human?" in answer.err
-    assert stub.called == {}
-
-
-@pytest.mark.parametrize("error", [InputError("a bad file"), KeyboardInterrupt()])
-def test_a_failure_leaves_what_was_there(
-    run: Run, two: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, error: BaseException
-) -> None:
-    def failing(*_: object, **__: object) -> None:
-        raise error
-
-    monkeypatch.setattr(matching, "match", failing)
-    page = two[0].with_name("page.html")
-    page.write_bytes(b"old")
-    assert run("view", *two, "-o", page).status == (1 if isinstance(error, InputError) else 130)
-    assert page.read_bytes() == b"old"
-    assert len(list(page.parent.iterdir())) == 3
-
-
-def test_files_of_one_name_are_told_apart(run: Run, known: tuple[Path, Path, Path]) -> None:
-    other, page = known[0].parent / "other" / "a.ply", known[0].with_name("page.html")
-    other.parent.mkdir()
-    other.write_bytes(known[1].read_bytes())
-    assert run("view", known[0], other, "--map", known[2], "-o", page).status == 0
-    assert [words_of(page)[side]["name"] for side in ("source", "target")] == [str(known[0]), str(other)]

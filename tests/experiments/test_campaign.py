@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.errors import InputError
 from meshmatch.experiments.bench import campaign
 from meshmatch.experiments.bench.campaign import POSES, Body, People, band_of, counted

@@ -24,7 +24,7 @@ from meshmatch.experiments.paper.implicit import (
 from meshmatch.implicit.model import ImplicitModel
 from meshmatch.implicit.network import ImplicitConfig, ImplicitNetwork
 from meshmatch.implicit.space import CUBE_RADIUS, cube_nodes
-from meshmatch.models.implicit_card import ImplicitCard
+from meshmatch.models.card import ImplicitCard
 from meshmatch.shapes.sampling import sample_surface
 from tests.implicit.boxes import box, box_sdf
 

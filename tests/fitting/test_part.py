@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from meshmatch.api.inputs import as_model
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.errors import OptionError
 from meshmatch.fitting import fitter
 from meshmatch.fitting.fit import Fit

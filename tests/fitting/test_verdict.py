@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Floats, Ints
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter, cap_verdict

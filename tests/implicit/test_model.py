@@ -15,13 +15,15 @@ from meshmatch.errors import MeshmatchError, ModelError, OptionError
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.triangles import is_watertight
 from meshmatch.implicit.codes import fit_implicit, nearest_code
-from meshmatch.implicit.model import ImplicitFit, ImplicitModel, load_implicit, nearest_on_template
-from meshmatch.models.implicit_card import IMPLICIT, is_implicit, read_implicit_card
+from meshmatch.implicit.fit import ImplicitFit
+from meshmatch.implicit.model import ImplicitModel, load_implicit, nearest_on_template
+from meshmatch.implicit.training import train_implicit
+from meshmatch.models.card import IMPLICIT, is_implicit, read_implicit_card
 from meshmatch.models.registry import WEIGHTS
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
-from tests.implicit.boxes import box, box_sdf
+from tests.implicit.boxes import TRAIN, box, box_sdf, config
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +95,38 @@ def test_an_unseen_shape_finds_its_code(model: ImplicitModel, tmp_path: Path) ->
     assert given.residual < 3
     with pytest.raises(OptionError, match="steps"):
         fit_implicit(model, moved, steps=0)
+
+
+def test_a_shape_that_stands_otherwise_is_turned(tmp_path: Path) -> None:
+    """A plane whose wings lie along z in its file; after its turn all is as it is for the same plane as it should stand."""
+    axes = (1, 2, 0)
+
+    def plane(span: float) -> tuple[np.ndarray, np.ndarray]:
+        points = np.random.default_rng(int(1000 * span)).uniform(-1.1, 1.1, (20_000, 3))
+        parts = [((1, 0, 0), (span, 0.1, 0.2)), ((0, 0, 0), (0.15, 0.15, 1)), ((0, 0.3, -0.8), (0.1, 0.4, 0.2))]
+        found = [box_sdf(points - np.array(middle) * (0, 1, 1), np.array(half)) for middle, half in parts]
+        return points, np.min(found, axis=0)
+
+    folder = tmp_path / "planes"
+    folder.mkdir()
+    for number, span in enumerate((0.7, 0.8, 0.9)):
+        points, distances = plane(span)
+        np.savez(folder / f"plane{number}.npz", points=points, distances=distances)
+    training = replace(TRAIN, steps=150, rate=3e-3, average=0.9)
+    model = load_implicit(train_implicit(tmp_path / "m", folder, config=config("mls"), training=training))
+    points, distances = plane(0.85)
+    files = [tmp_path / name for name in ("as-they.npz", "turned.npz")]
+    np.savez(files[0], points=points, distances=distances)
+    np.savez(files[1], points=points[:, axes], distances=distances)
+    as_they, turned = (fit_implicit(model, file, steps=5) for file in files)
+    assert as_they.notes == ()
+    assert np.array_equal(as_they.frame.rotation, np.eye(3))
+    assert len(turned.notes) == 1
+    assert np.allclose(turned.frame.apply(points[:, axes]), as_they.frame.apply(points))
+    between = model.blend(as_they, turned, 0.5).frame
+    assert np.allclose(between.rotation @ between.rotation, turned.frame.rotation)
+    found = model.register(turned, 32)
+    assert np.argmax(np.ptp(found.verts, axis=0)) == axes.index(2)  # the fuselage
 
 
 def test_a_code_is_searched_as_its_model_was_trained(model: ImplicitModel) -> None:

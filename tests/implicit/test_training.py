@@ -13,7 +13,7 @@ from meshmatch.implicit.objective import ImplicitLoss
 from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
 from meshmatch.implicit.space import CUBE_RADIUS, cube_nodes
 from meshmatch.implicit.training import AS_PUBLISHED, build_implicit, train_implicit
-from meshmatch.models.implicit_card import IMPLICIT
+from meshmatch.models.card import IMPLICIT
 from meshmatch.models.registry import WEIGHTS
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.training.loop import StepReport

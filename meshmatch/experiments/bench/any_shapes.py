@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 from typer import Option
 
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.experiments import runner
 from meshmatch.fitting.fit_config import FitConfig

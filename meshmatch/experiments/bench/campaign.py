@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from typer import Option
 
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
 from meshmatch.collections.fit_files import save_fit
 from meshmatch.errors import MeshmatchError

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from typer import Option
 
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.pairs import VERDICTS, matched
 from meshmatch.experiments.bench.scores import TruthDistances

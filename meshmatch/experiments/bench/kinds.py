@@ -24,7 +24,7 @@ import numpy as np
 from rich.table import Table
 from typer import Option
 
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Ints
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.pairs import matched

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.api.inputs import as_model, validated
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.fit_files import load_fit, save_fit
 from meshmatch.errors import InputError

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.experiments.bench.sets import Pair, Shapes
 from meshmatch.experiments.runner import track
 from meshmatch.fitting.fit import Fit

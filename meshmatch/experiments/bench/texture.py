@@ -22,7 +22,8 @@ import numpy as np
 from typer import Option
 
 from meshmatch.api.inputs import as_model
-from meshmatch.api.matching import match, register
+from meshmatch.api.matcher import Matcher
+from meshmatch.api.matching import match
 from meshmatch.arrays import Float, Floats
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.speed import sized
@@ -94,7 +95,7 @@ def trip_of(name: str, folder: Path) -> Trip:
         look = load_appearance(samples / "dancer-textured.glb", source)
         target = source
     if name == "re-posed":
-        fit = register(samples / "climber.ply")
+        fit = Matcher().fit(samples / "climber.ply")
         target = decimate(dense_shape(as_model("human"), fit), 2 * VERTICES)
         found = match(source, target)
         return Trip(source, look, target, found.backward(), found.map)

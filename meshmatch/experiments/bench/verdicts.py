@@ -27,7 +27,7 @@ from scipy.optimize import minimize
 from scipy.stats import beta
 from typer import Option
 
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments import runner

@@ -26,7 +26,7 @@ from meshmatch.experiments.hostile.learned import write_eggs
 from meshmatch.experiments.hostile.samples import small_shape, write_small_model
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.models.implicit_card import IMPLICIT
+from meshmatch.models.card import IMPLICIT
 from meshmatch.models.registry import HOME_VARIABLE
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.formats import Textured

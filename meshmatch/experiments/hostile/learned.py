@@ -23,7 +23,7 @@ from meshmatch.collections.collection import Collection
 from meshmatch.implicit.network import ImplicitConfig
 from meshmatch.implicit.samples import read_implicit_samples
 from meshmatch.implicit.training import TRAINING, build_implicit, train_implicit
-from meshmatch.models.implicit_card import IMPLICIT
+from meshmatch.models.card import IMPLICIT
 from meshmatch.models.network import NetworkConfig
 from meshmatch.models.registry import CARD, TEMPLATE, WEIGHTS
 from meshmatch.shapes.files import save_shape

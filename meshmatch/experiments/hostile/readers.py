@@ -23,9 +23,8 @@ from meshmatch.generators.pose_files import load_poses
 from meshmatch.implicit.model import load_implicit
 from meshmatch.implicit.samples import samples_of
 from meshmatch.maps.files import load_map
-from meshmatch.models.card import read_card
+from meshmatch.models.card import IMPLICIT, read_card, read_implicit_card
 from meshmatch.models.checkpoint import load_weights as load_network
-from meshmatch.models.implicit_card import IMPLICIT, read_implicit_card
 from meshmatch.models.registry import TEMPLATE, verify_model
 from meshmatch.shapes.appearance import ImageReader
 from meshmatch.shapes.files import load_shape, save_shape

@@ -21,8 +21,8 @@ from meshmatch.experiments.hostile.learned import learned_samples
 from meshmatch.maps import MAP_SUFFIXES
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.card import IMPLICIT, ImplicitCard, write_card
 from meshmatch.models.checkpoint import save_weights as save_network
-from meshmatch.models.implicit_card import ImplicitCard, write_implicit_card
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats import Textured
@@ -131,7 +131,7 @@ def make_samples(folder: Path) -> list[Sample]:  # noqa: C901
         add("images", f"i.{suffix}", Path.write_bytes, _image(paint, kind))
     built_in = bundled_folder() / "models" / "human"
     add("cards", "card.json", lambda path: shutil.copyfile(built_in / "card.json", path))
-    add("cards", "implicit.json", lambda path: write_implicit_card(_implicit(), path.parent))
+    add("cards", IMPLICIT, lambda path: write_card(_implicit(), path))
     state = {"a.weight": np.random.default_rng(4).random((4, 70)), "a.bias": np.zeros(4)}
     for storage in ("int8", "float16", "float32"):
         add("safetensors", "w.safetensors", lambda path, kind: save_network(state, path, storage=kind), storage)

@@ -37,11 +37,12 @@ from meshmatch.experiments.bench.charts import stacked
 from meshmatch.experiments.makers.furniture import KINDS, furniture
 from meshmatch.experiments.paper.part_transfer import mean_overlap
 from meshmatch.fields.field import arap_energy, volume_energy
-from meshmatch.implicit.model import ImplicitFit, ImplicitModel, load_implicit, nearest_on_template
+from meshmatch.implicit.fit import ImplicitFit
+from meshmatch.implicit.model import ImplicitModel, load_implicit, nearest_on_template
 from meshmatch.implicit.network import ImplicitConfig
 from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
 from meshmatch.implicit.training import AS_PUBLISHED, DIF_NET, TRAINING, train_implicit
-from meshmatch.models.implicit_card import IMPLICIT
+from meshmatch.models.card import IMPLICIT
 from meshmatch.outputs import make_folder
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look

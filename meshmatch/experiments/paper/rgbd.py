@@ -46,7 +46,7 @@ from scipy.spatial.transform import Rotation
 from typer import Option
 
 from meshmatch.api.inputs import validated
-from meshmatch.api.matching import Matcher
+from meshmatch.api.matcher import Matcher
 from meshmatch.api.transfer import transfer_colors
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.experiments import runner
