@@ -77,7 +77,8 @@ def interpolate(
     )
     if how.implicit and suffix in (".html", ".htm"):
         hint = "give a name without a suffix for a folder, or one that ends in .png"
-        raise OptionError(f"{output.name}: surfaces of an implicit model share no vertices, as a page needs", hint)
+        what = "a page needs shapes that share vertices, and the surfaces of an implicit model do not"
+        raise OptionError(f"{output.name}: {what}", hint)
     console = Console(run.quiet)
     # What cannot be written, a mistyped model and broken files are told before the long work.
     with (replace_on_success if suffix else folder_on_success)(output) as temporary:

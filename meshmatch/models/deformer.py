@@ -99,7 +99,7 @@ class Deformer(nn.Module):
     def rotate_rows(self, vectors: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "R 3"]:
         if isinstance(self.decoder, layers.PointDecoder):
             return fields.turned_rows(vectors, turn)
-        nodes = self.nodes.double().cpu().numpy()  # as `NodeNetwork` does
+        nodes = _array(self.nodes)  # as `NodeNetwork` does
         return (nodes + vectors) @ turn - nodes
 
     def align(
@@ -181,4 +181,5 @@ def with_weights(config: NetworkConfig, K: int, weights: Mapping[str, np.ndarray
 
 
 def _array(tensor: torch.Tensor) -> Floats:
-    return tensor.double().cpu().numpy()
+    """In NumPy's precision, which only the CPU is asked for: a device may have no float64."""
+    return tensor.cpu().double().numpy()

@@ -25,7 +25,7 @@ def nearest_index(
     queries: Float[torch.Tensor, "B Q D"], points: Float[torch.Tensor, "B P D"]
 ) -> Int[torch.Tensor, "B Q"]:
     """Index of the nearest of ``points``: trees on a CPU, where comparing all pairs is far slower."""
-    if queries.is_cuda:
+    if queries.device.type != "cpu":
         return torch.cdist(queries, points).argmin(-1)
     found = [
         quick_tree(cloud).query(query)[1]

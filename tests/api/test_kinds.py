@@ -267,19 +267,6 @@ def test_damaged_models_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyP
         kinds.installed_models()
 
 
-def test_no_model_can_be_called_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(registry.HOME_VARIABLE, str(tmp_path / "home"))
-    folder = tmp_path / "auto"
-    folder.mkdir()
-    source = registry.built_in_folder() / "human"
-    for file in source.iterdir():
-        (folder / file.name).write_bytes(file.read_bytes())
-    card = folder / "card.json"
-    card.write_text(card.read_text().replace('"name": "human"', '"name": "auto"', 1))
-    with pytest.raises(ModelError, match="no model can be called auto"):
-        registry.add_model(folder)
-
-
 def test_animals_are_told_before_the_rarer_kinds_are_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[str] = []
     cards = {name: as_model(name).card for name in ("hand", "head", "human", "quadruped")}

@@ -42,6 +42,7 @@ def test_the_samples_match_well(both) -> None:
     assert (both.source_fit.up, both.target_fit.up) == ("+y", "+z")
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_map(
     dancer: Shape, both, remembered_fits: Callable, monkeypatch: pytest.MonkeyPatch
 ) -> None:

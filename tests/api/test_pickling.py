@@ -120,7 +120,9 @@ def test_a_collection_comes_back_without_its_fits(tmp_path: Path) -> None:
     assert repr(back) == f"Collection({str(tmp_path)!r})"
 
 
-@pytest.mark.parametrize("start", ["spawn", "fork", "forkserver"])
+@pytest.mark.parametrize(
+    "start", ["spawn", pytest.param("fork", marks=pytest.mark.slow), pytest.param("forkserver", marks=pytest.mark.slow)]
+)
 def test_processes_of_every_kind_fit_alike(
     start: str, matcher: Matcher, eggs: tuple[Shape, Shape], result: MatchResult
 ) -> None:
@@ -142,6 +144,7 @@ class Points:
         return points_of(self.matcher, self.shapes[number])
 
 
+@pytest.mark.slow
 def test_a_data_loader_fits_in_its_workers(matcher: Matcher, eggs: tuple[Shape, Shape], result: MatchResult) -> None:
     from torch.utils.data import DataLoader
 

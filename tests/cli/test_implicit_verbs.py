@@ -224,7 +224,7 @@ def test_the_registry_knows_implicit_models(
         (["match", "-o", "map.npz", "--up", "y"], "--up does not go with an implicit model"),
         (["match", "-o", "map.npz", "--landmarks", "pairs.txt"], "--landmarks does not go"),
         (["interpolate", "-o", "way", "--mesh", "template"], "--mesh does not go"),
-        (["interpolate", "-o", "way.html"], "share no vertices"),
+        (["interpolate", "-o", "way.html"], "a page needs shapes that share vertices"),
         (["interpolate", "-o", "way", "--resolution", "33"], "must be even"),
     ],
 )

@@ -85,8 +85,8 @@ def test_an_unseen_shape_finds_its_code(model: ImplicitModel, tmp_path: Path) ->
     found = fit_implicit(model, moved, steps=120)
     assert found.residual < min(0.8 * first.residual, 3)
     assert np.abs(sides(model.surface(found, 32)) / sides(moved) - 1).max() < 0.3
-    again = fit_implicit(model, moved, steps=120)
-    assert np.array_equal(found.code, again.code)
+    again = fit_implicit(model, moved, steps=1)
+    assert np.array_equal(first.code, again.code)
     assert (first.verdict == "good") == (not first.reasons)
     # the same from given distances
     points = np.random.default_rng(0).uniform(-1.3, 1.3, (20_000, 3))

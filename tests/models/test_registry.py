@@ -110,6 +110,12 @@ def test_built_in_models_stay(blob: Path, tmp_path: Path) -> None:
     assert verify_model("human").name == "human"
 
 
+def test_no_model_is_called_auto(tmp_path: Path) -> None:
+    write_model(tmp_path / "auto", name="auto")
+    with pytest.raises(ModelError, match="no model can be called auto"):
+        add_model(tmp_path / "auto")
+
+
 def test_a_taken_name_needs_replace(blob: Path) -> None:
     add_model(blob)
     write_model(blob, seed=7)
