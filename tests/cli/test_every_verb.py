@@ -86,7 +86,7 @@ WRONG: list[tuple[str, str, tuple[str, ...]]] = [
     ("-o nowhere/out{}", "there is no folder nowhere", ()),
     ("-o folder{}", "is a folder", ()),
     ("-o out.bad", ".bad", ()),
-    ("-o out", "out", ()),
+    ("-o out", "", ()),  # a name without a suffix
     ("--picture p.jpg", "a picture is a PNG", ("view",)),
     ("--picture nowhere/p.png", "there is no folder nowhere", ("view",)),
     ("--picture folder.png", "is a folder", ("view",)),
