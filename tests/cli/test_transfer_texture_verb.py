@@ -295,9 +295,9 @@ def a_cloud() -> None:
         *(
             (nothing, call(*words.split(), map=None), told)
             for words, told in (
-                ("--size 8", "16 to 8192 texels"),
-                ("--size 9000", "16 to 8192 texels"),
-                ("--samples 0", "1 to 8 samples"),
+                ("--size 8", "size must be an integer from 16 to 8192"),
+                ("--size 9000", "size must be an integer from 16 to 8192"),
+                ("--samples 0", "samples must be an integer from 1 to 8"),
                 ("--padding 33", "padding of 33 texels"),
                 ("--blank purple", "--blank purple"),
                 ("--blank 2,0,0", "a color has 3 or 4 numbers within 0..1"),
