@@ -134,11 +134,12 @@ def map_of_fits(
     if not isinstance(first, Fit) and not isinstance(second, Fit):
         assert first.owner and first.source and second.source
         return first.owner.match(first, second, first.source, second.source)
-    places = []
-    for fit, own in zip(fits, before, strict=True):
+
+    def places(fit: Fit | ImplicitFit, own: Fit | ImplicitFit) -> Places:
         assert isinstance(fit, Fit) and isinstance(own, Fit)
-        places.append(Places.of(shape_of(fit), fit, own, threads))
-    return build_map(*places, threads)
+        return Places.of(shape_of(fit), fit, own, threads)
+
+    return build_map(places(first, before[0]), places(second, before[1]), threads)
 
 
 def shape_of(fit: Fit) -> Repaired:

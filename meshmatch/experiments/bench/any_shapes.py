@@ -135,7 +135,7 @@ def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[
         "pair": " to ".join(pair),
         "error": error_of(folder, pair[1], arrived),
         "verdict": result.map.verdict,
-        "trust": result.target_fit.trust,
+        "confidence": float(result.map.confidence.mean()),
         "ambiguous": any("ambiguous" in reason for reason in result.map.reasons),
         "cpu": spent,
     }
