@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from meshmatch.api import matching
+from meshmatch.api import matcher, matching
 from meshmatch.errors import OutputError
 from meshmatch.maps.files import load_map
 from meshmatch.models.trained import TrainedModel
@@ -157,7 +157,7 @@ def test_register_in_full_resolution(
     stub.make_fit = lambda *_, **__: moved
     network = SimpleNamespace(config=SimpleNamespace(field="mls"))
     model = TrainedModel(small_card(), template, network)  # type: ignore[arg-type]
-    monkeypatch.setattr(matching, "as_model", lambda name: model)
+    monkeypatch.setattr(matcher, "as_model", lambda name: model)
     output = two[0].with_name("fitted.ply")
     answer = run("register", two[0], "-o", output, "--dense", "--json", "--model", "human")
     assert (answer.status, json.loads(answer.out)["vertices"]) == (0, 642)

@@ -131,12 +131,12 @@ def test_a_folder_that_refuses_files(
 ) -> None:
     """As above, for every user: the system says no when the file is made."""
 
-    def refused(self: Path, *_: object, **__: object) -> None:
+    def not_allowed(self: Path, *_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied", str(self))
 
     before = set(os.listdir(tmp_path))
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "touch", refused)
+        patch.setattr(Path, "touch", not_allowed)
         answer = run("match", *two, "-o", tmp_path / "map.npy")
     refused(answer, "Permission denied", tmp_path, before)
 

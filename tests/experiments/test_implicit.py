@@ -35,7 +35,7 @@ def card_of(count: int, scale: float) -> ImplicitCard:
     names, frames = [f"plane{k}" for k in range(count)], [[scale, 0, 0, 0]] * count
     return ImplicitCard(
         name="planes", category="plane", network={}, shapes=names, frames=frames, data="", licence="", recipe={}, seed=0,
-        steps=0, training_minutes=0.0, weights_sha256="", created="",
+        steps=0, training_minutes=0.0, weights_sha256="0" * 64, created="2026-01-31",
     )  # fmt: skip
 
 

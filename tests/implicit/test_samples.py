@@ -80,7 +80,7 @@ def test_a_mesh_with_a_hole_may_be_taken_as_a_surface() -> None:
         ({"points": np.zeros((5, 3))}, "needs points"),
         ({"points": np.zeros((5, 2)), "distances": np.zeros(5)}, "needs points"),
         ({"points": np.zeros((5, 3)), "distances": np.full(5, np.nan)}, "finite"),
-        ({"points": np.zeros((5, 3)), "normals": np.full((5, 3), 1e308)}, "is huge"),
+        ({"points": np.zeros((5, 3)), "normals": np.full((5, 3), 1e308)}, "huge"),
         ({"points": np.eye(5, 3), "distances": np.array([-1e40, -1, -1, -1, 1])}, "far beyond"),
         ({"points": np.full((5, 3), "a"), "distances": np.zeros(5)}, "finite"),
         ({"points": np.zeros((5, 3)), "distances": np.ones(5)}, "four are needed"),
