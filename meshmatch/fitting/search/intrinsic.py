@@ -27,7 +27,6 @@ _PROFILE = 12  # distances at which the area around an extremity is asked
 # Of the diameter along the surface: an extremity is a maximum of the mean distance that stands out by so much from the
 # way to a higher one, and lies so far from the others. At most so many are told apart.
 _PERSISTENCE, _APART, _MOST = 0.04, 0.08, 14
-_TOO_MANY = 3  # times as many vertices as asked: the shape is in crumbs, and is thinned as a cloud
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +48,7 @@ class ThinMesh:
         """`InputError` for a cloud whose points lie on no surface."""
         kept, corners = low_mesh(shape, faces)
         used, renumbered = np.unique(corners, return_inverse=True)
-        if len(used) > _TOO_MANY * faces:
+        if len(used) > faces:  # twice as many as of a closed surface: it is in crumbs, and is thinned as a cloud
             cloud = Shape(shape.verts, np.empty((0, 3), np.int64), shape.name)
             kept, corners = triangulate_cloud(cloud, faces)
             used, renumbered = np.unique(corners, return_inverse=True)
