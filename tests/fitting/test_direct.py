@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.fitting.direct import DirectConfig, match_directly
 from meshmatch.fitting.judge.direct import DirectFeatures, judge_direct
 from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh
-from meshmatch.fitting.search.proposals import extremity_proposals, rigid_proposals, spectral_proposals
+from meshmatch.fitting.search.proposals import Assignments, extremity_proposals, rigid_proposals, spectral_proposals
 from meshmatch.fitting.solve.driver import minimise
 from meshmatch.fitting.solve.surface_nodes import SurfaceNodes
 from meshmatch.shapes.normalise import sqrt_area_frame
@@ -91,6 +91,17 @@ def test_a_map_of_the_surface_is_among_the_proposals(make: Any, pair: tuple[Shap
     true = frame_applied(pair[1]).verts[meshes[0].kept]
     errors = [np.linalg.norm(each.points - true, axis=1).mean() for each in found]
     assert min(errors) < 0.08
+
+
+def test_exchanges_lead_to_the_right_assignment_and_a_mirror_image_costs_more(thin: ThinMesh) -> None:
+    surface = Intrinsic(thin)
+    right = tuple(range(len(LIMBS)))
+    wrong = (1, 0, *right[2:])
+    same = Assignments(surface, surface)
+    same.climb(wrong)
+    assert min(same.judged, key=same.cost) == right and same.cost(right) < same.cost(wrong)
+    mirrored = ThinMesh(thin.kept, thin.verts * [-1, 1, 1], thin.faces[:, ::-1])  # as far apart, but turned over
+    assert Assignments(surface, Intrinsic(mirrored)).cost(right) > same.cost(right) + 0.02
 
 
 def test_a_turned_copy_is_found_by_a_rigid_motion(thin: ThinMesh) -> None:

@@ -240,7 +240,7 @@ def extremity_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
     """
     if min(len(source.extremities), len(target.extremities)) < 2:
         return []
-    judge = _Assignments(source, target)
+    judge = Assignments(source, target)
     best = sorted(judge.candidates(), key=judge.cost)[: SETTINGS.climbs]
     for start in best:
         judge.climb(start)
@@ -259,7 +259,7 @@ Assignment = tuple[int, ...]
 """For each extremity of the source that of the target, or -1."""
 
 
-class _Assignments:
+class Assignments:
     """Assignments of the extremities of two shapes, and what each costs."""
 
     def __init__(self, source: Intrinsic, target: Intrinsic) -> None:
