@@ -19,6 +19,7 @@ from tests.cli.conftest import Run
 from tests.conftest import icosphere
 
 FEW = ("--nodes", "60", "--radius", "0.35", "--strategy", "uniform", "-q")
+AS_THEY_ARE = ("--align", "none", "--mirror", "no")
 
 
 @pytest.fixture(autouse=True)
@@ -40,39 +41,35 @@ def eggs(tmp_path: Path) -> Path:
     return folder
 
 
-def test_prepare_says_what_it_chose(run: Run, eggs: Path, tmp_path: Path) -> None:
-    answer = run("prepare", eggs, "-o", tmp_path / "out", *FEW[:-1], "--json")
-    record = json.loads(answer.out)
-    assert (record["registered"], record["align"], record["scale"], record["landmarks"]) == (0, "rigid", "area", 0)
-    assert "which lies nearest to all others" in answer.err
-    assert "3 shapes without correspondence" in answer.err
-
-
-def test_prepare_says_what_kind_the_shapes_are(
+def test_prepare_says_what_it_chose_and_what_kind_the_shapes_are(
     run: Run, eggs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[dict[str, Path]] = []
     monkeypatch.setattr(kinds, "kinds_of", lambda files, *_: seen.append(files) or dict.fromkeys(files, "hand"))
-    answer = run("prepare", eggs, "-o", tmp_path / "out", *FEW[:-1], "--json")
+    answer = run("prepare", eggs, "-o", tmp_path / "out", *FEW[:-1], "--mirror", "no", "--json")
+    record = json.loads(answer.out)
+    assert (record["registered"], record["align"], record["scale"], record["landmarks"]) == (0, "rigid", "area", 0)
+    assert "which lies nearest to all others" in answer.err
+    assert "3 shapes without correspondence" in answer.err
     assert f"the model hand knows these shapes: to begin with it, `meshmatch fit {eggs} -o fits`" in answer.err
-    assert any("knows these shapes" in note for note in json.loads(answer.out)["notes"])
-    assert list(seen[0]) == json.loads(answer.out)["shapes"]
+    assert any("knows these shapes" in note for note in record["notes"])
+    assert list(seen[0]) == record["shapes"]
     assert all(path.is_file() for path in seen[0].values())
 
-    assert run("prepare", eggs, "-o", tmp_path / "out", *FEW).status == 0
+    assert run("prepare", eggs, "-o", tmp_path / "out", *FEW, *AS_THEY_ARE).status == 0
     assert len(seen) == 1  # nobody listens, nobody asks
 
     def refuse(*_: object) -> dict[str, str]:
         raise ModelError("no model is installed", "see `meshmatch models list`")
 
     monkeypatch.setattr(kinds, "kinds_of", refuse)
-    answer = run("prepare", eggs, "-o", tmp_path / "out", *FEW[:-1])
+    answer = run("prepare", eggs, "-o", tmp_path / "out", *FEW[:-1], *AS_THEY_ARE)
     assert answer.status == 0
     assert "the kinds of these shapes were not read: no model is installed" in answer.err
 
 
 def test_from_a_folder_to_a_map(run: Run, eggs: Path, tmp_path: Path) -> None:
-    assert run("prepare", eggs, "-o", tmp_path / "out", *FEW, "--align", "none").status == 0
+    assert run("prepare", eggs, "-o", tmp_path / "out", *FEW, *AS_THEY_ARE).status == 0
     answer = run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", "--steps", "3")
     assert answer.status == 0, answer.err
     assert "learned from 3 shapes of out, without correspondence" in answer.err
@@ -143,7 +140,7 @@ def test_known_points_and_preset_reach_the_training(
     monkeypatch.setattr("meshmatch.training.train.train_model", stub)
     if registered:
         (eggs / "egg1.ply").unlink()
-    prepared = ("--landmarks", ".tip.npy", "--template", "egg2")
+    prepared = ("--landmarks", ".tip.npy", "--template", "egg2", *AS_THEY_ARE)
     answer = run("prepare", eggs, "-o", tmp_path / "out", *FEW[:-1], *prepared)
     assert answer.status == 0 and "1 known points" in answer.err
     answer = run(

@@ -78,14 +78,14 @@ def test_normalised_shapes_have_area_one_and_few_faces(folder: Path, tmp_path: P
 
 def test_files_of_one_stem_do_not_overwrite_each_other(folder: Path, torus: Shape, tmp_path: Path) -> None:
     save_shape(folder / "egg0.ply", torus)
-    prepared(folder, tmp_path / "out", FEW, align="none")
+    prepared(folder, tmp_path / "out", FEW, align="none", mirror="no")
     files = sorted(file.name for file in (tmp_path / "out" / "normalised").iterdir())
     assert files == ["egg0.obj.ply", "egg0.ply.ply", "egg1.ply", "egg2.ply"]
 
 
 def test_shapes_of_another_connectivity_are_not_registered(folder: Path, sphere: Shape, tmp_path: Path) -> None:
     save_shape(folder / "odd.ply", Shape(egg(sphere, 1), sphere.faces[:, [1, 2, 0]]))
-    made = prepared(folder, tmp_path / "out", FEW, align="none")
+    made = prepared(folder, tmp_path / "out", FEW, align="none", mirror="no")
     assert made.shapes.shape == (0, 642, 3)
     assert len(made.names) == 4
     with pytest.raises(InputError, match="do not share one connectivity") as caught:
@@ -99,7 +99,7 @@ def test_what_cannot_be_read_is_noted_and_left_out(folder: Path, tmp_path: Path,
     (folder / "notes.txt").write_text("not a shape")
     np.save(folder / "point.npy", np.zeros((300, 3)))  # has no area
     save_shape(folder / "dirty.obj", Shape(np.concatenate([sphere.verts, FAR[None]]), sphere.faces))
-    made = prepared(folder, tmp_path / "out", FEW, align="none")
+    made = prepared(folder, tmp_path / "out", FEW, align="none", mirror="no")
     notes = "\n".join(made.notes)
     for name in ("broken.ply left out", "empty.off left out", "point.npy left out", "dirty.obj: 1 vertex"):
         assert name in notes
@@ -134,15 +134,15 @@ def test_a_registered_shape_with_lost_positions_is_left_out(folder: Path, tmp_pa
 
 def test_a_template_of_clouds_is_a_mesh_or_one_of_them(folder: Path, tmp_path: Path, sphere: Shape) -> None:
     np.save(folder / "a_cloud.npy", sphere.verts)
-    made = prepared(folder, tmp_path / "out", FEW, align="none")
+    made = prepared(folder, tmp_path / "out", FEW, align="none", mirror="no")
     assert made.template.shape.F == 1280  # of the first mesh
     assert len(made.shapes) == 0
     clouds = tmp_path / "clouds"
     clouds.mkdir()
     np.save(clouds / "a.npy", sphere.verts)
-    made = prepared(clouds, tmp_path / "out2", FEW, align="none")
+    made = prepared(clouds, tmp_path / "out2", FEW, align="none", mirror="no")
     assert made.template.shape.V > 600  # triangulated
-    made = prepared(clouds, tmp_path / "out2", FEW, align="none", template=folder / "egg0.obj")
+    made = prepared(clouds, tmp_path / "out2", FEW, align="none", mirror="no", template=folder / "egg0.obj")
     assert made.template.shape.F == 1280
     assert made.names == ("a.npy",)
 

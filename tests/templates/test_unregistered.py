@@ -23,7 +23,7 @@ NONE = np.empty((0, 3), np.int64)
 
 
 def prepared(folder: Path, output: Path, nodes: NodeConfig = FEW, **choices) -> Prepared:
-    return prepare(folder, output, PrepareConfig(nodes, **choices))
+    return prepare(folder, output, PrepareConfig(nodes, mirror="no", **choices))
 
 
 def pear(splits: int, stretch: float = 1.0) -> Shape:
@@ -34,28 +34,49 @@ def pear(splits: int, stretch: float = 1.0) -> Shape:
     return Shape(verts, ball.faces)
 
 
+def turn_of(number: int) -> np.ndarray:
+    return Rotation.from_rotvec([0, 0, 0.5 * (number - 2)]).as_matrix()
+
+
 @pytest.fixture
 def pears(tmp_path: Path) -> Path:
     """Four pears of different connectivity, unit, place and turn; the third stands as its template does."""
-    folder = tmp_path / "pears"
+    return write_pears(tmp_path / "pears")
+
+
+def write_pears(folder: Path) -> Path:
     folder.mkdir()
     for n, (splits, stretch) in enumerate([(2, 0.8), (3, 1.3), (2, 1.0), (3, 1.05)]):
         shape = pear(splits, stretch)
-        turn = Rotation.from_rotvec([0, 0, 0.5 * (n - 2)]).as_matrix()
-        save_shape(folder / f"pear{n}.ply", Shape(10.0**n * shape.verts @ turn.T + n, shape.faces))
+        save_shape(folder / f"pear{n}.ply", Shape(10.0**n * shape.verts @ turn_of(n).T + n, shape.faces))
     return folder
 
 
-def test_a_folder_without_correspondence(pears: Path, tmp_path: Path) -> None:
-    made = prepared(pears, tmp_path / "out", FEW)
-    assert (len(made.shapes), made.align, made.landmarks) == (0, "rigid", 0)
-    assert any(note.startswith("template: pear") for note in made.notes)
-    assert not is_registered(tmp_path / "out")
-    template = load_template(tmp_path / "out" / "template.safetensors")
-    samples = read_samples(tmp_path / "out", template)
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Prepared]:
+    """Pears with both their tips as landmarks, but one; the folder made of them, and what was said."""
+    place = tmp_path_factory.mktemp("made")
+    folder = write_pears(place / "pears")
+    for n in (1, 2, 3):
+        height = pear(2 if n % 2 == 0 else 3).verts[:, 1]
+        tips = np.array([height.argmax(), height.argmin()])
+        if n == 1:  # as places, one of them missing
+            tips = load_shape(folder / "pear1.ply").verts[tips]
+            tips[1] = np.nan
+        np.save(folder / f"pear{n}.tips.npy", tips)
+    return folder, place / "out", prepared(folder, place / "out", landmarks=".tips.npy")
+
+
+def test_a_folder_without_correspondence(made: tuple[Path, Path, Prepared]) -> None:
+    pears, output, said = made
+    assert (len(said.shapes), said.align) == (0, "rigid")
+    assert any(note.startswith("template: pear") for note in said.notes)
+    assert said.names == tuple(f"pear{n}.ply" for n in range(4))  # the files of points are no shapes
+    assert not is_registered(output)
+    samples = read_samples(output, load_template(output / "template.safetensors"))
     assert samples.points.shape == samples.normals.shape == (4, 4096, 3)
     assert (samples.align, samples.scale) == ("rigid", "area")
-    words = json.loads((tmp_path / "out" / "prepared.json").read_text())
+    words = json.loads((output / "prepared.json").read_text())
     for number, (name, each) in enumerate(zip(words["names"], words["frames"], strict=True)):
         frame = Frame(each["scale"], np.array(each["rotation"]), np.array(each["center"]))
         original = load_shape(pears / name)
@@ -64,7 +85,19 @@ def test_a_folder_without_correspondence(pears: Path, tmp_path: Path) -> None:
         gap = np.linalg.norm(there.verts[:, None] - samples.points[number][None, :2000], axis=2).min(0)
         assert gap.max() < 0.15  # samples lie on the shape, in the frame that was written down
     assert max(words["apart"]) < 0.06  # turned to the template
-    assert len(list((tmp_path / "out" / "normalised").iterdir())) == 4
+    assert len(list((output / "normalised").iterdir())) == 4
+
+
+def test_landmarks_follow_their_shapes(made: tuple[Path, Path, Prepared]) -> None:
+    _, output, said = made
+    assert said.landmarks == 2
+    samples = read_samples(output, said.template)
+    known = samples.landmarks
+    assert np.isnan(known[0]).all() and np.isnan(known[1, 1]).all()
+    places = said.template.shape.verts[samples.template_landmarks]
+    assert np.linalg.norm(places[0] - places[1]) > 0.5  # the length of a pear
+    assert np.linalg.norm(known[2:] - places, axis=2).max() < 0.25
+    assert np.linalg.norm(known[1, 0] - places[0]) < 0.25
 
 
 def test_the_typical_shape_is_the_middle_one() -> None:
@@ -118,31 +151,7 @@ def test_the_sphere_scale_is_the_templates_radius(pears: Path, tmp_path: Path) -
     assert np.linalg.norm(frame.apply(pear(2).verts), axis=1).max() == pytest.approx(0.5)
 
 
-def test_known_points_follow_their_shapes(pears: Path, tmp_path: Path) -> None:
-    tips = {}
-    for n in range(4):
-        shape = load_shape(pears / f"pear{n}.ply")
-        plain = pear(2 if n % 2 == 0 else 3)
-        tips[n] = np.array([plain.verts[:, 1].argmax(), plain.verts[:, 1].argmin()])
-        if n == 1:  # as places, one of them missing
-            place = shape.verts[tips[n]]
-            place[1] = np.nan
-            np.save(pears / "pear1.tips.npy", place)
-        elif n != 3:
-            np.save(pears / f"pear{n}.tips.npy", tips[n])
-    made = prepared(pears, tmp_path / "out", FEW, landmarks=".tips.npy", template="pear2")
-    assert made.landmarks == 2
-    assert made.names == tuple(f"pear{n}.ply" for n in range(4))  # the files of points are no shapes
-    samples = read_samples(tmp_path / "out", made.template)
-    known = samples.landmarks
-    assert np.isnan(known[1, 1]).all() and np.isnan(known[3]).all()
-    top, bottom = made.template.shape.verts[samples.template_landmarks]
-    assert top[1] > 0.25 and bottom[1] < -0.25
-    assert np.linalg.norm(known[0] - [top, bottom], axis=1).max() < 0.25
-    assert np.linalg.norm(known[1, 0] - top) < 0.25
-
-
-def test_known_points_in_a_folder_of_their_own_and_as_text(pears: Path, tmp_path: Path) -> None:
+def test_landmarks_in_a_folder_of_their_own_and_as_text(pears: Path, tmp_path: Path) -> None:
     points = tmp_path / "points"
     points.mkdir()
     (points / "pear2.txt").write_text("0\n-1\n5\n")
@@ -153,7 +162,7 @@ def test_known_points_in_a_folder_of_their_own_and_as_text(pears: Path, tmp_path
     known = read_landmarks(points / "pear2.txt", clean)
     assert np.allclose(known[[0, 2]], clean.original.verts[[0, 5]]) and np.isnan(known[1]).all()
     with pytest.raises(InputError, match="has no landmarks, or not all"):
-        prepared(pears, tmp_path / "out", FEW, landmarks=points, template="pear2")
+        prepared(pears, tmp_path / "out", FEW, landmarks=points, template="pear2", align="none")
     with pytest.raises(OptionError, match=r"no shape of .* has landmarks"):
         find_landmarks(".nothing", pears, files)
 
@@ -166,27 +175,26 @@ def test_known_points_in_a_folder_of_their_own_and_as_text(pears: Path, tmp_path
         ([0.5, 1.0], "holds no landmarks"),
         ([[1, 2], [3, 4]], "holds no landmarks"),
         ([], "holds no landmarks"),
+        ("# only words\n", "holds no landmark"),
+        (b"no numbers", "is not an npy file"),
     ],
 )
-def test_wrong_known_points_are_told(pears: Path, tmp_path: Path, values: list, told: str) -> None:
-    np.save(tmp_path / "x.npy", np.array(values))
+def test_wrong_landmarks_are_told(tmp_path: Path, values: list | bytes | str, told: str) -> None:
+    path = tmp_path / ("x.txt" if isinstance(values, str) else "x.npy")
+    if isinstance(values, list):
+        np.save(path, np.array(values))
+    else:
+        path.write_bytes(values.encode() if isinstance(values, str) else values)
     with pytest.raises(InputError) as caught:
-        read_landmarks(tmp_path / "x.npy", repair(load_shape(pears / "pear0.ply")))
+        read_landmarks(path, repair(pear(2)))
     assert told in caught.value.message + caught.value.hint
-    for words in ("# nothing\n", "# only words\n"):
-        (tmp_path / "x.txt").write_text(words)
-        with pytest.raises(InputError, match="holds no landmark"):
-            read_landmarks(tmp_path / "x.txt", repair(load_shape(pears / "pear0.ply")))
-    (tmp_path / "x.npy").write_bytes(b"no numbers")
-    with pytest.raises(InputError, match="is not an npy file"):
-        read_landmarks(tmp_path / "x.npy", repair(load_shape(pears / "pear0.ply")))
 
 
 def test_files_of_different_length_do_not_belong_together(pears: Path, tmp_path: Path) -> None:
     np.save(pears / "pear0.tips.npy", np.arange(3))
     np.save(pears / "pear2.tips.npy", np.arange(2))
     with pytest.raises(InputError, match="of 2 and of 3 points"):
-        prepared(pears, tmp_path / "out", FEW, landmarks=".tips.npy", template="pear2")
+        prepared(pears, tmp_path / "out", FEW, landmarks=".tips.npy", template="pear2", align="none")
 
 
 def test_a_template_of_another_kind_is_refused(pears: Path, tmp_path: Path) -> None:
@@ -212,15 +220,13 @@ def test_few_points_one_point_and_strays_are_left_out_or_told(pears: Path, tmp_p
     assert "fog.npy differs much from the template" in notes
 
 
-def test_a_damaged_or_foreign_folder_is_told(pears: Path, tmp_path: Path) -> None:
-    made, other = (
-        prepared(pears, tmp_path / output, FEW, template=template, align="none")
-        for output, template in (("out", "pear0"), ("other", "pear1"))
-    )
+def test_a_damaged_or_foreign_folder_is_told(made: tuple[Path, Path, Prepared], pears: Path, tmp_path: Path) -> None:
+    template = made[2].template
+    other = prepared(pears, tmp_path / "other", FEW, template="pear1", align="none").template
     with pytest.raises(InputError, match="another template"):
-        read_samples(tmp_path / "out", other.template)
+        read_samples(made[1], other)
     with pytest.raises(InputError, match="not a prepared folder"):
-        read_samples(tmp_path, made.template)
-    (tmp_path / "out" / "points.safetensors").write_bytes(b"?")
+        read_samples(tmp_path, template)
+    (tmp_path / "other" / "points.safetensors").write_bytes(b"?")
     with pytest.raises(InputError, match="not a prepared folder"):
-        read_samples(tmp_path / "out", made.template)
+        read_samples(tmp_path / "other", other)
