@@ -10,6 +10,8 @@ which command it ran, and its tables. A page asks for a table between two commen
 
 the number of the table in the file, from 1, and which columns (all of them where none is named). A page begins the table
 of all sets (`SUMMARY`) with ``<!-- summary -->``. Whatever stands between the comments is replaced.
+
+A file that the commands of today cannot make again says in ``last_commit`` which commit was the last that could.
 """
 
 from __future__ import annotations
@@ -98,6 +100,8 @@ def table_of(words: str, docs: Path) -> str:
     places = [table["columns"].index(each) for each in wanted]
     rows = [[_SHOWN_AS.get(row[place], row[place]) for place in places] for row in table["rows"]]
     told = f"[{name}.json](results/{name}.json): {found['date']}, commit {found['commit']}, {found['machine']}"
+    if last := found.get("last_commit"):
+        told += f"; to repeat it, check out {last}"
     return f"\n{markdown(wanted, rows)}\n{told}.\n\n"
 
 

@@ -137,9 +137,8 @@ def test_the_command_speaks_of_the_users_mistakes(
 
 
 def test_a_fit_that_was_kept_maps_as_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the frame that another model found, too."""
     shapes = [load_shape(SAMPLES / name) for name in ("dancer.ply", "climber.ply")]
-    method = OurMethod(oriented_by="human", kept=tmp_path / "fits")
+    method = OurMethod(kept=tmp_path / "fits")
     fits = [method.fit(shape) for shape in shapes]
     monkeypatch.setattr(OurMethod, "_matcher", lambda _: SimpleNamespace(config=FitConfig()))  # which fits nothing
     again = [method.fit(shape) for shape in shapes]

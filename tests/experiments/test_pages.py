@@ -1,8 +1,10 @@
 """Results are files of one form; the pages are made from them, are fresh, and name nothing that is not there."""
 
+import importlib
 import importlib.util
 import json
 import re
+import shlex
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,10 @@ from meshmatch.experiments.runner import Report, saved_record, table
 DOCS = pages.DOCS
 ROOT = DOCS.parent
 FILES = sorted((DOCS / "results").glob("*.json"))
+OF_ROOMS = {
+    f"meshmatch.experiments.{room}": f"meshmatch.experiments.{room}.{module}"
+    for room, module in (("bench", "accuracy"), ("hostile", "campaign"))
+}
 TEXTS = [(name, (DOCS / name).read_text(encoding="utf-8")) for name in pages.PAGES]
 
 
@@ -24,6 +30,27 @@ def test_a_file_of_results_says_how_it_was_made(path: Path) -> None:
     assert found["commands"] and all(isinstance(each, str) for each in found["commands"])
     for each in found["tables"]:
         assert each["title"] and {len(row) for row in each["rows"]} == {len(each["columns"])}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_the_commands_of_results_are_here_or_in_a_commit_that_is_named(path: Path) -> None:
+    found = json.loads(path.read_text(encoding="utf-8"))
+    if "last_commit" in found:
+        assert re.fullmatch(r"[0-9a-f]{7,40}", found["last_commit"])
+        return
+    for command in found["commands"]:
+        words = shlex.split(command.partition(", ")[0])
+        if words[:2] == ["python", "-m"]:
+            module = importlib.import_module(OF_ROOMS.get(words[2], words[2]))
+            assert module.main([*words[3:], "--help"]) == 0  # an unknown option would be refused
+
+
+def test_a_page_names_the_last_commit_of_a_command_that_is_gone(tmp_path: Path) -> None:
+    (tmp_path / "results").mkdir()
+    record = {"date": "d", "commit": "c", "machine": "m", "last_commit": "abc1234"}
+    record |= {"tables": [{"columns": ["a"], "rows": [["1"]]}]}
+    (tmp_path / "results" / "few.json").write_text(json.dumps(record))
+    assert pages.table_of("few 1", tmp_path).endswith("d, commit c, m; to repeat it, check out abc1234.\n\n")
 
 
 def test_a_file_that_an_experiment_writes_has_the_same_form() -> None:

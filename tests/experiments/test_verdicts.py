@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from meshmatch.errors import InputError
 from meshmatch.experiments.bench import verdicts
-from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, TUNED, Cases
+from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, TUNED, Cases, furniture, melded
+from meshmatch.geometry.triangles import face_parts, is_watertight
 from meshmatch.shapes.shape import Shape
 
 pytest.importorskip("anny")
@@ -29,15 +30,24 @@ def cases() -> Cases:
     [
         pytest.param(name, marks=pytest.mark.slow if name in SLOW else ())
         for name in FAMILIES
-        if name not in ("dressed", "stylised", "furniture")
+        if name not in ("dressed", "stylised")
     ],
 )
 def test_a_case_is_drawn_again_alike_with_its_truth(cases: Cases, family: str) -> None:
     case, again = cases.draw(family, 0), cases.draw(family, 0)
     assert np.array_equal(case.shape.verts, again.shape.verts) and np.array_equal(case.truth, again.truth)
     assert len(case.truth) == case.shape.V and case.truth.max() < cases.template.shape.V
-    assert (case.truth < 0).all() == (family in ("animal", "solid", "kit"))
+    assert (case.truth < 0).all() == (family in ("animal", "furniture", "solid", "kit"))
     assert not np.array_equal(case.shape.verts, cases.draw(family, 2).shape.verts)
+
+
+def test_furniture_is_watertight_and_of_one_piece() -> None:
+    for number in range(3):
+        corners = furniture(number, np.random.default_rng(number))
+        whole = melded(corners)
+        assert is_watertight(whole.faces) and face_parts(whole.faces, whole.V).max() == 0
+        low, high = np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))
+        assert np.abs(whole.bounds - [low, high]).max() < 0.05 * np.ptp(whole.bounds, axis=0).max()
 
 
 def test_families_that_tune_measure_nothing() -> None:

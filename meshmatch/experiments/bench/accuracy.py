@@ -4,9 +4,6 @@ A pair that cannot be matched is not left out: it counts as the map that sends e
 measures a stated part and says so.
 
 --output FOLDER keeps fits and maps: the same command goes on where it was stopped.
-
---oriented-by MODEL asks what --model is worth where the orientation is no question: every shape is first turned into the
-frame of that model's unrefined fit, and up and front are told. Maps are between the same vertices, and measured as ever.
 """
 
 from __future__ import annotations
@@ -159,8 +156,8 @@ def run_set(
     return SetRun(evaluate_set(bench, maps, pairs=pairs, cache=cache), fit_seconds, map_seconds, failed, fits)
 
 
-def scores_table(sets: Sequence[SetScores], oriented_by: str = "") -> Table:
-    """A row for each set, and one for each kind of pair in it; the title names the model that found the orientation."""
+def scores_table(sets: Sequence[SetScores]) -> Table:
+    """A row for each set, and one for each kind of pair in it."""
     rows = []
     for whole in sets:
         for scores in (whole, *whole.groups()):
@@ -171,8 +168,7 @@ def scores_table(sets: Sequence[SetScores], oriented_by: str = "") -> Table:
     columns = {"set": "set", "pairs": "pairs:>", "mean": "mean_cm:.2f", "median": "median_cm:.2f"}
     columns |= {"median pair": "median_pair_cm:.2f", f"over {LOST_CM:g} cm": "share_over_15cm:.2%"}
     columns |= {"flips": "flips:.1%", "worst pair": "worst:.2f"}
-    title = f"Geodesic error, cm at {SKIN_M2} m2 of skin ({GEODESIC})"
-    return runner.table(f"{title}, oriented by {oriented_by}" if oriented_by else title, rows, columns)
+    return runner.table(f"Geodesic error, cm at {SKIN_M2} m2 of skin ({GEODESIC})", rows, columns)
 
 
 INCOMPLETE = "Not all pairs were measured: these means are not the benchmark's."
@@ -183,7 +179,6 @@ def main(
     data: runner.Data = runner.DATA,
     sets: Annotated[str, Option(help=f"of {', '.join(ALL_SETS)}")] = ",".join(SET_NAMES),
     model: runner.Model = "human",
-    oriented_by: Annotated[str, Option(help="model whose fits turn every shape upright first; none by default")] = "",
     refine: Refine = "nodes",
     seed: runner.Seed = 0,
     limit_pairs: runner.LimitPairs = None,
@@ -195,12 +190,11 @@ def main(
 ) -> runner.Report:
     benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
     weights = as_model(model).card.weights_sha256  # a wrong name would cost every pair
-    told = as_model(oriented_by).card.weights_sha256 if oriented_by else ""
     if output is not None:
-        asked = {"weights": weights, "oriented_by": told, "refine": refine, "seed": seed, "threads": threads}
+        asked = {"weights": weights, "refine": refine, "seed": seed, "threads": threads}
         runner.once(output / "asked.json", asked, lambda: runner.circumstances(threads, jobs))
     fits, made = (None, None) if output is None else (output / "fits", output / "maps")
-    method = OurMethod(model, refine, seed, threads=threads, oriented_by=oriented_by, kept=fits)
+    method = OurMethod(model, refine, seed, threads=threads, kept=fits)
     runs: list[SetRun] = []
     for bench in benches:
         pairs = runner.spread(bench.pairs, limit_pairs)
@@ -215,4 +209,4 @@ def main(
     if any(len(each.errors) < each.expected for each in scores):
         notes.append(INCOMPLETE)
     record = {"geodesic": GEODESIC, "sets": {each.scores.bench.name: each.as_dict() for each in runs}}
-    return runner.Report(record, [scores_table(scores, oriented_by)], notes)
+    return runner.Report(record, [scores_table(scores)], notes)

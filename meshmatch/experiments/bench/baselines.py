@@ -8,17 +8,13 @@ model is not given, is skipped, and the output says so.
 - zoomout: pyfmaps, HKS and WKS, ZoomOut from 30 to 120 eigenfunctions; meshes thinned to 10,000 triangles.
 - nricp: trimesh's non-rigid ICP, source onto target from the rigid alignment; the source thinned to 5,000 triangles.
 - meshmonk: viscoelastic registration, source onto target from the rigid alignment; both thinned to 20,000 triangles.
-- coded: 3D-CODED (--coded), its code searched by the Chamfer distance.
-- transmatch: a transformer (--transmatch), not refined.
+- coded: 3D-CODED (--coded), its code searched by the Chamfer distance; ``meshmatch train --preset paper --field pointwise
+  --volume 0 --arap 0 --blend 0`` trains one.
 - ours: this project, refined and not.
 
-The first four have a second row each, with both shapes in the frames of our unrefined fits: what they do where the
-orientation is no question.
-
-The learned ones are trained by `experiments.paper.learned_baselines`; zoomout, nricp and meshmonk need
-pip install 'meshmatch[bench]'. Each result, a method on a set, is one JSON file in the output folder; a second run
-measures only what is not there. --minutes starts nothing new after that time. The table says how many pairs were
-measured, and how long learned methods were trained.
+zoomout, nricp and meshmonk need pip install 'meshmatch[bench]'. Each result, a method on a set, is one JSON file in the
+output folder; a second run measures only what is not there. The table says how many pairs were measured, and how long
+learned methods were trained.
 """
 
 from __future__ import annotations
@@ -68,48 +64,23 @@ class Choices:
     model: str = "human"
     coded: str | None = None
     coded_steps: int = 2000
-    transmatch: Path | None = None
     seed: int = 0
     threads: int = 1
 
 
-def _plain(
-    choices: Choices, name: str, label: str, method: Registration | ZoomOut, package: str = ""
-) -> list[Baseline]:
-    """The rows of a method that learns nothing: by itself, and from our orientation; it cannot run without its package."""
-    method = replace(method, seed=choices.seed)
-    digest = find_model(choices.model)[1].weights_sha256
-    rows = [Baseline(name, label, method)]
-    oriented = replace(method, oriented_by=choices.model)
-    rows.append(Baseline(f"{name}-oriented", f"{label}, our orientation", oriented, model=digest))
-    if not package or find_spec(package) is not None:
-        return rows
-    missing = f"{package} is not installed: pip install 'meshmatch[bench]'"
-    return [replace(row, method=None, missing=missing) for row in rows]
+def _plain(choices: Choices, name: str, label: str, method: Registration | ZoomOut, package: str) -> list[Baseline]:
+    """A method that learns nothing; it cannot run without its package, if it has one."""
+    if package and find_spec(package) is None:
+        return [Baseline(name, label, None, f"{package} is not installed: pip install 'meshmatch[bench]'")]
+    return [Baseline(name, label, replace(method, seed=choices.seed))]
 
 
 def _coded(choices: Choices) -> list[Baseline]:
     if choices.coded is None:
-        return [Baseline("coded", "3D-CODED", None, _NOT_GIVEN.format("coded"))]
+        return [Baseline("coded", "3D-CODED", None, "give --coded MODEL, trained as the help says")]
     card = find_model(choices.coded)[1]
     method = coded(choices.coded, choices.coded_steps, choices.seed)
-    oriented = replace(method, oriented_by=choices.model)
-    told = f"{card.weights_sha256} {find_model(choices.model)[1].weights_sha256}"
-    minutes = card.training_minutes
-    return [
-        Baseline("coded", "3D-CODED", method, "", minutes, card.weights_sha256),
-        Baseline("coded-oriented", "3D-CODED, our orientation", oriented, "", minutes, told),
-    ]
-
-
-def _transmatch(choices: Choices) -> list[Baseline]:
-    if choices.transmatch is None:
-        return [Baseline("transmatch", "TransMatch", None, _NOT_GIVEN.format("transmatch"))]
-    from meshmatch.experiments.paper.learned_baselines import TransMatch, load_transmatch
-
-    words = load_transmatch(choices.transmatch).words
-    method, minutes = TransMatch(str(choices.transmatch), seed=choices.seed), float(words.get("minutes", 0.0))
-    return [Baseline("transmatch", "TransMatch", method, "", minutes, f"{words.get('date')} step {words.get('steps')}")]
+    return [Baseline("coded", "3D-CODED", method, "", card.training_minutes, card.weights_sha256)]
 
 
 def _ours(choices: Choices) -> list[Baseline]:
@@ -120,29 +91,25 @@ def _ours(choices: Choices) -> list[Baseline]:
     return [Baseline(*row, "", card.training_minutes, card.weights_sha256) for row in rows]
 
 
-_NOT_GIVEN = "give --{0} MODEL, made by python -m meshmatch.experiments.paper.learned_baselines {0}"
+_PLAIN: dict[str, tuple[str, Registration | ZoomOut, str]] = {
+    "rigid": ("rigid, nearest", Registration("rigid"), ""),
+    "zoomout": ("ZoomOut (pyfmaps)", ZoomOut(), "pyFM"),
+    "nricp": ("nricp (trimesh)", Registration("nricp", 5000), "trimesh"),
+    "meshmonk": ("meshmonk", Registration("meshmonk", 20_000), "meshmonk"),
+}
 METHODS: dict[str, Callable[[Choices], list[Baseline]]] = {
-    "rigid": partial(_plain, name="rigid", label="rigid, nearest", method=Registration("rigid")),
-    "zoomout": partial(_plain, name="zoomout", label="ZoomOut (pyfmaps)", method=ZoomOut(), package="pyFM"),
-    "nricp": partial(
-        _plain, name="nricp", label="nricp (trimesh)", method=Registration("nricp", 5000), package="trimesh"
-    ),
-    "meshmonk": partial(
-        _plain, name="meshmonk", label="meshmonk", method=Registration("meshmonk", 20_000), package="meshmonk"
-    ),
+    **{
+        name: partial(_plain, name=name, label=label, method=method, package=package)
+        for name, (label, method, package) in _PLAIN.items()
+    },
     "coded": _coded,
-    "transmatch": _transmatch,
     "ours": _ours,
 }
 """The rows of each method that can be asked for. `ModelError` or `TemplateError` for a model that cannot be read."""
 
 
-def measured(
-    row: Baseline, bench: BenchSet, folder: Path, limit: int | None, late: bool, **how: Any
-) -> dict[str, Any] | None:
-    """One result: read from the folder, or measured and written there; None if it is not there and it is too late.
-
-    ``how`` is that of `run_set`.
+def measured(row: Baseline, bench: BenchSet, folder: Path, limit: int | None, **how: Any) -> dict[str, Any]:
+    """One result: read from the folder, or measured and written there. ``how`` is that of `run_set`.
 
     Raises
     ------
@@ -151,23 +118,23 @@ def measured(
     InputError
         The file in the folder is damaged.
     """
-    assert row.method is not None
     pairs = runner.spread(bench.pairs, limit)
     path = folder / f"{bench.name}-{row.name}.json"
     settings = {key: str(value) for key, value in vars(row.method).items()}
     asked = {"method": row.name, "set": bench.name, "pairs": pairs, "settings": settings, "model": row.model}
-    before = runner.recall(path, asked)
-    if before is not None or late:
-        return before
-    began = time.perf_counter()
-    scores = run_set(bench, row.method, pairs, **how).as_dict()
-    scores.pop("fits")
-    found = {
-        **runner.circumstances(how.get("threads", 1), how.get("jobs", 1)),
-        **{"of": len(bench.pairs), "minutes": row.minutes},
-        **{"seconds": round(time.perf_counter() - began, 1), "scores": scores},
-    }
-    return runner.keep(path, asked, found)
+
+    def measure() -> dict[str, Any]:
+        assert row.method is not None
+        began = time.perf_counter()
+        scores = run_set(bench, row.method, pairs, **how).as_dict()
+        scores.pop("fits")
+        return {
+            **runner.circumstances(how.get("threads", 1), how.get("jobs", 1)),
+            **{"of": len(bench.pairs), "minutes": row.minutes},
+            **{"seconds": round(time.perf_counter() - began, 1), "scores": scores},
+        }
+
+    return runner.once(path, asked, measure)
 
 
 @runner.command
@@ -176,40 +143,32 @@ def main(
     sets: Annotated[str, Option(help=f"of {', '.join(ALL_SETS)}")] = ",".join(SET_NAMES),
     methods: Annotated[str, Option(help=f"of {', '.join(METHODS)}")] = ",".join(METHODS),
     limit_pairs: runner.LimitPairs = None,
-    minutes: Annotated[float, Option(help="start nothing new after so long")] = 1e6,
     output: Annotated[Path, Option(help="folder of the results")] = Path("out/baselines"),
     model: runner.Model = "human",
-    coded_model: Annotated[
-        str | None, Option("--coded", help="a model folder of experiments.paper.learned_baselines")
-    ] = None,
+    coded_model: Annotated[str | None, Option("--coded", help="a trained model of 3D-CODED")] = None,
     coded_steps: Annotated[int, Option(min=1, help="of its search over codes")] = 2000,
-    transmatch: Annotated[Path | None, Option(help="a folder of experiments.paper.learned_baselines")] = None,
     seed: runner.Seed = 0,
     jobs: runner.Jobs = 1,
     threads: runner.Threads = 1,
     cache: runner.Cache = None,
 ) -> runner.Report:
-    until = time.monotonic() + 60 * minutes
     benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
-    choices = Choices(model, coded_model, coded_steps, transmatch, seed, threads)
+    choices = Choices(model, coded_model, coded_steps, seed, threads)
     known = [row for name in runner.names_of(methods, METHODS, "method") for row in METHODS[name](choices)]
     make_folder(output)
     rows, skipped = [], {}
     for bench in benches:
         for row in known:
-            found = None
-            if row.method is not None:
-                runner.tell(f"{row.label} on {bench.name}")
-                how = {"cache": cache, "jobs": jobs, "threads": threads}
-                found = measured(row, bench, output, limit_pairs, time.monotonic() > until, **how)
-            if found is None:
-                skipped[f"{bench.name}, {row.label}"] = row.missing or "the time was up: run again to go on"
+            if row.method is None:
+                skipped[row.label] = row.missing
                 continue
+            runner.tell(f"{row.label} on {bench.name}")
+            found = measured(row, bench, output, limit_pairs, cache=cache, jobs=jobs, threads=threads)
             names = {"set": bench.name, "name": row.name, "label": row.label}
             scores = found["scores"]
             share = {"measured": f"{scores['pairs']} of {found['of']}", "failures": len(scores["failed"])}
             rows.append({**names, **share, **{key: found[key] for key in found if key != "scores"}, **scores})
-    notes = [f"skipped: {where}: {why}" for where, why in skipped.items()]
+    notes = [f"skipped: {label}: {why}" for label, why in skipped.items()]
     if not all(row["complete"] for row in rows):
         notes.append(INCOMPLETE)
     drawn = runner.table(f"Geodesic error, cm at {SKIN_M2} m2 of skin ({GEODESIC})", rows, COLUMNS)

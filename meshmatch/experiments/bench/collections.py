@@ -5,8 +5,6 @@ is what two processes gain. Errors count all pairs, as in `meshmatch.experiments
 pair are. The ten four-chamber hearts are fitted without a model (`--model none`). They were decimated independently; where
 two kept a vertex of the same original mesh, about a fifth of each, the truth is known exactly. Their error is Euclidean, for
 walls are thin, and the surface's own distance between two points of a wall may be long; in units of sqrt(area), times 100.
-Bodies are generated ones, enough of them that the start of the processes does not tell; of their maps those from the first
-body are measured, in straight distances.
 """
 
 from __future__ import annotations
@@ -32,15 +30,11 @@ from meshmatch.errors import InputError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.scores import evaluate_set
 from meshmatch.experiments.bench.sets import Pair, Shapes, load_folder, load_set
-from meshmatch.experiments.makers.human_bodies import write_bodies
 from meshmatch.fitting.without_model import NO_MODEL
-from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.files import load_shape
 
-HEART, BODIES = "heart", "bodies"
-SETS = ("scape", "faust", HEART, BODIES)
-_BODIES = 100
+HEART = "heart"
+SETS = ("scape", "faust", HEART)
 TRUTH = ".truth.npy"
 Truth = Mapping[str, Int[Ints, "V 2"]]
 """For each shape and vertex: the vertex of the original mesh, and the chamber."""
@@ -96,26 +90,12 @@ def timed_fits(shapes: list[Path], folder: Path, model: str, jobs: int) -> float
     return seconds
 
 
-def straight_cm(
-    folder: Path, orders: Mapping[str, Int[Ints, " V"]], source: str, target: str, vertex_map: VertexMap
-) -> float:
-    """Mean straight distance of the partners of generated bodies' vertices from the true ones (cm, the person scaled as
-    usual)."""
-    shape = load_shape(folder / f"{target}.ply")
-    true = np.argsort(orders[target])[orders[source]]
-    off = shape.verts[vertex_map.index] - shape.verts[true]
-    return CM_PER_UNIT / float(np.sqrt(shape.area)) * float(np.linalg.norm(off, axis=1).mean())
-
-
 def measure(name: str, data: Path, work: Path, limit: int | None, model: str | None = None) -> dict[str, Any]:
     """One row."""
     model, details = model or (NO_MODEL if name == HEART else "human"), {}
     if name == HEART:
         shapes, truth = load_folder(data / HEART, TRUTH)
         paths = [data / HEART / f"{each}.ply" for each in runner.spread(list(shapes), limit)]
-    elif name == BODIES:
-        orders = write_bodies(work / name, limit or _BODIES, seed=0)
-        paths = sorted((work / name).iterdir())
     else:
         bench = load_set(name, data)
         paths = [bench.path(each) for each in runner.spread(list(bench.shapes), limit)]
@@ -123,7 +103,7 @@ def measure(name: str, data: Path, work: Path, limit: int | None, model: str | N
     seconds = {folder: timed_fits(paths, folder, model, number) for folder, number in ((one, 1), (two, 2))}
     largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6  # of all processes so far
     collection = Collection(two, 2)
-    pairs = [pair for pair in permutations(collection.names, 2) if name != BODIES or pair[0] == collection.names[0]]
+    pairs = list(permutations(collection.names, 2))
     began = time.perf_counter()
     collection.save_maps(work / f"{name}-maps", pairs)
     written = time.perf_counter() - began
@@ -135,8 +115,6 @@ def measure(name: str, data: Path, work: Path, limit: int | None, model: str | N
     if name == HEART:
         details = heart_errors(shapes, truth, found)
         error, unit = details["mean_x100"], "x100 of sqrt(area)"
-    elif name == BODIES:
-        error, unit = float(np.mean([straight_cm(paths[0].parent, orders, *pair, found[pair]) for pair in pairs])), "cm"
     else:
         scores = evaluate_set(bench, {pair: one.index for pair, one in found.items()}, pairs=pairs, cache=work / "kept")
         error, unit = float(np.mean(list(scores.means_cm.values()))), "cm"

@@ -19,7 +19,6 @@ from typer import Argument, Option
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.sets import OUTLIERS_FILE, SET_NAMES, load_clouds, load_set
-from meshmatch.experiments.bench.texture import CHARACTERS
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 
@@ -56,6 +55,7 @@ LAYOUTS = {
     "animal": Layout(32, ".landmarks.npy"),
 }
 """Folders of ply files."""
+TEXTURED = ("Rogue.glb", "Rogue_Hooded.glb", "spot_triangulated.obj")
 
 
 def checked_truth(path: Path, layout: Layout, shape: Shape) -> int:
@@ -106,7 +106,7 @@ def row_of(shapes: Collection[Shape], truth: str) -> dict[str, Any]:
 
 def check_textured(folder: Path) -> dict[str, Any]:
     """The shapes with textures."""
-    paths = [folder / "textured" / name for name in CHARACTERS.values()]
+    paths = [folder / "textured" / name for name in TEXTURED]
     if missing := [path for path in paths if not path.is_file()]:
         raise InputError(f"there is no {missing[0]}")
     return row_of([load_shape(path) for path in paths], "none")

@@ -1,9 +1,8 @@
 """What the benchmark measures: the interface of a method, this project behind it, and other methods.
 
 Those that know no category and bend one shape onto the other begin with the same rigid alignment: both shapes scaled to
-area 1 and centered, all orientations tried (`shapes.align`); or with both shapes in the frame of a model's unrefined fit
-(``oriented_by``), which is what they do where the orientation is no question. The libraries do the work. One that gives up
-on a pair fails that pair (`InputError`); a bug of ours stays a bug.
+area 1 and centered, all orientations tried (`shapes.align`). The libraries do the work. One that gives up on a pair fails
+that pair (`InputError`); a bug of ours stays a bug.
 """
 
 from __future__ import annotations
@@ -56,7 +55,6 @@ class Method(Protocol):
 class OurMethod:
     """This project with its options.
 
-    ``oriented_by``: a model whose unrefined fit finds the orientation; then a fit searches only what is left of it.
     ``kept``: a folder of fits, of this method alone; a shape that has one there is not fitted again.
     """
 
@@ -65,7 +63,6 @@ class OurMethod:
     seed: int = 0
     partial: Partial = "auto"
     threads: int = 1
-    oriented_by: str = ""  # a model; empty: the fitted model searches by itself
     kept: Path | None = None
     latent: LatentRefineConfig = field(default_factory=LatentRefineConfig)  # of the search over codes
 
@@ -75,14 +72,11 @@ class OurMethod:
 
     def fit(self, shape: Shape) -> Fit:
         """Fit the model's template to the shape; `MeshmatchError` of a kept fit of another template, or a damaged one."""
-        matcher, config = self._matcher(), None
         path = None if self.kept is None else self.kept / f"{shape.hash}.safetensors"
-        if self.oriented_by:
-            shape, config = upright(self.oriented_by, shape, self.seed), replace(matcher.config, up="y", front="z")
         if path is not None and path.is_file():
             known, clean = load_fit(path, as_model(self.model).template), validated(shape)
             return replace(known.fit, verts=clean.shape.verts, repaired=clean, seconds=float(known.words["seconds"]))
-        fit = matcher.fit(shape, config)
+        fit = self._matcher().fit(shape)
         if path is not None:
             make_folder(path.parent)
             save_fit(path, fit, words={"seconds": fit.seconds})
@@ -93,31 +87,17 @@ class OurMethod:
         return self._matcher().map(source_fit, target_fit, agree=self.refine in ON_NODES)
 
 
-def frame_by(model: str, shape: Shape, seed: int = 0) -> Frame:
-    """The frame in which a model's unrefined fit sees a shape: area 1, upright (+y), facing forward (+z).
-
-    `MeshmatchError` where there is no such model, or it cannot fit the shape.
-    """
-    return Matcher(model, FitConfig(refine="none", partial="no", seed=seed)).fit(shape).frame
-
-
 def in_frame(shape: Shape, frame: Frame) -> Shape:
     """The same shape, vertex by vertex, in another frame than its file's."""
     return replace(shape, verts=frame.apply(shape.verts))
 
 
-def upright(model: str, shape: Shape, seed: int = 0) -> Shape:
-    """The same shape turned (and never mirrored) into the frame of a model's unrefined fit; errors as `frame_by`."""
-    frame = frame_by(model, shape, seed)
-    return in_frame(shape, replace(frame, rotation=frame.turn))
-
-
-def coded(model: str, steps: int = 2000, seed: int = 0, oriented_by: str = "") -> OurMethod:
-    """3D-CODED, a folder of `meshmatch.experiments.paper.learned_baselines`, whose losses had no constraint: its code is
-    refined by the Chamfer distance alone.
+def coded(model: str, steps: int = 2000, seed: int = 0) -> OurMethod:
+    """3D-CODED, a model of ``meshmatch train --preset paper --field pointwise`` whose losses had no constraint (``--volume 0
+    --arap 0 --blend 0``): its code is refined by the Chamfer distance alone.
     """
     latent = replace(LatentRefineConfig(steps=steps), volume=0.0, arap=0.0)
-    return OurMethod(model, "latent", seed, "no", oriented_by=oriented_by, latent=latent)
+    return OurMethod(model, "latent", seed, "no", latent=latent)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,9 +109,9 @@ class Placed:
     samples: OrientedPoints
 
 
-def placed(shape: Shape, seed: int = 0, faces: int | None = None, frame: Frame | None = None) -> Placed:
-    """Bring a shape into a frame (default: area 1, centered), sample it, and thin it to about so many faces."""
-    frame = frame or sqrt_area_frame(shape)
+def placed(shape: Shape, seed: int = 0, faces: int | None = None) -> Placed:
+    """Scale a shape to area 1, center it, sample it, and thin it to about so many faces."""
+    frame = sqrt_area_frame(shape)
     drawn = sample_surface(shape, _SAMPLES, np.random.default_rng(seed))
     whole = in_frame(shape, frame)
     thin = whole if faces is None or whole.is_cloud else decimate(whole, faces)
@@ -187,18 +167,16 @@ class Registration:
     kind: Literal["rigid", "nricp", "meshmonk"]
     faces: int | None = None
     seed: int = 0
-    oriented_by: str = ""  # a model; empty: all orientations of the pair are tried
 
     def fit(self, shape: Shape) -> Placed:
         """Scale, center, sample, thin."""
         if self.kind != "rigid":
             need_meshes(self.kind, shape)
-        frame = frame_by(self.oriented_by, shape, self.seed) if self.oriented_by else None
-        return placed(shape, self.seed, self.faces, frame)
+        return placed(shape, self.seed, self.faces)
 
     def map(self, source: Shape, source_fit: Placed, target: Shape, target_fit: Placed) -> VertexMap:
         """Align, register."""
-        turn = Frame.identity() if self.oriented_by else turn_to(source_fit, target_fit)
+        turn = turn_to(source_fit, target_fit)
         if self.kind == "rigid":
             moved = turn.apply(source_fit.whole.verts)
         else:
@@ -251,13 +229,11 @@ class Spectrum:
     mesh: Any
     at: Float[Floats, "V k"]  # the eigenfunctions at the original's vertices
     original: Int[Ints, " V_thin"]  # the original vertex nearest to each of the thinned mesh
-    verts: Float[Floats, "V_thin 3"]  # the thinned mesh's in the frame in which nearest vertices are a start
 
 
 @dataclass(frozen=True)
 class ZoomOut:
-    """pyfmaps: HKS and WKS, or nearest vertices in the frames of ``oriented_by``, give a functional map of ``first``
-    functions; ZoomOut takes it to ``last`` by ``step``.
+    """pyfmaps: HKS and WKS give a functional map of ``first`` functions; ZoomOut takes it to ``last`` by ``step``.
 
     Meshes of more than ``faces`` triangles are thinned to that first. Source vertices keep their exact place in the
     spectrum; targets are the vertices nearest to the thinned mesh's, so large targets cost about half an edge there.
@@ -271,13 +247,11 @@ class ZoomOut:
     descriptors: int = 100
     orient: float = 1.0
     seed: int = 0
-    oriented_by: str = ""  # a model; empty: descriptors alone
 
     def fit(self, shape: Shape) -> Spectrum:
         """Thin, and find the eigenfunctions."""
         need_meshes("ZoomOut", shape)
-        frame = frame_by(self.oriented_by, shape, self.seed) if self.oriented_by else sqrt_area_frame(shape)
-        whole = in_frame(shape, frame)
+        whole = in_frame(shape, sqrt_area_frame(shape))
         thin = decimate(whole, self.faces)
         used, faces = np.unique(thin.faces, return_inverse=True)  # a lone vertex makes the mass matrix singular
         thin = Shape(thin.verts[used], faces.reshape(-1, 3), thin.name)
@@ -289,21 +263,16 @@ class ZoomOut:
         surface = Surface(thin.verts, thin.faces, thin.vertex_normals)
         foot = surface.query(whole.verts, whole.vertex_normals)
         at = interpolate(mesh.eigenvectors, thin.faces[foot.face], foot.barycentric)
-        return Spectrum(mesh, at, cKDTree(whole.verts).query(thin.verts)[1], thin.verts)
+        return Spectrum(mesh, at, cKDTree(whole.verts).query(thin.verts)[1])
 
     def map(self, source: Shape, source_fit: Spectrum, target: Shape, target_fit: Spectrum) -> VertexMap:
         """Fit the functional map from target to source, which pulls vertices from source to target, and refine it."""
         first, second = target_fit.mesh, source_fit.mesh
         with library("ZoomOut"):
             from pyFM.refine.zoomout import zoomout_refine
-            from pyFM.spectral import FM_to_p2p, p2p_to_FM
+            from pyFM.spectral import FM_to_p2p
 
-            if self.oriented_by:
-                nearest = cKDTree(target_fit.verts).query(source_fit.verts)[1]
-                bases = (mesh.eigenvectors[:, : self.first] for mesh in (first, second))
-                coarse = p2p_to_FM(nearest, *bases, A2=second.A)
-            else:
-                coarse = self._described(first, second)
+            coarse = self._described(first, second)
             rounds = (self.last - self.first) // self.step
             vectors = first.eigenvectors, second.eigenvectors
             refined = zoomout_refine(coarse, *vectors, rounds, self.step, A2=second.A, n_jobs=1)

@@ -16,11 +16,11 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from skimage.measure import marching_cubes
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.experiments.bench.partial import seen_faces
-from meshmatch.experiments.makers.character_designs import Designer
-from meshmatch.experiments.makers.furniture import KINDS, furniture
+from meshmatch.experiments.makers.character_designs import people
 from meshmatch.experiments.makers.human_bodies import unseen_bodies
 from meshmatch.generators.generator import Generator
 from meshmatch.generators.kinds import GENERATORS, Kind
@@ -131,6 +131,43 @@ def boxes(corners: Sequence[Float[Floats, "2 3"]], edge: float) -> Shape:
         made = trimesh.creation.box(high - low).subdivide_to_size(edge)
         parts.append(Shape(np.asarray(made.vertices) + 0.5 * (low + high), np.asarray(made.faces)))
     return reduce(lambda whole, part: joined(whole, part, part.verts), parts)
+
+
+def furniture(number: int, rng: np.random.Generator) -> list[Float[Floats, "2 3"]]:
+    """The boxes of a chair, a plane or a table, by turns; y is up."""
+    wide, deep, tall, thick = rng.uniform((0.2, 0.2, 0.35, 0.02), (0.5, 0.5, 0.8, 0.05))
+    if number % 3 == 1:
+        tail = rng.uniform(0.1, 0.25)
+        solids = [
+            ((0, 0, 0), (1.5 * thick, 1.5 * thick, 0.5)),
+            ((0, 0, rng.uniform(-0.1, 0.15)), (wide + 0.1, 0.6 * thick, 0.3 * deep)),
+            ((0, 0, -0.45), (tail, 0.6 * thick, 0.05)),
+            ((0, tail, -0.45), (0.6 * thick, tail, 0.05)),
+        ]
+    else:
+        legs = [((x * (wide - thick), 0.5 * tall, z * (deep - thick)), (thick, 0.5 * tall, thick))
+                for x in (-1, 1) for z in (-1, 1)]  # fmt: skip
+        solids = [((0, tall, 0), (wide, thick, deep)), *legs]
+    if number % 3 == 0:
+        back = rng.uniform(0.2, 0.6)
+        solids.append(((0, tall + back, thick - deep), (wide, back, thick)))
+    return [np.array([np.subtract(middle, half), np.add(middle, half)]) for middle, half in solids]
+
+
+def melded(corners: Sequence[Float[Floats, "2 3"]], cells: int = 48) -> Shape:
+    """Boxes by their lower and upper corners as one watertight mesh with round edges, of so many cells along its longest
+    side."""
+    ends = np.array(corners)
+    low, high = ends[:, 0].min(0), ends[:, 1].max(0)
+    step = float((high - low).max()) / cells
+    ticks = [np.arange(a - 3 * step, b + 3 * step, step) for a, b in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*ticks, indexing="ij"), -1)
+    distance = np.full(points.shape[:3], np.inf)
+    for first, last in ends:
+        out = np.abs(points - 0.5 * (first + last)) - 0.5 * (last - first)
+        distance = np.minimum(distance, np.linalg.norm(np.maximum(out, 0), axis=-1) + np.minimum(out.max(-1), 0))
+    verts, faces, _, _ = marching_cubes(distance, step, spacing=(step,) * 3, allow_degenerate=False)
+    return Shape(verts.astype(np.float64) + low - 3 * step, faces.astype(np.int64))
 
 
 def on_floor(shape: Shape, side: float) -> Shape:
@@ -287,7 +324,7 @@ class Cases:
     def _character(self, number: int, kind: int) -> tuple[Shape, Ints]:
         drawn = self._casts.setdefault(kind, [])
         while len(drawn) <= number:
-            made = Designer.unseen(self.template, 100 + self.seed + len(drawn)).people(10, (kind,), "")
+            made = people(self.template, 10, kind, 100 + self.seed + len(drawn))
             drawn += [(each.shape, np.asarray(each.places)) for each in made]
         return drawn[number]
 
@@ -360,8 +397,8 @@ class Cases:
         return no_body(verts[int(rng.integers(len(verts)))], np.asarray(self._others[kind].template.shape.faces))
 
     def _furniture(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        mesh = furniture(sorted(KINDS)[number % 3], 50 + self.seed, number).mesh(48)
-        return no_body(np.asarray(mesh.verts), np.asarray(mesh.faces))
+        whole = melded(furniture(number, rng))
+        return no_body(whole.verts, whole.faces)
 
     def _solid(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         whole = solids(rng)
@@ -369,8 +406,7 @@ class Cases:
 
     def _kit(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         """Furniture of boxes that run into each other."""
-        made = furniture(sorted(KINDS)[number % 3], 70 + self.seed, number)
-        kit = boxes([solid.box for _, solid in made.solids], 0.2)
+        kit = boxes(furniture(number, rng), 0.2)
         return no_body(kit.verts, kit.faces)
 
     # Kept: nothing is tuned on these.

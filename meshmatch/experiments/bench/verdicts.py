@@ -31,7 +31,6 @@ from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.charts import Chart, Line, draw_lines
 from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, Case, Cases, between, direction
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
@@ -39,6 +38,7 @@ from meshmatch.fitting.judge.calibration import Calibration
 from meshmatch.generators.kinds import GENERATORS
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.outputs import make_folder
+from meshmatch.render.charts import draw_lines
 from meshmatch.shapes.shape import Shape
 
 RIGHT_CM, WRONG_CM = 5.0, 8.0
@@ -237,12 +237,13 @@ def main(
     steps, auc = calibration(mapped)
     bars, by_family, by_verdict = bars_of(found), rows_of(found, "family", names), rows_of(found, "verdict", VERDICTS)
     furthest = max(abs(row["near"] - row["confidence"]) for row in steps if "near" in row)
-    chart = Line([row["confidence"] for row in steps if "near" in row], [row["near"] for row in steps if "near" in row])
-    ideal = Line([0.0, 1.0], [0.0, 1.0])
+    shown = [row for row in steps if "near" in row]
+    lines = {
+        "measured": ([row["confidence"] for row in shown], [row["near"] for row in shown]),
+        "ideal": ([0, 1], [0, 1]),
+    }
     make_folder(output)
-    draw_lines(
-        [Chart("confidence", {"measured": chart, "ideal": ideal})], output / f"{kind}.png", f"within {RIGHT_CM:g} cm"
-    )
+    draw_lines(lines, output / f"{kind}.png", "confidence", f"within {RIGHT_CM:g} cm", {})
     tables = [
         runner.table(
             f"{kind}: verdicts by family, {seeds} seeds from {seed} on", by_family, {"family": "of", **_COLUMNS}

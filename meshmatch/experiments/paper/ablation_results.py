@@ -1,4 +1,4 @@
-"""The paper's tables, figures and claims, read off what is known of the ablation runs.
+"""The paper's tables and claims, read off what is known of the ablation runs.
 
 Training again from another seed moves errors by as much as many choices do, and six shapes are a small sample. So an order
 of two errors is there only where 95 % intervals of their difference leave out 0: over seeds (Welch's, of at least two
@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
@@ -19,7 +18,6 @@ import numpy as np
 from rich.table import Table
 from scipy.stats import bootstrap, ttest_ind, ttest_rel
 
-from meshmatch.experiments.bench.charts import Chart, Line, draw_lines
 from meshmatch.experiments.paper.ablation_views import (
     BASE,
     CODED,
@@ -28,16 +26,13 @@ from meshmatch.experiments.paper.ablation_views import (
     PAPER_MS,
     PAPER_SETS,
     TABLE4,
-    TRANSMATCH,
     VIEWS,
     Known,
     Run,
     View,
 )
 from meshmatch.experiments.runner import table
-from meshmatch.outputs import make_folder
 
-_AXIS = "mean error, cm (1.9 square meters of skin)"
 SUPPORTED, NOT_SUPPORTED, UNTESTED = "supported", "not supported", "not testable at this length"
 CLAIMS: tuple[tuple[str, tuple[Run, ...]], ...] = (
     (
@@ -61,8 +56,7 @@ CLAIMS: tuple[tuple[str, tuple[Run, ...]], ...] = (
     ),
     ("1000 supervised points < 50", (BASE, replace(BASE, supervised=50))),
     *(
-        (f"with {words}: ours < {rival}", (replace(BASE, **few), replace(other, **few)))  # type: ignore[arg-type]
-        for rival, other in (("3D-CODED", CODED), ("TransMatch", TRANSMATCH))
+        (f"with {words}: ours < 3D-CODED", (replace(BASE, **few), replace(CODED, **few)))  # type: ignore[arg-type]
         for words, few in (("250 shapes", {"shapes": 250}), ("50 supervised points", {"supervised": 50}))
     ),
 )
@@ -221,63 +215,8 @@ def tables(known: Known, views: Sequence[str], sets: Sequence[str], budget: str)
     found = []
     for name in views:
         view = VIEWS[name]
-        if view.heads and (name != "table4" or any(run in known.trained for run in view.runs)):
+        if name != "table4" or any(run in known.trained for run in view.runs):
             found.append(errors_table(view, known, sets, budget))
         if name == "table4" and known.times:
             found.append(cost_table(known))
     return found
-
-
-def draw_views(known: Known, views: Sequence[str], sets: Sequence[str], folder: Path) -> list[Path]:
-    """Draw the figures of which something is known; the files that were written."""
-    make_folder(folder)
-    written = []
-    for name in views:
-        path = folder / f"{name.replace('figure', 'figure-')}.png"
-        view = VIEWS[name]
-        drawn = (
-            _draw_descent(known, path) if name == "figure6" else view.across and _draw_lines(view, known, sets, path)
-        )
-        if drawn:
-            written.append(path)
-    return written
-
-
-def _draw_lines(view: View, known: Known, sets: Sequence[str], path: Path) -> bool:
-    """A chart for the held-out bodies and each set, with a line for each method."""
-    charts, ticks = [], sorted({float(row.words[0]) for row in view.rows})
-    for where in (HELD_OUT, *sets):
-        lines = {}
-        for method in dict.fromkeys(row.words[-1] for row in view.rows):
-            there = [(float(row.words[0]), known.error(row.run, where)) for row in view.rows if row.words[-1] == method]
-            there = [(at, errors) for at, errors in there if errors]
-            if there:
-                off = [stdev(errors) if len(errors) > 1 else 0.0 for _, errors in there]
-                points = [at for at, _ in there], [fmean(errors) for _, errors in there]
-                lines[method] = Line(*points, off)
-        if lines:
-            charts.append(Chart(f"{view.heads[0]}, {where}", lines, ticks, True))
-    if charts:
-        draw_lines(charts, path, _AXIS)
-    return bool(charts)
-
-
-def _draw_descent(known: Known, path: Path) -> bool:
-    """Error against steps, and against seconds; bands are the standard error over the bodies."""
-    if known.descent is None:
-        return False
-    steps, seconds = {}, {}
-    for name, line in known.descent["lines"].items():
-        errors = np.array(line["errors_cm"])
-        middle, off = errors.mean(1).tolist(), (errors.std(1) / np.sqrt(errors.shape[1])).tolist()
-        steps[name] = Line(line["steps"], middle, off)
-        seconds[name] = Line([0.0, *line["seconds"][1:]], middle, off)
-    places = [x for line in seconds.values() for x in line.x]
-    least = min(x for x in places if x > 0)
-    ticks = [10.0**power for power in range(-3, 4) if 0.5 * least <= 10.0**power <= 2 * max(places)]
-    charts = [
-        Chart("steps of refinement", steps, (0, 1, 3, 10, 30, 100, 300), True),
-        Chart("seconds of refinement of a body (processor)", seconds, (0.0, *ticks), True),
-    ]
-    draw_lines(charts, path, _AXIS)
-    return True

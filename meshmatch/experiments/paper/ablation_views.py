@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal
+from typing import Any
 
 from meshmatch.fields.shape_functions import FIELDS, FieldName
 from meshmatch.geometry.kernels import Kernel
@@ -28,7 +28,7 @@ class Run:
 
     Parameters
     ----------
-    field, kernel : of the deformation; TransMatch's transformer has none, and moves every point itself
+    field, kernel : of the deformation
     constraint : one of `CONSTRAINTS`
     nodes, radius : K, and r in the paper's unit
     strategy : how nodes are chosen
@@ -37,7 +37,7 @@ class Run:
     supervised : on how many template points the right place is told
     """
 
-    field: FieldName | Literal["transmatch"] = "mls"
+    field: FieldName = "mls"
     constraint: str = "vol+arap+Z"
     nodes: int = 300
     radius: float = 0.2
@@ -62,7 +62,6 @@ class Run:
 BASE = Run()
 CODED = replace(BASE, field="pointwise", constraint="none")
 """3D-CODED as a run."""
-TRANSMATCH = replace(BASE, field="transmatch", constraint="none")
 
 
 @dataclass(frozen=True)
@@ -78,15 +77,11 @@ class Row:
 
 @dataclass(frozen=True)
 class View:
-    """A table or figure: its title, the headings of its rows' words, and rows.
-
-    ``across`` is set where the first word is a number against which errors are drawn as lines, one for each last word.
-    """
+    """A table or figure: its title, the headings of its rows' words, and rows."""
 
     title: str
     heads: tuple[str, ...]
     rows: tuple[Row, ...]
-    across: bool = False
 
     @property
     def runs(self) -> list[Run]:
@@ -131,10 +126,10 @@ GRID = tuple(replace(BASE, nodes=K, radius=r) for K, r in _PAPER6)
 
 
 def _numbers(name: str, counts: Sequence[int]) -> tuple[Row, ...]:
-    """Ours, 3D-CODED and TransMatch, which see as many scans in as many steps."""
+    """Ours and 3D-CODED, which see as many scans in as many steps."""
     return tuple(
-        Row((str(count), words), replace(run, **{name: count}), method=how)  # type: ignore[arg-type]
-        for words, run, how in (("ours", BASE, "code"), ("3D-CODED", CODED, "code"), ("TransMatch", TRANSMATCH, "none"))
+        Row((str(count), words), replace(run, **{name: count}))  # type: ignore[arg-type]
+        for words, run in (("ours", BASE), ("3D-CODED", CODED))
         for count in counts
     )
 
@@ -157,10 +152,8 @@ VIEWS = {
             *(Row(("test time", words), BASE, paper, how) for how, words, paper in _PAPER5_TEST),
         ),
     ),
-    "figure9": View("Figure 9", ("training shapes", "method"), _numbers("shapes", (250, 500, 1000, 2000)), across=True),
-    "figure10": View(
-        "Figure 10", ("supervised points", "method"), _numbers("supervised", (50, 100, 1000)), across=True
-    ),
+    "figure9": View("Figure 9", ("training shapes", "method"), _numbers("shapes", (250, 500, 1000, 2000))),
+    "figure10": View("Figure 10", ("supervised points", "method"), _numbers("supervised", (50, 100, 1000))),
     "figure8": View(
         "Figure 8", ("template", "nodes by"), tuple(Row((pose, "{rule}"), replace(BASE, pose=pose)) for pose in POSES)
     ),
@@ -184,7 +177,6 @@ VIEWS = {
             Row(("300", "0.2", "{rule}", "cubic"), replace(BASE, kernel="cubic")),
         ),
     ),
-    "figure6": View("Figure 6", (), (Row((), BASE), Row((), CODED))),
 }
 """In the order in which their runs are trained."""
 
@@ -198,25 +190,19 @@ def all_runs(views: Sequence[str], seeds: int = 1, repeated: Sequence[str] = ())
 
 
 def methods_of(run: Run) -> tuple[str, ...]:
-    """With which refinements a run is measured, whatever its seed, the most usual one first: the paper's; those of table 5
-    where it looks; none where there is no code.
-    """
-    if run.field == "transmatch":
-        return ("none",)
-    alike = replace(run, seed=BASE.seed)
-    return ("code", "none", "chamfer") if alike == BASE else ("code",)
+    """With which refinements a run is measured, whatever its seed: the paper's, then those of table 5 where it looks."""
+    return ("code", "none", "chamfer") if replace(run, seed=BASE.seed) == BASE else ("code",)
 
 
 @dataclass(frozen=True)
 class Known:
     """What was measured: ``trained`` as `train_run` tells it, or {"skipped": why}; ``errors`` by run, set and method;
-    ``times`` of an iteration by name of the run; ``descent``: figure 6, as `ablation_errors.descend` tells it.
+    ``times`` of an iteration by name of the run.
     """
 
     trained: Mapping[Run, Mapping[str, Any]]
     errors: Mapping[tuple[Run, str, str], Mapping[str, Any]]
     times: Mapping[str, Mapping[str, Any]]
-    descent: Mapping[str, Any] | None = None
 
     def rule(self, run: Run) -> str:
         """How nodes were chosen in the end."""

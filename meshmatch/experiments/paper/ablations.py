@@ -1,10 +1,9 @@
 """The paper's ablations.
 
 Tables 4 (representations and constraints: errors and cost), 5 (regularisers), 6 (nodes and radius, kernel), 7 (how nodes
-are chosen); figures 6 (refinement), 8 (template pose), 9 (training shapes), 10 (supervised points). All are views of one
-set of runs. Each run is trained once, from the beginning, and measured on shapes that it has not seen and on pairs of the
-benchmark's sets. All runs take the same number of --steps; with
---minutes the same time instead (of the processor; with a GPU on the clock), in which what is slow learns less.
+are chosen); figures 8 (template pose), 9 (training shapes), 10 (supervised points). All are views of one set of runs. Each
+run is trained once, from the beginning, for the same number of --steps, and measured on shapes that it has not seen and on
+pairs of the benchmark's sets.
 
 What is measured lies in the output folder and is not measured again, so that a stopped command goes on with what is
 missing; --show measures nothing and shows what is there. The tables say the budget. Errors are in cm at 1.9 m2 of skin:
@@ -28,25 +27,19 @@ from meshmatch.errors import OptionError, TemplateError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.sets import ALL_SETS, CLOUD_SET, BenchSet, load_set
 from meshmatch.experiments.paper.ablation_errors import (
-    LINES,
     METHODS,
     Measure,
     Subject,
     chosen_names,
-    descend,
     errors_of,
     oriented,
     subject,
-    transformer_errors,
 )
-from meshmatch.experiments.paper.ablation_results import claims, claims_table, draw_views, tables
-from meshmatch.experiments.paper.ablation_training import Preset, Setting, timed, train_run, train_transformer
-from meshmatch.experiments.paper.ablation_views import BASE, CODED, VIEWS, Known, Run, all_runs, methods_of
+from meshmatch.experiments.paper.ablation_results import claims, claims_table, tables
+from meshmatch.experiments.paper.ablation_training import Setting, timed, train_run
+from meshmatch.experiments.paper.ablation_views import VIEWS, Known, Run, all_runs, methods_of
 from meshmatch.geometry.frames import Frame
 from meshmatch.models.registry import find_model
-
-BODIES = 5
-"""How many bodies figure 6 is measured on."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +50,6 @@ class Kept:
     setting: Setting
     measure: Measure
     steps: int
-    minutes: float | None
     model: str
     benches: Sequence[BenchSet]
     cache: Path | None
@@ -81,18 +73,16 @@ class Kept:
 
     def train(self, run: Run) -> dict[str, Any] | None:
         """How its training went; {"skipped": why} where nodes cannot be laid."""
-        budget: dict[str, Any] = {"steps": self.steps} if self.minutes is None else {"minutes": self.minutes}
 
         def measured() -> dict[str, Any]:
-            runner.tell(f"training {run.name}: {', '.join(f'{value:g} {name}' for name, value in budget.items())}")
+            runner.tell(f"training {run.name}: {self.steps} steps")
             try:
-                learn = train_transformer if run.field == "transmatch" else train_run
-                found = learn(run, self.setting, self.folder / run.name / "model", **budget)
+                found = train_run(run, self.setting, self.folder / run.name / "model", self.steps)
             except TemplateError as error:
                 found = {"skipped": error.message}
             return {**self.here(), **found}
 
-        asked = {"run": asdict(run), "setting": asdict(self.setting), **budget}
+        asked = {"run": asdict(run), "setting": asdict(self.setting), "steps": self.steps}
         return self.answer(self.folder / run.name / "trained.json", asked, measured)
 
     def errors(self, run: Run, trained: dict[str, Any]) -> dict[tuple[Run, str, str], dict[str, Any]]:
@@ -112,11 +102,8 @@ class Kept:
                     if not (folder / "model").is_dir():
                         raise OptionError(f"{folder} has lost its model", "remove that folder to train it again")
                     runner.tell(f"measuring {run.name} on {bench.name}: {how}")
-                    subjects, model = self.subjects(bench), folder / "model"
-                    if run.field == "transmatch":
-                        return {**self.here(), **transformer_errors(model, subjects, self.model, self.measure)}
-                    new = errors_of(as_model(model), run, subjects, self.model, [how], self.measure)
-                    return {**self.here(), **new[how]}
+                    model, subjects = as_model(folder / "model"), self.subjects(bench)
+                    return {**self.here(), **errors_of(model, run, subjects, self.model, how, self.measure)}
 
                 asked = {"model": trained.get("model"), "measure": asdict(self.measure), "set": bench.name}
                 asked |= {"method": how, "reference": self.reference}
@@ -157,57 +144,38 @@ class Kept:
         times = self.answer(self.folder / "times.json", asked, measured)
         return {} if times is None else times["times"]
 
-    def descent(self, trained: dict[Run, dict[str, Any]]) -> dict[str, Any] | None:
-        """Figure 6, if its runs are there."""
-        if not {BASE, CODED} <= trained.keys():
-            return None
-        digests = [trained[run].get("model") for run in (BASE, CODED)]
-        asked: dict[str, Any] = {"models": digests, "measure": asdict(self.measure), "bodies": BODIES}
-        asked["steps"] = [counts for _, _, counts in LINES.values()]
-
-        def measured() -> dict[str, Any]:
-            runner.tell("measuring figure 6")
-            models = {run: as_model(self.folder / run.name / "model") for run in (BASE, CODED)}
-            return {**self.here(), "lines": descend(models, self.setting, self.measure, BODIES)}
-
-        return self.answer(self.folder / "figure6.json", asked, measured)
-
     def known(self, runs: Sequence[Run], views: Sequence[str], rounds: int) -> Known:
-        """What is there, after measuring what is missing; no runs are trained in 0 minutes or steps."""
+        """What is there, after measuring what is missing; no runs are trained in 0 steps."""
         trained: dict[Run, dict[str, Any]] = {}
         errors: dict[tuple[Run, str, str], dict[str, Any]] = {}
-        for run in runs if (self.steps if self.minutes is None else self.minutes) else ():
+        for run in runs if self.steps else ():
             if (found := self.train(run)) is not None:
                 trained[run] = found
                 errors |= self.errors(run, found)
-        times = self.cost(rounds) if "table4" in views and rounds else {}
-        return Known(trained, errors, times, self.descent(trained) if "figure6" in views else None)
+        return Known(trained, errors, self.cost(rounds) if "table4" in views and rounds else {})
 
     def budget(self) -> str:
         """What the numbers cost, in words."""
-        words = [f"{self.steps} steps of every run" if self.minutes is None else f"{self.minutes:g} min of every run"]
+        words = [f"{self.steps} steps of every run"]
         if self.setting.batch:
             words.append(f"batches of {self.setting.batch}")
-        words += [f"preset {self.setting.preset}", f"{self.measure.code_steps} steps on the code"]
+        words.append(f"{self.measure.code_steps} steps on the code")
         return ", ".join([*words, f"the pairs of {self.measure.shapes} shapes of a set"])
 
 
 @runner.command
 def main(
-    output: Annotated[Path, Option(help="folder of what is measured, and of the figures")],
+    output: Annotated[Path, Option(help="folder of what is measured")],
     views: Annotated[str, Option(help=f"of {', '.join(VIEWS)}")] = ",".join(VIEWS),
     steps: Annotated[int, Option(min=0, help="of training a run; 0: table 4's cost alone")] = 300,
-    minutes: Annotated[float | None, Option(min=0, help="of training instead: equal time, see above")] = None,
     seeds: Annotated[int, Option(min=1, help="trainings of each run of the views that are repeated")] = 1,
     repeated: Annotated[str, Option(help="which views these are; may be empty")] = "table4",
-    without: Annotated[str, Option(help="leave out runs whose names have one of these words, such as pointwise")] = "",
     rounds: Annotated[int, Option(min=0, help="iterations of table 4's runs under the clock")] = 5,
     sets: Annotated[str, Option(help="on which errors are measured; may be empty")] = f"shrec19,{CLOUD_SET}",
     shapes: Annotated[int, Option(min=2, help="of each set, whose pairs are measured")] = 6,
     code_steps: Annotated[int, Option(min=1, help="of the search over codes")] = 100,
     methods: Annotated[str, Option(help="refinements, where a view asks for them")] = ",".join(METHODS),
-    preset: Annotated[Preset, Option(help="of the training")] = "small",
-    batch: Annotated[int | None, Option(min=1, help="shapes of a step; by default the preset's")] = None,
+    batch: Annotated[int | None, Option(min=1, help="shapes of a step; 32 by default")] = None,
     threads: runner.Threads = 1,
     model: runner.Model = "human",
     data: runner.Data = runner.DATA,
@@ -216,24 +184,19 @@ def main(
 ) -> runner.Report:
     names = [name for name in VIEWS if name in runner.names_of(views, VIEWS, "view")]
     runs = all_runs(names, seeds, runner.names_of(repeated, VIEWS, "view"))
-    runs = [run for run in runs if not any(word in run.name for word in without.split(",") if word)]
-    if minutes is not None:  # in which a transformer cannot be stopped
-        runs = [run for run in runs if run.field != "transmatch"]
     benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
-    setting, measure = Setting(preset, threads, batch), Measure(shapes=shapes, code_steps=code_steps)
+    setting, measure = Setting(threads, batch), Measure(shapes=shapes, code_steps=code_steps)
     wanted = runner.names_of(methods, METHODS, "method")
-    kept = Kept(output, setting, measure, steps, minutes, model, benches, cache, show, wanted)
+    kept = Kept(output, setting, measure, steps, model, benches, cache, show, wanted)
     known = kept.known(runs, names, rounds)
     where = [bench.name for bench in benches]
     found = claims(known, where)
-    drawn = [*tables(known, names, where, kept.budget()), claims_table(found)]
     missing = [run.name for run in runs if run not in known.trained]
-    notes = [f"Not measured: {', '.join(missing)}"] if missing else []
-    notes += [f"wrote {path}" for path in draw_views(known, names, where, output)]
     record = {
         **{"setting": asdict(setting), "measure": asdict(measure)},
         "runs": {run.name: each for run, each in known.trained.items()},
         "errors": {f"{run.name} {name} {how}": r["mean_cm"] for (run, name, how), r in known.errors.items()},
-        **{"times": known.times, "figure6": known.descent, "claims": [asdict(claim) for claim in found]},
+        **{"times": known.times, "claims": [asdict(claim) for claim in found]},
     }
-    return runner.Report(record, drawn, notes)
+    drawn = [*tables(known, names, where, kept.budget()), claims_table(found)]
+    return runner.Report(record, drawn, [f"Not measured: {', '.join(missing)}"] if missing else [])
