@@ -32,7 +32,7 @@ FITTING = ("fit_config", "solve", "search", "judge", "fit")
 
 # Which rooms know which third-party library.
 OWNERS = {
-    "PIL": {"shapes", "maps", "transfer", "render"},
+    "PIL": {"shapes", "maps", "transfer", "render", "experiments"},
     "anny": {"generators"},
     "distributed": {"collections"},
     "embreex": {"render"},
