@@ -2,16 +2,25 @@
 
 `install`, called by ``conftest.py`` before anything is imported, wraps functions with jaxtyping annotations as their
 module is loaded. Other annotations are left to mypy, and constructors too: dataclasses convert what they are given.
+Annotations are read once for each function, for some are called many thousand times: jaxtyping's own check of a call
+makes tests of fits take nearly twice as long.
 """
 
 import inspect
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import wraps
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from types import ModuleType, UnionType
 from typing import Any, Union, get_args, get_origin
 
-from jaxtyping import AbstractArray, jaxtyped
+import numpy as np
+from jaxtyping import AbstractArray
+
+Sizes = dict[str, Any]
+Check = Callable[[Any, Sizes], bool]
+"""Whether a value is what an annotation says, given the sizes that names have in this call; notes those of new names."""
+ARRAYS = ("Float[", "Int[", "Bool[", "UInt8[")
 
 
 def install(packages: Sequence[str]) -> None:
@@ -41,39 +50,120 @@ class _Loader(SourceFileLoader):
         for holder in (module, *(each for each in classes if each.__module__ == module.__name__)):
             for name, value in list(vars(holder).items()):
                 if inspect.isfunction(value) and value.__module__ == module.__name__ and _promises(value):
-                    setattr(holder, name, jaxtyped(value, typechecker=checked))
+                    setattr(holder, name, checked(value))
 
 
 def _promises(function: Callable[..., Any]) -> bool:
-    texts = map(str, function.__annotations__.values())
-    arrays = any(kind in text for text in texts for kind in ("Float[", "Int[", "Bool["))
+    arrays = any(_is_of_arrays(hint) for hint in function.__annotations__.values())
     return arrays and function.__name__ != "__init__" and not inspect.isgeneratorfunction(function)
 
 
-def checked(function: Callable[..., Any]) -> Callable[..., Any]:
-    """For jaxtyping, which turns a signature into a function: one that checks the arrays it is given."""
-    signature = inspect.signature(function)
-    hints = {name: parameter.annotation for name, parameter in signature.parameters.items()}
+def _is_of_arrays(hint: Any) -> bool:
+    return any(kind in str(hint) for kind in ARRAYS)
 
-    def check(*args: Any, **kwargs: Any) -> Any:
-        for name, value in signature.bind(*args, **kwargs).arguments.items():
-            if not fits(value, hints[name]):
-                raise TypeError(f"{name} is not {hints[name]}")
-        result = function(*args, **kwargs)  # by jaxtyping: the real result, handed through
-        if not fits(result, signature.return_annotation):
-            raise TypeError(f"the result is not {signature.return_annotation}")
+
+def checked(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same function, which raises `TypeError` for arrays that are not what its annotations say."""
+    order = list(inspect.signature(function).parameters)
+    checks: dict[str, Check] | None = None
+
+    @wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        nonlocal checks
+        if checks is None:  # not before, for modules may import each other for annotations
+            checks = dict(_checks(function))
+        sizes: Sizes = {}
+        for given in (zip(order, args, strict=False), kwargs.items()):
+            for name, value in given:
+                check = checks.get(name)
+                if check is not None and not check(value, sizes):
+                    raise TypeError(f"parameter {name} is not {function.__annotations__[name]}, with {sizes}")
+        result = function(*args, **kwargs)
+        check = checks.get("return")
+        if check is not None and not check(result, sizes):
+            raise TypeError(f"the result is not {function.__annotations__['return']}, with {sizes}")
         return result
+
+    return call
+
+
+def _checks(function: Callable[..., Any]) -> Iterator[tuple[str, Check]]:
+    for name, hint in function.__annotations__.items():
+        if _is_of_arrays(hint):
+            try:
+                found = _check_of(eval(hint, function.__globals__) if isinstance(hint, str) else hint)
+            except (AttributeError, NameError, TypeError):  # with names that are for type checkers alone
+                continue
+            if found is not None:
+                yield name, found
+
+
+def _check_of(hint: Any) -> Check | None:
+    """None for what is not checked."""
+    if inspect.isclass(hint) and issubclass(hint, AbstractArray):
+        return _array_check(hint)
+    inner = get_args(hint)
+    if get_origin(hint) in (Union, UnionType):
+        checks = [_check_of(each) for each in inner if each is not type(None)]
+        if None in checks:
+            return None
+        optional = type(None) in inner
+        return lambda value, sizes: optional if value is None else any(check(value, sizes) for check in checks)
+    if get_origin(hint) is tuple and Ellipsis not in inner:
+        each = [_check_of(part) or _anything for part in inner]
+        return lambda value, sizes: (
+            isinstance(value, tuple)
+            and len(value) == len(each)
+            and all(check(part, sizes) for check, part in zip(each, value, strict=True))
+        )
+    return None
+
+
+def _anything(value: Any, sizes: Sizes) -> bool:
+    return True
+
+
+def _array_check(hint: Any) -> Check:
+    kind, kinds = hint.array_type, set(hint.dtypes)
+    dims: list[str | int] = [int(word) if word.isdigit() else word for word in hint.dim_str.split()]
+    many = next((at for at, dim in enumerate(dims) if isinstance(dim, str) and dim.startswith(("*", "..."))), None)
+    seen: set[Any] = set()  # types of elements that are among the kinds
+
+    def check(value: Any, sizes: Sizes) -> bool:
+        if not isinstance(value, kind):
+            return False
+        if value.dtype not in seen:
+            if getattr(value.dtype, "name", str(value.dtype).removeprefix("torch.")) not in kinds:
+                return False
+            seen.add(value.dtype)
+        shape, wanted = tuple(value.shape), dims
+        if many is not None:
+            after = len(dims) - many - 1
+            if len(shape) < many + after or not _fits(str(dims[many]), shape[many : len(shape) - after], sizes):
+                return False
+            shape = shape[:many] + shape[len(shape) - after :]
+            wanted = dims[:many] + dims[many + 1 :]
+        if len(shape) != len(wanted):
+            return False
+        for dim, size in zip(wanted, shape, strict=True):
+            if type(dim) is int:
+                if dim != size:
+                    return False
+            elif dim != "_" and sizes.setdefault(dim, size) != size:
+                return False
+        return True
 
     return check
 
 
-def fits(value: Any, hint: Any) -> bool:
-    """Whether the arrays in a value are what an annotation says; sizes of one name must agree within a call."""
-    if inspect.isclass(hint) and issubclass(hint, AbstractArray):
-        return isinstance(value, hint)
-    inner = get_args(hint)
-    if get_origin(hint) in (Union, UnionType):
-        return any(value is None if each is type(None) else fits(value, each) for each in inner)
-    if get_origin(hint) is tuple and Ellipsis not in inner:
-        return isinstance(value, tuple) and len(value) == len(inner) and all(map(fits, value, inner))
-    return True
+def _fits(dim: str, shape: tuple[int, ...], sizes: Sizes) -> bool:
+    """Whether axes of any number are those of the same name: ``*#B`` may be broadcast to them, ``...`` are any."""
+    if dim == "...":
+        return True
+    before = sizes.setdefault(dim.replace("#", ""), shape)
+    if "#" not in dim:
+        return bool(before == shape)
+    try:
+        return np.broadcast_shapes(before, shape) == before
+    except ValueError:
+        return False
