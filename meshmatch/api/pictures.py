@@ -80,7 +80,7 @@ def picture(
     look = look or Look()
     check_picture(path)
     with thread_limit(1):
-        shown = _composed(shapes, look, match, values, labels, fit)
+        shown = composed(shapes, look, match=match, values=values, labels=labels, fit=fit)
         if names is not None:
             names = [names] if isinstance(names, str) else names
             if len(names) != len(shown.panels):
@@ -89,14 +89,18 @@ def picture(
         return shown.render(path, look)
 
 
-def _composed(
+def composed(
     given: Sequence[ShapeLike] | Composition,
     look: Look,
-    match: MapLike,
-    values: Sequence[ArrayLike] | None,
-    labels: Sequence[Labels | ArrayLike] | None,
-    fit: Fit | None,
+    *,
+    match: MapLike = None,
+    values: Sequence[ArrayLike] | None = None,
+    labels: Sequence[Labels | ArrayLike] | None = None,
+    fit: Fit | None = None,
+    title: str = "",
+    limits: tuple[float, float] | None = None,
 ) -> Composition:
+    """What `picture` draws; ``title`` and ``limits`` are those of the color scale of ``values``."""
     if isinstance(given, Composition):
         return given
     known = {"match": match, "values": values, "labels": labels, "fit": fit}
@@ -120,7 +124,7 @@ def _composed(
             if table.ndim not in (1, 2) or len(table) != shape.V:
                 hint = "one number or one color for each vertex, and one array for each shape"
                 raise InputError(f"{what} must be an array of ({shape.V},), not {table.shape}", hint)
-        return compose.compose_values(shapes, tables)
+        return compose.compose_values(shapes, tables, title, limits)
     if labels is not None:
         pairs = zip(labels, shapes, strict=True)
         read = [own if isinstance(own, Labels) else labels_of(own, shape) for own, shape in pairs]
@@ -133,7 +137,7 @@ def _composed(
             what = f"the fit is of {own.name or 'another shape'}, not of {shapes[0].name or 'this one'}"
             raise InputError(what, "draw the shape that was fitted")
         return compose.compose_fit(shapes[0], fit.shape, fit.frame.turn)
-    looks = [_read_look(source, shape)[0] for source, shape in zip(given, shapes, strict=True)]
+    looks = [read_look(source, shape)[0] for source, shape in zip(given, shapes, strict=True)]
     return compose.compose_shapes(list(zip(shapes, looks, strict=True)))
 
 
@@ -198,7 +202,7 @@ def view(
     shapes = as_shape(source, "source"), as_shape(target, "target")
     maps = find_maps(*shapes, match)
     with thread_limit(1):
-        (look, uv, note), (other, other_uv, other_note) = map(_read_look, (source, target), shapes)
+        (look, uv, note), (other, other_uv, other_note) = map(read_look, (source, target), shapes)
         both = maps.forward, maps.backward
         looks = share_look(shapes, (look, other), *both, coordinates=(uv, other_uv), workers=threads)
         shown = None if names is None else (names[0], names[1])
@@ -225,12 +229,18 @@ def _rotations(
     return None, None
 
 
-def _read_look(source: ShapeLike, shape: Shape) -> tuple[Appearance | None, Floats | None, str]:
-    """Textures and texture coordinates of a file. A look that cannot be read is no reason to show nothing."""
+def read_look(
+    source: ShapeLike, shape: Shape, image: Path | None = None
+) -> tuple[Appearance | None, Floats | None, str]:
+    """Textures and texture coordinates of a file, and what is to be said of them. A look that cannot be read is no reason to
+    show nothing, but an ``image`` that is (`InputError`).
+    """
     if not isinstance(source, str | Path):
         return None, None, ""
     try:
-        return find_appearance(source, shape), load_coordinates(source, shape), ""
+        return find_appearance(source, shape, image), load_coordinates(source, shape), ""
     except InputError as error:
+        if image is not None:
+            raise
         colors = None if shape.colors is None else vertex_colors_alone(shape)
         return colors, None, f"shown without its {'look' if colors is None else 'texture'}: {error.message}"

@@ -11,7 +11,7 @@ import meshmatch
 from meshmatch.cli import options, words
 from meshmatch.cli.transfer_options import Transfer, ViewMapOptions
 from meshmatch.cli.words import Console, print_json
-from meshmatch.errors import InputError, ModelError, OptionError, warn
+from meshmatch.errors import ModelError, OptionError, warn
 from meshmatch.models.registry import TEMPLATE, locate_model
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def picture(
     for k, (before, given) in enumerate(zip(own, name or words.names_of(shapes, own), strict=True)):
         if name or given != before:
             labels[k] = labels[k].replace(before, given) if len(labels) > len(shapes) else given
-    width, height = made.named(labels if names else [""] * len(labels)).render(output, look)
+    width, height = meshmatch.picture(made, output, look=look, names=labels if names else [""] * len(labels))
     console.say(f"drew {output}: {made.caption} ({width} x {height} pixels)")
     if json:
         record = {"output": output, "shapes": [str(path) for path in shapes], "shows": made.caption}
@@ -168,22 +168,17 @@ def picture(
 
 def _load_subject(path: Path, shown: PictureOptions) -> Subject:
     """Read a shape, or a template by its file or name, or that of a model."""
-    from meshmatch.shapes.appearance import vertex_colors_alone
-    from meshmatch.shapes.textured_files import find_appearance
+    from meshmatch.api.pictures import read_look
 
     if (template := _template(path)) is not None:
         return template, None
     shape = meshmatch.load_shape(path)
-    textured = not (shown.plain or shown.map or shown.values or shown.labels or shown.fit)
-    if not textured:
+    if shown.plain or shown.map or shown.values or shown.labels or shown.fit:
         return shape, None
-    try:
-        return shape, find_appearance(path, shape, shown.image)
-    except InputError as error:
-        if shown.image is not None:
-            raise
-        warn(f"{shape.name} is drawn without its texture: {error.message}")
-        return shape, None if shape.colors is None else vertex_colors_alone(shape)
+    look, _, note = read_look(path, shape, shown.image)
+    if note:
+        warn(f"{shape.name} is {note}")
+    return shape, look
 
 
 def _template(path: Path) -> "Template | None":
@@ -205,7 +200,8 @@ def _template(path: Path) -> "Template | None":
 
 def _compose(shown: PictureOptions, subjects: list[Subject], look: "Look", console: Console) -> "Composition":
     """Read what the options name, and compose the picture of it."""
-    from meshmatch.render.compose import compose_labels, compose_shapes, compose_values, merge_labels
+    from meshmatch.api.pictures import composed
+    from meshmatch.render.compose import compose_shapes
 
     shapes: list[Any] = [getattr(each, "shape", each) for each, _ in subjects]  # of a template its own
     if shown.map is not None:
@@ -218,12 +214,12 @@ def _compose(shown: PictureOptions, subjects: list[Subject], look: "Look", conso
         tables = [load_values(*pair).numbers for pair in zip(shown.values, shapes, strict=True)]
         colors = all(table.ndim == 2 and table.shape[1] > 1 for table in tables)
         title = shown.title or ("" if colors else shown.values[0].stem)
-        return compose_values(shapes, tables, title, shown.range)
+        return composed(shapes, look, values=tables, title=title, limits=shown.range)
     if shown.labels:
         from meshmatch.transfer.label_files import load_labels
 
         labels = [load_labels(*pair, shown.on) for pair in zip(shown.labels, shapes, strict=True)]
-        return compose_labels(shapes, *merge_labels(labels), [own.on == "faces" for own in labels])
+        return composed(shapes, look, labels=labels)
     return compose_shapes(subjects, plain=shown.plain)
 
 

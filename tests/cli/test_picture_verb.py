@@ -285,7 +285,7 @@ def test_a_shape_is_drawn_where_its_texture_is_lost(
     look = drawn.panels[0].appearance
     assert (look is not None) == colored
     if not (colored and lost == "square.mtl"):  # then it wears its colors, without a word
-        assert "warning: a.obj is drawn without its texture" in answer.err and word in answer.err
+        assert "warning: a.obj is shown without its" in answer.err and word in answer.err
     assert run("picture", tmp_path / "a.obj", "--image", tmp_path / lost, "-o", tmp_path / "p3.png").status == 1
 
 
