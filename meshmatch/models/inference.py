@@ -1,4 +1,5 @@
-"""Where a network is evaluated: in NumPy for matching (`NodeNetwork`), or in torch, for pointwise fields and on a GPU.
+"""Where a network is evaluated: in NumPy for matching (`NodeNetwork`), or in torch, for pointwise fields and on a GPU; and
+where it is trained.
 
 The layers are few, dense and small: their weights are read from memory once for a batch, so that twenty clouds cost about
 as much as four. `models.deformer` is the same network in torch; a test holds both to the same answers.
@@ -12,18 +13,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.special import erf
 
 from meshmatch.arrays import Float, Floats, Floats32
 from meshmatch.errors import OptionError, needs
 from meshmatch.fields.shape_functions import has_nodes
 from meshmatch.geometry.oriented import nearest, quick_tree
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.checkpoint import load_weights
 from meshmatch.models.network import POINT_SIZES, Network, NetworkConfig, weight_shapes
 from meshmatch.threads import parallel_map
 
 if TYPE_CHECKING:
+    import torch
+
     from meshmatch.models.deformer import Deformer
 
 _EPSILON = np.float32(1e-5)  # of layer and batch norms, as in torch
@@ -60,6 +63,13 @@ def in_torch(network: Network, K: int, device: str = "cpu") -> Deformer:
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         problem = f"device {device!r} cannot be used: {str(error).splitlines()[0][:80]}"
         raise OptionError(problem, "use cpu; cuda needs a GPU and a torch that was built for it") from error
+
+
+def training_device(rank: int = 0) -> torch.device:
+    """Where networks are trained: the GPU of this rank among the machine's, or the CPU where there is none."""
+    import torch
+
+    return torch.device("cuda", rank) if torch.cuda.is_available() else torch.device("cpu")
 
 
 class NodeNetwork:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from meshmatch.errors import ModelError, OptionError
 from meshmatch.models.deformer import Deformer
+from meshmatch.models.inference import training_device
 from meshmatch.outputs import replace_on_success
 from meshmatch.training.losses import CorrespondenceLoss, Objective
 
@@ -99,10 +100,9 @@ class Trainer:
         self.config = config
         self.rank = int(os.environ.get("RANK", 0))
         self.world = int(os.environ.get("WORLD_SIZE", 1))
-        cuda = torch.cuda.is_available()
-        self.device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0))) if cuda else torch.device("cpu")
+        self.device = training_device(int(os.environ.get("LOCAL_RANK", 0)))
         if self.world > 1 and not dist.is_initialized():
-            dist.init_process_group("nccl" if cuda else "gloo")
+            dist.init_process_group("gloo" if self.device.type == "cpu" else "nccl")
         self.model = model.to(self.device)
         self.points: Any = None if points is None else points.to(self.device)
         self.average = {n: p.detach().clone() for n, p in model.named_parameters()}
@@ -165,7 +165,7 @@ class Trainer:
 
     def run(
         self,
-        data: torch.utils.data.Dataset,
+        data: torch.utils.data.Dataset[Any],
         checkpoint: Path | None = None,
         report: Callable[[StepReport], None] | None = None,
         validate: Callable[[Deformer], float] | None = None,
@@ -207,7 +207,7 @@ class Trainer:
             self.save(checkpoint)
         self.model.eval()
 
-    def iterate(self, batch) -> dict[str, Tensor]:
+    def iterate(self, batch: Any) -> dict[str, Tensor]:
         """One step of training on a batch; returns its losses. The model must be in training mode."""
         config = self.config
         seed = config.seed * 7919 + self.step * self.world + self.rank
