@@ -29,7 +29,7 @@ def derived(derive: Callable[Concatenate[Owner, P], Value]) -> Callable[Concaten
     """Let a function of an object, and of hashable arguments, compute once for each object."""
 
     @wraps(derive)
-    def once(owner: Owner, *args: P.args, **kwargs: P.kwargs) -> Value:
+    def once(owner: Owner, /, *args: P.args, **kwargs: P.kwargs) -> Value:
         store, key = _store_of(owner), (derive, args, tuple(sorted(kwargs.items())))
         with store.lock:
             if key not in store.values:

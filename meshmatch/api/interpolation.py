@@ -15,7 +15,7 @@ import numpy as np
 from meshmatch.api.matcher import Matcher
 from meshmatch.api.matching import matcher_for
 from meshmatch.api.results import shape_of
-from meshmatch.arrays import Brief
+from meshmatch.arrays import Brief, Floats
 from meshmatch.errors import OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.blend import WAYS, Blend, Deviation, Way
@@ -27,7 +27,7 @@ from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import folder_on_success
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shapes, save_shape
-from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 
 if TYPE_CHECKING:

@@ -61,7 +61,7 @@ def fit(
     themselves, which must be complete. FITS/fits.csv lists the result of every shape.
     """
     from meshmatch.collections.setting import FAILED
-    from meshmatch.fitting.without_model import NO_MODEL
+    from meshmatch.models.registry import NO_MODEL
 
     how.check()
     if how.model != NO_MODEL:

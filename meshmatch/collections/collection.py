@@ -27,12 +27,11 @@ from meshmatch.collections.workers import hired
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.without_model import NO_MODEL
 from meshmatch.maps.build import build_map
 from meshmatch.maps.files import check_suffix
 from meshmatch.maps.places import Places
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.models.registry import AUTO
+from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.templates.prepared_folder import RegisteredShapes

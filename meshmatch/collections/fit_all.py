@@ -31,8 +31,8 @@ from meshmatch.collections.tasks import (
 from meshmatch.collections.workers import Died, Item, Result, Workers
 from meshmatch.errors import InputError
 from meshmatch.fitting.solve.agreement import AgreeConfig, held_mean, log_stretch, stretch_of
-from meshmatch.fitting.without_model import NO_MODEL
 from meshmatch.maps.vertex_map import VERDICTS
+from meshmatch.models.registry import NO_MODEL
 from meshmatch.progress import ProgressCallback
 
 TABLE = "fits.csv"

@@ -16,8 +16,9 @@ from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.without_model import NO_MODEL, fit_viscously, viscous_system
+from meshmatch.fitting.without_model import fit_viscously, viscous_system
 from meshmatch.maps.places import Places
+from meshmatch.models.registry import NO_MODEL
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape

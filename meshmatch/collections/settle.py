@@ -18,9 +18,9 @@ from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.solve.viscous import ViscousConfig
-from meshmatch.fitting.without_model import NO_MODEL, template_of
+from meshmatch.fitting.without_model import template_of
 from meshmatch.geometry.frames import kabsch
-from meshmatch.models.registry import AUTO
+from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.input_files import read_json
 from meshmatch.shapes.shape import Shape

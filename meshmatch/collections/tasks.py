@@ -25,8 +25,8 @@ from meshmatch.fitting.agree import member_of, with_vectors
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree_step, log_stretch
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.system import node_system
-from meshmatch.fitting.without_model import NO_MODEL
 from meshmatch.maps.places import Places
+from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.input_files import read_npy
 from meshmatch.shapes.parts import leave_out

@@ -76,8 +76,8 @@ class Field:
         """The same on the points from ``start`` to ``stop``; after `for_training`."""
         return Field(self.phi[start:stop], self.gradient[3 * start : 3 * stop])
 
-    def to(self, *args, **kwargs) -> Field:
-        return Field(self.phi.to(*args, **kwargs), self.gradient.to(*args, **kwargs))
+    def to(self, device: str | torch.device) -> Field:
+        return Field(self.phi.to(device), self.gradient.to(device))
 
     def _apply(self, matrix: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
         return apply_shape_functions(matrix, rows)
@@ -92,19 +92,19 @@ class _DescentField(Field):
 
     def _apply(self, matrix: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
         transpose = self.phi_transpose if matrix is self.phi else self.gradient_transpose
-        return _Product.apply(rows[0], matrix, transpose)[None]
+        return _Product.apply(rows[0], matrix, transpose)[None]  # type: ignore[no-untyped-call]
 
 
 class _Product(torch.autograd.Function):
     """A sparse matrix times a dense one, whose gradient uses a kept transpose."""
 
     @staticmethod
-    def forward(ctx, dense, matrix, transpose):
+    def forward(ctx: Any, dense: torch.Tensor, matrix: torch.Tensor, transpose: torch.Tensor) -> torch.Tensor:
         ctx.transpose = transpose
         return matrix @ dense
 
     @staticmethod
-    def backward(ctx, gradient):
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         return ctx.transpose @ gradient, None, None
 
 
@@ -222,9 +222,9 @@ class PointwiseField:
         points = self.points[start:stop]
         return PointwiseField(points, points, self.motion, self.D)
 
-    def to(self, *args, **kwargs) -> PointwiseField:
+    def to(self, device: str | torch.device) -> PointwiseField:
         """Where the points are; the network is moved by whoever owns it."""
-        points, gradient_points = (each.to(*args, **kwargs) for each in (self.points, self.gradient_points))
+        points, gradient_points = (each.to(device) for each in (self.points, self.gradient_points))
         return PointwiseField(points, gradient_points, self.motion, self.D)
 
 

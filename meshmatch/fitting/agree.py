@@ -12,9 +12,10 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.reasons import Verdict
 from meshmatch.fitting.judge.verdict import folded_by_agreement
-from meshmatch.fitting.search.task import Landmarks, take_samples, without_interior
+from meshmatch.fitting.search.task import take_samples, without_interior
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree
 from meshmatch.fitting.solve.system import NodeSystem, node_system
+from meshmatch.fitting.solve.terms import Landmarks
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map

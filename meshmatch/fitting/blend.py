@@ -11,7 +11,6 @@ from typing import Literal, get_args
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
@@ -20,6 +19,7 @@ from meshmatch.fitting.search.task import take_samples
 from meshmatch.fitting.solve.blend import FieldPath, RotationBlend, StretchBlend, polar
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.fitting.fit import Fit, axis_name
@@ -36,6 +35,7 @@ from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.solve.terms import GoalTerm, LandmarkTerm, PairTerm, Term
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.normalise import sqrt_area_frame

@@ -7,13 +7,13 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints, Pickled
 from meshmatch.errors import OptionError
 from meshmatch.fitting.judge.reasons import Reason, Verdict
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 

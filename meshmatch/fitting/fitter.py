@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, off_torch
 from meshmatch.errors import OptionError
@@ -22,6 +21,7 @@ from meshmatch.fitting.search.refinement import REFINEMENTS, fit_part, fit_whole
 from meshmatch.fitting.search.task import FitTask, Registration
 from meshmatch.fitting.solve.terms import Landmarks
 from meshmatch.geometry.oriented import quick_tree
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.repair import Repaired

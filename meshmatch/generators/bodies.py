@@ -14,7 +14,6 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize as unit
 
@@ -25,6 +24,7 @@ from meshmatch.generators.limbs import FOLDED, Draw, Limbs, draw_arms, draw_limb
 from meshmatch.generators.pose_files import GivenPoses
 from meshmatch.generators.rig import Rig, cached_rig, forward_kinematics, penetration, skin
 from meshmatch.generators.rotations import DEGREE, rotation_between, rotation_from_vector
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.progress import Progress
 from meshmatch.templates.template import Template
 
@@ -194,7 +194,16 @@ def pose_limbs(
     return matrices
 
 
-def _pose_arm(vectors, matrices, rig, heads, side, suffix, limbs, draw) -> None:
+def _pose_arm(
+    vectors: torch.Tensor,
+    matrices: dict[int, torch.Tensor],
+    rig: Rig,
+    heads: torch.Tensor,
+    side: float,
+    suffix: str,
+    limbs: Limbs,
+    draw: Draw,
+) -> None:
     joint = rig.joint
     upper, elbow, wrist = (heads[:, joint(name + suffix)] for name in ("upperarm01", "lowerarm01", "wrist"))
     rest_arm, rest_fore = unit(elbow - upper), unit(wrist - elbow)
@@ -217,7 +226,16 @@ def _pose_arm(vectors, matrices, rig, heads, side, suffix, limbs, draw) -> None:
     vectors[:, joint("wrist" + suffix)] = draw.normal3(16)
 
 
-def _pose_leg(vectors, matrices, rig, heads, side, suffix, limbs, draw) -> None:
+def _pose_leg(
+    vectors: torch.Tensor,
+    matrices: dict[int, torch.Tensor],
+    rig: Rig,
+    heads: torch.Tensor,
+    side: float,
+    suffix: str,
+    limbs: Limbs,
+    draw: Draw,
+) -> None:
     joint = rig.joint
     hip, knee, ankle = (heads[:, joint(name + suffix)] for name in ("upperleg01", "lowerleg01", "foot"))
     rest_thigh, rest_shin = unit(knee - hip), unit(ankle - knee)
@@ -239,7 +257,7 @@ def _pose_leg(vectors, matrices, rig, heads, side, suffix, limbs, draw) -> None:
     vectors[:, joint("foot" + suffix)] = ankle_vector
 
 
-def _pose_hand(vectors, rig, heads, suffix, limbs, draw) -> None:
+def _pose_hand(vectors: torch.Tensor, rig: Rig, heads: torch.Tensor, suffix: str, limbs: Limbs, draw: Draw) -> None:
     joint = rig.joint
     for finger in range(1, 6):
         first, second, third = (joint(f"finger{finger}-{k}{suffix}") for k in (1, 2, 3))

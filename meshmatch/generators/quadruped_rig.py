@@ -144,7 +144,7 @@ def mean_of_neighbours(faces: Int[Ints, "M 3"], count: int) -> csr_matrix:
     sides = edges_of(faces).vertices
     a, b = np.concatenate([sides, sides[:, ::-1]]).T
     joined = coo_matrix((np.ones(len(a)), (a, b)), (count, count)).tocsr()
-    return diags(1 / np.maximum(np.asarray(joined.sum(1)).reshape(-1), 1)) @ joined
+    return (diags(1 / np.maximum(np.asarray(joined.sum(1)).reshape(-1), 1)) @ joined).tocsr()
 
 
 def ramp(values: Floats, low: float, high: float) -> Floats:

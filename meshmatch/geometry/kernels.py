@@ -11,9 +11,9 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.geometry.trees import cKDTree
 
 Kernel = Literal["cubic", "smooth"]
 # Smallest accepted eigenvalue of the scaled moment matrix, relative to its trace. Set by hand, as is the margin below.

@@ -154,7 +154,7 @@ def face_parts(faces: Int[Ints, "F 3"], V: int) -> Int[Ints, " F"]:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    kind = np.int32 if V < 2**31 else np.int64
+    kind: Any = np.int32 if V < 2**31 else np.int64
     ends = faces[:, :2].ravel().astype(kind), faces[:, 1:].ravel().astype(kind)  # two edges of a face join its corners
     graph = coo_array((np.ones(len(ends[0]), np.int8), ends), shape=(V, V)).tocsr()
     del ends  # for millions of faces ask for little memory

@@ -11,13 +11,13 @@ from typing import get_args
 import numpy as np
 import torch
 from scipy.ndimage import zoom
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, ModelError, OptionError, needs
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.kernels import KERNELS
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.implicit.fit import REACH, ImplicitFit
 from meshmatch.implicit.network import Deformation, ImplicitConfig, ImplicitNetwork
 from meshmatch.implicit.samples import FILLED

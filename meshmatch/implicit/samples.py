@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Floats32
 from meshmatch.errors import InputError
 from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import is_watertight
 from meshmatch.shapes.files import SUFFIXES, load_shape
 from meshmatch.shapes.input_files import existing, read_npz

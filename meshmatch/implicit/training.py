@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.implicit.network import ImplicitConfig, ImplicitNetwork
 from meshmatch.implicit.objective import PUBLISHED, ImplicitBatch, ImplicitLoss
 from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
@@ -38,7 +38,7 @@ AS_PUBLISHED = replace(
 
 
 @dataclass(frozen=True, eq=False)
-class ImplicitDataset(torch.utils.data.Dataset):
+class ImplicitDataset(torch.utils.data.Dataset[ImplicitBatch]):
     """Batch s of the samples depends on the seed and s alone."""
 
     samples: ImplicitSamples

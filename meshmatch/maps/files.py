@@ -196,7 +196,7 @@ def _write_mat(path: Path, m: VertexMap) -> None:
 
     record = _record(m) | {"matlab_index": m.index + 1, "reasons": np.array(list(m.reasons), dtype=object)}
     with path.open("wb") as file:
-        savemat(file, record, oned_as="column")
+        savemat(file, record, oned_as="column")  # type: ignore[arg-type]  # files serve as well
         file.seek(0)  # the first 116 bytes are free text; the time in it would make every file differ
         file.write(f"MATLAB 5.0 MAT-file, {_FORMAT}".encode("ascii").ljust(116))
 

@@ -18,11 +18,11 @@ from typing import Self, TypeVar
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Ints32
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.oriented import feature_tree
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import (
     closest_on_triangles,
     edge_lengths,

@@ -13,10 +13,10 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.shape import Shape
 

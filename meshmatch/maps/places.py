@@ -16,10 +16,10 @@ from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_matrix, identity, vstack
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, Ints32
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import blend, triangle_areas, vertex_areas, vertex_normals
 from meshmatch.maps.footpoints import Footpoints, Surface, closest_footpoints, in_core_frame, template_footpoints
 from meshmatch.shapes.repair import Repaired
@@ -193,7 +193,7 @@ def expectation(
     F, T = len(fit.faces), len(fit.points)
     rows = np.repeat(np.arange(F), 3)
     centers = csr_matrix((np.full(3 * F, 1 / 3), (rows, fit.faces.reshape(-1))), (F, T))
-    matrix = vstack([identity(T), centers]).tocsr()
+    matrix = csr_matrix(vstack([identity(T), centers]))
     areas = vertex_areas(fit.points, fit.faces), triangle_areas(fit.points, fit.faces)  # half of the whole each
     prior = np.concatenate([0.5 * area for area in areas])
     tree = cKDTree(matrix @ fit.points)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 from meshmatch.arrays import Float, Floats, Floats32
 from meshmatch.errors import ModelError
@@ -51,14 +51,14 @@ class NetworkConfig:
                 raise ModelError(f"network option {name} must be an integer from 0 to {limit}, not {value!r}")
 
     @staticmethod
-    def from_dict(values: dict) -> NetworkConfig:
+    def from_dict(values: dict[str, Any]) -> NetworkConfig:
         known = NetworkConfig.__dataclass_fields__
         unknown = sorted(set(values) - set(known))
         if unknown:
             raise ModelError(f"unknown network options: {', '.join(unknown)}", "update meshmatch")
         return NetworkConfig(**values)
 
-    def to_dict(self) -> dict:
+    def to_dict(self) -> dict[str, Any]:
         return asdict(self)
 
 

@@ -290,8 +290,9 @@ def remove_model(name: str) -> None:
 
 def _registered(name: str) -> Path:
     """The folder of a registered model; `ModelError` if there is none."""
-    for act in (lambda: None, lambda: settle(user_folder())):
-        act()
+    for again in (False, True):
+        if again:
+            settle(user_folder())
         for parent in (built_in_folder(), user_folder()):
             if is_name(name) and (parent / name).is_dir():
                 return parent / name

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, OptionError
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.facing import Rotations, same_side, upright

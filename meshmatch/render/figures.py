@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.render import surface
 from meshmatch.render.facing import facing
 from meshmatch.render.scales import CLAY, Color

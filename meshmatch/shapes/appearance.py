@@ -18,7 +18,7 @@ from io import BytesIO
 from typing import Literal
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from meshmatch.arrays import Float, Floats, Int, Ints, UInts8
 from meshmatch.errors import InputError, warn
@@ -163,7 +163,7 @@ class ImageReader:
                         return _rgba(image)
         except Image.DecompressionBombError as error:
             raise _too_large(label, "over 179 million pixels") from error
-        except Image.UnidentifiedImageError as error:
+        except UnidentifiedImageError as error:
             raise InputError(f"{label} cannot be read as an image", "save it as png or jpg") from error
         except _DAMAGE as error:
             what = (str(error) or type(error).__name__).strip().splitlines()[0][:80]

@@ -73,7 +73,7 @@ def roughness(points: Float[Floats, "V 3"]) -> float:
 
 def outlier_points(points: Float[Floats, "V 3"], far: float = 3.0) -> Bool[Bools, " V"]:
     """True for a point that lies ``far`` times further from its neighbours than these from theirs, and than usual."""
-    from scipy.spatial import cKDTree
+    from meshmatch.geometry.trees import cKDTree
 
     part = _part(points)
     if len(part) < 20:
@@ -126,7 +126,7 @@ def _neighbourhoods(points: Floats) -> tuple[Floats, Floats, Ints, int, float]:
 @lru_cache(maxsize=4)
 def _neighbours(data: bytes) -> tuple[Floats, Ints]:
     """Of points as bytes, so that areas, normals and roughness of a cloud ask once."""
-    from scipy.spatial import cKDTree
+    from meshmatch.geometry.trees import cKDTree
 
     part = np.frombuffer(data).reshape(-1, 3)
     distance, index = cKDTree(part).query(part, min(max(len(part) // 200, 18), len(part) - 1) + 1)
@@ -142,6 +142,6 @@ def _spread(points: Floats, index: Ints) -> Floats:
 
 
 def _nearest(part: Floats, points: Floats) -> Ints:
-    from scipy.spatial import cKDTree
+    from meshmatch.geometry.trees import cKDTree
 
     return np.asarray(cKDTree(part).query(points)[1])

@@ -47,7 +47,7 @@ def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
     used, corner = np.unique(corners, return_inverse=True)
     colors = None
     if shape.colors is not None:
-        from scipy.spatial import cKDTree
+        from meshmatch.geometry.trees import cKDTree
 
         colors = shape.colors[cKDTree(shape.verts).query(verts[used])[1]]
     return Shape(verts[used], corner.reshape(-1, 3), shape.name, colors)

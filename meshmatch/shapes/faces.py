@@ -121,7 +121,7 @@ def find_parts(
 def _gaps(verts: Floats, faces: Ints, face_areas: Floats, part: Ints, body: Ints, others: Ints) -> tuple[Floats, float]:
     """Distance (parts,) of each of the `others` to the parts in `body`, infinite beyond `_FAR`, else 0; and the body's
     diagonal."""
-    from scipy.spatial import cKDTree
+    from meshmatch.geometry.trees import cKDTree
 
     gap = np.zeros(int(part.max()) + 1)
     ours, theirs = np.isin(part, body), np.isin(part, others)

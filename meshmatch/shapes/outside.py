@@ -7,10 +7,10 @@ What is hidden belongs to nothing, yet it is surface: it makes the shape seem la
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.derived import derived
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.shapes.sampling import Samples, sample_surface
 from meshmatch.shapes.shape import Shape
 

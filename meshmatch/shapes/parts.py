@@ -229,7 +229,7 @@ def _touching(
 
 def _with_belongings(parts: Parts, number: int, points: Float[Floats, "S 3"], owner: Int[Ints, " S"]) -> frozenset[int]:
     """A part and the small ones that lie on or in it, such as eyes."""
-    from scipy.spatial import cKDTree
+    from meshmatch.geometry.trees import cKDTree
 
     area = parts.areas[number - 1]
     small = np.flatnonzero(parts.areas <= _SMALL * area) + 1

@@ -159,7 +159,7 @@ def _result(
     answer = new[stands]
     lost = np.flatnonzero(answer < 0)
     if len(lost):
-        from scipy.spatial import cKDTree
+        from meshmatch.geometry.trees import cKDTree
 
         tree = cKDTree(repaired.verts, compact_nodes=False, balanced_tree=False)
         answer[lost] = tree.query(shape.verts[stands[lost]])[1]

@@ -14,15 +14,15 @@ from typing import Literal, get_args
 
 import numpy as np
 import robust_laplacian
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import eigsh
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, UInt8, UInts8
 from meshmatch.derived import derived
 from meshmatch.errors import OptionError, TemplateError
 from meshmatch.geometry.kernels import poorly_supported
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.shapes.decimate import Quality, decimate
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import Samples, farthest_points, sample_surface, triangulate_cloud
@@ -294,7 +294,7 @@ def _near_pairs(shape: Shape, share: float) -> tuple[Int[Ints, " S"], UInt8[UInt
     return some, np.concatenate([np.packbits(np.isfinite(block[:, some]), axis=1) for block in blocks])
 
 
-def edge_graph(shape: Shape) -> coo_matrix:
+def edge_graph(shape: Shape) -> csr_matrix:
     """Symmetric sparse graph (V, V) of edge lengths."""
     edges = shape.edges.vertices
     length = np.maximum(np.linalg.norm(shape.verts[edges[:, 0]] - shape.verts[edges[:, 1]], axis=1), 1e-12)

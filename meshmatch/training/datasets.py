@@ -73,7 +73,7 @@ class Batch(OnDevice):
 
 
 @dataclass(frozen=True, eq=False)
-class BatchDataset(torch.utils.data.Dataset):
+class BatchDataset(torch.utils.data.Dataset[Batch]):
     """Item s is the batch of training step s.
 
     ``template_core`` are the template's vertices of the core, ``core`` their indices; ``loss_points`` the indices of
@@ -220,7 +220,7 @@ def deformed_source(shapes: Float[Tensor, "N V 3"], deform: float = DEFORM) -> S
 
 
 @dataclass(frozen=True, eq=False)
-class CloudDataset(torch.utils.data.Dataset):
+class CloudDataset(torch.utils.data.Dataset[CloudBatch]):
     """Item s is the batch of training step s, a function of the seed and s alone."""
 
     points: Float[Tensor, "N P 3"]

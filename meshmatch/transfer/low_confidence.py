@@ -11,9 +11,9 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import cg
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Floats, Int, Ints
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import same_rows
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import NO_LABEL, largest_weights
@@ -39,7 +39,7 @@ def vertex_graph(shape: Shape) -> csr_array:
         near = cKDTree(shape.verts).query(shape.verts, min(_NEIGHBOURS + 1, shape.V))[1].reshape(shape.V, -1)
         pairs = np.stack([np.repeat(near[:, 0], near.shape[1] - 1), near[:, 1:].ravel()], axis=1)
     else:
-        pairs = shape.edges.vertices
+        pairs = shape.edges.vertices.astype(np.int64)
     first = same_rows(shape.verts)
     twins = np.flatnonzero(first != np.arange(shape.V))
     return _graph(shape.verts, np.concatenate([pairs, np.stack([first[twins], twins], axis=1)]))

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import closest_on_triangles, interpolate, squared_lengths, unit
 from meshmatch.maps.footpoints import Footpoints, reassign_islands
 from meshmatch.maps.vertex_map import VertexMap, corners_of

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Floats, Floats32, Ints, Ints32
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import blend, closest_on_triangles, same_rows, squared_lengths, triangle_areas
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.mapped_mesh import length_of

@@ -200,7 +200,8 @@ def weights_of(matrix: csr_array | ArrayLike, shape: Shape) -> SkinWeights:
     """Skin weights of the vertices of `shape` from a table (V, J), dense or sparse, of numbers that are not negative
     (`InputError`); joints are named by number.
     """
-    sparse = csr_array(matrix if issparse(matrix) else _table("weights", matrix, np.float64), dtype=np.float64)
+    table: Any = matrix if issparse(matrix) else _table("weights", matrix, np.float64)
+    sparse = csr_array(table, dtype=np.float64)
     return SkinWeights(_normalized("the array", sparse, shape), tuple(str(joint) for joint in range(sparse.shape[1])))
 
 

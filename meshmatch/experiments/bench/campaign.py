@@ -22,7 +22,6 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 import trimesh
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from typer import Option
 
@@ -42,6 +41,7 @@ from meshmatch.generators.limbs import Draw, Limbs
 from meshmatch.generators.proportions import TOON, draw_style, rounded, stretched
 from meshmatch.generators.rig import forward_kinematics, penetration, skin
 from meshmatch.generators.rotations import DEGREE, rotation_from_vector
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.decimate import decimate

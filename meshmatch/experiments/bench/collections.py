@@ -30,8 +30,8 @@ from meshmatch.errors import InputError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.scores import evaluate_set
 from meshmatch.experiments.bench.sets import Pair, Shapes, load_folder, load_set
-from meshmatch.fitting.without_model import NO_MODEL
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.registry import NO_MODEL
 
 HEART = "heart"
 SETS = ("scape", "faust", HEART)

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from meshmatch.api.inputs import as_model, validated
 from meshmatch.api.matcher import Matcher
@@ -27,6 +26,7 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import ON_NODES, FitConfig, LatentRefineConfig, Partial, Refine
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.footpoints import Surface
 from meshmatch.maps.vertex_map import VertexMap

@@ -14,7 +14,6 @@ from functools import cached_property, partial, reduce
 import numpy as np
 import torch
 import trimesh
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
@@ -25,6 +24,7 @@ from meshmatch.experiments.makers.human_bodies import unseen_bodies
 from meshmatch.generators.generator import Generator
 from meshmatch.generators.kinds import GENERATORS, Kind
 from meshmatch.generators.proportions import CHILD, PLAIN, TOON
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Int, Ints
 from meshmatch.experiments.makers.other_triangles import other_triangles
@@ -17,6 +16,7 @@ from meshmatch.generators.bodies import template_rig
 from meshmatch.generators.characters import Cast, sample_layers
 from meshmatch.generators.figure import Figure
 from meshmatch.generators.proportions import SHARES
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template

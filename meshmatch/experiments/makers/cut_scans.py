@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
@@ -22,6 +21,7 @@ from meshmatch.experiments.bench.sets import Pair
 from meshmatch.experiments.makers.other_triangles import other_triangles
 from meshmatch.generators.cutouts import CutShapes
 from meshmatch.generators.kinds import Kind
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.shape import Shape

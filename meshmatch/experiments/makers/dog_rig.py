@@ -15,7 +15,6 @@ from typing import Annotated
 import numpy as np
 from scipy.sparse import diags
 from scipy.sparse.linalg import spsolve
-from scipy.spatial import cKDTree
 from typer import Option
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
@@ -23,6 +22,7 @@ from meshmatch.experiments import runner
 from meshmatch.experiments.makers.mujoco_skin import find_files, read_animal
 from meshmatch.generators.quadruped_rig import AnimalRig, mean_of_neighbours, save_rig, smooth_step
 from meshmatch.generators.quadrupeds import resting_animal
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.generators.bodies import human_source, pose_limbs
 from meshmatch.generators.limbs import Draw, Limbs
 from meshmatch.generators.rig import Rig, cached_rig, forward_kinematics, skin
 from meshmatch.generators.rotations import rotation_from_vector
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, choose_nodes, make_template

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from meshmatch.api.inputs import as_model, validated
 from meshmatch.arrays import Float, Floats
@@ -22,13 +21,14 @@ from meshmatch.experiments.bench.scores import TruthDistances
 from meshmatch.experiments.bench.sets import BenchSet
 from meshmatch.experiments.paper.ablation_views import Run
 from meshmatch.experiments.runner import spread
-from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit_config import FitConfig, LatentRefineConfig
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.search.latent import LatentRefineConfig, refine_code
+from meshmatch.fitting.search.latent import refine_code
 from meshmatch.fitting.search.predictor import Candidate, Predictor
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame, RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.evaluate import CM_PER_UNIT, LOST_CM
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.sampling import sample_surface

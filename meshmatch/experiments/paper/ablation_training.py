@@ -26,10 +26,11 @@ from meshmatch.fields.field import Field, PointField, PointwiseField
 from meshmatch.generators.bodies import human_source
 from meshmatch.generators.generator import Source
 from meshmatch.maps.evaluate import CM_PER_UNIT
+from meshmatch.models.card import read_card
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.layers import BasisEncoder
 from meshmatch.models.network import NetworkConfig
-from meshmatch.models.registry import CARD, read_card
+from meshmatch.models.registry import CARD
 from meshmatch.outputs import make_folder
 from meshmatch.templates.make import NodeConfig, Strategy, lay_nodes
 from meshmatch.templates.template import Template, read_template

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.fitting.judge.calibration import CALIBRATION
@@ -22,6 +21,7 @@ from meshmatch.fitting.search.visibility import area_share, visible_vertices
 from meshmatch.fitting.solve.agreement import log_stretch
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import edge_lengths, edges_of
 from meshmatch.shapes.sampling import Samples, sample_surface
 from meshmatch.shapes.shape import Shape

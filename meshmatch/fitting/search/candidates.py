@@ -18,7 +18,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.fitting.search.frames import frames_of_part, frames_to_try
@@ -35,6 +34,7 @@ from meshmatch.fitting.search.visibility import area_share, visible_vertices
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.progress import Progress
 from meshmatch.shapes.sampling import sample_surface

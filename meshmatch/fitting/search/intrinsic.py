@@ -13,9 +13,9 @@ import robust_laplacian
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.sparse.linalg import eigsh
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import edge_lengths, edges_of, vertex_areas, vertex_normals
 from meshmatch.shapes.sampling import farthest_points, triangulate_cloud
 from meshmatch.shapes.shape import Shape
@@ -75,7 +75,7 @@ class ThinMesh:
         edges = edges_of(self.faces).vertices.astype(np.int64)
         length = edge_lengths(self.verts, edges)
         part = connected_components(coo_matrix((length, edges.T), (len(self.verts),) * 2), directed=False)[1]
-        bridges = _bridges(self.verts, part)
+        bridges = _bridges(self.verts, part.astype(np.int64))
         edges = np.concatenate([edges, bridges])
         length = np.maximum(edge_lengths(self.verts, edges), 1e-9)
         graph = coo_matrix((length, edges.T), (len(self.verts),) * 2).tocsr()

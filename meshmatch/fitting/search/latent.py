@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.derived import derived
@@ -12,6 +11,7 @@ from meshmatch.fields.field import Field, PointField, arap_energy, volume_energy
 from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.fit_config import LatentRefineConfig
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.trained import TrainedModel, torch_network
 from meshmatch.progress import Progress
 from meshmatch.shapes.sampling import farthest_points

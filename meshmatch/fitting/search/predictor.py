@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
@@ -22,6 +21,7 @@ from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints, nearest_unsigned, with_normals
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.network import Network
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.sampling import sample_surface

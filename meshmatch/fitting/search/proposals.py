@@ -13,13 +13,13 @@ from itertools import product
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh
 from meshmatch.geometry.frames import kabsch
 from meshmatch.geometry.oriented import with_normals
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import triangle_vectors
 
 Kind = Literal["rigid", "affine", "spectral", "extremities"]

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import needs
@@ -37,6 +36,7 @@ from meshmatch.fitting.solve.nodes import refine_nodes
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.progress import Progress
 from meshmatch.threads import parallel_map
 

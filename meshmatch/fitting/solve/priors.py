@@ -12,9 +12,9 @@ from typing import Any, Protocol
 
 import numpy as np
 from scipy.sparse import csr_matrix
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.geometry.trees import cKDTree
 
 _MAX_ITERATIONS = 20  # of Newton's: five are the rule, and convergence is quadratic
 

@@ -113,7 +113,7 @@ class NodeSystem:
 
     def normals(self, moved: Float[Floats, "V 3"]) -> Float[Floats, "V 3"]:
         """Area-weighted unit vertex normals of moved vertices."""
-        summed = self._incidence @ triangle_vectors(moved, self.faces)
+        summed = np.asarray(self._incidence @ triangle_vectors(moved, self.faces))
         return summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-20)
 
     def solve(

@@ -13,12 +13,12 @@ from typing import Protocol
 
 import numpy as np
 from scipy.sparse import csc_matrix
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fitting.fit_config import Pairing
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.oriented import OrientedPoints, feature_tree, with_normals
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import vertex_areas
 
 _SHARERS = 16  # vertices of the template that share a point, at most
@@ -146,7 +146,7 @@ def _shared_pairs(
     # Directions are the template's, so all that pulls at a vertex is summed before they are asked.
     begins = np.arange(0, share.size + 1, share.shape[1])
     shares = csc_matrix((share.reshape(-1), at.reshape(-1), begins), (V, len(share)))
-    total, pull = shares @ np.ones(len(share)), shares @ some.points
+    total, pull = np.asarray(shares @ np.ones(len(share))), np.asarray(shares @ some.points)
     mean = pull / np.maximum(total, 1e-300)[:, None]
     return _summed(np.arange(V), mean, surface.normals, total, config.point_share, V)
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.facing import Rotations, facing, facing_matched
 from meshmatch.render.surface import corners_of

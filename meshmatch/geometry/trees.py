@@ -1,0 +1,23 @@
+"""SciPy's tree of points, of which we always ask several at once: its answers are arrays."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from scipy.spatial import cKDTree as _cKDTree
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from numpy.typing import ArrayLike
+
+    from meshmatch.arrays import Floats, Ints
+
+    class cKDTree(_cKDTree):
+        """As SciPy's."""
+
+        def query(self, x: ArrayLike, k: Any = 1, **options: Any) -> tuple[Floats, Ints]:  # type: ignore[override]
+            """Distances to the nearest points, and their numbers."""
+
+else:
+    cKDTree = _cKDTree
