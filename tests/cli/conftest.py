@@ -24,7 +24,7 @@ from tests.conftest import some_fit
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures whose size is not given are small: rays cost seconds."""
-    monkeypatch.setattr("meshmatch.render.picture.HEIGHT", 240)
+    monkeypatch.setattr("meshmatch.render.picture.HEIGHT", 160)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,12 @@ from tests.cli.conftest import Run
 from tests.collections.ellipsoids import ellipsoids
 
 
+@pytest.fixture(autouse=True)
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is in the folder has tests of its own."""
+    monkeypatch.setattr("meshmatch.collections.atlas_files.render_shapes", lambda *_: None)
+
+
 @pytest.fixture
 def shapes(tmp_path: Path) -> Path:
     folder = tmp_path / "shapes"

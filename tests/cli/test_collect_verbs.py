@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
 
 
 @pytest.fixture(scope="module")
-def fits(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def fits(tmp_path_factory: pytest.TempPathFactory, remembered_fits: Any) -> Path:
     """Fits that the verb made, of two bodies and of a file that is none."""
     from meshmatch.cli import main
 

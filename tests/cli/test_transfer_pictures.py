@@ -17,10 +17,8 @@ from meshmatch.render.scales import Scale, Swatches
 from meshmatch.shapes.colors import UNKNOWN, label_colors
 from meshmatch.shapes.files import load_shape, save_shape
 from tests.cli.conftest import FakeMatching, Run, fake_fit, well
-from tests.cli.test_transfer_verbs import call, pair  # noqa: F401  (pair is a fixture)
+from tests.cli.test_transfer_verbs import OUTPUT, call, pair  # noqa: F401  (pair is a fixture)
 from tests.shapes.painted import encoded, quarters, write_square_obj
-
-VERBS = ("transfer-color", "transfer-labels", "transfer-weights", "transfer-landmarks")
 
 
 class Drawn:
@@ -39,9 +37,9 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> Drawn:
     return recorder
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_a_picture_of_both_shapes(run: Run, pair: Path, verb: str) -> None:  # noqa: F811
-    answer = well(run(*call(verb, "--picture", "p.png", "--json")))
+@pytest.mark.parametrize("noun", OUTPUT)
+def test_a_picture_of_both_shapes(run: Run, pair: Path, noun: str) -> None:  # noqa: F811
+    answer = well(run(*call(f"{noun} --picture p.png --json")))
     assert json.loads(answer.out)["picture"] == "p.png"
     assert "drew p.png: both shapes with what was transferred" in answer.err
     with Image.open("p.png") as image:
@@ -50,24 +48,24 @@ def test_a_picture_of_both_shapes(run: Run, pair: Path, verb: str) -> None:  # n
     left, right = np.split(pixels, [image.size[0] // 2], axis=1)
     assert (left < 240).any(axis=2).mean() > 0.1
     assert (right < 240).any(axis=2).mean() > 0.1
-    assert json.loads(well(run(*call(verb, "--json"))).out)["picture"] is None
+    assert json.loads(well(run(*call(f"{noun} --json"))).out)["picture"] is None
 
 
 def test_colors_and_numbers(run: Run, pair: Path, drawn: Drawn) -> None:  # noqa: F811
-    well(run(*call("transfer-color", "--picture", "p.png")))
+    well(run(*call("color --picture p.png")))
     a, b = load_shape("a.ply"), load_shape("b.ply")
     assert a.colors is not None
     assert np.asarray(drawn.panels[0].colors) == pytest.approx(a.colors[:, :3], abs=1e-6)
     assert np.asarray(drawn.panels[1].colors) == pytest.approx(b.verts / 2 + 0.5, abs=0.05)
     assert [panel.label for panel in drawn.panels] == ["a.ply", "b.ply"]
-    well(run(*call("transfer-color", "--values", "values.npy", "--picture", "p.png", out="v.npy")))
+    well(run(*call("color --values values.npy --picture p.png", out="v.npy")))
     scale = drawn.look.legend
     assert isinstance(scale, Scale)
     assert scale.title == "values (the first of 3 numbers)"
     assert np.array_equal(drawn.panels[0].colors, scale.colors(a.verts[:, 0]))
     assert np.asarray(drawn.panels[1].colors) == pytest.approx(scale.colors(b.verts[:, 0]), abs=0.05)
     np.save("one.npy", a.verts[:, 1])
-    well(run(*call("transfer-color", "--values", "one.npy", "--picture", "p.png", out="v.npy")))
+    well(run(*call("color --values one.npy --picture p.png", out="v.npy")))
     assert isinstance(drawn.look.legend, Scale)
     assert drawn.look.legend.title == "one"
 
@@ -77,8 +75,7 @@ def test_labels_and_those_left_blank(run: Run, pair: Path, drawn: Drawn, to: str
     a = load_shape("a.ply")
     unsure = np.where(a.verts[:, 0] > 0, 1.0, 0.1)
     save_map("ab.npz", replace(load_map("ab.npz"), confidence=unsure))
-    words = ("--to", to, "--blank", "9", "--picture", "p.png")
-    well(run(*call("transfer-labels", *words)))
+    well(run(*call(f"labels --to {to} --blank 9 --picture p.png")))
     legend = drawn.look.legend
     assert isinstance(legend, Swatches)
     assert legend.names == ("0", "1", "none")
@@ -93,7 +90,7 @@ def test_labels_and_those_left_blank(run: Run, pair: Path, drawn: Drawn, to: str
 
 
 def test_weights_show_the_heaviest_joint(run: Run, pair: Path, drawn: Drawn) -> None:  # noqa: F811
-    well(run(*call("transfer-weights", "--picture", "p.png")))
+    well(run(*call("weights --picture p.png")))
     assert isinstance(drawn.look.legend, Swatches)
     assert drawn.look.legend.names == ("up", "down")
     z = load_shape("b.ply").verts[:, 2]
@@ -103,7 +100,7 @@ def test_weights_show_the_heaviest_joint(run: Run, pair: Path, drawn: Drawn) -> 
 
 
 def test_landmarks_are_balls_of_one_color(run: Run, pair: Path, drawn: Drawn) -> None:  # noqa: F811
-    well(run(*call("transfer-landmarks", "--picture", "p.png")))
+    well(run(*call("landmarks --picture p.png")))
     a = load_shape("a.ply")
     for panel in drawn.panels:
         assert np.asarray(panel.points) == pytest.approx(a.verts[[3, 7]], abs=1e-6)
@@ -139,6 +136,8 @@ def test_after_a_match_shapes_are_turned_as_their_fits_say(
     back = invert_map(forward, load_shape("a.ply"), load_shape("b.ply"))
     stub.make_map = lambda a, b, **about: forward if a.name == "a.ply" else back
     stub.make_fit = lambda shape, *_: fake_fit(shape, frame=Frame(1.0, next(turns), np.zeros(3)))
-    well(run(*call("transfer-color", "--picture", "p.png", map=None)))
+    words = call("color --picture p.png")
+    at = words.index("--map")
+    well(run(*words[:at], *words[at + 2 :]))
     for panel, rotation in zip(drawn.panels, (np.eye(3), np.diag([-1.0, 1.0, -1.0])), strict=True):
         assert np.array_equal(panel.rotation, rotation)

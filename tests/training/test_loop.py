@@ -100,7 +100,15 @@ def test_worker_processes_change_nothing(egg: Template) -> None:
     assert same(trained(0), trained(1))
 
 
-@pytest.mark.parametrize("bf16", [False, True])
+def test_half_precision_changes_the_loss_a_little(egg: Template) -> None:
+    found = []
+    for bf16 in (False, True):
+        run = trainer(egg, replace(CONFIG, steps=2, bf16=bf16))
+        run.run(small_data(egg, run.model, length=2), None, lambda now: found.append(now.terms["total"]), every=2)
+    assert found[0] != found[1] == pytest.approx(found[0], rel=0.05)
+
+
+@pytest.mark.parametrize("bf16", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_little_training_lowers_the_loss(egg: Template, bf16: bool) -> None:
     config = replace(CONFIG, steps=80, rate=3e-3, bf16=bf16)
     run = trainer(egg, config)

@@ -52,7 +52,7 @@ def eggs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def model(eggs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The preset as it is, but for a narrow network, few points, small batches, and what suits 200 steps."""
+    """The preset as it is, but for a narrow network, few points, small batches, and what suits 60 steps."""
     root = tmp_path_factory.mktemp("paper")
     prepare(eggs, root / "prepared", PrepareConfig(NodeConfig("uniform", 36, 0.45)))
     plain = recipes.paper
@@ -66,7 +66,7 @@ def model(eggs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(recipes, "paper", narrow)
-        words = ["--preset", "paper", "--steps", "200", "--workers", "0", "--name", "eggs", "-q"]
+        words = ["--preset", "paper", "--steps", "60", "--workers", "0", "--name", "eggs", "-q"]
         prepared = str(root / "prepared")
         assert main(["train", "--shapes", prepared, "-o", str(root / "model"), *words]) == 0
     return root / "model"
@@ -79,7 +79,7 @@ def loaded(model: Path) -> TrainedModel:
 
 def test_the_model_has_the_papers_choices(loaded: TrainedModel) -> None:
     card = loaded.card
-    assert card.steps == 200
+    assert card.steps == 60
     assert card.field["kernel"] == "cubic"
     assert (card.network["encoder"], card.network["decoder"]) == ("point", "node")
     assert card.recipe["scan"]["upright"] is True
