@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 CARD, WEIGHTS, TEMPLATE = "card.json", "weights.safetensors", "template.safetensors"
 HOME_VARIABLE = "MESHMATCH_HOME"
 AUTO = "auto"
+"""In place of a model's name: the shapes decide which of the installed models fits them."""
 NO_MODEL = "none"
 """In place of a model's name: shapes are registered without one."""
-"""In place of a model's name: the shapes decide which of the installed models fits them."""
 _ELSEWHERE = f"try again, or set {HOME_VARIABLE} to a folder of yours"
 _loading = threading.Lock()
 
@@ -245,8 +245,8 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
     if not os.path.isdir(source):
         raise ModelError(f"there is no folder {str(source)[:200]}", "a model is a folder with a card.json")
     card = read_any_card(source)
-    if card.name == AUTO:
-        raise ModelError(f"no model can be called {AUTO}", "change the name on its card")
+    if card.name in (AUTO, NO_MODEL):
+        raise ModelError(f"no model can be called {card.name}", "change the name on its card")
     large, last = ((WEIGHTS,), IMPLICIT) if isinstance(card, ImplicitCard) else ((TEMPLATE, WEIGHTS), CARD)
     for file in large:
         read_header(source / file)  # before a huge file is copied

@@ -110,10 +110,11 @@ def test_built_in_models_stay(blob: Path, tmp_path: Path) -> None:
     assert verify_model("human").name == "human"
 
 
-def test_no_model_is_called_auto(tmp_path: Path) -> None:
-    write_model(tmp_path / "auto", name="auto")
-    with pytest.raises(ModelError, match="no model can be called auto"):
-        add_model(tmp_path / "auto")
+@pytest.mark.parametrize("name", ["auto", "none"])
+def test_no_model_is_called_as_a_choice_is(tmp_path: Path, name: str) -> None:
+    write_model(tmp_path / name, name=name)
+    with pytest.raises(ModelError, match=f"no model can be called {name}"):
+        add_model(tmp_path / name)
 
 
 def test_a_taken_name_needs_replace(blob: Path) -> None:
