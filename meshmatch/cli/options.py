@@ -123,7 +123,7 @@ def load_truth(
     """True points on source and target, where they are known."""
     import numpy as np
 
-    from meshmatch.shapes.table_files import load_pairs, load_points
+    from meshmatch.shapes.tables import load_pairs, load_points
 
     if points is not None:
         return load_points(points[0]), load_points(points[1])
@@ -269,7 +269,7 @@ class PairOptions(FitOptions):
         self, source: meshmatch.Shape, target: meshmatch.Shape, run: RunOptions, console: Console
     ) -> meshmatch.MatchResult:
         """Match two shapes, with bars."""
-        from meshmatch.shapes.table_files import load_pairs
+        from meshmatch.shapes.tables import load_pairs
 
         pairs = None if self.known_pairs is None else load_pairs(self.known_pairs)
         from meshmatch.api.matching import match

@@ -83,7 +83,7 @@ def prepare(
     shapes.safetensors, points.safetensors, normalised/ and prepared.json.
     """
     from meshmatch.render.compose import compose_shapes
-    from meshmatch.shapes.table_files import load_points
+    from meshmatch.shapes.tables import load_points
     from meshmatch.templates.make import NodeConfig
     from meshmatch.templates.prepare import PrepareConfig
     from meshmatch.templates.prepare import prepare as prepare_shapes

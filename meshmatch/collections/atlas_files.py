@@ -41,7 +41,7 @@ from meshmatch.render.viewer.single_pages import Varying, write_atlas_page
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.formats.gltf_out import write_morphs
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.table_files import write_rows
+from meshmatch.shapes.tables import write_rows
 
 MORPHS = 10
 """Modes in modes.glb."""

@@ -18,7 +18,7 @@ from meshmatch.collections.superimpose import Scale
 from meshmatch.errors import InputError
 from meshmatch.shapes.files import SUFFIXES, load_shape
 from meshmatch.shapes.input_files import read_text
-from meshmatch.shapes.table_files import read_by_suffix
+from meshmatch.shapes.tables import read_by_suffix
 
 _IN_MEMORY = 256 * 2**20  # bytes; more are kept in a temporary file
 _LINE = 200  # bytes of memory for a line

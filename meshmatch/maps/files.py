@@ -25,10 +25,10 @@ from meshmatch.maps import MAP_SUFFIXES
 from meshmatch.maps.mat_file import read_mat
 from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap, check_map
 from meshmatch.outputs import replace_on_success
-from meshmatch.shapes import table_files
+from meshmatch.shapes import tables
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.input_files import check_memory, read_bytes, read_json, read_npy, read_npz
-from meshmatch.shapes.text_tables import read_table, whole
+from meshmatch.shapes.tables import read_table, whole
 
 CSV_COLUMNS = ("source_vertex", "target_vertex", "face", "w0", "w1", "w2", "confidence")
 _ARRAYS = ("index", "face", "barycentric", "confidence")
@@ -37,7 +37,7 @@ _COUNTS = ("source_vertices", "target_vertices")
 _KNOWN = (*_ARRAYS, *_WORDS, *_COUNTS, "reasons")
 _FORMAT = "meshmatch map 1"
 _VERTEX = 140  # bytes of memory for each vertex, while a map is read
-check_suffix = partial(table_files.check_suffix, suffixes=MAP_SUFFIXES, what="maps")
+check_suffix = partial(tables.check_suffix, suffixes=MAP_SUFFIXES, what="maps")
 
 
 def save_map(path: str | Path, vertex_map: VertexMap) -> None:
@@ -104,7 +104,7 @@ def load_map(path: str | Path, source: ShapeLike | None = None, target: ShapeLik
     """
     check_suffix(path)
     readers = dict.fromkeys(_FORMATS, _read)
-    found = table_files.read_by_suffix(path, readers, "maps", f"a map holds an array 'index': {DIRECTION}")
+    found = tables.read_by_suffix(path, readers, "maps", f"a map holds an array 'index': {DIRECTION}")
     source = None if source is None else as_shape(source)
     target = None if target is None else as_shape(target)
     return found.for_shapes(source, target, Path(path).name)
@@ -150,7 +150,7 @@ def _read_txt(path: Path) -> dict[str, Any]:
 
 
 def _write_npz(path: Path, m: VertexMap) -> None:
-    table_files.write_npz(path, _record(m) | {"reasons": np.array(m.reasons, dtype=np.str_)})
+    tables.write_npz(path, _record(m) | {"reasons": np.array(m.reasons, dtype=np.str_)})
 
 
 def _read_npz(path: Path) -> dict[str, Any]:
@@ -160,8 +160,8 @@ def _read_npz(path: Path) -> dict[str, Any]:
 
 def _write_csv(path: Path, m: VertexMap) -> None:
     columns: list[list[Any]] = [list(range(m.source_vertices)), m.index.tolist(), m.face.tolist()]
-    columns += [*m.barycentric.T.tolist(), table_files.short_floats(m.confidence)]
-    table_files.write_rows(path, CSV_COLUMNS, zip(*columns, strict=True))
+    columns += [*m.barycentric.T.tolist(), tables.short_floats(m.confidence)]
+    tables.write_rows(path, CSV_COLUMNS, zip(*columns, strict=True))
 
 
 def _read_csv(path: Path) -> dict[str, Any]:
@@ -172,7 +172,7 @@ def _read_csv(path: Path) -> dict[str, Any]:
     if "target_vertex" not in column:
         raise InputError("there is no column 'target_vertex'", f"the columns are {','.join(CSV_COLUMNS)}")
     if "source_vertex" in column:
-        table_files.check_numbered(column["source_vertex"])
+        tables.check_numbered(column["source_vertex"])
     record = {name: column[name] for name in column if name in ("face", "confidence")}
     record["index"] = column["target_vertex"]
     if {"w0", "w1", "w2"} <= set(column):
@@ -183,7 +183,7 @@ def _read_csv(path: Path) -> dict[str, Any]:
 def _write_json(path: Path, m: VertexMap) -> None:
     record = _record(m)
     record |= {name: record[name].tolist() for name in ("index", "face", "barycentric")}
-    table_files.write_json(path, record | {"confidence": table_files.short_floats(m.confidence)})
+    tables.write_json(path, record | {"confidence": tables.short_floats(m.confidence)})
 
 
 def _read_json(path: Path) -> Any:
@@ -209,7 +209,7 @@ def _read_mat(path: Path) -> dict[str, Any]:
 
 
 _FORMATS: dict[str, tuple[Callable[[Path, VertexMap], None], Callable[[Path], Any]]] = {
-    ".npy": (lambda path, m: table_files.write_npy(path, m.index), lambda path: _bare(read_npy(path))),
+    ".npy": (lambda path, m: tables.write_npy(path, m.index), lambda path: _bare(read_npy(path))),
     ".npz": (_write_npz, _read_npz),
     ".csv": (_write_csv, _read_csv),
     ".txt": (_write_txt, _read_txt),

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from meshmatch.arrays import Bool, Bools, Floats, as_numbers, off_torch
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import as_path, plain_text, replace_on_success
-from meshmatch.shapes import table_files
+from meshmatch.shapes import tables
 from meshmatch.shapes.colors import INVISIBLE
 from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, obj, off, plain, ply, stl
 from meshmatch.shapes.input_files import existing, read_bytes
@@ -42,7 +42,7 @@ _FORMATS: dict[str, tuple[Callable[[Path, bytes], Raw], Callable[[Path, Shape], 
 _WRITERS = {suffix: write for suffix, (_, write) in _FORMATS.items() if write is not None}
 SUFFIXES = tuple(_FORMATS)
 """The suffixes that `load_shape` knows; `save_shape` writes all of them but .gltf and .pcd."""
-check_suffix = partial(table_files.check_suffix, suffixes=_WRITERS, what="shapes")
+check_suffix = partial(tables.check_suffix, suffixes=_WRITERS, what="shapes")
 
 Choice: TypeAlias = str | int | Sequence[str | int]
 """Meshes of a scene by name, or parts of a mesh by number: one or several."""

@@ -19,7 +19,7 @@ import numpy as np
 from meshmatch.errors import InputError
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.input_files import check_memory, read_bytes, read_json, read_npy, read_text
-from meshmatch.shapes.text_tables import DECIMAL_COMMA, is_missing, is_number, number, read_table
+from meshmatch.shapes.tables import DECIMAL_COMMA, is_missing, is_number, number, read_table
 
 Space = Literal["", "LPS", "RAS"]
 Kind = Literal["vertex", "face", "position", "missing"]

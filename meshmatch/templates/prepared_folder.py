@@ -26,7 +26,7 @@ from meshmatch.shapes.landmark_files import LANDMARK_READERS, Space, read_landma
 from meshmatch.shapes.normalise import ALIGNS, Align, align, residual
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.sampling import sample_surface
-from meshmatch.shapes.table_files import read_by_suffix
+from meshmatch.shapes.tables import read_by_suffix
 from meshmatch.templates.template import SCALES, Scale, Template, template_radius, template_samples, unit_frame
 
 T = TypeVar("T")

@@ -18,16 +18,16 @@ from numpy.typing import ArrayLike, NDArray
 from meshmatch.arrays import Brief, Int, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import plain_text
-from meshmatch.shapes import table_files
+from meshmatch.shapes import tables
 from meshmatch.shapes.colors import label_colors
 from meshmatch.shapes.input_files import read_json, read_npy, read_text
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.text_tables import is_missing, is_number, number, read_table, unquoted
+from meshmatch.shapes.tables import is_missing, is_number, number, read_table, unquoted
 
 On = Literal["vertices", "faces"]
 Label = int | str
 LABEL_SUFFIXES = (".npy", ".csv", ".txt", ".json", ".ply")
-check_labels_suffix = partial(table_files.check_suffix, suffixes=LABEL_SUFFIXES, what="labels")
+check_labels_suffix = partial(tables.check_suffix, suffixes=LABEL_SUFFIXES, what="labels")
 _AS_FLOAT = re.compile(r"[+-]?[0-9]+[.,][0-9]*(?:[eE][+-]?[0-9]+)?")
 _HINT = "one label for each vertex or triangle of the source, in the order of its file; polygons are fans of triangles"
 
@@ -79,7 +79,7 @@ def load_labels(path: str | Path, shape: Shape, on: On | None = None) -> Labels:
         ".txt": lambda path: _read_txt(path, (shape.V, shape.F)),
         ".json": lambda path: _read_json(path, shape, on),
     }
-    values, written = table_files.read_by_suffix(path, readers, "labels", _HINT)
+    values, written = tables.read_by_suffix(path, readers, "labels", _HINT)
     name = Path(path).name
     if on is not None and written is not None and on != written:
         raise OptionError(f"{name} says that it holds labels of {written}, not of {on}", "leave out --on")
@@ -168,7 +168,7 @@ def _read_txt(path: Path, counts: tuple[int, int]) -> tuple[list[str], str | Non
         rows = [[unquoted(cell.strip()) for cell in line.split(mark, 1)] for line in lines]
         if all(len(row) == 2 for row in rows):
             numbers = [row[0] for row in rows[_owner(rows[0]) is not None :]]
-            if _owner(rows[0]) or (len(rows) > 2 and table_files.is_numbered(numbers)):
+            if _owner(rows[0]) or (len(rows) > 2 and tables.is_numbered(numbers)):
                 return _from_rows(rows, counts)
     quoted = all(unquoted(line) != line for line in lines)
     return _from_rows([[unquoted(line) if quoted else line] for line in lines], counts)
@@ -193,10 +193,10 @@ def _from_rows(rows: list[list[str]], counts: tuple[int, int]) -> tuple[list[str
         raise InputError(f"it has {len(head)} columns and none is called label", "use vertex,label")
     if re.fullmatch(r"(vertex|face)\W+label", head[0]):
         raise InputError(f"{rows[0][0]!r} names two columns", "put a comma, a semicolon or a tab between columns")
-    if head == ["", "label"] and table_files.is_numbered(["0", *(row[0] for row in rows)]):
+    if head == ["", "label"] and tables.is_numbered(["0", *(row[0] for row in rows)]):
         return [row[1] for row in rows], written  # as R numbers rows
     if written is not None or (len(head) == 2 and column == 1):
-        table_files.check_numbered([row[0] for row in rows])
+        tables.check_numbered([row[0] for row in rows])
     return [row[column] for row in rows], written
 
 
@@ -235,14 +235,14 @@ def save_labels(path: Path, labels: Labels, shape: Shape) -> None:
         raise OptionError(f"{path.name}: this format holds labels of at most {bits} bits", "choose .csv or .json")
     cells = [labels.names[code] for code in labels.codes.tolist()]
     if suffix == ".npy":
-        table_files.write_npy(path, np.array(cells, np.str_ if labels.are_words else np.int64))
+        tables.write_npy(path, np.array(cells, np.str_ if labels.are_words else np.int64))
     elif suffix == ".txt":
         path.write_text("".join(f"{cell}\n" for cell in cells), encoding="utf-8")
     elif suffix == ".csv":
-        table_files.write_rows(path, ["vertex" if labels.on == "vertices" else "face", "label"], enumerate(cells))
+        tables.write_rows(path, ["vertex" if labels.on == "vertices" else "face", "label"], enumerate(cells))
     elif suffix == ".json":
         record = {"format": "meshmatch labels 1", "on": labels.on, "shape": shape.name, "labels": cells}
-        table_files.write_json(path, record)
+        tables.write_json(path, record)
     else:
         _write_ply(path, labels, shape)
 

@@ -18,7 +18,7 @@ from meshmatch.arrays import Brief, Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.vertex_map import VertexMap, corners_of
-from meshmatch.shapes import table_files
+from meshmatch.shapes import tables
 from meshmatch.shapes.landmark_files import (
     LANDMARK_READERS,
     LandmarkFile,
@@ -33,7 +33,7 @@ from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, know
 # A landmark this far from the surface, in diagonals of the shape, belongs to another shape.
 _ELSEWHERE = 0.25
 LANDMARK_SUFFIXES = (".csv", ".json", ".pp", ".fcsv", ".mrk.json")
-check_landmarks_suffix = partial(table_files.check_suffix, suffixes=LANDMARK_SUFFIXES, what="landmarks")
+check_landmarks_suffix = partial(tables.check_suffix, suffixes=LANDMARK_SUFFIXES, what="landmarks")
 _HINT = "a row each: name,vertex or name,x,y,z; MeshLab's .pp, 3D Slicer's .mrk.json or .fcsv, .pts, .tps, .json"
 
 
@@ -165,7 +165,7 @@ def load_landmarks(path: str | Path, shape: Shape, space: Space = "") -> tuple[L
     readers = dict.fromkeys(
         LANDMARK_READERS, lambda path: _on_shape(read_landmark_file(path, shape.name, space), shape)
     )
-    return table_files.read_by_suffix(path, readers, "landmarks", _HINT)
+    return tables.read_by_suffix(path, readers, "landmarks", _HINT)
 
 
 def _on_shape(found: LandmarkFile, shape: Shape) -> tuple[Landmarks, float]:
@@ -208,20 +208,20 @@ def save_landmarks(path: Path, landmarks: Landmarks, space: Space = "LPS", name:
     """
     suffix = check_landmarks_suffix(path)
     columns = (landmarks.vertex, landmarks.points, landmarks.face, landmarks.barycentric)
-    sure = table_files.short_floats(landmarks.confidence)
+    sure = tables.short_floats(landmarks.confidence)
     rows = list(zip(landmarks.names, *(column.tolist() for column in columns), sure, strict=True))
     points = zip(landmarks.names, landmarks.points.tolist(), landmarks.confidence.tolist(), strict=True)
     if suffix == ".fcsv":
         path.write_text("\n".join(fcsv_lines(points, space)) + "\n", encoding="utf-8")
     elif (name or path.name).lower().endswith(".mrk.json"):
-        table_files.write_json(path, markups_record(points, space), indent=1)
+        tables.write_json(path, markups_record(points, space), indent=1)
     elif suffix == ".csv":
         cells = ([name, vertex, *xyz, face, *weights, trust] for name, vertex, xyz, face, weights, trust in rows)
-        table_files.write_rows(path, ["name", "vertex", "x", "y", "z", "face", "w0", "w1", "w2", "confidence"], cells)
+        tables.write_rows(path, ["name", "vertex", "x", "y", "z", "face", "w0", "w1", "w2", "confidence"], cells)
     elif suffix == ".json":
         keys = ("name", "vertex", "position", "face", "barycentric", "confidence")
         records = [dict(zip(keys, row, strict=True)) for row in rows]
-        table_files.write_json(path, {"format": "meshmatch landmarks 1", "landmarks": records}, indent=1)
+        tables.write_json(path, {"format": "meshmatch landmarks 1", "landmarks": records}, indent=1)
     else:
         root = ElementTree.Element("PickedPoints")
         for name, _, (x, y, z), *_ in rows:

@@ -19,22 +19,22 @@ from scipy.sparse import csr_array, issparse
 from meshmatch.arrays import Brief, Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import plain_text
-from meshmatch.shapes import table_files
+from meshmatch.shapes import tables
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.input_files import read_bytes, read_json, read_npy, read_npz
 from meshmatch.shapes.shape import LARGEST, Shape
-from meshmatch.shapes.text_tables import read_table
+from meshmatch.shapes.tables import read_table
 
 VALUE_SUFFIXES = (".npy", ".csv", ".ply")
 _COLOR_SUFFIXES = (".ply", ".glb", ".obj", ".off", ".npy", ".csv")
-check_values_suffix = partial(table_files.check_suffix, suffixes=VALUE_SUFFIXES, what="values")
-check_color_suffix = partial(table_files.check_suffix, suffixes=_COLOR_SUFFIXES, what="vertex colors")
+check_values_suffix = partial(tables.check_suffix, suffixes=VALUE_SUFFIXES, what="values")
+check_color_suffix = partial(tables.check_suffix, suffixes=_COLOR_SUFFIXES, what="vertex colors")
 _HINT = "one row of numbers for each vertex of the source, in the order of its file: .npy or .csv"
 # Properties that a ply has already.
 _RESERVED = {"x", "y", "z", "red", "green", "blue", "alpha", "r", "g", "b", "a"}
 WEIGHT_SUFFIXES = (".npz", ".json")
-check_weights_suffix = partial(table_files.check_suffix, suffixes=WEIGHT_SUFFIXES, what="skin weights")
+check_weights_suffix = partial(tables.check_suffix, suffixes=WEIGHT_SUFFIXES, what="skin weights")
 _WEIGHTS_FORMAT = "meshmatch skin weights 1"
 _WEIGHTS_HINT = "arrays 'joints' (V, N) and 'weights' (V, N), or 'weights' (V, J) alone; 'names' (J,)"
 _MAX_JOINTS = 1 << 20
@@ -51,7 +51,7 @@ class Values:
 def load_values(path: str | Path, shape: Shape) -> Values:
     """Read numbers of the vertices of `shape`; `InputError` if there is not one row for each."""
     readers = {".npy": _read_npy} | dict.fromkeys((".csv", ".txt"), lambda path: _read_text(path, shape.V))
-    found = table_files.read_by_suffix(path, readers, "values", _HINT)
+    found = tables.read_by_suffix(path, readers, "values", _HINT)
     name, rows = Path(path).name, len(found.numbers)
     if rows != shape.V:
         raise InputError(f"{name} has {rows} rows, but {shape.name or 'the source'} has {shape.V} vertices", _HINT)
@@ -78,7 +78,7 @@ def _read_text(path: Path, count: int) -> Values:
     if len(numbers) == count:
         table.check_no_doubt()
     if names and names[0].lower() == "vertex":
-        table_files.check_numbered(numbers[:, 0])
+        tables.check_numbered(numbers[:, 0])
         names, numbers = names[1:], numbers[:, 1:]
     elif len(names) > 1 and names[0] in ("", "Unnamed: 0") and _is_row_number(numbers[:, 0]):
         names, numbers = names[1:], numbers[:, 1:]
@@ -101,9 +101,9 @@ def save_values(path: Path, values: Values, shape: Shape) -> None:
     columns = table.shape[1]
     names = values.names or (("value",) if columns == 1 else tuple(f"value_{k}" for k in range(columns)))
     if suffix == ".npy":
-        table_files.write_npy(path, numbers)
+        tables.write_npy(path, numbers)
     elif suffix == ".csv":
-        table_files.write_rows(path, ["vertex", *names], ([k, *row] for k, row in enumerate(table.tolist())))
+        tables.write_rows(path, ["vertex", *names], ([k, *row] for k, row in enumerate(table.tolist())))
     else:
         from meshmatch.shapes.formats import ply
 
@@ -192,7 +192,7 @@ def load_weights(path: str | Path, shape: Shape) -> SkinWeights:
         ".glb": lambda path: read_skin(path, read_bytes(path)),
         ".gltf": lambda path: read_skin(path, read_bytes(path)),
     }
-    matrix, names = table_files.read_by_suffix(path, readers, "skin weights", _WEIGHTS_HINT)
+    matrix, names = tables.read_by_suffix(path, readers, "skin weights", _WEIGHTS_HINT)
     return SkinWeights(_normalized(Path(path).name, matrix, shape), names)
 
 
@@ -277,7 +277,7 @@ def save_weights(path: Path, weights: SkinWeights) -> None:
     shares[rows[order], place] = matrix.data[order]
     if suffix == ".npz":
         names = np.array(weights.names, np.str_)
-        table_files.write_npz(path, {"format": _WEIGHTS_FORMAT, "names": names, "joints": joints, "weights": shares})
+        tables.write_npz(path, {"format": _WEIGHTS_FORMAT, "names": names, "joints": joints, "weights": shares})
     else:
         record = {"format": _WEIGHTS_FORMAT, "names": weights.names, "joints": joints.tolist()}
-        table_files.write_json(path, record | {"weights": table_files.short_floats(shares)})
+        tables.write_json(path, record | {"weights": tables.short_floats(shares)})

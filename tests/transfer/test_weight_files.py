@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.table_files import write_json
+from meshmatch.shapes.tables import write_json
 from meshmatch.transfer.attributes import largest_weights
 from meshmatch.transfer.vertex_files import SkinWeights, load_weights, save_weights, weights_of
 from tests.conftest import icosphere

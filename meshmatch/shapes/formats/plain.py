@@ -12,7 +12,7 @@ from meshmatch.shapes import formats
 from meshmatch.shapes.formats import NO_FACES, Raw, columns, damaged, numbers, words_per_line
 from meshmatch.shapes.input_files import check_text, read_npy
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.table_files import write_npy
+from meshmatch.shapes.tables import write_npy
 
 _MOST_HEADERS = 30
 _WORDS = re.compile(
