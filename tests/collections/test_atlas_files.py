@@ -19,13 +19,20 @@ from tests.collections.ellipsoids import ellipsoids
 
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("meshmatch.render.picture.HEIGHT", 240)
+    monkeypatch.setattr("meshmatch.render.picture.HEIGHT", 120)
 
 
 @pytest.fixture(scope="module")
 def atlas() -> Atlas:
     given = ellipsoids(8, splits=1)
     return Atlas.of(given.points, given.faces, [f"é, {k}.ply" for k in range(8)])
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without pictures and charts, which have tests of their own."""
+    for name in ("render_shapes", "draw_beside", "draw_histogram"):
+        monkeypatch.setattr(f"meshmatch.collections.atlas_files.{name}", lambda *_, **__: None)
 
 
 def table(path: Path) -> tuple[list[str], list[list[str]]]:
@@ -87,7 +94,7 @@ def test_every_file_says_what_the_atlas_knows(tmp_path: Path, atlas: Atlas) -> N
             assert np.asarray(image.convert("L")).std() > 5, name
 
 
-def test_morph_targets_are_the_modes(tmp_path: Path, atlas: Atlas) -> None:
+def test_morph_targets_are_the_modes(tmp_path: Path, atlas: Atlas, undrawn: None) -> None:
     write_folder(tmp_path, atlas, rotation=np.eye(3))
     document, arrays = glb(tmp_path / "modes.glb")
     (mesh,) = document["meshes"]
@@ -109,8 +116,13 @@ def test_morph_targets_are_the_modes(tmp_path: Path, atlas: Atlas) -> None:
     assert np.allclose(load_shape(tmp_path / "modes.glb").verts, atlas.mean, atol=1e-6)
 
 
-def test_the_same_atlas_gives_the_same_bytes(tmp_path: Path, atlas: Atlas) -> None:
+@pytest.mark.parametrize("drawn", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_same_atlas_gives_the_same_bytes(
+    tmp_path: Path, atlas: Atlas, drawn: bool, request: pytest.FixtureRequest
+) -> None:
     """And what was not asked for is not there."""
+    if not drawn:
+        request.getfixturevalue("undrawn")
     folders = [tmp_path / name for name in "ab"]
     for folder in folders:
         folder.mkdir()

@@ -88,7 +88,7 @@ def test_progress_is_told(model: TrainedModel, scan: OrientedPoints) -> None:
 
 def test_a_fit_refined_by_code_has_a_lower_energy_than_the_networks(model: TrainedModel) -> None:
     shape = bent_egg(model, 4)
-    config = FitConfig(samples=400, copies=4, latent=CONFIG)
+    config = FitConfig(samples=400, copies=4, hypotheses=1, careful=1, variants=2, finalists=1, latent=CONFIG)
     plain = Fitter(model, replace(config, refine="none")).fit(shape)
     refined = Fitter(model, replace(config, refine="latent")).fit(shape)
     assert np.allclose(plain.frame.rotation, refined.frame.rotation)
