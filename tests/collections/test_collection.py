@@ -30,6 +30,7 @@ from tests.conftest import icosphere
 
 SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
 NAMES = ["climber", "dancer", "turned"]
+QUICK = meshmatch.FitConfig(refine="none", copies=16, careful=1)
 pytestmark = pytest.mark.usefixtures("remembered_fits")
 
 
@@ -111,13 +112,13 @@ def test_nothing_is_done_twice_and_more_may_come(shapes: Path, tmp_path: Path) -
     first, whole = tmp_path / "first", tmp_path / "whole"
     two = [shapes / "dancer.ply", shapes / "climber.ply"]
     collection = meshmatch.Collection(first, workers=2)
-    collection.fit(two, model="human")
+    collection.fit(two, model="human", config=QUICK)
     before = contents(first)
     times = {path: path.stat().st_mtime_ns for path in first.rglob("*.safetensors")}
-    collection.fit(two)
+    collection.fit(two, config=QUICK)
     assert {path: path.stat().st_mtime_ns for path in first.rglob("*.safetensors")} == times
-    collection.fit(shapes)
-    meshmatch.Collection(whole, workers=1).fit(shapes, model="human")
+    collection.fit(shapes, config=QUICK)
+    meshmatch.Collection(whole, workers=1).fit(shapes, model="human", config=QUICK)
     assert contents(first) == contents(whole) != before and set(before) < set(contents(first))
     assert not (first / "agreeing").exists()
 
