@@ -4,7 +4,6 @@ Everything here fails before the first fit, which is made to fail the test if it
 """
 
 import os
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -21,70 +20,50 @@ def home(no_fit: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("MESHMATCH_HOME", str(tmp_path.parent / f"{tmp_path.name}-home"))
 
 
-def write_text(path: Path, text: str) -> None:
-    path.write_text(text)
+HEAD = "ply\nformat binary_little_endian 1.0\nelement vertex 100\n" + "".join(f"property float {a}\n" for a in "xyz")
+HEAD += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+NAN = "v nan nan nan\n" * 3 + "f 1 2 3\n"
+RANDOM = np.random.default_rng(0).normal(size=(20, 3))
 
-
-def truncated_ply(path: Path) -> None:
-    head = "ply\nformat binary_little_endian 1.0\nelement vertex 100\n"
-    head += "".join(f"property float {axis}\n" for axis in "xyz")
-    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    path.write_bytes(head.encode() + struct.pack("<30f", *range(30)))
-
-
-def all_nan(path: Path) -> None:
-    write_text(path, "v nan nan nan\n" * 3 + "f 1 2 3\n")
-
-
-def nan_cloud(path: Path) -> None:
-    np.save(path, np.full((500, 3), np.nan))
-
-
-def one_triangle(path: Path) -> None:
-    save_shape(path, Shape(np.eye(3), np.array([[0, 1, 2]]), "one"))
-
-
-def flat_faces(path: Path) -> None:
-    save_shape(path, Shape(np.eye(3), np.array([[0, 1, 1], [2, 2, 2]]), "flat"))
-
-
-def few_points(path: Path) -> None:
-    np.save(path, np.random.default_rng(0).normal(size=(20, 3)))
-
-
-# name of the file, how it is made (None: not at all), a word of the message that names the trouble
-BAD_FILES = {
+# name of the file, what is in it (None: there is none), a word of the message that names the trouble
+BAD_FILES: dict[str, tuple[str, bytes | str | np.ndarray | Shape | None, str]] = {
     "missing": ("bad.ply", None, "there is no file"),
-    "0 bytes": ("bad.ply", lambda path: path.write_bytes(b""), "0 bytes"),
-    "not a mesh": ("bad.ply", lambda path: write_text(path, "Dear Sir or Madam,\n"), "is not a ply file"),
-    "a picture called obj": ("bad.obj", lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n\0\0"), "is not an obj file"),
-    "unknown kind": ("bad.docx", lambda path: write_text(path, "x"), "unsupported file format"),
-    "no suffix": ("bad", lambda path: write_text(path, "x"), "no suffix"),
-    "truncated ply": ("bad.ply", truncated_ply, "fewer vertex rows than the 100"),
-    "truncated glb": ("bad.glb", lambda path: path.write_bytes(b"glTF\2\0\0\0\xff\0\0\0"), "is only 12"),
-    "no vertices": ("bad.off", lambda path: write_text(path, "OFF\n0 0 0\n"), "no vertices"),
-    "face of a missing vertex": (
-        "bad.obj",
-        lambda path: write_text(path, "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
-        "refers to vertex 9",
-    ),
-    "all NaN": ("bad.obj", all_nan, "no vertex has a usable position"),
-    "a cloud of NaN": ("bad.npy", nan_cloud, "no vertex has a usable position"),
-    "one triangle": ("bad.ply", one_triangle, "only 1 usable triangle"),
-    "no face with area": ("bad.ply", flat_faces, "no face with any area"),
-    "few points": ("bad.npy", few_points, "only 20 distinct point positions"),
-    "a folder": ("bad.ply", lambda path: path.mkdir(), "is a folder"),
-    "a map for a cloud": ("bad.npy", lambda path: np.save(path, np.arange(9)), "bad.npy"),
+    "0 bytes": ("bad.ply", b"", "0 bytes"),
+    "not a mesh": ("bad.ply", "Dear Sir or Madam,\n", "is not a ply file"),
+    "a picture called obj": ("bad.obj", b"\x89PNG\r\n\x1a\n\0\0", "is not an obj file"),
+    "unknown kind": ("bad.docx", "x", "unsupported file format"),
+    "no suffix": ("bad", "x", "no suffix"),
+    "truncated ply": ("bad.ply", HEAD.encode() + bytes(120), "fewer vertex rows than the 100"),
+    "truncated glb": ("bad.glb", b"glTF\2\0\0\0\xff\0\0\0", "is only 12"),
+    "no vertices": ("bad.off", "OFF\n0 0 0\n", "no vertices"),
+    "face of a missing vertex": ("bad.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "refers to vertex 9"),
+    "all NaN": ("bad.obj", NAN, "no vertex has a usable position"),
+    "a cloud of NaN": ("bad.npy", np.full((500, 3), np.nan), "no vertex has a usable position"),
+    "one triangle": ("bad.ply", Shape(np.eye(3), np.array([[0, 1, 2]])), "only 1 usable triangle"),
+    "no face with area": ("bad.ply", Shape(np.eye(3), np.array([[0, 1, 1], [2, 2, 2]])), "no face with any area"),
+    "few points": ("bad.npy", RANDOM, "only 20 distinct point positions"),
+    "a folder": ("bad.ply/inside", "", "is a folder"),
+    "a map for a cloud": ("bad.npy", np.arange(9), "bad.npy"),
 }
+
+
+def write(path: Path, content: bytes | str | np.ndarray | Shape) -> None:
+    path.parent.mkdir(exist_ok=True)
+    if isinstance(content, Shape):
+        save_shape(path, content)
+    elif isinstance(content, np.ndarray):
+        np.save(path, content)
+    else:
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 @pytest.mark.parametrize("side", ["source", "target", "register"])
 @pytest.mark.parametrize("kind", BAD_FILES)
 def test_bad_files(run: Run, two: tuple[Path, Path], tmp_path: Path, kind: str, side: str) -> None:
-    name, make, told = BAD_FILES[kind]
-    bad = tmp_path / name
-    if make is not None:
-        make(bad)
+    name, content, told = BAD_FILES[kind]
+    bad = tmp_path / name.partition("/")[0]
+    if content is not None:
+        write(tmp_path / name, content)
     before = set(os.listdir(tmp_path))
     words = {
         "source": ("match", bad, two[1], "-o", tmp_path / "map.npy"),
