@@ -45,7 +45,8 @@ def read_only(values: Any, dtype: type, label: str) -> NDArray[Any]:
     """
     own = isinstance(values, np.ndarray) and values.dtype == dtype and values.base is None
     if own and values.flags.c_contiguous and not values.flags.writeable:
-        return values
+        shared: NDArray[Any] = values
+        return shared
     try:
         values = off_torch(values)
         if np.iscomplexobj(values):

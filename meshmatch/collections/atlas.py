@@ -187,7 +187,7 @@ class Atlas(Brief, Pickled):
     @property
     def distances(self) -> Float[Floats, " S"]:
         """(S,) root mean square distance of each shape from the mean over the surface, as far as the modes have it."""
-        return np.sqrt(np.square(self.scores * self.deviations).sum(axis=1))
+        return np.asarray(np.sqrt(np.square(self.scores * self.deviations).sum(axis=1)))
 
     @cached_property
     def mean_shape(self) -> Shape:
@@ -335,7 +335,7 @@ class Atlas(Brief, Pickled):
         InputError
             The atlas does not have the name.
         """
-        return np.linalg.norm(self.offsets(self.scores[self.rows([name])])[0], axis=1)
+        return np.asarray(np.linalg.norm(self.offsets(self.scores[self.rows([name])])[0], axis=1))
 
     def rows(self, names: Sequence[str]) -> Int[Ints, " N"]:
         """Which shapes have these names.
@@ -497,4 +497,4 @@ def _outward(modes: Floats, mean: Floats, weights: Floats) -> Floats:
     flat = modes.reshape(len(modes), -1)
     largest = flat[np.arange(len(flat)), np.abs(flat).argmax(axis=1)]
     size = np.sqrt(weights @ np.square(mean).sum(axis=1))
-    return np.where(np.abs(growth) > 1e-6 * size, np.sign(growth), np.sign(largest))
+    return np.asarray(np.where(np.abs(growth) > 1e-6 * size, np.sign(growth), np.sign(largest)))

@@ -142,7 +142,8 @@ def _short(values: Any) -> Any:
 
 
 def _furthest(atlas: Atlas) -> list[int]:
-    return np.argsort(-atlas.distances, kind="stable")[:_FURTHEST].tolist()
+    rows: list[int] = np.argsort(-atlas.distances, kind="stable")[:_FURTHEST].tolist()
+    return rows
 
 
 def _write_morphs(path: Path, atlas: Atlas) -> None:

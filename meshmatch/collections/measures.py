@@ -209,7 +209,7 @@ class _Collection:
 
     def _laid(self, row: int, laid: Superimposed) -> Floats:
         """The points of a shape laid over the others."""
-        return laid.align(np.asarray(self._shapes[row], np.float64)[None])[0]
+        return np.asarray(laid.align(np.asarray(self._shapes[row], np.float64)[None])[0])
 
     def _real(self, row: int, laid: Superimposed) -> _Real:
         """The surface of a shape laid over the others."""

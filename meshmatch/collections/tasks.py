@@ -162,7 +162,7 @@ def agree_a_little(task: AgreeTask) -> Float[Floats, "G 3 3"]:
         now = np.array([agree_step(system, *each, common) for each in steps])
         save_array(store, group.file(task.step), now)
     gradients = [system.deformation_gradient(start) for start in _starts(members, now, before)]
-    return np.sum([log_stretch(F) for F in gradients], axis=0)
+    return np.asarray(np.sum([log_stretch(F) for F in gradients], axis=0))
 
 
 def _member(read: StoredFit, how: AgreeConfig) -> Member:

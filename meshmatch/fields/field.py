@@ -57,7 +57,8 @@ class Field:
         columns = self._apply(self.gradient, rows).unflatten(1, (-1, 3))  # B P k a
         # At least float32: in bfloat16 the small difference from the identity would be lost.
         kind = torch.promote_types(rows.dtype, torch.float32)
-        return columns.transpose(-1, -2) + torch.eye(3, dtype=kind, device=rows.device)
+        result: torch.Tensor = columns.transpose(-1, -2) + torch.eye(3, dtype=kind, device=rows.device)
+        return result
 
     def for_training(self, gradients: int | None = None) -> Field:
         """The same arranged for large batches; the gradient at the first ``gradients`` points alone."""
@@ -92,7 +93,8 @@ class _DescentField(Field):
 
     def _apply(self, matrix: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
         transpose = self.phi_transpose if matrix is self.phi else self.gradient_transpose
-        return _Product.apply(rows[0], matrix, transpose)[None]  # type: ignore[no-untyped-call]
+        result: torch.Tensor = _Product.apply(rows[0], matrix, transpose)[None]  # type: ignore[no-untyped-call]
+        return result
 
 
 class _Product(torch.autograd.Function):
@@ -117,7 +119,8 @@ def apply_shape_functions(
     """
     B, K, _ = vectors.shape
     flat = vectors.transpose(0, 1).reshape(K, B * 3)
-    return (matrix @ flat).unflatten(1, (B, 3)).transpose(0, 1)
+    result: torch.Tensor = (matrix @ flat).unflatten(1, (B, 3)).transpose(0, 1)
+    return result
 
 
 def _tensor(matrix: Any) -> torch.Tensor:
@@ -135,7 +138,8 @@ def _tensor(matrix: Any) -> torch.Tensor:
 def determinant(F: Float[torch.Tensor, "*B 3 3"]) -> Float[torch.Tensor, "*B"]:
     """Determinant written out: several times faster than a batched LU."""
     a, b, c = F[..., 0], F[..., 1], F[..., 2]
-    return (torch.linalg.cross(a, b) * c).sum(-1)
+    result: torch.Tensor = (torch.linalg.cross(a, b) * c).sum(-1)
+    return result
 
 
 def volume_energy(F: Float[torch.Tensor, "*B 3 3"]) -> Float[torch.Tensor, "*B"]:
@@ -161,7 +165,8 @@ def pack(code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B R 3"]:
     """Rows of codes, without a turn."""
     D = code.shape[1]
     fill = 3 * (code_rows(D) + TURN_ROWS) - D
-    return torch.nn.functional.pad(code, (0, fill)).unflatten(1, (-1, 3))
+    result: torch.Tensor = torch.nn.functional.pad(code, (0, fill)).unflatten(1, (-1, 3))
+    return result
 
 
 def unpack(

@@ -191,7 +191,7 @@ class _LocalFits:
     @property
     def along(self) -> Float[Floats, " N"]:
         """p(x)^T M^-1 p(q_i) with p(x) = [1, 0, 0, 0]."""
-        return (self.inverse[:, 0][self.at] * self.basis).sum(1)
+        return np.asarray((self.inverse[:, 0][self.at] * self.basis).sum(1))
 
 
 def _summed(at: Int[Ints, " N"], P: int) -> Any:
@@ -275,4 +275,4 @@ def build_rbf(points: ArrayLike, nodes: ArrayLike) -> ShapeFunctions:
 
 def multiquadric(offset: Float[Floats, "*N 3"]) -> Float[Floats, "*N"]:
     """phi of offsets, in units of the nodes' radius."""
-    return np.sqrt(CONSTANT + STEEPNESS * np.square(offset).sum(-1))
+    return np.asarray(np.sqrt(CONSTANT + STEEPNESS * np.square(offset).sum(-1)))

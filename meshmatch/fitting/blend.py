@@ -123,7 +123,7 @@ class Blend:
         """Node vectors at a time, core frame."""
         weights = self.weights(time)
         if weights.max() == 1.0:  # a fit itself
-            return self._keys[weights.argmax()]
+            return np.asarray(self._keys[weights.argmax()])
         there, correction = self._path(weights), np.tensordot(weights, self._correction, 1)
         if self._node_field is not None:
             correction = np.einsum("kij,kj->ki", polar(self._node_field.deformation_gradient_at(there))[0], correction)

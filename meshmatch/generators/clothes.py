@@ -34,7 +34,8 @@ class Wear(Draw):
 
 def torso(rig: Rig, heads: Float[Tensor, "B J 3"]) -> Float[Tensor, "B 1 1"]:
     """Size of bodies, 1 for an ordinary one."""
-    return (heads[:, rig.joint("neck01")] - heads[:, rig.joint("root")]).norm(dim=-1)[:, None, None] / _TORSO
+    result: Tensor = (heads[:, rig.joint("neck01")] - heads[:, rig.joint("root")]).norm(dim=-1)[:, None, None] / _TORSO
+    return result
 
 
 def step(values: Tensor, at: Tensor, width: float = _HEM) -> Tensor:

@@ -99,7 +99,7 @@ class MeanBody:
         return MeanBody(places[0], faces, words, parents, places[1], weights.numpy(), moved, names, measures)
 
     def joint(self, name: str) -> Float[Floats, " 3"]:
-        return self.joints[self.names.index(name)]
+        return np.asarray(self.joints[self.names.index(name)])
 
     def moved_by(self, word: str) -> Float[Floats, " V"]:
         """How far the measures with a word in their names move every vertex, of the furthest."""

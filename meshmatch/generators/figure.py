@@ -99,7 +99,8 @@ class Figure:
         flat = values.transpose(0, 1).flatten(1).numpy()
         for _ in range(rounds):
             flat = 0.5 * flat + 0.5 * (self.mean_of_neighbours @ flat)
-        return torch.from_numpy(flat).unflatten(1, (len(values), -1)).transpose(0, 1)
+        result: Tensor = torch.from_numpy(flat).unflatten(1, (len(values), -1)).transpose(0, 1)
+        return result
 
     def normals(self, verts: Float[Tensor, "B V 3"]) -> Float[Tensor, "B V 3"]:
         """Smoothed unit normals."""

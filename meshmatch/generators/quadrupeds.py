@@ -221,7 +221,7 @@ def make_animal(rig: AnimalRig, seed: int, number: int) -> Float[Floats, "V 3"]:
     centers = posed[rng.integers(len(posed), size=12)]
     reach = rng.uniform(0.08, 0.25, 12)
     near = np.exp(-np.square(np.linalg.norm(posed[:, None] - centers, axis=2) / reach))
-    return posed + near @ rng.normal(0, 0.007, (12, 3))
+    return np.asarray(posed + near @ rng.normal(0, 0.007, (12, 3)))
 
 
 def resting_animal(rig: AnimalRig) -> Float[Floats, "V 3"]:

@@ -205,7 +205,8 @@ def skin(
     """Linear blend skinning: posed vertices."""
     transforms = torch.cat([world.flatten(2), offset], -1)  # B J 12
     blended = torch.einsum("vj,bjk->bvk", rig.weights, transforms)
-    return (blended[..., :9].unflatten(-1, (3, 3)) @ rest[..., None])[..., 0] + blended[..., 9:]
+    result: Tensor = (blended[..., :9].unflatten(-1, (3, 3)) @ rest[..., None])[..., 0] + blended[..., 9:]
+    return result
 
 
 # Capsules for self-intersection: (start joint, end joint, radius in units of the torso length).
@@ -243,4 +244,5 @@ def penetration(
     radii = torch.tensor(sizes)
     gap = (points[:, pairs[:, 0], :, None] - points[:, pairs[:, 1], None]).norm(dim=-1).amin((-1, -2))
     touch = 0.85 * (radii[pairs[:, 0]] + radii[pairs[:, 1]])
-    return (touch - gap / torso[:, None]).clamp_min(0).sum(-1)
+    result: Tensor = (touch - gap / torso[:, None]).clamp_min(0).sum(-1)
+    return result

@@ -20,7 +20,8 @@ def rotation_from_vector(vector: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
     sine, cosine = angle.sin()[..., None], angle.cos()[..., None]
-    return torch.eye(3).to(vector) + sine * cross + (1 - cosine) * (cross @ cross)
+    result: Tensor = torch.eye(3).to(vector) + sine * cross + (1 - cosine) * (cross @ cross)
+    return result
 
 
 def rotation_between(a: Float[Tensor, "*B 3"], b: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:

@@ -91,4 +91,4 @@ def _through(
     )
     found = curve * np.stack(square) + (first - curve * (high + middle)) * S
     found[[0, 3, 5]] += value - first * high + curve * high * middle
-    return found
+    return np.asarray(found)

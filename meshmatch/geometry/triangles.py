@@ -176,7 +176,7 @@ class Edges:
     @property
     def open(self) -> Int[Ints32, "N 2"]:
         """Vertices of the edges that have one face."""
-        return self.vertices[self.sizes == 1]
+        return np.asarray(self.vertices[self.sizes == 1])
 
     @property
     def counts(self) -> tuple[int, int]:

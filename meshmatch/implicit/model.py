@@ -312,7 +312,8 @@ class ImplicitModel:
 
 
 def _at_most(step: Float[torch.Tensor, "P 3"]) -> Float[torch.Tensor, "P 3"]:
-    return step * (_STEP / step.norm(dim=1, keepdim=True).clamp_min(_STEP))
+    result: torch.Tensor = step * (_STEP / step.norm(dim=1, keepdim=True).clamp_min(_STEP))
+    return result
 
 
 def zero_surface(distance: Callable[[Float[Floats, "P 3"]], Float[Floats, " P"]], resolution: int, name: str) -> Shape:

@@ -80,7 +80,8 @@ class SineNetwork(nn.Module):
     def forward(self, points: Float[torch.Tensor, "B P 3"], _: object = None) -> Float[torch.Tensor, "B P 1"]:
         for layer in self.layers[:-1]:
             points = torch.sin(self.frequency * layer(points))
-        return self.layers[-1](points)
+        result: torch.Tensor = self.layers[-1](points)
+        return result
 
 
 class HyperNetwork(nn.Module):
@@ -152,7 +153,8 @@ class ReducedDeformation(nn.Module):
 
     def vectors(self, code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B K 3"]:
         """Where the nodes go, relative to where they are."""
-        return _GAIN * self.decoder(code).unflatten(1, (-1, 3))
+        result: torch.Tensor = _GAIN * self.decoder(code).unflatten(1, (-1, 3))
+        return result
 
     def forward(self, points: torch.Tensor, code: torch.Tensor, slopes: bool = True) -> tuple[torch.Tensor, ...]:
         """u and c at points (B, P, 3); with ``slopes`` also their gradients."""

@@ -26,7 +26,7 @@ def cube_nodes(per_edge: int = 3) -> Float[Floats, "K 3"]:
     """The vertices of the cube from -1 to 1, and so many evenly spread nodes inside each of its edges."""
     ticks = np.linspace(-1, 1, per_edge + 2)
     lattice = np.array(list(product(ticks, repeat=3)))
-    return lattice[(np.abs(lattice) == 1).sum(1) >= 2]
+    return np.asarray(lattice[(np.abs(lattice) == 1).sum(1) >= 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,8 @@ class SpaceField:
     def _carried(self, vectors: torch.Tensor) -> Float[torch.Tensor, "B P 4 3"]:
         """sum_i w_i p_i v_i^T."""
         one = pad(self.nodes, (1, 0), value=1.0).expand(len(vectors), -1, -1)
-        return (self.weight @ _outer(one, vectors)).unflatten(2, (4, 3))
+        result: torch.Tensor = (self.weight @ _outer(one, vectors)).unflatten(2, (4, 3))
+        return result
 
 
 def _outer(a: Float[torch.Tensor, "*K M"], b: Float[torch.Tensor, "*K N"]) -> Float[torch.Tensor, "*K MN"]:

@@ -164,7 +164,7 @@ def heights(shape: Shape, fit: Fit, foot: Footpoints) -> Float[Floats, " V"]:
     """How far the vertices of a shape lie above their footpoints on the fitted template, at most `_HIGH` either way."""
     above = in_core_frame(shape, fit)[0] - foot.values(fit.faces, fit.points)
     above *= foot.values(fit.faces, vertex_normals(fit.points, fit.faces))
-    return np.clip(above.sum(1), -_HIGH, _HIGH)
+    return np.asarray(np.clip(above.sum(1), -_HIGH, _HIGH))
 
 
 def is_noisy(shape: Shape) -> bool:

@@ -126,14 +126,16 @@ class Deformer(nn.Module):
         change = 0.1 * self.corrector(features.flatten(1)).unflatten(-1, (-1, 3))
         if isinstance(self.decoder, layers.PointDecoder):
             change = nn.functional.pad(change, (0, 0, 0, TURN_ROWS))  # the code alone is learned
-        return vectors + change
+        result: torch.Tensor = vectors + change
+        return result
 
     def forward(self, points: Float[torch.Tensor, "B P 3"]) -> Float[torch.Tensor, "B R 3"]:
         """The rows of scans in the core frame; with nodes, these are their vectors."""
         vectors = self.decoder(self.encoder(self.encoder.features(points)))
         for _ in range(self.config.corrections):
             vectors = self.correct(vectors, points)
-        return vectors
+        result: torch.Tensor = vectors
+        return result
 
     # The same questions in arrays, as `models.network.Network` has them: for fields that torch alone can evaluate.
 
@@ -153,11 +155,11 @@ class Deformer(nn.Module):
 
     @torch.inference_mode()
     def encode(self, cloud: Float[Floats, "P 3"]) -> Float[Floats, " D"]:
-        return _array(self.encoder(self.encoder.features(self._tensor(cloud))))[0]
+        return np.asarray(_array(self.encoder(self.encoder.features(self._tensor(cloud))))[0])
 
     @torch.inference_mode()
     def decode(self, code: Float[Floats, " D"]) -> Float[Floats, "R 3"]:
-        return _array(self.decoder(self._tensor(code)))[0]
+        return np.asarray(_array(self.decoder(self._tensor(code)))[0])
 
     def _tensor(self, array: Floats) -> torch.Tensor:
         return torch.from_numpy(np.asarray(array, np.float32))[None].to(self.nodes.device)

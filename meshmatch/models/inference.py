@@ -96,10 +96,10 @@ class NodeNetwork:
 
     def encode(self, cloud: Float[Floats, "P 3"]) -> Float[Floats, " D"]:
         points = np.asarray(cloud, np.float32)
-        return self._encode([points])[0].astype(np.float64)
+        return np.asarray(self._encode([points])[0].astype(np.float64))
 
     def decode(self, code: Float[Floats, " D"]) -> Float[Floats, "K 3"]:
-        return self._decode(code[None].astype(np.float32))[0].astype(np.float64)
+        return np.asarray(self._decode(code[None].astype(np.float32))[0].astype(np.float64))
 
     def rotate_rows(self, rows: Float[Floats, "K 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "K 3"]:
         nodes = self.weights["nodes"].astype(np.float64)
@@ -149,17 +149,17 @@ class NodeNetwork:
     def _linear(self, name: str, x: Floats32) -> Floats32:
         out = x @ self.weights[f"{name}.weight"].T
         bias = self.weights.get(f"{name}.bias")
-        return out if bias is None else out + bias
+        return np.asarray(out if bias is None else out + bias)
 
     def _layer_norm(self, name: str, x: Floats32) -> Floats32:
         offset = x - x.mean(-1, keepdims=True)
         scale = 1 / np.sqrt(np.square(offset).mean(-1, keepdims=True) + _EPSILON)
-        return offset * scale * self.weights[f"{name}.weight"] + self.weights[f"{name}.bias"]
+        return np.asarray(offset * scale * self.weights[f"{name}.weight"] + self.weights[f"{name}.bias"])
 
     def _batch_norm(self, name: str, x: Floats32) -> Floats32:
         mean, variance = self.weights[f"{name}.running_mean"], self.weights[f"{name}.running_var"]
         scale = self.weights[f"{name}.weight"] / np.sqrt(variance + _EPSILON)
-        return (x - mean) * scale + self.weights[f"{name}.bias"]
+        return np.asarray((x - mean) * scale + self.weights[f"{name}.bias"])
 
     def _residual_mlp(self, name: str, x: Float[Floats32, "B I"]) -> Float[Floats32, "B O"]:
         """`models.layers.residual_mlp`."""
@@ -182,7 +182,7 @@ def rotation_from_six(six: Float[Floats, "B 6"]) -> Float[Floats, "B 3 3"]:
 
 
 def _gelu(x: Floats32) -> Floats32:
-    return np.float32(0.5) * x * (1 + erf(x * np.float32(np.sqrt(0.5))))
+    return np.asarray(np.float32(0.5) * x * (1 + erf(x * np.float32(np.sqrt(0.5)))))
 
 
 def _two_way_offsets(anchors: Float[Floats32, "A 3"], points: Floats32, tree: cKDTree) -> Floats32:

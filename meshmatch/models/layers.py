@@ -71,7 +71,8 @@ class ResidualBlock(nn.Module):
         nn.init.zeros_(self.narrow.bias)
 
     def forward(self, x: Float[torch.Tensor, "*B W"]) -> Float[torch.Tensor, "*B W"]:
-        return x + self.narrow(nn.functional.gelu(self.widen(self.norm(x))))
+        result: torch.Tensor = x + self.narrow(nn.functional.gelu(self.widen(self.norm(x))))
+        return result
 
 
 def residual_mlp(inputs: int, width: int, depth: int, outputs: int) -> nn.Sequential:
@@ -116,7 +117,8 @@ class BasisEncoder(nn.Module):
         return offsets * 5.0
 
     def forward(self, features: Float[torch.Tensor, "B ..."]) -> Float[torch.Tensor, "B D"]:
-        return self.network(features.flatten(1))
+        result: torch.Tensor = self.network(features.flatten(1))
+        return result
 
 
 class PointEncoder(nn.Module):
@@ -145,7 +147,8 @@ class PointEncoder(nn.Module):
 
     def forward(self, features: Float[torch.Tensor, "B ..."]) -> Float[torch.Tensor, "B D"]:
         found = self.points(features.flatten(0, 1)).unflatten(0, features.shape[:2])
-        return self.head(found.amax(1))
+        result: torch.Tensor = self.head(found.amax(1))
+        return result
 
 
 class FlatDecoder(nn.Module):
@@ -157,7 +160,8 @@ class FlatDecoder(nn.Module):
 
     def forward(self, code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B K 3"]:
         """Node vectors of codes."""
-        return self.network(code).unflatten(-1, (-1, 3))
+        result: torch.Tensor = self.network(code).unflatten(-1, (-1, 3))
+        return result
 
 
 class NodeDecoder(nn.Module):
@@ -178,7 +182,8 @@ class NodeDecoder(nn.Module):
     def forward(self, code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B K 3"]:
         """Node vectors of codes."""
         hidden = self.from_code(code)[:, None] + self.from_node(self.nodes)  # B K width
-        return 2 * torch.tanh(self.network(hidden.flatten(0, 1))).unflatten(0, hidden.shape[:2])
+        result: torch.Tensor = 2 * torch.tanh(self.network(hidden.flatten(0, 1))).unflatten(0, hidden.shape[:2])
+        return result
 
 
 class PointDecoder(nn.Module):

@@ -151,7 +151,7 @@ def _smooth(values: Float[Floats32, "H W 2"], hits: Hits, which: Bool[Bools, "H 
 
 def _same_surface(gap: Floats32, cosine: Floats32, pixel: float) -> Floats32:
     """0..1: 1 for two places within two pixels of one plane (``gap`` apart), with normals that nearly agree."""
-    return np.clip(3.0 - np.abs(gap) / np.float32(pixel), 0, 1) * np.clip(4 * cosine - 2.4, 0, 1)
+    return np.asarray(np.clip(3.0 - np.abs(gap) / np.float32(pixel), 0, 1) * np.clip(4 * cosine - 2.4, 0, 1))
 
 
 def _shifted(step: int, axis: int, shape: tuple[int, int]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:

@@ -174,7 +174,7 @@ class Scene:
 
 
 def _unit(x: float, y: float, z: float) -> Float[Floats32, " 3"]:
-    return (np.array([x, y, z]) / np.linalg.norm([x, y, z])).astype(np.float32)
+    return np.asarray((np.array([x, y, z]) / np.linalg.norm([x, y, z])).astype(np.float32))
 
 
 _KEY, _FILL, _RIM = _unit(-0.50, 0.95, 0.85), _unit(0.85, 0.05, 0.55), _unit(0.5, 0.6, -0.6)
@@ -186,7 +186,7 @@ _LAMP = 0.40  # radius of the key lamp's disc at distance 1
 def _spread(count: int) -> Float[Floats, "count 3"]:
     """Numbers in 0..1, evenly spread, and any run of them too (Roberts' R3 sequence)."""
     root = 1.22074408460575947536  # of x^4 = x + 1
-    return (0.5 + np.arange(1, count + 1)[:, None] * np.array([1 / root, root**-2, root**-3])) % 1.0
+    return np.asarray((0.5 + np.arange(1, count + 1)[:, None] * np.array([1 / root, root**-2, root**-3])) % 1.0)
 
 
 def _key_directions() -> Directions:

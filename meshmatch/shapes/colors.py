@@ -50,7 +50,7 @@ _BYTE_OF_ROOT: UInts8 = np.round(255.0 * to_srgb((np.arange(_STEPS + 1) / _STEPS
 def bytes_of(linear: Float[Floats32, ...]) -> UInt8[UInts8, ...]:
     """The nearest byte of an image for amounts of light in 0..1, of any shape; what lies outside is clipped."""
     root = np.sqrt(np.clip(linear, 0.0, 1.0, dtype=np.float32))
-    return _BYTE_OF_ROOT.take((root * np.float32(_STEPS) + np.float32(0.5)).astype(np.int32))
+    return np.asarray(_BYTE_OF_ROOT.take((root * np.float32(_STEPS) + np.float32(0.5)).astype(np.int32)))
 
 
 _ROOTS_OF_OKLAB = np.array(

@@ -63,7 +63,7 @@ def duplicate_faces(faces: Int[Ints, "F 3"]) -> Bool[Bools, " F"]:
     first = same_rows(np.stack([low, a + b + c - low - high, high], axis=1))
     double = first != np.arange(len(faces))
     if not double.any():
-        return double
+        return np.asarray(double)
     many = np.bincount(first, minlength=len(faces))
     second = np.flatnonzero(double & (many[first] == 2))
     pair = np.stack([first[second], second], axis=1)
@@ -76,7 +76,7 @@ def duplicate_faces(faces: Int[Ints, "F 3"]) -> Bool[Bools, " F"]:
     others = np.searchsorted(single, keys, "right") - np.searchsorted(single, keys, "left")  # pairs 3
     flap = ((others == 0) | (others == 2)).all(axis=1) & (others == 2).any(axis=1)
     double[pair[flap, 0]] = True
-    return double
+    return np.asarray(double)
 
 
 def _handed(faces: Ints) -> Bools:

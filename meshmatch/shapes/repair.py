@@ -179,4 +179,4 @@ def _valid_neighbour(shape: Shape, valid: Bools) -> Ints:
             a, b = shape.faces[:, k], shape.faces[:, other]
             helps = ~valid[a] & valid[b]
             stands[a[helps]] = b[helps]
-    return stands
+    return np.asarray(stands)

@@ -246,7 +246,8 @@ def _mirror_some(
         names = [clean.original.name for clean, flag in zip(found, flags, strict=True) if flag]
         shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
         notes.append(f"{len(names)} of {len(found)} shapes are mirror images of the others, and were mirrored: {shown}")
-    return flags.tolist()
+    turned: list[bool] = flags.tolist()
+    return turned
 
 
 def _template_file(path: Path) -> Repaired:

@@ -98,7 +98,7 @@ def registered_stack(
         return np.zeros((0, len(vertices), 3), np.float32)
     chosen = np.stack(complete)
     # Centred before the numbers become short: a scan in a surveyor's coordinates would lose its digits.
-    return (chosen - chosen.mean(1, keepdims=True)).astype(np.float32)
+    return np.asarray((chosen - chosen.mean(1, keepdims=True)).astype(np.float32))
 
 
 def rotation_range(stack: Float[Floats32, "N V 3"], like: Float[Floats, "V 3"]) -> Align:

@@ -65,7 +65,7 @@ def pull_directions(
     rotations = (left * sign[:, None, :]) @ right
     turned = np.einsum("nij,nj->ni", rotations, back.apply(np.nan_to_num(directions)))
     length = np.linalg.norm(turned, axis=1, keepdims=True)
-    return turned / np.where(length > 0, length, 1.0)
+    return np.asarray(turned / np.where(length > 0, length, 1.0))
 
 
 def pull_labels(

@@ -167,7 +167,7 @@ class MappedMesh:
     def _opposed(self, normals: Floats, corners: Ints) -> Floats:
         """(N,) 0 where one of three corners faces into one half of space with a normal, up to 1 where all face away."""
         cosine = np.einsum("nd,nkd->nk", normals, self.normals[corners]).max(axis=1)
-        return np.maximum(-cosine, 0.0)
+        return np.asarray(np.maximum(-cosine, 0.0))
 
 
 def discontinuous_faces(source_to_target: VertexMap, source: Shape, target: Shape) -> Bool[Bools, " F_source"]:

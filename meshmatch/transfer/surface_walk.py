@@ -139,7 +139,7 @@ class PointWalker(SurfaceWalker):
 
 def weighted(a: list[Floats32] | Floats32, b: list[Floats32]) -> Floats32:
     """(N,) products of columns, three each, added up."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def duals(corners: Floats) -> tuple[Floats, Floats]:

@@ -86,7 +86,7 @@ class MaterialSampler:
 
 def _folded(uv: Floats) -> Floats:
     """Coordinates (F, 3, 2) without whole repeats of an image, also of a mirrored one: they change nothing."""
-    return uv - 2.0 * np.floor(uv.min(axis=1, keepdims=True) / 2.0)
+    return np.asarray(uv - 2.0 * np.floor(uv.min(axis=1, keepdims=True) / 2.0))
 
 
 def _meaning(used: list[Material]) -> tuple[Alpha, float, bool]:
@@ -150,7 +150,7 @@ def reach_of(first: Floats, second: Floats) -> Floats:
     b = np.einsum("ni,ni->n", first, second)
     longest = np.sqrt((a + c) / 2 + np.sqrt(((a - c) / 2) ** 2 + b * b))
     area = np.sqrt(squared_lengths(cross_product(first, second)))
-    return np.maximum(np.sqrt(area), longest / 2)
+    return np.asarray(np.maximum(np.sqrt(area), longest / 2))
 
 
 def _charts(walker: SurfaceWalker, look: Appearance, pictured: Bools) -> Ints32:
@@ -252,7 +252,7 @@ class TexelLocator:
         """(N,) of the map at points (3, N) of triangles (N,)."""
         held = np.maximum(weights, 0)
         sure = weighted(held, [self._confidence.take(column.take(face)) for column in self._corners])
-        return sure / (held[0] + held[1] + held[2])
+        return np.asarray(sure / (held[0] + held[1] + held[2]))
 
     def _continued(self, face: Ints32, weights: Floats32, corner: Ints) -> Floats32:
         """Points (3, N) of discontinuous triangles: the surface around the nearest corner, continued."""

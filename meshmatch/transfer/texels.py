@@ -256,4 +256,4 @@ def wrapped(index: Ints, size: Ints | int, wrap: Wrap) -> Ints:
     if wrap == "repeat":
         return index % size
     folded = index % (2 * np.asarray(size))
-    return np.minimum(folded, 2 * size - 1 - folded)
+    return np.asarray(np.minimum(folded, 2 * size - 1 - folded))

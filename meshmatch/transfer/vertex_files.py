@@ -51,7 +51,7 @@ class Values:
 def load_values(path: str | Path, shape: Shape) -> Values:
     """Read numbers of the vertices of `shape`; `InputError` if there is not one row for each."""
     readers = {".npy": _read_npy} | dict.fromkeys((".csv", ".txt"), lambda path: _read_text(path, shape.V))
-    found = tables.read_by_suffix(path, readers, "values", _HINT)
+    found: Values = tables.read_by_suffix(path, readers, "values", _HINT)
     name, rows = Path(path).name, len(found.numbers)
     if rows != shape.V:
         raise InputError(f"{name} has {rows} rows, but {shape.name or 'the source'} has {shape.V} vertices", _HINT)

@@ -61,7 +61,7 @@ def shapes_of(folder: Path) -> list[str]:
 
 @cache
 def keypoints_of(folder: Path, shape: str) -> Int[Ints, " N"]:
-    return np.load(folder / f"{shape}.keypoints.npy", allow_pickle=False).astype(np.int64)
+    return np.asarray(np.load(folder / f"{shape}.keypoints.npy", allow_pickle=False).astype(np.int64))
 
 
 @cache
@@ -69,7 +69,7 @@ def distances(folder: Path, shape: str) -> Float[Floats, "N V"]:
     """From each keypoint to all vertices, along edges, in units of sqrt(area)."""
     mesh = load_shape(folder / f"{shape}.ply")
     found = dijkstra(edge_graph(mesh), directed=False, indices=keypoints_of(folder, shape)) / np.sqrt(mesh.area)
-    return np.where(np.isfinite(found), found, found[np.isfinite(found)].max())
+    return np.asarray(np.where(np.isfinite(found), found, found[np.isfinite(found)].max()))
 
 
 def symmetries(folder: Path) -> list[Int[Ints, " N"]]:

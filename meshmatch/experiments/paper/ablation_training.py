@@ -244,7 +244,8 @@ def body_errors(model: Deformer, batch: Batch, points: LossPoints) -> Float[torc
     batch = batch.to(points.positions.device)
     off = points.moved(model(batch.points)) - batch.targets
     model.train(was)
-    return off.double().norm(dim=-1).mean(1).cpu()
+    result: Tensor = off.double().norm(dim=-1).mean(1).cpu()
+    return result
 
 
 def _wait(trainer: Trainer) -> None:

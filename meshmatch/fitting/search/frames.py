@@ -159,7 +159,7 @@ def standing_grid(center: Float[Floats, " 3"]) -> list[RigidPose]:
 def axis_vector(name: str) -> Float[Floats, " 3"]:
     """Unit vector of an axis name such as "y", "+y" or "-z"; any other name is an `OptionError`."""
     axis, sign = axis_of(name)
-    return sign * np.eye(3)[axis]
+    return np.asarray(sign * np.eye(3)[axis])
 
 
 def forced_frames(

@@ -67,7 +67,7 @@ class ThinMesh:
     def areas(self) -> Float[Floats, " V"]:
         """Share of the surface around each vertex."""
         areas = vertex_areas(self.verts, self.faces)
-        return areas / areas.sum()
+        return np.asarray(areas / areas.sum())
 
     @cached_property
     def graph(self) -> csr_matrix:
@@ -113,7 +113,7 @@ class Intrinsic:
     @cached_property
     def distances(self) -> Float[Floats, "V V"]:
         """Between all vertices, along edges."""
-        return self._lengths / self._lengths.max()
+        return np.asarray(self._lengths / self._lengths.max())
 
     @cached_property
     def functions(self) -> Float[Floats, "V K"]:
@@ -149,7 +149,7 @@ class Intrinsic:
         """Share of the surface within growing distances of each extremity: a thin limb has little nearby."""
         radii = np.linspace(0.05, 1, _PROFILE)
         within = self.distances[self.extremities][:, :, None] < radii
-        return np.einsum("tvr,v->tr", within.astype(np.float64), self.mesh.areas)
+        return np.asarray(np.einsum("tvr,v->tr", within.astype(np.float64), self.mesh.areas))
 
     @cached_property
     def limbs(self) -> tuple[Float[Floats, " T"], Float[Floats, "V T"]]:

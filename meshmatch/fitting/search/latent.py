@@ -92,7 +92,7 @@ def refine_code(
         if progress is not None and (step % 20 == 0 or step == config.steps - 1):
             progress((step + 1) / config.steps)
     assert best_vectors is not None
-    return best_vectors.double().cpu().numpy()
+    return np.asarray(best_vectors.double().cpu().numpy())
 
 
 @derived

@@ -87,11 +87,11 @@ class Mirror:
 
     def points(self, points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
         """Points of the mirrored shape, in the core frame."""
-        return points * _FLIP
+        return np.asarray(points * _FLIP)
 
     def vectors(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "K 3"]:
         """Node vectors of the mirrored deformation: x moves to M f(M x) where f moved it before."""
-        return self.exchange @ vectors * _FLIP
+        return np.asarray(self.exchange @ vectors * _FLIP)
 
 
 @derived
@@ -278,4 +278,5 @@ def _capped_distances(
 
 def weighted_mean(values: np.ndarray, weights: Float[Floats, " N"] | None) -> np.floating:
     """Mean of N values by weights that are not negative; without them, all count the same."""
-    return values.mean() if weights is None else weights @ values / max(weights.sum(), 1e-300)
+    mean: np.floating = values.mean() if weights is None else weights @ values / max(weights.sum(), 1e-300)
+    return mean

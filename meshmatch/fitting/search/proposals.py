@@ -216,7 +216,7 @@ def _zoomed(C: Floats, own: Floats, theirs: Floats, last: int, more: int) -> tup
 
 def _nearest(points: Floats, among: Floats) -> Ints:
     """The nearest row for each point, all compared with all: these spaces have too many dimensions for a tree."""
-    return (points @ among.T - 0.5 * np.square(among).sum(1)).argmax(1)
+    return np.asarray((points @ among.T - 0.5 * np.square(among).sum(1)).argmax(1))
 
 
 def _distance_error(source: Intrinsic, target: Intrinsic, at: Ints, vertex: Ints) -> float:

@@ -249,7 +249,7 @@ class WholeComparison:
     def vertices(self, candidate: Candidate) -> Float[Floats, "V 3"]:
         """Where an interpretation has the template's vertices, in one frame for all."""
         moved = self.task.system.moved(candidate.vectors)
-        return candidate.pose.to_world(moved) / np.sqrt(candidate.share)
+        return np.asarray(candidate.pose.to_world(moved) / np.sqrt(candidate.share))
 
 
 class PartComparison(WholeComparison):

@@ -60,7 +60,7 @@ class StretchBlend:
     def at(self, weights: Float[Floats, " n"]) -> Float[Floats, "N 3 3"]:
         """Stretches for weights that sum to one."""
         values, axes = np.linalg.eigh(np.tensordot(weights, self._logs, 1))
-        return (axes * np.exp(np.clip(values, -_MAX_LOG, _MAX_LOG))[:, None, :]) @ axes.transpose(0, 2, 1)
+        return np.asarray((axes * np.exp(np.clip(values, -_MAX_LOG, _MAX_LOG))[:, None, :]) @ axes.transpose(0, 2, 1))
 
 
 def polar(F: Float[Floats, "N 3 3"]) -> tuple[Float[Floats, "N 3 3"], Float[Floats, "N 3 3"]]:

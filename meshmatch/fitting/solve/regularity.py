@@ -79,7 +79,7 @@ class Unfolding:
         return best
 
     def _deformation_gradient(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3 3"]:
-        return (self._gradient @ vectors).reshape(-1, 3, 3).transpose(0, 2, 1) + np.eye(3)
+        return np.asarray((self._gradient @ vectors).reshape(-1, 3, 3).transpose(0, 2, 1) + np.eye(3))
 
 
 def opened(F: Float[Floats, "N 3 3"]) -> Float[Floats, "N 3 3"]:

@@ -90,7 +90,7 @@ class NodeSystem:
         """F at the gradient points, F[g, a, k] = d x'_a / d x_k."""
         if not self.linear:
             return self.field.deformation_gradient_at(vectors, self.gradient_points)
-        return (self.equations.gradient @ vectors).reshape(-1, 3, 3).transpose(0, 2, 1) + np.eye(3)
+        return np.asarray((self.equations.gradient @ vectors).reshape(-1, 3, 3).transpose(0, 2, 1) + np.eye(3))
 
     def regularity(self, vectors: Float[Floats, "K 3"]) -> Regularity:
         """How regular the deformation is, at all vertices."""
@@ -114,7 +114,7 @@ class NodeSystem:
     def normals(self, moved: Float[Floats, "V 3"]) -> Float[Floats, "V 3"]:
         """Area-weighted unit vertex normals of moved vertices."""
         summed = np.asarray(self._incidence @ triangle_vectors(moved, self.faces))
-        return summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-20)
+        return np.asarray(summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-20))
 
     def solve(
         self,

@@ -92,7 +92,7 @@ def check_places(name: str, size: int, vertices: int, faces: int = 0, text: bool
 def runs(starts: Int[Ints, " N"], sizes: Int[Ints, " N"], step: int = 1) -> Int[Ints, " M"]:
     """start, start + step, ... of every run, one run after the other."""
     within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return np.repeat(starts, sizes) + step * within
+    return np.asarray(np.repeat(starts, sizes) + step * within)
 
 
 def fan(corners: Int[Ints, " N"], sizes: Int[Ints, " P"]) -> Int[Ints, "F 3"]:
@@ -219,7 +219,7 @@ def columns(
     if len(counts) and (counts == counts[0]).all():
         return values.reshape(len(counts), -1)[:, first:last]
     starts = np.cumsum(counts) - counts
-    return values[starts[:, None] + np.arange(first, last)]
+    return np.asarray(values[starts[:, None] + np.arange(first, last)])
 
 
 def lines_of(text: bytes, *words: bytes) -> list[tuple[bytes, Ints]]:
