@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from meshmatch.shapes.textured_files import load_appearance, save_textured
 from meshmatch.templates.location import bundled_folder
 from meshmatch.transfer.texels import faces_on
 from meshmatch.transfer.unwrap import unwrapped
-from tests.cli.conftest import Run, refused, well
+from tests.cli.conftest import Answer, Run, refused, well
 from tests.conftest import icosphere
 from tests.shapes.painted import FACES, encoded, quarters, write_gltf, write_square_obj
 from tests.transfer.known import split
@@ -50,13 +51,15 @@ def pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def call(*more: str | Path, target: str = "b.ply", out: str = "out.glb", map: str | None = "ab.npz") -> list[str]:
-    words = ["transfer-texture", "a.glb", target, "-o", out, *([] if map is None else ["--map", map])]
-    return [*words, *SMALL, *map_str(more)]
+def call(words: str = "", target: str = "b.ply", out: str = "out.glb", map: str | None = "ab.npz") -> list[str]:
+    """The whole call, with these options."""
+    given = [] if map is None else ["--map", map]
+    return ["transfer-texture", "a.glb", target, "-o", out, *given, *SMALL, *words.split()]
 
 
-def map_str(words: tuple[str | Path, ...]) -> list[str]:
-    return [str(word) for word in words]
+def told(answer: Answer) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads(well(answer).out)
+    return record
 
 
 def seen(path: str, at: np.ndarray) -> np.ndarray:
@@ -102,30 +105,26 @@ def test_a_finer_copy_shows_the_same(run: Run, pair: Path, out: str) -> None:
 
 
 def test_json_says_all_of_it(run: Run, pair: Path) -> None:
-    answer = well(run(*call("--json", "-q", out="out.obj")))
-    record = json.loads(answer.out)
+    answer = run(*call("--json -q", out="out.obj"))
+    record = told(answer)
     assert answer.err == ""
     assert record["files"] == ["out.obj", "out.mtl", "out.png"]
     assert (record["size"], record["uv"], record["alpha"]) == (64, "new", "opaque")
     assert 0.1 < record["used"] < 1
     assert record["low_confidence_share"] == record["filled_share"] == record["blank_share"] == 0
-    assert record["source"] == "a.glb" and record["target"] == "b.ply" and record["map"] == "ab.npz"
+    assert (record["source"], record["target"], record["map"]) == ("a.glb", "b.ply", "ab.npz")
     assert record["baking_seconds"] > 0
 
 
-def test_the_targets_own_coordinates_are_used_replaced_or_demanded(run: Run, pair: Path) -> None:
+@pytest.mark.parametrize(("uv", "used"), [("auto", "own"), ("keep", "own"), ("new", "new")])
+def test_the_targets_own_coordinates_are_used_replaced_or_demanded(run: Run, pair: Path, uv: str, used: str) -> None:
     b = load_shape("b.ply")
     own = unwrapped(b, 64, 2)
     save_textured("b.glb", Textured(b.verts, b.faces, own), picture())
-    b2 = load_shape("b.glb")
-    found = load_map("ab.npz")
-    save_map("ab2.npz", VertexMap.between(load_shape("a.glb"), b2, found.index))
-    for uv in ("auto", "keep"):
-        answer = well(run(*call("--uv", uv, "--json", target="b.glb", map="ab2.npz")))
-        assert json.loads(answer.out)["uv"] == "own"
-        shape = load_shape("out.glb")
-        np.testing.assert_allclose(load_appearance("out.glb", shape).uv, own, atol=1e-6)
-    assert json.loads(well(run(*call("--uv", "new", "--json", target="b.glb", map="ab2.npz"))).out)["uv"] == "new"
+    save_map("ab2.npz", VertexMap.between(load_shape("a.glb"), load_shape("b.glb"), load_map("ab.npz").index))
+    assert told(run(*call(f"--uv {uv} --json", target="b.glb", map="ab2.npz")))["uv"] == used
+    found = load_appearance("out.glb", load_shape("out.glb")).uv
+    assert (found.shape == own.shape and np.allclose(found, own, atol=1e-6)) == (used == "own")
 
 
 def test_overlapping_coordinates_are_replaced_with_a_note(run: Run, pair: Path) -> None:
@@ -133,102 +132,91 @@ def test_overlapping_coordinates_are_replaced_with_a_note(run: Run, pair: Path) 
     mirrored = np.abs(b.verts[b.faces][:, :, :2]) * 0.9
     save_textured("b.obj", Textured(b.verts, b.faces, mirrored), picture())
     save_map("ab2.npz", replace(load_map("ab.npz"), target_hash=load_shape("b.obj").hash))
-    answer = well(run(*call("--json", target="b.obj", map="ab2.npz")))
+    answer = run(*call("--json", target="b.obj", map="ab2.npz"))
+    assert told(answer)["uv_note"]
     assert "note: b.obj: its own texture coordinates cannot be used: they overlap" in answer.err
-    assert json.loads(answer.out)["uv_note"]
     before = {path.name for path in pair.iterdir()}
-    refused(run(*call("--uv", "keep", target="b.obj", map="ab2.npz")), "they overlap", pair, before)
+    refused(run(*call("--uv keep", target="b.obj", map="ab2.npz")), "they overlap", pair, before)
 
 
 def test_size_samples_and_padding(run: Run, pair: Path) -> None:
-    def image() -> np.ndarray:
+    def image(words: str) -> np.ndarray:
+        well(run(*call(words)))
         found = load_appearance("out.glb", load_shape("out.glb")).materials[0].image
         assert found is not None
         return found
 
-    well(run(*call("--size", "48")))
-    assert image().shape == (48, 48, 4)
-    kinds = []
-    for samples in ("1", "3"):
-        well(run(*call("--samples", samples)))
-        kinds.append(image())
-    assert (kinds[0] != kinds[1]).any()
-    well(run(*call("--padding", "0")))
-    look = load_appearance("out.glb", load_shape("out.glb"))
-    off = faces_on(look.uv * 64, 64)[0] < 0
-    assert (image()[off, :3] == 0).all()
-    well(run(*call("--padding", "4")))
-    assert image()[..., :3].max(axis=2).min() > 0
+    assert image("--size 48").shape == (48, 48, 4)
+    assert (image("--samples 1") != image("--samples 3")).any()
+    assert image("--padding 4")[..., :3].max(axis=2).min() > 0
+    bare = image("--padding 0")
+    off = faces_on(load_appearance("out.glb", load_shape("out.glb")).uv * 64, 64)[0] < 0
+    assert (bare[off, :3] == 0).all()
 
 
-def test_doubt_is_kept_filled_or_left_blank(run: Run, pair: Path) -> None:
-    found = load_map("ab.npz")
-    a = load_shape("a.glb")
-    sure = np.where(a.verts[:, 2] > 0.3, 0.0, 1.0).astype(np.float32)
-    save_map("doubt.npz", replace(found, confidence=sure))
-    share = (1 - 0.3) / 2  # of a sphere, above z = 0.3
+@pytest.fixture
+def doubtful(pair: Path) -> None:
+    """The map knows nothing about z > 0.3."""
+    sure = np.where(load_shape("a.glb").verts[:, 2] > 0.3, 0.0, 1.0).astype(np.float32)
+    save_map("doubt.npz", replace(load_map("ab.npz"), confidence=sure))
+
+
+def test_doubt_is_kept_filled_or_left_blank(run: Run, doubtful: None) -> None:
     kept = run(*call("--json", map="doubt.npz"))
-    record = json.loads(well(kept).out)
-    assert record["low_confidence_share"] == pytest.approx(share, abs=0.08)
+    assert told(kept)["low_confidence_share"] == pytest.approx((1 - 0.3) / 2, abs=0.08)  # of a sphere, above z = 0.3
     assert "has less confidence than 0.3: kept" in kept.err
     top = np.array([[0.0, 0.0, 1.0]])
     was = seen("out.glb", top)
 
-    record = json.loads(well(run(*call("--json", "--fill", map="doubt.npz"))).out)
+    record = told(run(*call("--json --fill", map="doubt.npz")))
     assert record["filled_share"] == record["low_confidence_share"]
     assert (seen("out.glb", top) != was).any()
-    answer = well(run(*call("--json", "--blank", "#ff0080", map="doubt.npz")))
-    assert json.loads(answer.out)["blank_share"] > 0.2 and "left blank" in answer.err
+    answer = run(*call("--json --blank #ff0080", map="doubt.npz"))
+    assert told(answer)["blank_share"] > 0.2 and "left blank" in answer.err
     np.testing.assert_array_equal(seen("out.glb", top), [[255, 0, 128]])
-    record = json.loads(well(run(*call("--json", "--blank", "0", map="doubt.npz"))).out)
-    assert record["alpha"] == "mask"
+    assert told(run(*call("--json --blank 0", map="doubt.npz")))["alpha"] == "mask"
     assert load_appearance("out.glb", load_shape("out.glb")).materials[0].alpha == "mask"
-    record = json.loads(well(run(*call("--json", "--min-confidence", "0", map="doubt.npz"))).out)
-    assert record["low_confidence_share"] == 0
+    assert told(run(*call("--json --min-confidence 0", map="doubt.npz")))["low_confidence_share"] == 0
 
 
-def test_clouds_and_ply_get_vertex_colors(run: Run, pair: Path) -> None:
+def test_doubt_about_vertex_colors(run: Run, doubtful: None) -> None:
+    assert told(run(*call("--json --blank 1,0,0", map="doubt.npz", out="out.ply")))["blank"] > 0
+    colors = load_shape("out.ply").colors
+    assert colors is not None
+    np.testing.assert_array_equal(colors[load_shape("b.ply").verts[:, 2].argmax(), :3], [1, 0, 0])
+    assert told(run(*call("--json --fill", map="doubt.npz", out="out.ply")))["filled"] > 0
+
+
+@pytest.mark.parametrize(
+    ("target", "out"), [("b.npy", "a.ply"), ("b.ply", "a.ply"), ("b.npy", "a.obj"), ("b.ply", "a.off")]
+)
+def test_clouds_and_ply_get_vertex_colors(run: Run, pair: Path, target: str, out: str) -> None:
     b = load_shape("b.ply")
     np.save("b.npy", b.verts)
-    cloud = load_shape("b.npy")
-    save_map("cloud.npz", VertexMap.between(load_shape("a.glb"), cloud, load_map("ab.npz").index))
-    for target, map, out in (("b.npy", "cloud.npz", "out.ply"), ("b.ply", "ab.npz", "mesh.ply"),
-                             ("b.npy", "cloud.npz", "cloud.obj"), ("b.ply", "ab.npz", "mesh.off")):  # fmt: skip
-        answer = well(run(*call("--json", target=target, map=map, out=out)))
-        found = load_shape(out)
-        assert found.colors is not None and found.V == b.V
-        assert found.is_cloud == (target == "b.npy")
-        assert "with vertex colors" in answer.err
-        assert json.loads(answer.out)["files"] == [out]
-    assert not Path("cloud.mtl").exists()
-    assert np.ptp(found.colors[:, :3]) > 0.5
-    # and a painted mesh is a source like any other
+    save_map("ab.npz", VertexMap.between(load_shape("a.glb"), load_shape(target), load_map("ab.npz").index))
+    answer = run(*call("--json", target=target, out=out))
+    assert told(answer)["files"] == [out] and not Path("a.mtl").exists()
+    assert "with vertex colors" in answer.err
+    found = load_shape(out)
+    assert found.colors is not None and np.ptp(found.colors[:, :3]) > 0.5
+    assert (found.V, found.is_cloud) == (b.V, target == "b.npy")
+
+
+def test_a_painted_mesh_is_a_source_like_any_other(run: Run, pair: Path) -> None:
+    well(run(*call(out="mesh.ply")))
+    b = load_shape("b.ply")
     save_map("ba.npz", VertexMap.between(load_shape("mesh.ply"), b, np.arange(b.V)))
-    words = ["transfer-texture", "mesh.ply", "b.ply", "-o", "again.glb", "--map", "ba.npz", *SMALL]
-    well(run(*words))
+    well(run("transfer-texture", "mesh.ply", "b.ply", "-o", "again.glb", "--map", "ba.npz", *SMALL))
     off = np.abs(seen("again.glb", sample_points()) - seen("a.glb", sample_points())).max(axis=1)
     assert np.median(off) < 20
-
-
-def test_doubt_about_vertex_colors(run: Run, pair: Path) -> None:
-    sure = np.where(load_shape("a.glb").verts[:, 2] > 0.3, 0.0, 1.0).astype(np.float32)
-    save_map("doubt.npz", replace(load_map("ab.npz"), confidence=sure))
-    record = json.loads(well(run(*call("--json", "--blank", "1,0,0", map="doubt.npz", out="out.ply"))).out)
-    colors = load_shape("out.ply").colors
-    assert colors is not None and record["blank"] > 0
-    top = load_shape("b.ply").verts[:, 2].argmax()
-    np.testing.assert_array_equal(colors[top, :3], [1, 0, 0])
-    record = json.loads(well(run(*call("--json", "--fill", map="doubt.npz", out="out.ply"))).out)
-    assert record["filled"] > 0
 
 
 def test_a_picture_for_a_source_that_names_none(run: Run, pair: Path) -> None:
     write_square_obj(pair / "square.obj", mtl=None)
     (pair / "skin.png").write_bytes(encoded(quarters(32)))
-    square = load_shape("square.obj")
-    save_map("id.npz", VertexMap.identity(square))
-    words = ["transfer-texture", "square.obj", "square.obj", "-o", "out.obj", "--map", "id.npz", *SMALL]
-    well(run(*words, "--size", "32", "--image", "skin.png"))
+    save_map("id.npz", VertexMap.identity(load_shape("square.obj")))
+    words = "square.obj square.obj -o out.obj --map id.npz --size 32 --image skin.png --padding 2 --threads 1"
+    well(run("transfer-texture", *words.split()))
     look = load_appearance("out.obj", load_shape("out.obj"))
     np.testing.assert_array_equal(look.materials[0].image, quarters(32))
     np.testing.assert_array_equal(load_shape("out.obj").faces, FACES)
@@ -237,7 +225,7 @@ def test_a_picture_for_a_source_that_names_none(run: Run, pair: Path) -> None:
 def test_the_same_words_give_the_same_bytes(run: Run, pair: Path) -> None:
     well(run(*call()))
     first = Path("out.glb").read_bytes()
-    well(run(*call("--threads", "2")))
+    well(run(*call("--threads 2")))
     assert Path("out.glb").read_bytes() == first
 
 
@@ -281,7 +269,7 @@ def a_cloud() -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "words", "told"),
+    ("spoil", "words", "said"),
     [
         (plain_source, call(map=None), "a.glb has no texture and no vertex colors: there is nothing to transfer"),
         (damaged_source, call(map=None), "a.glb"),
@@ -293,8 +281,8 @@ def a_cloud() -> None:
             "a.obj needs the image skin.png of its material paint, which is not there",
         ),
         *(
-            (nothing, call(*words.split(), map=None), told)
-            for words, told in (
+            (nothing, call(words, map=None), said)
+            for words, said in (
                 ("--size 8", "size must be an integer from 16 to 8192"),
                 ("--size 9000", "size must be an integer from 16 to 8192"),
                 ("--samples 0", "samples must be an integer from 1 to 8"),
@@ -309,19 +297,19 @@ def a_cloud() -> None:
         ),
         (
             lambda: Path("skin.png").write_bytes(png_bytes(picture())),
-            call("--image", "skin.png", out="skin.obj", map=None),
+            call("--image skin.png", out="skin.obj", map=None),
             "cannot write skin.png: it is an input",
         ),
         (lambda: Path("out.png").mkdir(), call(out="out.obj", map=None), "cannot write out.png: it is a folder"),
-        (a_cloud, call("--uv", "keep", target="b.npy", out="out.ply", map=None), "b.npy gets vertex colors"),
-        (nothing, call("--uv", "keep", out="out.ply", map=None), "end the output in .glb or .obj"),
+        (a_cloud, call("--uv keep", target="b.npy", out="out.ply", map=None), "b.npy gets vertex colors"),
+        (nothing, call("--uv keep", out="out.ply", map=None), "end the output in .glb or .obj"),
     ],
 )
 def test_what_cannot_be_is_told_before_the_work(
-    run: Run, pair: Path, no_fit: None, spoil: Callable[[], object], words: list[str], told: str
+    run: Run, pair: Path, no_fit: None, spoil: Callable[[], object], words: list[str], said: str
 ) -> None:
     spoil()
-    refused(run(*words), told, pair, {path.name for path in pair.iterdir()})
+    refused(run(*words), said, pair, {path.name for path in pair.iterdir()})
 
 
 def test_a_full_disk_leaves_nothing(run: Run, pair: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -341,7 +329,7 @@ def test_without_a_map_the_two_are_matched(run: Run, tmp_path: Path, monkeypatch
     samples = bundled_folder() / "samples"
     answer = run(
         "transfer-texture", samples / "dancer-textured.glb", samples / "climber.ply", "-o", "out.glb",
-        *("--size", "512", "--refine", "none", "--seed", "1", "--json"),
+        *("--size", "256", "--refine", "none", "--seed", "1", "--json"),
     )  # fmt: skip
     record = json.loads(well(answer).out)
     assert "matched dancer-textured.glb to climber.ply" in answer.err
@@ -355,5 +343,5 @@ def test_without_a_map_the_two_are_matched(run: Run, tmp_path: Path, monkeypatch
     image = look.materials[0].image
     assert image is not None
     uv = look.uv[top].mean(axis=1)
-    hair = image[(uv[:, 1] * 512).astype(int), (uv[:, 0] * 512).astype(int), :3].astype(int)
+    hair = image[(uv[:, 1] * 256).astype(int), (uv[:, 0] * 256).astype(int), :3].astype(int)
     assert np.median(np.abs(hair - (92, 56, 33)).max(axis=1)) < 40

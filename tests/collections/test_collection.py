@@ -382,9 +382,9 @@ def test_a_sequence_is_followed_and_a_lost_frame_found_again(tmp_path: Path, mon
 
     monkeypatch.setattr(Fitter, "fit", counted)
     collection = meshmatch.Collection(tmp_path / "fits", workers=1)
-    made = collection.fit(
-        folder, model="human", sequence=True, agree=False, tell=lambda record: order.append(record.name)
-    )
+    few = meshmatch.FitConfig(variants=4, finalists=2)
+    tell = lambda record: order.append(record.name)  # noqa: E731
+    made = collection.fit(folder, model="human", config=few, sequence=True, agree=False, tell=tell)
     assert order == [f"frame{number}" for number in range(7, 13)]
     assert {record.verdict for record in made.records} == {"good"}
     assert (collection.map("frame8", "frame10").index == np.arange(dancer.V)).mean() > 0.5
