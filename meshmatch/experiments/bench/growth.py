@@ -8,17 +8,18 @@ the count makes exponents smaller than they are, so that only rows of some secon
 from __future__ import annotations
 
 import base64
+import io
 import json
 import math
-import struct
 import tempfile
 import time
-import zlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from PIL import Image
 from typer import Option
 
 from meshmatch.arrays import Floats, Ints
@@ -39,14 +40,6 @@ from meshmatch.transfer.surface_walk import SurfaceWalker
 from meshmatch.transfer.texel_colors import MaterialSampler
 
 Step = Callable[[], object]
-_PNG = b"\x89PNG\r\n\x1a\n" + b"".join(
-    struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-    for kind, data in (
-        (b"IHDR", struct.pack(">IIBBBBB", 1, 1, 8, 2, 0, 0, 0)),
-        (b"IDAT", zlib.compress(b"\0\xff\0\0")),
-        (b"IEND", b""),
-    )
-)
 
 
 def grid(side: int) -> tuple[Floats, Ints]:
@@ -136,6 +129,14 @@ def scene(path: Path, nodes: list[dict[str, Any]], **more: Any) -> Path:
     return path
 
 
+@cache
+def png() -> bytes:
+    """An image of one red texel."""
+    data = io.BytesIO()
+    Image.new("RGB", (1, 1), "red").save(data, "png")
+    return data.getvalue()
+
+
 def _uri(kind: str, data: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"
 
@@ -173,7 +174,7 @@ def images(n: int, folder: Path) -> Step:
         meshes=[{"primitives": [{"attributes": attributes, "material": k}]} for k in range(n)],
         materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": k}}} for k in range(n)],
         textures=[{"source": k} for k in range(n)],
-        images=[{"uri": _uri("image/png", _PNG)} for _ in range(n)],
+        images=[{"uri": _uri("image/png", png())} for _ in range(n)],
     )
     return lambda: sampled(path)
 
@@ -181,7 +182,7 @@ def images(n: int, folder: Path) -> Step:
 def materials(n: int, folder: Path) -> Step:
     """An obj with n materials that share an image, each triangle a chart of its own."""
     path, shape = folder / "materials.obj", loose(n, 0.1)
-    (folder / "m.png").write_bytes(_PNG)
+    (folder / "m.png").write_bytes(png())
     (folder / "m.mtl").write_text("".join(f"newmtl m{k}\nKd 1 0 0\nmap_Kd m.png\n" for k in range(n)))
     rows = [f"v {x} {y} {z}" for x, y, z in shape.verts.tolist()] + ["vt 0 0", "vt 1 0", "vt 0 1"]
     rows += [f"g g{k}\nusemtl m{k}\nf {3 * k + 1}/1 {3 * k + 2}/2 {3 * k + 3}/3" for k in range(n)]
