@@ -53,6 +53,13 @@ def models(monkeypatch: pytest.MonkeyPatch) -> list[TrainedModel]:
     return known
 
 
+@pytest.fixture
+def poor_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No model fits what reads strangely."""
+    poor = SimpleNamespace(verdict="poor", trust=0.0, partial=False)
+    monkeypatch.setattr(classify.Fitter, "fit", lambda *_: poor)
+
+
 def choose(*shapes: Shape, settled: TrainedModel | None = None) -> tuple[str, list[str]]:
     choice = kinds.choose_model([validated(shape) for shape in shapes], [CONFIG] * len(shapes), settled)
     return choice.model.card.name, choice.words
@@ -81,7 +88,7 @@ def test_later_shapes_are_of_the_kind_before(models: list[TrainedModel]) -> None
         choose(ball("dog 6 6 4"), settled=models[0])
 
 
-@pytest.mark.usefixtures("models")
+@pytest.mark.usefixtures("models", "poor_fits")
 def test_a_complete_shape_of_no_kind_is_refused() -> None:
     with pytest.raises(InputError, match=r"chair 7 7 6 does not look like .*: human, quadruped"):
         choose(ball("man 3 4 6"), ball("chair 7 7 6"))
@@ -156,7 +163,7 @@ def test_a_cloud_that_reads_strangely_is_of_the_kind_that_fits_it() -> None:
         assert word in words[0]
 
 
-@pytest.mark.usefixtures("models")
+@pytest.mark.usefixtures("models", "poor_fits")
 @pytest.mark.parametrize("unsure", [cloud("half 7 7 6"), ball("half 7 7 6", opened=True)])
 def test_what_may_be_a_part_takes_the_other_shapes_kind(unsure: Shape) -> None:
     for shapes in ((unsure, ball("man 3 4 6")), (ball("man 3 4 6"), unsure)):
