@@ -1,4 +1,4 @@
-"""Errors of animals by kind, by verdict and by animal: by hand, and bumpy balls with a model of a body."""
+"""Errors of animals by kind, by verdict and by animal: by hand, and bumpy balls with a model of an egg."""
 
 import json
 from dataclasses import replace
@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch.api.inputs import as_model
 from meshmatch.experiments.bench import kinds
 from meshmatch.experiments.bench.sets import Pair
 from meshmatch.experiments.makers.cut_scans import CutScan
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
 from tests.experiments.small_bench import build
+from tests.fitting.eggs import egg_model, write_model
 
 
 def test_rows_by_hand() -> None:
@@ -30,7 +30,8 @@ def test_every_pair_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     (tmp_path / "faust").rename(tmp_path / "animal")
     spoiled = tmp_path / "animal" / "tr_reg_010.landmarks.npy"  # of the same body each: the maps are perfect
     np.save(spoiled, np.roll(np.load(spoiled), 1))
-    words = ["--data", str(tmp_path), "--cache", str(tmp_path / "cache"), "--sets", "animals", "--model", "human"]
+    model = write_model(egg_model(), tmp_path / "egg")
+    words = ["--data", str(tmp_path), "--cache", str(tmp_path / "cache"), "--sets", "animals", "--model", str(model)]
     assert kinds.main(words) == 0
     record = json.loads(capsys.readouterr().out.splitlines()[-1])["animals"]
     assert record["all"]["pairs"] == sum(row["pairs"] for row in record["verdict"]) == 6
@@ -44,8 +45,8 @@ def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
     own, kept = np.arange(balls[0].V), np.ones(balls[0].V, bool)
     made = [CutScan(ball, ball, own, kept, 2.0, mirrored=number == 1) for number, ball in enumerate(balls)]
     monkeypatch.setattr(kinds, "make_scans", lambda kind, count, seed: made[:count])
-    human = as_model("human")
-    both = TrainedModel(replace(human.card, mirror="auto"), human.template, human.inference)
+    egg = egg_model()
+    both = TrainedModel(replace(egg.card, mirror="auto"), egg.template, egg.inference)
     subjects = kinds.cut_scans("hand", 3, 0, tmp_path / "cache")
     record, tables = kinds.measured("hand", subjects, kinds.Matcher(both))
     assert [str(table.title).split()[-1] for table in tables] == ["length", "verdict", "sides", "Sides"]
