@@ -4,6 +4,7 @@ the main path comes to it.
 
 from __future__ import annotations
 
+import threading
 from typing import Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ Quality = Literal["fast", "meshlab"]
 _AGGRESSIVENESS = (3.0, 4.0, 2.5, 5.0)
 """To try in turn. On closed bodies 3 kept the mesh closed with the least error where 7, the library's own choice, did
 not; but it can stop short of the target, which higher ones reach."""
+_one_at_a_time = threading.Lock()  # fast_simplification keeps its mesh in global variables
 _COLLAPSE = "meshing_decimation_quadric_edge_collapse"
 
 
@@ -59,7 +61,8 @@ def _fast(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Ints]:
     closed = is_watertight(faces)
     best: tuple[tuple[int, int], Floats, Ints] | None = None
     for aggressiveness in _AGGRESSIVENESS:
-        small = fast_simplification.simplify(verts, faces.astype(np.int32), target_count=target, agg=aggressiveness)
+        with _one_at_a_time:
+            small = fast_simplification.simplify(verts, faces.astype(np.int32), target_count=target, agg=aggressiveness)
         new_faces = np.asarray(small[1], np.int64)
         new_faces = new_faces[(new_faces != np.roll(new_faces, 1, axis=1)).all(axis=1)]  # no vertex is named twice
         if len(new_faces) == 0:

@@ -11,6 +11,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.triangles import is_watertight
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import parallel_map
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1750.0])
@@ -70,6 +71,14 @@ def test_the_first_closed_result_is_taken_or_the_best(
     small = decimate(sphere, 300)
     assert abs(small.F - faces) < 4 and is_watertight(small.faces) == (faces == 300)
     assert len(asked) == tries and asked[0] == 3.0  # the gentlest way first
+
+
+def test_threads_do_not_mix_their_meshes(make_sphere: Callable[[int], Shape]) -> None:
+    shapes = [make_sphere(5), Shape(make_sphere(5).verts * [1.0, 2.0, 3.0], make_sphere(5).faces)] * 12
+    alone = [decimate(shape, 900) for shape in shapes[:2]]
+    for number, found in enumerate(parallel_map(lambda shape: decimate(shape, 900), shapes, threads=2)):
+        assert np.array_equal(found.verts, alone[number % 2].verts)
+        assert np.array_equal(found.faces, alone[number % 2].faces)
 
 
 def test_target_is_reached_where_the_gentle_way_stops_short(sphere: Shape) -> None:
