@@ -5,14 +5,20 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from meshmatch.api.inputs import LandmarkPairs, landmark_vertices, refuse_far_parts
 from meshmatch.api.results import MatchResult, map_of_fits
+from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.build import judged_by_pairs
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.repair import Repaired
 from meshmatch.threads import thread_limit, worker_slot
+
+if TYPE_CHECKING:
+    from meshmatch.fitting.direct import KnownPairs
+    from meshmatch.fitting.solve.system import NodeSystem
 
 _UNKNOWN = "no installed model knows these shapes: they were matched directly"
 _UNUSED = "up, front and partial have no meaning without a model, and were not used"
@@ -30,22 +36,45 @@ def match_without_model(
 
     `InputError` where a shape cannot be matched: large parts far apart, or a cloud that is no surface.
     """
-    from meshmatch.fitting import direct
-
-    for each in clean:
-        refuse_far_parts(each)
     source, target = clean
     pairs = None if landmarks is None else landmark_vertices(clean, landmarks)
     known = None if pairs is None else (source.original.verts[pairs[0]], target.original.verts[pairs[1]])
-    config = direct.DirectConfig(seed=configs[0].seed)
-    with thread_limit(1), worker_slot(threading.Semaphore(threads)):
-        found = direct.match_directly(source.shape, target.shape, config, known, progress)
-        fits = replace(found.source, repaired=source), replace(found.target, repaired=target)
-        mapped = map_of_fits(fits, fits, threads)
+    fits, _ = fit_to_first(clean, configs, threads, progress, known)
+    with thread_limit(1):
+        mapped = map_of_fits((fits[0], fits[1]), (fits[0], fits[1]), threads)
         if pairs is not None:
             mapped = judged_by_pairs(mapped, target.original, pairs, fits[1].frame.scale)
+    notes = direct_notes(clean, configs, unknown)
+    return MatchResult(mapped, fits[0], fits[1], fits[1].seconds, notes, (fits[0], fits[1]), threads)
+
+
+def fit_to_first(
+    clean: Sequence[Repaired],
+    configs: Sequence[FitConfig],
+    threads: int,
+    progress: ProgressCallback | None,
+    known: KnownPairs | None = None,
+) -> tuple[list[Fit], NodeSystem]:
+    """Fits of two or more repaired shapes, whose template is the first of them, and what moves it; errors as
+    `match_without_model`. ``known`` are pairs of positions on the first and the second.
+    """
+    from meshmatch.fitting.direct import DirectConfig, match_directly
+
+    for each in clean:
+        refuse_far_parts(each)
+    first, *others = clean
+    config = DirectConfig(seed=configs[0].seed)
+    with thread_limit(1), worker_slot(threading.Semaphore(threads)):
+        found = [match_directly(first.shape, each.shape, config, known, progress) for each in others]
+    fits = [replace(found[0].source, repaired=first)]
+    fits += [replace(each.target, repaired=own) for each, own in zip(found, others, strict=True)]
+    return fits, found[0].system
+
+
+def direct_notes(clean: Sequence[Repaired], configs: Sequence[FitConfig], unknown: bool) -> tuple[str, ...]:
+    """What is to be said of shapes that were matched directly; ``unknown`` says that no model knew them."""
     notes = [_UNKNOWN] if unknown else []
     if any(each.up or each.front or each.partial == "yes" for each in configs):
         notes.append(_UNUSED)
     notes += [f"{each.shape.name}: {note}" for each in clean for note in each.notes]
-    return MatchResult(mapped, *fits, fits[1].seconds, tuple(dict.fromkeys(notes)), fits, threads)
+    return tuple(dict.fromkeys(notes))

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
+from meshmatch.api.direct import direct_notes, fit_to_first
+from meshmatch.api.inputs import UnknownKindsError, configs_for, usable
 from meshmatch.api.matcher import Matcher
 from meshmatch.api.matching import matcher_for
 from meshmatch.api.results import shape_of
@@ -21,8 +23,9 @@ from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.blend import WAYS, Blend, Deviation, Way
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.maps.footpoints import Surface, SurfaceBinding, in_core_frame
-from meshmatch.models.registry import AUTO
+from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import folder_on_success
 from meshmatch.progress import ProgressCallback
@@ -200,8 +203,7 @@ def interpolate(
     began = time.monotonic()
     options = options or InterpolationOptions()
     matcher = matcher_for(model, None, threads, progress)
-    if isinstance(matcher, Matcher):
-        shapes = as_shapes(shapes)
+    loaded = as_shapes(shapes) if isinstance(matcher, Matcher) else []
     for count, what in ((len(shapes), "two shapes to go between"), (frames, "two shapes to make")):
         if not isinstance(count, Integral):
             raise OptionError(f"the number of shapes to make must be an integer, not {count!r}", "give 2 or more")
@@ -209,17 +211,57 @@ def interpolate(
             raise OptionError(f"a sequence needs at least {what}, not {count}", "give two or more")
     if not isinstance(matcher, Matcher):
         return _surfaces(matcher, shapes, frames, options, config)
-    fits = matcher.fit_all(shapes, config)
+    configs = configs_for(config or matcher.config, len(loaded))
+    try:
+        if model == NO_MODEL:
+            registered = _registered_directly(matcher, loaded, configs, options, unknown=False)
+        else:
+            registered = _registered(matcher, loaded, configs)
+    except UnknownKindsError:
+        registered = _registered_directly(matcher, loaded, configs, options, unknown=True)
+    fits = registered.fits
+    with thread_limit(1):
+        repaired = [shape_of(fit).shape for fit in fits]
+        blend = Blend(registered.mover, fits, None, repaired, options.way)
+        steps, place, distance = _steps(blend, fits, np.linspace(options.start, options.stop, frames), options, matcher)
+    return Interpolation(
+        steps, tuple(fits), tuple(blend.times.tolist()), place, distance, time.monotonic() - began, registered.notes
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Registered:
+    """Fits of one template, what moves it, and what is to be said of the shapes."""
+
+    fits: list[Fit]
+    mover: TrainedModel | NodeSystem
+    notes: tuple[str, ...]
+
+
+def _registered(matcher: Matcher, shapes: Sequence[Shape], configs: Sequence[FitConfig]) -> _Registered:
+    """By a model. `UnknownKindsError` where the shapes should choose it, and none knows them."""
+    fits = matcher.fit_all(shapes, configs)
     notes = tuple(dict.fromkeys(note for fit in fits for note in fit.notes))
     with thread_limit(1):
         repaired = [shape_of(fit).shape for fit in fits]
-        first = config if isinstance(config, FitConfig) or config is None else config[0]
-        fits = agreed_fits(matcher.model, repaired, fits, first)
-        blend = Blend(matcher.model, fits, None, repaired, options.way)
-        steps, place, distance = _steps(blend, fits, np.linspace(options.start, options.stop, frames), options, matcher)
-    return Interpolation(
-        steps, tuple(fits), tuple(blend.times.tolist()), place, distance, time.monotonic() - began, notes
-    )
+        return _Registered(agreed_fits(matcher.model, repaired, fits, configs[0]), matcher.model, notes)
+
+
+def _registered_directly(
+    matcher: Matcher,
+    shapes: Sequence[Shape],
+    configs: Sequence[FitConfig],
+    options: InterpolationOptions,
+    unknown: bool,
+) -> _Registered:
+    """The first shape is the template of all; `OptionError` for a choice that needs a model."""
+    if options.mesh == "template":
+        raise OptionError("without a model there is no template", "leave out the mesh: that of the first shape moves")
+    if options.way == "codes":
+        raise OptionError("without a model there are no codes", "leave out the blend: the field is blended")
+    clean = [usable(shape) for shape in shapes]
+    fits, system = fit_to_first(clean, configs, matcher.threads, matcher.progress)
+    return _Registered(fits, system, direct_notes(clean, configs, unknown))
 
 
 def _surfaces(

@@ -92,6 +92,29 @@ class MatchResult:
         with thread_limit(1):
             return map_of_fits((self.target_fit, self.source_fit), (target, source), self.threads)
 
+    def deformed_source(self) -> Shape:
+        """The source's own mesh, deformed onto the target.
+
+        Its vertices follow the fitted template and keep their offsets from it, so that details are carried along.
+
+        Returns
+        -------
+        Shape
+            The vertices and faces of the source's file in their order, in the frame and unit of the target's file.
+
+        Raises
+        ------
+        OptionError
+            The model is an implicit one, which has no template that could carry a mesh.
+        """
+        from meshmatch.maps.deformed import deformed
+
+        source, target = self.source_fit, self.target_fit
+        if not (isinstance(source, Fit) and isinstance(target, Fit)):
+            raise OptionError("an implicit model carries no mesh from shape to shape", "choose another model, or none")
+        with thread_limit(1):
+            return deformed(shape_of(source), source, target, self.threads)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MapPair(Brief):

@@ -8,7 +8,7 @@ from typer import Argument, Option
 import meshmatch
 from meshmatch.cli import options, words
 from meshmatch.cli.options import FitOptions, PairOptions, RunOptions, check_outputs, grouped, optional, output_option
-from meshmatch.cli.words import Console, print_json, print_rows
+from meshmatch.cli.words import Console, Json, print_json, print_rows
 from meshmatch.errors import OptionError
 from meshmatch.models.registry import check_model
 from meshmatch.outputs import replace_on_success
@@ -78,26 +78,32 @@ def register(
     *,
     shape: Path = Argument(..., metavar="SHAPE", help="The shape to fit the template to."),
     output: Path = output_option(
-        "MESH", "The fitted template, in the frame and unit of SHAPE: .ply, .obj, .off, .stl or .glb."
+        "MESH",
+        "The fitted template, in the frame and unit of SHAPE; with --onto, the mesh of SHAPE in those of TARGET: .ply, "
+        ".obj, .off, .stl or .glb.",
     ),
     how: FitOptions,
     run: RunOptions,
+    onto: Path | None = optional("TARGET", "Deform the mesh of SHAPE onto this shape instead, of any kind."),
     dense: bool = Option(False, "--dense", help="Write the template in its full resolution."),
     picture: Path | None = optional("PNG", "Draw the template over the shape, colored by distance."),
 ) -> None:
-    """Fit the model's template to one shape.
+    """Fit the model's template to one shape, or one shape to another.
 
     This is a non-rigid registration: the template is deformed, and the shape stays where it is. Results for all
     shapes have the same vertices and triangles in the same order. With more than one thread, results may differ in
-    the last bits.
+    the last bits. With --onto, the mesh of SHAPE is deformed onto TARGET, which stays where it is.
     """
     from meshmatch.api.matching import matcher_for
     from meshmatch.shapes.files import check_suffix
 
-    how.check(not_implicit=["dense"])
+    how.check(not_implicit=["dense", "onto"])
     check_suffix(output)
-    check_outputs([shape], output, picture=picture)
+    check_outputs([shape, onto], output, picture=picture)
     console = Console(run.quiet)
+    if onto is not None:
+        how.refuse(["dense"], "--onto")
+        return _register_onto(shape, onto, output, picture, how, run, console)
     with replace_on_success(output) as temporary:
         check_model(how.model)
         (loaded,) = how.load(shape)
@@ -121,6 +127,42 @@ def register(
     if run.json:
         record = {"output": output, "picture": picture, "vertices": fitted.V, "faces": fitted.F, "dense": dense}
         print_json(record | how.record(fit) | words.fit_record(loaded.name, fit) | {"notes": list(fit.notes)})
+
+
+def _register_onto(
+    shape: Path, onto: Path, output: Path, picture: Path | None, how: FitOptions, run: RunOptions, console: Console
+) -> None:
+    """Deform the mesh of one shape onto another."""
+    from meshmatch.api.matching import match as match_shapes
+
+    names = words.names_of([shape, onto])
+    with replace_on_success(output) as temporary:
+        check_model(how.model)
+        a, b = how.load(shape, onto)
+        if a.is_cloud:
+            raise OptionError(f"{names[0]} has no faces, and only a mesh can be deformed", "exchange the shapes")
+        with console.progress() as report:
+            result = match_shapes(
+                a, b, model=how.model, config=how.configs()[0], threads=run.threads, progress=report
+            )  # fmt: skip
+        found = result.map
+        words.refuse_poor(run.strict, found.verdict, found.reasons, "the registration")
+        moved = result.deformed_source()
+        meshmatch.save_shape(temporary, moved)
+    if picture is not None:
+        from meshmatch.render.compose import compose_fit
+
+        compose_fit(b, moved, result.rotations[1], what=f"the mesh of {names[0]}").render(picture)
+    words.tell_match(console, result, names)
+    words.tell_verdict(console, found.verdict, found.reasons, "the registration")
+    console.say(f"wrote {output}: the mesh of {names[0]} on {names[1]}, {moved.V} vertices ({result.seconds:.1f} s)")
+    if picture is not None:
+        console.say(f"drew {picture}: the mesh over {names[1]}, and their distance")
+    if run.json:
+        fits = [words.fit_record(*each) for each in zip(names, (result.source_fit, result.target_fit), strict=True)]
+        record: Json = {"output": output, "picture": picture, "onto": onto, "vertices": moved.V, "faces": moved.F}
+        record |= {"verdict": found.verdict, "reasons": found.reasons, "fits": fits, "notes": result.notes}
+        print_json(record | how.record(result.source_fit) | {"seconds": round(result.seconds, 3)})
 
 
 def evaluate(

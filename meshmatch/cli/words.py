@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import meshmatch
 from meshmatch.errors import OutputError, PoorFit, visible
+from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import plain_text
 from meshmatch.progress import ProgressCallback
 
@@ -189,8 +190,10 @@ def why(reasons: Sequence[str]) -> str:
 
 
 def fit_words(fit: meshmatch.Fit | meshmatch.ImplicitFit) -> str:
-    """The verdict, and the axes where the model knows them."""
-    return f"{fit.verdict} fit" + (f", up {fit.up}, front {fit.front}" if isinstance(fit, meshmatch.Fit) else "")
+    """The verdict, and the axes where a model knows them."""
+    if not isinstance(fit, meshmatch.Fit) or fit.model == NO_MODEL:
+        return f"{fit.verdict} fit"
+    return f"{fit.verdict} fit, up {fit.up}, front {fit.front}"
 
 
 def tell_match(console: Console, result: meshmatch.MatchResult, names: Sequence[str]) -> None:

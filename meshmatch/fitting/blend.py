@@ -17,7 +17,7 @@ from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.search.task import take_samples
 from meshmatch.fitting.solve.blend import FieldPath, RotationBlend, StretchBlend, polar
-from meshmatch.fitting.solve.system import node_system
+from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.trained import TrainedModel
@@ -56,7 +56,8 @@ class Blend:
 
     Parameters
     ----------
-    fits : at least two, of the model's template
+    model : whose template it is; or, without a model, what moves the template, and blends the "field" alone
+    fits : at least two, of one template
     times : (n,) increasing: when each fit is met; evenly from 0 to 1 by default
     shapes : the repaired shapes, for the way "codes" alone
     way : blend what the "field" does, or the "codes" that the network has for the shapes
@@ -67,7 +68,7 @@ class Blend:
 
     def __init__(
         self,
-        model: TrainedModel,
+        model: TrainedModel | NodeSystem,
         fits: Sequence[Fit],
         times: Sequence[float] | None = None,
         shapes: Sequence[Shape] | None = None,
@@ -75,35 +76,39 @@ class Blend:
     ) -> None:
         if len(fits) < 2:
             raise OptionError("at least two shapes are needed to blend between them")
+        trained = None if isinstance(model, NodeSystem) else model
         for fit in fits:
-            fit.check_template(model.template.hash)
+            fit.check_template(fits[0].template_hash if trained is None else trained.template.hash)
         self.times = np.linspace(0, 1, len(fits)) if times is None else np.asarray(times, float)
         if self.times.shape != (len(fits),) or not (np.diff(self.times) > 0).all():
             raise OptionError(f"{len(fits)} shapes need as many times, each later than the one before")
         self._curve = CubicSpline(self.times, np.eye(len(fits)), bc_type="natural")
         self._keys = np.stack([fit.vectors for fit in fits])
-        self._system = node_system(model)
+        self._system = model if isinstance(model, NodeSystem) else node_system(model)
         self._stretches = StretchBlend([polar(self._system.deformation_gradient(key))[1] for key in self._keys])
         if way == "field":
-            if not model.has_nodes:
+            if trained is not None and not trained.has_nodes:
                 raise OptionError(
-                    f"model {model.card.name} is pointwise: it has no nodes that could blend what the field does",
+                    f"model {trained.card.name} is pointwise: it has no nodes that could blend what the field does",
                     "blend codes instead (--blend codes), or use a model of another field",
                 )
-            self._path: Path = FieldPath(self._system, list(self._keys), model.template.core)
+            core = np.arange(len(self._system.verts)) if trained is None else trained.template.core
+            self._path: Path = FieldPath(self._system, list(self._keys), core)
         elif way == "codes":
+            if trained is None:
+                raise OptionError("without a model there are no codes", "blend the field instead")
             if shapes is None or len(shapes) != len(fits):
                 raise OptionError("blending codes needs the shape of each fit")
-            self._path = _code_path(model, shapes, fits)
+            self._path = _code_path(trained, shapes, fits)
         else:
             raise OptionError(f"unknown way to blend {way!r}", f"choose one of {', '.join(WAYS)}")
         met = [self._path(row) for row in np.eye(len(fits))]
         self._correction = self._keys - np.stack(met)
-        # At the template vertex beside each node the field is sure to have nodes enough around it.
-        verts = model.template.shape.verts
-        beside = verts[cKDTree(verts).query(model.template.nodes)[1]]
-        self._node_field = model.field(beside) if way == "codes" and model.has_nodes else None
-        if self._node_field is not None:
+        self._node_field = None
+        if way == "codes" and trained is not None and trained.has_nodes:
+            # At the template vertex beside each node the field is sure to have nodes enough around it.
+            verts = trained.template.shape.verts
+            self._node_field = trained.field(verts[cKDTree(verts).query(trained.template.nodes)[1]])
             turns = np.stack([polar(self._node_field.deformation_gradient_at(vectors))[0] for vectors in met])
             self._correction = np.einsum("nkij,nki->nkj", turns, self._correction)
         self._turns = RotationBlend([fit.frame.turn[None] for fit in fits])

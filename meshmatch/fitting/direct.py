@@ -163,13 +163,14 @@ class _Tried:
 class DirectMatch:
     """Two fits of one template: the source as it is, and the source moved onto the target.
 
-    Node vectors of the second fit are in the target's own orientation, before its core frame is turned to the source's.
     ``tried`` are the features of the fits that were compared in the end, best first, each with what it began from.
+    ``system`` moves the template by node vectors: the same for every shape that one source is registered to.
     """
 
     source: Fit
     target: Fit
     tried: tuple[tuple[str, DirectFeatures], ...]
+    system: NodeSystem
 
 
 def match_directly(
@@ -222,7 +223,7 @@ def match_directly(
     seconds = time.monotonic() - began
     compared = tuple((each.proposal.kind, each.features) for each in finished)
     report(1.0)
-    return DirectMatch(replace(first, seconds=seconds), replace(second, seconds=seconds), compared)
+    return DirectMatch(replace(first, seconds=seconds), replace(second, seconds=seconds), compared, fine.system)
 
 
 def _proposals(meshes: Sequence[ThinMesh], report: Progress) -> list[Proposal]:
@@ -347,7 +348,7 @@ def _fits(
         source,
         frame=core,
         points=turn.to_local(moved),
-        vectors=vectors,
+        vectors=system.vectors_to(turn.to_local(moved)),
         residual=residual,
         verts=shapes[1].verts,
         verdict=verdict,

@@ -159,18 +159,22 @@ def _painted_points(shape: Shape, vertices: Int[Ints, " N"], values: Float[Float
 
 
 def compose_fit(
-    shape: Shape, fitted: Shape, rotation: Float[Floats, "3 3"] | None = None, limits: tuple[float, float] | None = None
+    shape: Shape,
+    fitted: Shape,
+    rotation: Float[Floats, "3 3"] | None = None,
+    limits: tuple[float, float] | None = None,
+    what: str = "the template",
 ) -> Composition:
-    """A fitted template (same frame and unit) as blue glass over the shape, and the shape colored by its distance."""
+    """A fitted template or mesh (same frame and unit) as blue glass over the shape, and the shape colored by its distance."""
     distance = distances(shape, fitted)
-    scale = Scale.of(distance, "distance to the template (unit of the file)", limits)
+    scale = Scale.of(distance, f"distance to {what} (unit of the file)", limits)
     record = {"distance_mean": float(np.nanmean(distance)), "distance_max": float(np.nanmax(distance))}
     panels = (
-        Panel(shape, label=f"{shape.name} and the template", over=fitted),
+        Panel(shape, label=f"{shape.name} and {what}", over=fitted),
         Panel(shape, scale.colors(distance), "how far apart they are"),
     )
     turn = None if rotation is None else upright(rotation)
-    return Composition(panels, scale, "the template over the shape", record).rotated((turn, turn))
+    return Composition(panels, scale, f"{what} over the shape", record).rotated((turn, turn))
 
 
 def distances(shape: Shape, fitted: Shape) -> Float[Floats, " V"]:

@@ -1,6 +1,7 @@
 """Shapes that no model knows are matched directly, by every road that makes a map."""
 
 import pickle
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,7 +16,9 @@ from meshmatch.api.matcher import Matcher
 from meshmatch.cli.app import app
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting import direct
-from meshmatch.geometry.frames import kabsch
+from meshmatch.geometry.frames import Frame, kabsch
+from meshmatch.maps.deformed import deformed
+from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from tests.fitting.test_direct import QUICK, bent, creature
 
@@ -101,3 +104,51 @@ def test_the_command_line_matches_without_a_model(shapes: tuple[Shape, Shape], t
     assert done.exit_code == 0, done.output
     assert len(np.load(tmp_path / "map.npy")) == shapes[0].V
     assert '"model": "none"' in done.stdout and "not used" in done.output
+
+
+@pytest.mark.usefixtures("quick")
+def test_shapes_between_two_that_no_model_knows(shapes: tuple[Shape, Shape], monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(clean: Any, *_: Any) -> Any:
+        raise kinds.UnknownKindsError(f"{clean[0].shape.name} is of no kind")
+
+    monkeypatch.setattr(kinds, "choose_model", refuse)
+    options = meshmatch.InterpolationOptions(place="files")
+    found = meshmatch.interpolate(shapes, 3, options=options)
+    assert any("directly" in note for note in found.notes)
+    for step, shape in zip((found.steps[0], found.steps[2]), shapes, strict=True):
+        off = np.linalg.norm(step.shape.verts - shape.verts, axis=1) / np.sqrt(shape.area)
+        assert off.mean() < (1e-9 if step.time == 0 else 0.03)
+    assert found.to_target is not None and found.to_target < 0.02
+    for changed in ({"mesh": "template"}, {"way": "codes"}):
+        with pytest.raises(OptionError, match="without a model"):
+            meshmatch.interpolate(shapes, 3, options=meshmatch.InterpolationOptions(**changed), model="none")  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("quick")
+def test_one_mesh_is_laid_onto_another_shape(shapes: tuple[Shape, Shape], tmp_path: Any) -> None:
+    files = [tmp_path / f"{shape.name}.ply" for shape in shapes]
+    for file, shape in zip(files, shapes, strict=True):
+        meshmatch.save_shape(file, shape)
+    words = ["register", str(files[0]), "--onto", str(files[1]), "-o", str(tmp_path / "laid.ply"), "--model", "none"]
+    done = CliRunner().invoke(app, [*words, "--json"])
+    assert done.exit_code == 0, done.output
+    laid = meshmatch.load_shape(tmp_path / "laid.ply")
+    assert np.array_equal(laid.faces, shapes[0].faces)
+    assert (np.linalg.norm(laid.verts - shapes[1].verts, axis=1) / np.sqrt(shapes[1].area)).mean() < 0.03
+    assert '"model": "none"' in done.stdout
+    refused = CliRunner().invoke(app, [*words, "--dense"])
+    assert "--dense does not go with --onto" in str(refused.exception)
+
+
+def test_a_mesh_laid_onto_a_mirror_image_still_faces_out(shapes: tuple[Shape, Shape], found: Any) -> None:
+    source, fit = repair(shapes[0]), found.target
+    mirror = Frame(fit.frame.scale, fit.frame.rotation @ np.diag([-1.0, 1.0, 1.0]), fit.frame.center)
+    plain, mirrored = (deformed(source, found.source, each) for each in (fit, replace(fit, frame=mirror)))
+    assert np.allclose(mirrored.verts - fit.frame.center, (plain.verts - fit.frame.center) * [-1, 1, 1])
+    for shape in (plain, mirrored):
+        assert np.linalg.det(shape.verts[shape.faces] - fit.frame.center).sum() > 0
+
+
+def test_node_vectors_of_a_fit_make_its_points(found: Any) -> None:
+    made = found.system.moved(found.target.vectors)
+    assert np.linalg.norm(made - found.target.points, axis=1).mean() < 1e-3

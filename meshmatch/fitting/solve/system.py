@@ -23,6 +23,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.derived import derived
 from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.solve.regularity import Regularity, Unfolding
+from meshmatch.geometry.frames import kabsch
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import triangle_vectors
 from meshmatch.models.trained import TrainedModel
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 # Where the upper triangle xx xy xz yy yz zz belongs in a 3 x 3 block, row by row.
 _BLOCK = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 _DIAGONAL = [0, 3, 5]
+_HELD = 1e-6  # weight of what decides where points do not
 # More products than this (about a gigabyte while they are sorted) are not kept.
 _MAX_PRODUCTS = 20_000_000
 
@@ -85,6 +87,12 @@ class NodeSystem:
     def moved(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3"]:
         """Template vertices under node vectors, or under whatever rows the field reads."""
         return self.verts + (self.phi @ vectors if self.linear else self.field.displaced(vectors))
+
+    def vectors_to(self, points: Float[Floats, "V 3"]) -> Float[Floats, "K 3"]:
+        """Node vectors that take the template's vertices to points that the field can reach, or nearly."""
+        weights = np.tile([1.0, 0.0, 0.0, 1.0, 0.0, 1.0], (len(points), 1))
+        turns = np.tile(kabsch(self.verts, points).rotation, (len(self.gradient_points), 1, 1))
+        return self.solve(weights, points, _HELD, turns, _HELD, np.zeros((self.K, 3)))
 
     def deformation_gradient(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "G 3 3"]:
         """F at the gradient points, F[g, a, k] = d x'_a / d x_k."""
