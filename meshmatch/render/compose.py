@@ -165,7 +165,7 @@ def compose_fit(
     limits: tuple[float, float] | None = None,
     what: str = "the template",
 ) -> Composition:
-    """A fitted template or mesh (same frame and unit) as blue glass over the shape, and the shape colored by its distance."""
+    """A fitted mesh (same frame and unit) as blue glass over the shape, and the shape colored by its distance."""
     distance = distances(shape, fitted)
     scale = Scale.of(distance, f"distance to {what} (unit of the file)", limits)
     record = {"distance_mean": float(np.nanmean(distance)), "distance_max": float(np.nanmax(distance))}
