@@ -17,10 +17,11 @@ from meshmatch.shapes.repair import Repaired
 from meshmatch.threads import thread_limit, worker_slot
 
 if TYPE_CHECKING:
-    from meshmatch.fitting.direct import KnownPairs
-    from meshmatch.fitting.solve.system import NodeSystem
+    from meshmatch.fitting.direct import DirectMatch, KnownPairs
 
 _UNKNOWN = "no installed model knows these shapes: they were matched directly"
+_BETTER = "the model {} fits these shapes less well than they fit each other: they were matched directly"
+_CLEARLY = 0.003  # how much lower the energy must be of a map that is not good, for it to replace a model's
 _UNUSED = "up, front and partial have no meaning without a model, and were not used"
 
 
@@ -31,20 +32,28 @@ def match_without_model(
     threads: int,
     progress: ProgressCallback | None,
     unknown: bool = False,
+    guess: MatchResult | None = None,
 ) -> MatchResult:
     """The map of two repaired shapes, of which the first is the template of both; ``unknown`` says that no model knew them.
+    What a model found, and does not call good, is a ``guess``, and given back where nothing better is found.
 
     `InputError` where a shape cannot be matched: large parts far apart, or a cloud that is no surface.
     """
     source, target = clean
     pairs = None if landmarks is None else landmark_vertices(clean, landmarks)
     known = None if pairs is None else (source.original.verts[pairs[0]], target.original.verts[pairs[1]])
-    fits, _ = fit_to_first(clean, configs, threads, progress, known)
+    by_model = None if guess is None else (guess.source_fit.points_in_file, guess.target_fit.points_in_file)
+    fits, found = fit_to_first(clean, configs, threads, progress, known, by_model)
+    verdict = fits[1].verdict
+    if guess is not None and verdict != "good" and (verdict == "poor" or found.over_guess < _CLEARLY):
+        return guess
     with thread_limit(1):
         mapped = map_of_fits((fits[0], fits[1]), (fits[0], fits[1]), threads)
         if pairs is not None:
             mapped = judged_by_pairs(mapped, target.original, pairs, fits[1].frame.scale)
     notes = direct_notes(clean, configs, unknown)
+    if guess is not None:
+        notes = (_BETTER.format(guess.source_fit.model), *notes)
     return MatchResult(mapped, fits[0], fits[1], fits[1].seconds, notes, (fits[0], fits[1]), threads)
 
 
@@ -54,9 +63,10 @@ def fit_to_first(
     threads: int,
     progress: ProgressCallback | None,
     known: KnownPairs | None = None,
-) -> tuple[list[Fit], NodeSystem]:
-    """Fits of two or more repaired shapes, whose template is the first of them, and what moves it; errors as
-    `match_without_model`. ``known`` are pairs of positions on the first and the second.
+    guess: KnownPairs | None = None,
+) -> tuple[list[Fit], DirectMatch]:
+    """Fits of two or more repaired shapes, whose template is the first of them, and how it was matched to the second; errors
+    as `match_without_model`. ``known`` are pairs of positions on these two, and ``guess`` what a model says of them.
     """
     from meshmatch.fitting.direct import DirectConfig, match_directly
 
@@ -65,10 +75,10 @@ def fit_to_first(
     first, *others = clean
     config = DirectConfig(seed=configs[0].seed)
     with thread_limit(1), worker_slot(threading.Semaphore(threads)):
-        found = [match_directly(first.shape, each.shape, config, known, progress) for each in others]
+        found = [match_directly(first.shape, each.shape, config, known, progress, guess) for each in others]
     fits = [replace(found[0].source, repaired=first)]
     fits += [replace(each.target, repaired=own) for each, own in zip(found, others, strict=True)]
-    return fits, found[0].system
+    return fits, found[0]
 
 
 def direct_notes(clean: Sequence[Repaired], configs: Sequence[FitConfig], unknown: bool) -> tuple[str, ...]:

@@ -260,8 +260,8 @@ def _registered_directly(
     if options.way == "codes":
         raise OptionError("without a model there are no codes", "leave out the blend: the field is blended")
     clean = [usable(shape) for shape in shapes]
-    fits, system = fit_to_first(clean, configs, matcher.threads, matcher.progress)
-    return _Registered(fits, system, direct_notes(clean, configs, unknown))
+    fits, found = fit_to_first(clean, configs, matcher.threads, matcher.progress)
+    return _Registered(fits, found.system, direct_notes(clean, configs, unknown))
 
 
 def _surfaces(

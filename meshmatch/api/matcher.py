@@ -299,7 +299,10 @@ class Matcher:
             if landmarks is not None:
                 found = judged_by_pairs(found, clean[1].original, pairs, agreed[1].frame.scale)
         notes = tuple(dict.fromkeys((*(words for kind in kinds for words in kind), *fits[0].notes, *fits[1].notes)))
-        return MatchResult(found, *agreed, time.monotonic() - began, notes, before, self.threads)
+        result = MatchResult(found, *agreed, time.monotonic() - began, notes, before, self.threads)
+        if self._auto and landmarks is None and found.verdict != "good" and _both_whole(clean, agreed):
+            result = match_without_model(clean, configs, None, self.threads, self.progress, guess=result)
+        return replace(result, seconds=time.monotonic() - began)
 
     def _choose(
         self, clean: Sequence[Repaired], configs: Sequence[FitConfig]
@@ -386,3 +389,9 @@ class Matcher:
         shapes = [shape_of(fit).shape for fit in fits]
         first, second = agreed_fits(self.model, shapes, list(fits), config, known, threads=self.threads)
         return first, second
+
+
+def _both_whole(clean: Sequence[Repaired], fits: Sequence[Fit]) -> bool:
+    """Whether both are meshes of one whole shape, of which nothing was left out: these can be matched directly as well."""
+    alone = all(not (each.shape.is_cloud or each.far_parts or each.left_out) for each in clean)
+    return alone and not any(fit.partial for fit in fits)

@@ -46,6 +46,7 @@ from meshmatch.threads import parallel_map
 KnownPairs = tuple[Float[Floats, "N 3"], Float[Floats, "N 3"]]
 """Positions on the source and on the target that belong together."""
 _KNOWN_WEIGHT = 0.05  # of each known pair; all other pairs together have about 1
+_SAME = 0.1  # share of vertices by which a map differs from a guess, if it is much the same
 _NEAR = 3  # vertices of the coarse mesh by which one of the fine mesh moves
 
 
@@ -67,11 +68,10 @@ class DirectConfig:
     coarse, fine : triangles of the thinned meshes that are fitted first and last
     samples, few, fewer : points of the target: for the last fits, for the better coarse ones, and for all
     coarse_nodes, fine_nodes : nodes of both meshes
-    first, second, third, last : least squares of all proposals, of the better ones, of the best on the fine mesh, and of the
-        one that is taken
+    first, second, third, last : least squares of all proposals, of the better ones, of the best on the fine mesh, of which
+        the energies decide, and of the one that is taken, which may stretch more
     better, best : how many proposals are fitted a second, and a third time
     unlike : share of vertices by which these differ at least
-    close : energy by which fits are about as good as the best
     seed : of all random numbers
     """
 
@@ -89,7 +89,6 @@ class DirectConfig:
     better: int = 16
     best: int = 6
     unlike: float = 0.03
-    close: float = 0.003
     seed: int = 0
 
 
@@ -106,7 +105,7 @@ class _Level:
     def of(cls, mesh: ThinMesh, nodes: SurfaceNodes, known: KnownPairs | None, seed: int) -> _Level:
         terms: tuple[LandmarkTerm, ...] = ()
         if known is not None:
-            nearest = cKDTree(mesh.verts).query(known[0])[1]
+            nearest = np.asarray(cKDTree(mesh.verts).query(known[0])[1])
             terms = (LandmarkTerm((nearest, known[1]), _KNOWN_WEIGHT),)
         return cls(mesh, *nodes.system(mesh.shape, mesh.graph, seed), terms)
 
@@ -126,10 +125,16 @@ class _Level:
         """As rigid as possible, about the shape as it is."""
         return RotatedReference(np.tile(np.eye(3), (len(self.system.gradient_points), 1, 1)))
 
-    def onto(self, goals: Float[Floats, "V 3"], schedule: Schedule) -> Float[Floats, "K 3"]:
-        """Node vectors that bring each vertex near a goal of its own, as rigidly as possible."""
+    def onto(self, goals: Float[Floats, "V 3"], schedule: Schedule, prior: Prior) -> Float[Floats, "K 3"]:
+        """Node vectors that bring each vertex near a goal of its own."""
         problem = Problem(system=self.system, terms=[GoalTerm(goals), *self.known], schedule=schedule)
-        return minimise(problem, self.rigid, np.zeros((self.system.K, 3)))
+        return minimise(problem, prior, np.zeros((self.system.K, 3)))
+
+    def begun(self, proposal: Proposal) -> Float[Floats, "K 3"]:
+        """Near a proposal: as rigid as possible, or with limbs that may be longer or shorter than its own."""
+        if proposal.kind in ("rigid", "affine"):
+            return self.onto(proposal.points, _ONTO, self.rigid)
+        return self.onto(proposal.points, _ONTO_STRETCHED, self.viscous)
 
     def refined(
         self,
@@ -146,6 +151,7 @@ class _Level:
 
 
 _ONTO = Schedule(steps=6, prior=(3e-2, 1e-3), scale=(1.0, 0.15), damping=1e-6)
+_ONTO_STRETCHED = Schedule(steps=6, prior=(3e-2, 1e-3), scale=(1.0, 0.3), damping=1e-6)
 _ONTO_AGAIN = Schedule(steps=4, prior=(1e-3, 3e-4), scale=(1.0, 0.15), damping=1e-6)
 
 
@@ -163,14 +169,18 @@ class _Tried:
 class DirectMatch:
     """Two fits of one template: the source as it is, and the source moved onto the target.
 
-    ``tried`` are the features of the fits that were compared in the end, best first, each with what it began from.
-    ``system`` moves the template by node vectors: the same for every shape that one source is registered to.
+    ``system`` moves the template by node vectors: the same for every shape that one source is registered to. ``tried`` are
+    the features of the fits that were compared in the end, best first, each with what it began from; ``leads`` how much
+    higher the energies of those are that differ from the best one, and ``over_guess`` that of the guess, if there was one: 0
+    where it is much the same map.
     """
 
     source: Fit
     target: Fit
     tried: tuple[tuple[str, DirectFeatures], ...]
     system: NodeSystem
+    leads: tuple[float, ...] = ()
+    over_guess: float = np.inf
 
 
 def match_directly(
@@ -179,6 +189,7 @@ def match_directly(
     config: DirectConfig | None = None,
     known: KnownPairs | None = None,
     progress: ProgressCallback | None = None,
+    guess: KnownPairs | None = None,
 ) -> DirectMatch:
     """Register a repaired shape to another one, without a model.
 
@@ -192,6 +203,9 @@ def match_directly(
         Positions (N, 3) on the source and (N, 3) on the target, in their files' coordinates, that belong together.
     progress
         Called with the stage, the name of the source, and the share that is done.
+    guess
+        Positions (T, 3) all over the source and where they may belong on the target, (T, 3), as another method found; one
+        more proposal.
 
     Returns
     -------
@@ -207,23 +221,34 @@ def match_directly(
     report = Progress(progress, source.name).stage("matching without a model")
     frames = sqrt_area_frame(source), sqrt_area_frame(target)
     shapes = [Shape(frame.apply(each.verts), each.faces) for frame, each in zip(frames, (source, target), strict=True)]
-    if known is not None:
-        known = frames[0].apply(known[0]), frames[1].apply(known[1])
+    known, guess = (pairs and (frames[0].apply(pairs[0]), frames[1].apply(pairs[1])) for pairs in (known, guess))
     coarse = parallel_map(ThinMesh.of, shapes, [config.coarse] * 2)
     report(0.05)
     proposals = _proposals(coarse, report.between(0.05, 0.4))
+    if guess is not None:
+        proposals.append(Proposal("guess", _carried(coarse[0].verts, *guess)))
     samples = sample_surface(shapes[1], config.samples, np.random.default_rng(config.seed))
     level = _Level.of(coarse[0], config.coarse_nodes, known, config.seed)
     tried = _screened(level, proposals, samples, config, report.between(0.4, 0.75))
     fine = _Level.of(ThinMesh.of(shapes[0], config.fine), config.fine_nodes, known, config.seed)
     finished = _finished(level, fine, tried, samples, config, report.between(0.75, 0.9))
-    best, vectors, leads = _decided(fine, finished, samples, config)
-    judged = judge_direct(best.features, leads)
+    best, *others = finished
+    apart = [each.features.energy for each in others if differ(each.moved, best.moved) > config.unlike]
+    leads = tuple(energy - best.features.energy for energy in apart)
+    judged = judge_direct(best.features.energy, leads)
+    vectors = fine.refined(samples, best.vectors, config.last, fine.viscous)
     first, second = _fits(fine, frames, (source, target), vectors, best.features.residual, judged, config.seed)
     seconds = time.monotonic() - began
     compared = tuple((each.proposal.kind, each.features) for each in finished)
+    over_guess = np.inf
+    if guess is not None and differ(best.moved, _carried(fine.mesh.verts, *guess)) < _SAME:
+        over_guess = 0.0
+    elif guess is not None:
+        energies = [features.energy for kind, features in compared if kind == "guess"]
+        over_guess = min(energies, default=np.inf) - best.features.energy
     report(1.0)
-    return DirectMatch(replace(first, seconds=seconds), replace(second, seconds=seconds), compared, fine.system)
+    first, second = (replace(fit, seconds=seconds) for fit in (first, second))
+    return DirectMatch(first, second, compared, fine.system, leads, over_guess)
 
 
 def _proposals(meshes: Sequence[ThinMesh], report: Progress) -> list[Proposal]:
@@ -241,33 +266,33 @@ def _screened(
     """Proposals fitted on few nodes: all for a few steps, then those that look better; no two alike, best first."""
     done = 0
 
-    def fit(proposal: Proposal, some: OrientedPoints, vectors: Floats, how: NodeRefineConfig) -> _Tried:
+    def fit(
+        proposal: Proposal, some: OrientedPoints, vectors: Floats, how: NodeRefineConfig, pairs: Pairs | None = None
+    ) -> _Tried:
         nonlocal done
         vectors = level.refined(some, vectors, how)
-        features = level.features(some, vectors)
+        features = level.features(some, vectors, pairs)
         done += 1
         report(min(done / (len(proposals) + config.better), 1.0))
         return _Tried(proposal, vectors, level.system.moved(vectors), features)
 
     fewer, few = samples.first(config.fewer), samples.first(config.few)
-    first = parallel_map(lambda each: fit(each, fewer, level.onto(each.points, _ONTO), config.first), proposals)
+    first = parallel_map(lambda each: fit(each, fewer, level.begun(each), config.first), proposals)
     better = _distinct(first, config.better, config.unlike)
-    return parallel_map(lambda each: fit(each.proposal, few, each.vectors, config.second), better)
+    pairs = neighbours(few)
+    return parallel_map(lambda each: fit(each.proposal, few, each.vectors, config.second, pairs), better)
 
 
 def _finished(
     level: _Level, fine: _Level, tried: list[_Tried], samples: OrientedPoints, config: DirectConfig, report: Progress
 ) -> list[_Tried]:
     """The best fits on the fine mesh, best first."""
-    distance, near = cKDTree(level.mesh.verts).query(fine.mesh.verts, _NEAR)
-    weights = 1 / (distance + 1e-3)
-    weights /= weights.sum(1, keepdims=True)
     pairs = neighbours(samples)
     chosen = _distinct(tried, config.best, config.unlike)
 
     def fit(each: _Tried) -> _Tried:
-        shift = (weights[..., None] * (each.moved - level.mesh.verts)[near]).sum(1)
-        vectors = fine.refined(samples, fine.onto(fine.mesh.verts + shift, _ONTO_AGAIN), config.third)
+        goals = fine.mesh.verts + _carried(fine.mesh.verts, level.mesh.verts, each.moved - level.mesh.verts)
+        vectors = fine.refined(samples, fine.onto(goals, _ONTO_AGAIN, fine.rigid), config.third)
         features = fine.features(samples, vectors, pairs)
         report(0.9)
         return _Tried(each.proposal, vectors, fine.system.moved(vectors), features)
@@ -275,31 +300,13 @@ def _finished(
     return sorted(parallel_map(fit, chosen), key=lambda each: each.features.energy)
 
 
-def _decided(
-    fine: _Level, finished: list[_Tried], samples: OrientedPoints, config: DirectConfig
-) -> tuple[_Tried, Float[Floats, "K 3"], list[float]]:
-    """The best fit, its last node vectors, and how much higher the energies of the others are that differ from it.
-
-    Fits that are about as good as the best one are compared after the last refinement, which lets them stretch.
-    """
-    limit = finished[0].features.energy + config.close
-    close = [each for each in finished if each.features.energy <= limit]
-    pairs = neighbours(samples)
-
-    def last(each: _Tried) -> tuple[float, Floats]:
-        vectors = fine.refined(samples, each.vectors, config.last, fine.viscous)
-        return fine.features(samples, vectors, pairs).energy, vectors
-
-    ends = parallel_map(last, close)
-    energies = [energy for energy, _ in ends]
-    chosen = int(np.argmin(energies))
-    best = close[chosen]
-    leads = [
-        energies[k] - energies[chosen] if k < len(close) else each.features.energy - best.features.energy
-        for k, each in enumerate(finished)
-        if differ(each.moved, best.moved) > config.unlike
-    ]
-    return best, ends[chosen][1], leads
+def _carried(
+    points: Float[Floats, "V 3"], at: Float[Floats, "T 3"], values: Float[Floats, "T 3"]
+) -> Float[Floats, "V 3"]:
+    """Values at some points carried to others, from the nearest ones."""
+    distance, near = cKDTree(at).query(points, _NEAR)
+    weights = 1 / (np.asarray(distance) + 1e-3)
+    return np.asarray((weights[..., None] * values[near]).sum(1) / weights.sum(1, keepdims=True))
 
 
 def _distinct(tried: list[_Tried], count: int, unlike: float) -> list[_Tried]:

@@ -16,6 +16,7 @@ from meshmatch.geometry.triangles import dot, interpolate, triangle_vectors, uni
 from meshmatch.shapes.shape import Shape
 
 _NEIGHBOURS = 16
+_ENOUGH = 30  # points of which one is chosen are as good to choose from as many more
 _LONGEST = 3.0  # of an edge, against the usual reach of a point's sixth neighbour
 
 
@@ -110,8 +111,10 @@ def triangulate_cloud(cloud: Shape, most: int) -> tuple[Int[Ints, " V"], Int[Int
     hardly any two stars agree: the points lie on no surface.
     """
     chosen = np.arange(cloud.V)
-    if cloud.V > most // 2:
-        chosen = np.sort(farthest_points(cloud.verts, most // 2))
+    if cloud.V > _ENOUGH * (most // 2):  # every pass looks at all points
+        chosen = np.sort(np.random.default_rng(0).choice(cloud.V, _ENOUGH * (most // 2), replace=False))
+    if len(chosen) > most // 2:
+        chosen = np.sort(chosen[farthest_points(cloud.verts[chosen], most // 2)])
     points, normals = cloud.verts[chosen], cloud.vertex_normals[chosen]
     k = min(_NEIGHBOURS, len(points) - 1)
     distance, index = cKDTree(points).query(points, k + 1)

@@ -12,6 +12,8 @@ from typer.testing import CliRunner
 
 import meshmatch
 from meshmatch.api import kinds
+from meshmatch.api.direct import match_without_model
+from meshmatch.api.inputs import usable
 from meshmatch.api.matcher import Matcher
 from meshmatch.cli.app import app
 from meshmatch.errors import InputError, OptionError
@@ -65,6 +67,22 @@ def test_what_no_model_knows_is_matched_directly_and_this_is_said(
     assert any("directly" in note for note in result.notes)
     with pytest.raises(InputError, match="no kind"):
         meshmatch.register(shapes[0])
+
+
+@pytest.mark.parametrize(
+    ("direct_verdict", "over_guess", "taken"),
+    [("good", 0.0, True), ("fair", 0.01, True), ("fair", 0.0, False), ("poor", 0.01, False)],
+)
+def test_a_map_of_a_model_that_is_not_good_gives_way_to_a_better_one(
+    direct_verdict: Any, over_guess: float, taken: bool, found: Any, shapes: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = replace(found.target, verdict=direct_verdict)
+    monkeypatch.setattr(direct, "match_directly", lambda *_: replace(found, target=target, over_guess=over_guess))
+    clean, configs = [usable(shape) for shape in shapes], [meshmatch.FitConfig()] * 2
+    by_model: Any = SimpleNamespace(source_fit=replace(found.source, model="human"), target_fit=found.target)
+    result = match_without_model(clean, configs, None, 1, None, guess=by_model)
+    assert (result is not by_model) == taken
+    assert not taken or any("human" in note and "directly" in note for note in result.notes)
 
 
 def test_one_known_shape_of_two_is_still_told() -> None:

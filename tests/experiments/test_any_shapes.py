@@ -59,3 +59,17 @@ def test_a_row_counts_every_pair_and_names_the_worst() -> None:
     row = row_of("box", found)
     assert (row["pairs"], row["mean"], row["median"], row["worst"]) == (3, 10.0, 6.0, "b to a")
     assert row["under"] == pytest.approx(2 / 3) and (row["good"], row["good_over"]) == (2, 1)
+
+
+def test_the_calibration_of_direct_maps_tells_right_from_wrong() -> None:
+    rng = np.random.default_rng(0)
+    found = [
+        {"error": 3.0 if right else 30.0, "energy": rng.normal(0.03 if right else 0.05, 0.008), "leads": leads}
+        for right in [True] * 60 + [False] * 40
+        for leads in [(rng.uniform(0.002, 0.02), 0.03) if right else (rng.uniform(0, 0.004),)]
+    ]
+    fitted = any_shapes.fitted_calibration(found)
+    assert fitted.energy > 0 and fitted.lead > 0 and "100 pairs" in fitted.data
+    told = [fitted.logit(each["energy"], each["leads"]) > 0 for each in found]
+    assert np.mean([a == (each["error"] < 10) for a, each in zip(told, found, strict=True)]) > 0.85
+    assert fitted.logit(0.03, [0.004, 0.5]) == fitted.logit(0.03, [0.5, 0.004]) < fitted.logit(0.03, [])

@@ -13,21 +13,28 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
+from datetime import date
 from functools import cache, partial
 from itertools import permutations
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+from scipy.optimize import linear_sum_assignment, minimize
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 from typer import Option
 
+from meshmatch.api.inputs import usable
 from meshmatch.api.matcher import Matcher
+from meshmatch.api.results import map_of_fits
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.experiments import runner
+from meshmatch.fitting.direct import DirectConfig, match_directly
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.judge.calibration import DirectCalibration
+from meshmatch.models.registry import NO_MODEL
 from meshmatch.shapes.files import load_shape
 from meshmatch.templates.make import edge_graph
 
@@ -127,18 +134,43 @@ def error_of(folder: Path, target: str, vertices: Int[Ints, " N"]) -> float:
 def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[str, Any]:
     """Error, verdict and cost of one pair."""
     source, target = (load_shape(folder / f"{name}.ply") for name in pair)
-    began = time.process_time()
-    result = Matcher(model, FitConfig(seed=seed), threads=1).match(source, target)
+    began, evidence = time.process_time(), {}
+    if model == NO_MODEL:
+        clean = usable(source), usable(target)
+        found = match_directly(clean[0].shape, clean[1].shape, DirectConfig(seed=seed))
+        fits = replace(found.source, repaired=clean[0]), replace(found.target, repaired=clean[1])
+        mapped = map_of_fits(fits, fits, 1)
+        evidence = {"energy": found.tried[0][1].energy, "leads": found.leads}
+    else:
+        mapped = Matcher(model, FitConfig(seed=seed), threads=1).match(source, target).map
     spent = time.process_time() - began
-    arrived = result.map.index[keypoints_of(folder, pair[0])]
+    arrived = mapped.index[keypoints_of(folder, pair[0])]
     return {
         "pair": " to ".join(pair),
         "error": error_of(folder, pair[1], arrived),
-        "verdict": result.map.verdict,
-        "confidence": float(result.map.confidence.mean()),
-        "ambiguous": any("ambiguous" in reason for reason in result.map.reasons),
+        "verdict": mapped.verdict,
+        "confidence": float(mapped.confidence.mean()),
+        "ambiguous": any("ambiguous" in reason for reason in mapped.reasons),
         "cpu": spent,
+        **evidence,
     }
+
+
+def fitted_calibration(found: Sequence[dict[str, Any]], most: float = 0.008, ridge: float = 0.002) -> DirectCalibration:
+    """By logistic regression, with a little ridge, of maps without a model that are right and wrong."""
+    right = np.array([each["error"] < OFF for each in found])
+    values = np.array([[-each["energy"], min([most, *each["leads"]])] for each in found])
+    deviation = values.std(0) + 1e-9
+
+    def loss(p: Floats) -> float:
+        costs = np.logaddexp(0.0, np.where(right, -1.0, 1.0) * (values / deviation @ p[1:] + p[0]))
+        return float(costs.mean() + ridge * np.square(p[1:]).sum())
+
+    offset, *weights = minimize(loss, np.zeros(3), method="L-BFGS-B").x
+    energy, lead = (float(weight) for weight in weights / deviation)
+    data = f"{len(found)} pairs of experiments.bench.any_shapes, of which {int(right.sum())} are right"
+    today = date.today().isoformat()
+    return DirectCalibration(offset=float(offset), energy=energy, lead=lead, most=most, data=data, date=today)
 
 
 def row_of(name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -168,6 +200,7 @@ def main(
     seed: runner.Seed = 0,
     data: runner.Data = runner.DATA,
     work: runner.Work = None,
+    fit: Annotated[bool, Option("--fit", help="also find the weights of the verdict")] = False,
 ) -> runner.Report:
     names = CLASSES if classes == "all" else runner.names_of(classes, (*CLASSES, *TURNING), "class")
     rows, everything = [], []
@@ -185,4 +218,5 @@ def main(
     return runner.Report(
         {"rows": [*rows, total], "pairs": everything},
         [runner.table("Keypoints, x100 of sqrt(area)", [*rows, total], _COLUMNS)],
+        notes=[str(fitted_calibration(everything))] if fit else [],
     )

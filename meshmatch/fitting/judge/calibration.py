@@ -1,11 +1,12 @@
-"""Weights of the verdict that a command fitted: replace them by what it prints, and do not edit them by hand.
+"""Weights of the verdicts that commands fitted: replace them by what these print, and do not edit them by hand.
 
-`experiments.bench.verdicts` with ``--fit`` fits them to right and wrong fits whose truth is known (logistic
-regression), and prints a `Calibration` to put here, with its data, seeds and date inside.
+`experiments.bench.verdicts` and `experiments.bench.any_shapes` with ``--fit`` fit them to right and wrong fits whose truth
+is known (logistic regression), and print what belongs here, with its data, seeds and date inside.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 
@@ -28,3 +29,24 @@ CALIBRATION = Calibration(
     seeds=(0, 1, 2, 3, 4, 5),
     date="2026-11-25",
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DirectCalibration:
+    """The logit of a right map without a model: ``offset``, less ``energy`` times the energy of the best fit, plus ``lead``
+    times how much higher that of the next one is. More than ``most`` of it says no more.
+    """
+
+    offset: float
+    energy: float
+    lead: float
+    most: float
+    data: str
+    date: str
+
+    def logit(self, energy: float, leads: Sequence[float]) -> float:
+        """Of a fit, and by how much it leads the others."""
+        return self.offset - self.energy * energy + self.lead * min([self.most, *leads])
+
+
+DIRECT = DirectCalibration(offset=4.5, energy=100.0, lead=400.0, most=0.008, data="", date="")

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
+from meshmatch.fitting.judge.calibration import DIRECT
 from meshmatch.fitting.judge.reasons import Reason, Verdict
 from meshmatch.fitting.search.discontinuities import Pairs, discontinuous_share
 from meshmatch.fitting.search.predictor import two_way_residual
@@ -19,13 +20,10 @@ from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.oriented import OrientedPoints
 
 # Weights of the energy beside the residual. Chosen on 30 pairs of 15 kinds of shapes.
-_STRETCH, _TORN = 0.02, 0.1
-# Logistic regression of a mean error of at most 10 % of sqrt(area) on the energy and on its lead over the next fit: 30 fits,
-# 22 of them right. More lead says no more.
-_OFFSET, _ENERGY, _LEAD, _MOST_LEAD = 4.5, -125.0, 480.0, 0.006
+_STRETCH, _TORN = 0.03, 0.2
 _GOOD, _FAIR = 0.9, 0.5
 # Another fit whose energy is so little higher is as good; so many are told.
-_TIE, _TOLD = 0.001, 9
+_TIE, _TOLD = 0.0015, 9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,11 +61,10 @@ class DirectFeatures:
         return self.residual + _STRETCH * self.stretch + _TORN * self.discontinuous
 
 
-def judge_direct(best: DirectFeatures, leads: Sequence[float]) -> tuple[Verdict, float, tuple[Reason, ...]]:
+def judge_direct(energy: float, leads: Sequence[float]) -> tuple[Verdict, float, tuple[Reason, ...]]:
     """Verdict, trust (0..1) and reasons of the best fit; ``leads`` are how much higher the energies are of other fits, which
     differ from it clearly."""
-    lead = min([_MOST_LEAD, *leads])
-    trust = float(1 / (1 + np.exp(-(_OFFSET + _ENERGY * best.energy + _LEAD * lead))))
+    trust = float(1 / (1 + np.exp(-DIRECT.logit(energy, leads))))
     reasons = []
     if equal := sum(each < _TIE for each in leads):
         count = f"{min(equal, _TOLD) + 1}{' or more' if equal > _TOLD else ''}"

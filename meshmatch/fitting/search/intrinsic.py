@@ -27,6 +27,7 @@ _PROFILE = 12  # distances at which the area around an extremity is asked
 # Of the diameter along the surface: an extremity is a maximum of the mean distance that stands out by so much from the
 # way to a higher one, and lies so far from the others. At most so many are told apart.
 _PERSISTENCE, _APART, _MOST = 0.04, 0.08, 14
+_SHARES = (0.15, 0.3, 0.5, 0.7)  # of the way to an extremity: where ways are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +151,23 @@ class Intrinsic:
         radii = np.linspace(0.05, 1, _PROFILE)
         within = self.distances[self.extremities][:, :, None] < radii
         return np.asarray(np.einsum("tvr,v->tr", within.astype(np.float64), self.mesh.areas))
+
+    @cached_property
+    def spread(self) -> Float[Floats, "T T"]:
+        """How far apart the ways from the middle to two extremities run, from 0 for the closest two to 1 for the furthest:
+        distances between points at the same shares of each way, whatever their lengths. The order of legs along a body, or
+        of arms around it, is in these.
+        """
+        ends, near = self.extremities, self.distances[int(self.eccentricity.argmin())]
+        detour = near + self.distances[ends] - near[ends][:, None]  # (T, V), 0 on the way to each
+        off = ~np.eye(len(ends), dtype=bool)
+        spread = np.zeros(off.shape)
+        for share in _SHARES:
+            at = (np.abs(near - share * near[ends][:, None]) + 2 * detour).argmin(1)
+            apart = self.distances[np.ix_(at, at)]
+            low, high = apart[off].min(), apart[off].max()
+            spread += np.where(off, (apart - low) / max(high - low, 1e-9), 0) / len(_SHARES)
+        return spread
 
     @cached_property
     def limbs(self) -> tuple[Float[Floats, " T"], Float[Floats, "V T"]]:

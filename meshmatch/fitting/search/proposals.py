@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import product, zip_longest
 from typing import Literal
 
 import numpy as np
@@ -22,7 +22,7 @@ from meshmatch.geometry.oriented import with_normals
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import triangle_vectors
 
-Kind = Literal["rigid", "affine", "spectral", "extremities"]
+Kind = Literal["rigid", "affine", "spectral", "extremities", "guess"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +56,7 @@ class ProposalSettings:
     functions, first_functions, more : eigenfunctions of a map in the end and after the first steps, and how many are added
         in each step
     maps : maps of each kind that are kept
-    beam, assignments : partial assignments of extremities that are kept, and complete ones that are compared
-    climbs : of these, how many are improved by exchanging two extremities at a time
+    beam, assignments : partial assignments of extremities that are kept, and complete ones, of each search
     skipped : cost of an extremity without counterpart
     same : share of vertices by which two maps differ at least, where two vertices ``apart`` differ
     facing : how much the share of triangles that keep their orientation counts, against the error of distances
@@ -77,8 +76,7 @@ class ProposalSettings:
     more: int = 5
     maps: int = 16
     beam: int = 400
-    assignments: int = 60
-    climbs: int = 6
+    assignments: int = 50
     skipped: float = 0.12
     same: float = 0.02
     apart: float = 0.1
@@ -235,17 +233,18 @@ def _facing(source: Intrinsic, target: Intrinsic, vertex: Int[Ints, " V"]) -> fl
 
 
 def extremity_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
-    """Maps that send extremities to extremities, chosen by how far these lie from each other, and by how far the ways from
-    the middle to two of them are one: lengths of limbs may differ. A beam search; then two are exchanged while that helps.
+    """Maps that send extremities to extremities, chosen by how these lie to each other, by a beam search.
+
+    What is compared is how far they lie apart, how far the ways from the middle to two of them are one, and in what order
+    these ways run: lengths of limbs may differ.
     """
     if min(len(source.extremities), len(target.extremities)) < 2:
         return []
     judge = Assignments(source, target)
-    best = sorted(judge.candidates(), key=judge.cost)[: SETTINGS.climbs]
-    for start in best:
-        judge.climb(start)
-    found = sorted(judge.judged.values(), key=lambda each: each[0])
-    kept = _distinct(target, [vertex for _, facing, vertex in found if facing > 0])
+    orders = judge.candidates()
+    by_cost = sorted(dict.fromkeys(each for order in orders for each in order), key=judge.cost)
+    mixed = [each for turn in zip_longest(by_cost, *orders) for each in turn if each is not None]
+    kept = _distinct(target, [judge.judged[each][2] for each in dict.fromkeys(mixed) if judge.judged[each][1] > 0])
     maps = []
     for vertex in kept:
         smooth = _smoothed(source, target, vertex)
@@ -268,16 +267,22 @@ class Assignments:
         ends, ends_to = source.extremities, target.extremities
         self._counts = len(ends), len(ends_to)
         profiles = np.abs(source.profiles[:, None] - target.profiles[None]).mean(2)
-        self._single = 0.5 * (profiles + 0.3 * np.abs(reach[:, None] - reach_to))
+        single = 0.5 * (profiles + 0.3 * np.abs(reach[:, None] - reach_to))
         apart = source.distances[np.ix_(ends, ends)], target.distances[np.ix_(ends_to, ends_to)]
         shared = along[ends] * reach, along_to[ends_to] * reach_to
-        of_pairs = [np.abs(a[:, :, None, None] - b) for a, b in (apart, shared)]
-        self._double = 0.5 * of_pairs[0] + 2.0 * of_pairs[1]  # of i, k and of j, l that they go to
+        # Of i that goes to j, and of i, k that go to j, l; three ways to compare.
+        of_lengths = 0.5 * _changes(*apart) + 2.0 * _changes(*shared)
+        of_order = [0.2 * _changes(of(source.spread), of(target.spread)) for of in (np.asarray, _ranks)]
+        self._costs = [(single, of_lengths), *((0.2 * single, each) for each in of_order)]
         self._along = np.column_stack([along, source.eccentricity]), np.column_stack([along_to, target.eccentricity])
         self.judged: dict[Assignment, tuple[float, float, Ints]] = {}
 
-    def candidates(self) -> list[Assignment]:
-        """The best assignments of a beam search, extremities in the order in which they stand out."""
+    def candidates(self) -> list[list[Assignment]]:
+        """The best assignments of beam searches, one by each way to compare."""
+        return [self._searched(*costs) for costs in self._costs]
+
+    def _searched(self, single: Float[Floats, "T U"], double: Float[Floats, "T T U U"]) -> list[Assignment]:
+        """By a beam search, extremities in the order in which they stand out."""
         beam: list[tuple[float, Assignment]] = [(0.0, ())]
         for i in range(self._counts[0]):
             longer = []
@@ -285,8 +290,8 @@ class Assignments:
                 longer.append((cost + SETTINGS.skipped, (*sofar, -1)))
                 known = [(k, other) for k, other in enumerate(sofar) if other >= 0]
                 for j in set(range(self._counts[1])).difference(sofar):
-                    pairs = sum(self._double[i, k, j, other] for k, other in known) / max(len(known), 1)
-                    longer.append((cost + self._single[i, j] + pairs, (*sofar, j)))
+                    pairs = sum(double[i, k, j, other] for k, other in known) / max(len(known), 1)
+                    longer.append((cost + single[i, j] + pairs, (*sofar, j)))
             beam = sorted(longer)[: SETTINGS.beam]
         found = [each for _, each in beam[: SETTINGS.assignments]]
         return [each for each in found if sum(j >= 0 for j in each) >= 2]
@@ -305,24 +310,17 @@ class Assignments:
             self.judged[assignment] = cost, facing, vertex
         return self.judged[assignment][0]
 
-    def climb(self, assignment: Assignment) -> None:
-        """Exchange two extremities at a time while that lowers the cost."""
-        while True:
-            best = min(self._exchanged(assignment), key=self.cost, default=assignment)
-            if self.cost(best) >= self.cost(assignment):
-                return
-            assignment = best
 
-    @staticmethod
-    def _exchanged(assignment: Assignment) -> Sequence[Assignment]:
-        found = []
-        for i in range(len(assignment)):
-            for j in range(i):
-                if assignment[i] != assignment[j]:
-                    other = list(assignment)
-                    other[i], other[j] = other[j], other[i]
-                    found.append(tuple(other))
-        return found
+def _changes(own: Float[Floats, "T T"], theirs: Float[Floats, "U U"]) -> Float[Floats, "T T U U"]:
+    return np.abs(own[:, :, None, None] - theirs)
+
+
+def _ranks(table: Float[Floats, "T T"]) -> Float[Floats, "T T"]:
+    """Of a symmetric table the rank of each pair, from 0 to 1."""
+    above = np.triu_indices(len(table), 1)
+    ranks = np.zeros(table.shape)
+    ranks[above] = np.argsort(np.argsort(table[above], kind="stable"), kind="stable") / max(len(above[0]) - 1, 1)
+    return ranks + ranks.T
 
 
 def _smoothed(source: Intrinsic, target: Intrinsic, vertex: Int[Ints, " V"]) -> Int[Ints, " V"]:
