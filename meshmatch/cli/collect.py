@@ -58,7 +58,8 @@ def fit(
 
     Each shape is reported when it is finished; one that cannot be fitted does not stop the others. Run the command
     again to continue after an interruption or to add shapes. With --model none the template is built from the shapes
-    themselves, which must be complete. FITS/fits.csv lists the result of every shape.
+    themselves, which must be complete, in any pose and orientation; mirror images are found. FITS/fits.csv lists the
+    result of every shape.
     """
     from meshmatch.collections.setting import FAILED
     from meshmatch.models.registry import NO_MODEL

@@ -16,7 +16,7 @@ from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.without_model import fit_viscously, viscous_system
+from meshmatch.fitting.without_model import fit_without_model
 from meshmatch.maps.places import Places
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.models.trained import TrainedModel
@@ -28,7 +28,7 @@ from meshmatch.threads import thread_limit
 FIRST, ALONE, AGREEING, FITS = "first", "alone", "agreeing", "fits"
 """Folders of a collection: without a model, fits of the shape that is the first template; fits before they agree; what
 they agree on so far; and finished fits."""
-TEMPLATE = "template.safetensors"
+TEMPLATE, FIRST_TEMPLATE = "template.safetensors", "first.safetensors"
 SUFFIX = ".safetensors"
 FAILED = "failed"
 """In place of a verdict, for a shape that could not be fitted."""
@@ -135,12 +135,21 @@ class Setting:
     def fit(self, shape: Shape, last: Fit | None = None) -> Fit:
         """Fit one shape; a frame of a sequence from the last one's fit."""
         if self.model == NO_MODEL:
-            part, template = validated(shape), self.template
+            part, begun, mirror = validated(shape), self._begun(shape.name), self.config.mirror != "no"
             with thread_limit(1):
-                found = fit_viscously(template, viscous_system(template), part.shape)
+                found = fit_without_model(self.template, part.shape, start=begun, mirror=mirror)
             return replace(found, repaired=part)
         matcher = Matcher(self.trained, self.config, 1)
         return matcher.fit(shape) if last is None else matcher.follow(shape, last)
+
+    def _begun(self, name: str) -> Fit | None:
+        """Without a model, where the mean begins: the fit of the first template, if it is to be believed."""
+        file = f"{FIRST}/{name}{SUFFIX}"
+        if self.template_file == FIRST_TEMPLATE or not self.store.exists(file):
+            return None
+        with self.store.reading(file) as path:
+            found = load_fit(path, template_at(self.store, FIRST_TEMPLATE)).fit
+        return None if found.verdict == "poor" else found
 
     def choices(self) -> dict[str, Any]:
         """How shapes are read and fitted, as JSON has it."""
@@ -150,7 +159,8 @@ class Setting:
 
     def digest(self) -> str:
         """Of all that decides how a shape is fitted."""
-        return digest_of(self.template_hash, json.dumps(self.choices(), sort_keys=True))
+        searched = "searched" if self.model == NO_MODEL else ""
+        return digest_of(self.template_hash, json.dumps(self.choices(), sort_keys=True) + searched)
 
 
 def template_at(store: Store, file: str = TEMPLATE) -> Template:

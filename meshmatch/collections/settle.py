@@ -13,13 +13,12 @@ import numpy as np
 
 from meshmatch.api.inputs import as_model, check_config, usable, validated
 from meshmatch.api.kinds import choose_model
-from meshmatch.collections.setting import FIRST, TEMPLATE, Setting, Source
+from meshmatch.collections.setting import FIRST, FIRST_TEMPLATE, TEMPLATE, Setting, Source
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.solve.viscous import ViscousConfig
-from meshmatch.fitting.without_model import template_of
-from meshmatch.geometry.frames import kabsch
+from meshmatch.fitting.without_model import mean_shape, template_of
 from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.input_files import read_json
@@ -28,9 +27,10 @@ from meshmatch.templates.prepared_folder import medoid
 from meshmatch.templates.template import Template, load_template, save_template
 
 SCHEMA = 1
-ABOUT, FIRST_TEMPLATE = "collection.json", "first.safetensors"
+ABOUT = "collection.json"
 _READ_AHEAD = 20  # shapes that are asked for their kind before none is known
 _COMPARED = 40  # shapes among which the first template is looked for
+_AVERAGED = 200  # of which the mean is made
 
 
 def settled(wish: Setting, sources: Sequence[Source]) -> Setting:
@@ -83,7 +83,7 @@ def _first_template(store: Store, sources: Sequence[Source], new: bool) -> Templ
             found.append(validated(sources[number].load()))
     if not found:
         raise InputError(f"none of {len(some)} shapes can be a template", "are they meshes?")
-    chosen = found[medoid(found, "near", "area", 0)]
+    chosen = found[medoid(found, "rigid", "area", 0)]
     return template_of(chosen.shape, chosen.shape.name, ViscousConfig())
 
 
@@ -91,19 +91,13 @@ def on_the_mean(setting: Setting, names: Sequence[str]) -> Setting:
     """The same with the mean of the shapes that the first template was fitted to as the template of all; with the first
     where there are none.
 
-    A template that lies in the middle has less far to go. The mean is taken after rotation and translation to the first
-    mean, twice; each shape at area 1.
+    A template that lies in the middle has less far to go. Of many shapes, some make the mean.
     """
     first = mean = setting.template
     if names:
-        reference = np.asarray(first.shape.verts)
-        for _ in range(2):
-            total = np.zeros_like(reference)
-            for name in names:
-                points = setting.read(FIRST, name).fit.points
-                total += kabsch(points, reference).to_world(points)
-            reference = total / len(names)
-        mean = template_of(Shape(reference, first.shape.faces), "mean", ViscousConfig())
+        some = np.unique(np.linspace(0, len(names) - 1, min(len(names), _AVERAGED)).astype(int))
+        fits = [setting.read(FIRST, names[number]).fit for number in some]
+        mean = template_of(Shape(mean_shape(first, fits), first.shape.faces), "mean", ViscousConfig())
     with setting.store.writing(TEMPLATE) as path:
         save_template(mean, path)
     return replace(setting, template_file=TEMPLATE, template_hash=mean.hash)

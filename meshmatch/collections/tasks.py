@@ -77,7 +77,7 @@ def fit_alone(task: FitTask) -> Record:
             vertices=fit.repaired.original.V,
             seconds=round(time.monotonic() - began, 3),
             digest=digest,
-            notes=fit.repaired.notes[0] if fit.left_out else "",
+            notes=fit.repaired.notes[0] if fit.left_out else "; ".join(fit.notes) if fit.model == NO_MODEL else "",
         )
         words = {"record": asdict(record), "roughness": fit.repaired.shape.roughness}
         with setting.store.writing(file) as path:

@@ -1,32 +1,61 @@
-"""A template fitted without a network, to a shape that stands as it does: one of a collection of scans."""
+"""A template fitted without a network, to a shape of its kind: in any pose and orientation, or mirrored.
+
+Surfaces are brought together by least squares alone (`meshmatch.fitting.solve.viscous`), which finds what lies near. A
+shape that stands as the template does, once it is turned, needs no more. For others the template is first registered to
+the shape as two shapes of no kind are (`meshmatch.fitting.direct`), and begins there.
+"""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.derived import derived
+from meshmatch.errors import InputError
 from meshmatch.fields.shape_functions import build_field
+from meshmatch.fitting.direct import DirectConfig, match_directly
 from meshmatch.fitting.fit import Fit, judged_fit
+from meshmatch.fitting.fit_config import Schedule
 from meshmatch.fitting.fitter import cap_verdict
+from meshmatch.fitting.judge.direct import DirectFeatures
 from meshmatch.fitting.judge.features import compute_features
 from meshmatch.fitting.judge.reasons import Reason
 from meshmatch.fitting.judge.verdict import judge
-from meshmatch.fitting.search.predictor import two_way_residual
 from meshmatch.fitting.search.task import take_samples
+from meshmatch.fitting.solve.blend import FieldPath
+from meshmatch.fitting.solve.driver import Problem, minimise
+from meshmatch.fitting.solve.priors import RotatedReference
 from meshmatch.fitting.solve.system import NodeSystem
+from meshmatch.fitting.solve.terms import LandmarkTerm
 from meshmatch.fitting.solve.viscous import ViscousConfig, viscous_vectors
+from meshmatch.geometry.frames import Frame, RigidPose, kabsch
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.shapes.normalise import align
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, low_mesh, make_template
+from meshmatch.templates.sides import mirrored
 from meshmatch.templates.template import Template
 
 _ALIGNED_BY = 2400  # samples
-# With a residual beyond this (units of sqrt(area)) a shape does not stand as the template does: it is turned.
-_TURNED = 0.12
+_MIRROR = Frame(1.0, np.diag([-1.0, 1.0, 1.0]), np.zeros(3))
+# Where the template roughly belongs is all that is asked of a search.
+_ROUGHLY = DirectConfig(coarse=1200, fine=2400, samples=3000, few=1200, fewer=700, better=8, best=3)
+_ONTO = Schedule(steps=6, prior=(1e-2, 1e-3), scale=(1.0, 1.0), damping=1e-6)
+# Set by hand, on femurs, hearts, ants and four-legged animals: a shape to which the template comes so near, and stretches so
+# little (0.6 for hearts, 0.8 and more for ants in other poses), stands as the template does;
+_NEAR, _STRETCH = 0.045, 0.7
+# a pose that was searched must have so much less than the shape as it is: 0.73 of it for an ant in another pose, 0.95 for
+# one whose legs were exchanged; and so must a mirror image: 0.66 for femurs, 0.97 for ants.
+_SEARCHED, _MIRRORED = 0.9, 0.85
+_SHRUNK = 0.93  # area of a mean of shapes that are posed, against theirs: 0.997 of femurs, 0.87 of ants
+_LOST = 0.5  # trust of a search whose result is not believed
 
 
 def template_of(shape: Shape, name: str, config: ViscousConfig) -> Template:
@@ -42,32 +71,162 @@ def viscous_system(template: Template) -> NodeSystem:
     return NodeSystem(template.shape, build_field(verts, template.nodes, template.radius, "smooth"))
 
 
-def fit_viscously(template: Template, system: NodeSystem, shape: Shape, config: ViscousConfig | None = None) -> Fit:
-    """Fit a template to a repaired shape, turned to it if they do not stand alike; a mesh, or a cloud.
+def mean_shape(template: Template, fits: Sequence[Fit]) -> Float[Floats, "V 3"]:
+    """The template's vertices in the middle of its fits: their mean, after rotation and translation to the first mean,
+    twice.
 
-    Such a fit is fair at best, for nothing was learned of what corresponds.
+    Where shapes are posed, that would shrink what turns. The mean is then of what the field does.
+    """
+    mean = np.asarray(template.shape.verts)
+    for _ in range(2):
+        mean = np.mean([kabsch(fit.points, mean).to_world(fit.points) for fit in fits], axis=0)
+    faces = template.shape.faces
+    if Shape(mean, faces).area > _SHRUNK * np.mean([Shape(fit.points, faces).area for fit in fits]):
+        return np.asarray(mean)
+    path = FieldPath(viscous_system(template), [fit.vectors for fit in fits], template.core)
+    return viscous_system(template).moved(path(np.full(len(fits), 1 / len(fits))))
+
+
+@dataclass(frozen=True, eq=False)
+class _Begin:
+    """From where least squares begin: the core frame, and node vectors there; ``trust`` and ``doubts`` of the search that
+    found it, if there was one.
+    """
+
+    frame: Frame
+    vectors: Float[Floats, "K 3"]
+    trust: float = 1.0
+    doubts: tuple[Reason, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """Where least squares ended, and the samples of the shape in the core frame."""
+
+    begin: _Begin
+    samples: OrientedPoints
+    vectors: Float[Floats, "K 3"]
+    features: DirectFeatures
+
+    @property
+    def energy(self) -> float:
+        return self.features.energy
+
+    @property
+    def alike(self) -> bool:
+        """Whether the shape stands as the template does."""
+        return self.features.residual < _NEAR and self.features.stretch < _STRETCH
+
+
+class _Task:
+    """One shape, and the template that is fitted to it."""
+
+    def __init__(self, template: Template, shape: Shape, config: ViscousConfig) -> None:
+        self.template, self.shape, self.config = template, shape, config
+        self.system = viscous_system(template)
+        self._own, self._samples = take_samples(shape, config.samples, np.random.default_rng(config.seed + 1))
+        self._resting = sample_surface(template.shape, _ALIGNED_BY, np.random.default_rng(config.seed))
+
+    def fitted(self, begin: _Begin) -> _Fitted:
+        points = begin.frame.apply(self._own.undo(self._samples.points))
+        normals = self._samples.normals @ self._own.rotation @ begin.frame.rotation.T
+        samples = replace(self._samples, points=points, normals=normals).facing(self.system.surface(begin.vectors))
+        vectors = viscous_vectors(self.system, samples, self.config, begin.vectors)
+        return _Fitted(begin, samples, vectors, DirectFeatures.of(self.system, samples, vectors))
+
+    def turned(self, side: Frame | None) -> _Begin:
+        """The template as it rests, on the shape, or on its mirror image, turned in any way."""
+        outer = self._own if side is None else self._own.compose(side)
+        normals = self._samples.normals if side is None else self._samples.normals @ side.rotation.T
+        points = self._samples.points if side is None else side.apply(self._samples.points)
+        samples = replace(self._samples, points=points, normals=normals).first(_ALIGNED_BY)
+        pose = align(samples, self._resting, "rigid")[0].pose
+        return _Begin(outer.compose(pose.frame), np.zeros((self.system.K, 3)))
+
+    def searched(self, side: Frame | None) -> list[_Begin]:
+        """Where the template belongs on the shape, or on its mirror image, in another pose; none of what is no surface."""
+        image = self.shape if side is None else mirrored(self.shape)
+        try:
+            found = match_directly(self.template.shape, image, replace(_ROUGHLY, seed=self.config.seed))
+        except InputError:
+            return []
+        at = np.asarray(cKDTree(self.system.verts).query(found.source.frame.undo(found.source.points))[1], np.int64)
+        vectors = self.onto(at, found.target.points)
+        frame = found.target.frame if side is None else side.compose(found.target.frame)
+        return [_Begin(frame, vectors, found.target.trust, found.target.reasons)]
+
+    def onto(self, at: Int[Ints, " N"], points: Float[Floats, "N 3"]) -> Float[Floats, "K 3"]:
+        """Node vectors that take some vertices of the template to points, as rigidly as possible."""
+        prior = RotatedReference(np.tile(np.eye(3), (len(self.system.gradient_points), 1, 1)))
+        problem = Problem(system=self.system, terms=[LandmarkTerm((at, points), 1 / len(at))], schedule=_ONTO)
+        return minimise(problem, prior, np.zeros((self.system.K, 3)))
+
+    def near(self, start: Fit) -> _Begin:
+        """The template as it rests, where a fit of another template of the same vertices has its shape."""
+        samples = self._samples.first(_ALIGNED_BY)
+        points = start.frame.apply(self._own.undo(samples.points))
+        normals = samples.normals @ self._own.rotation @ start.frame.rotation.T
+        pose: RigidPose = align(replace(samples, points=points, normals=normals), self._resting, "near")[0].pose
+        return _Begin(start.frame.compose(pose.frame), np.zeros((self.system.K, 3)))
+
+    def best(self, sides: Sequence[Frame | None]) -> _Fitted:
+        """The best fit of the shape; or of its mirror image, if that fits clearly better."""
+        found = [self.fitted(self.turned(side)) for side in sides]
+        if not any(each.alike for each in found):
+            for number, side in enumerate(sides):
+                for begin in self.searched(side):
+                    found[number] = _clearly_better(self.fitted(begin), found[number], _SEARCHED)
+        plain, *other = found
+        return _clearly_better(other[0], plain, _MIRRORED) if other else plain
+
+    def best_from(self, start: Fit) -> _Fitted:
+        """The best fit from where another template of the same vertices was fitted."""
+        found = self.fitted(self.near(start))
+        if found.alike:
+            return found
+        ambiguous = tuple(reason for reason in start.reasons if reason.code == "ambiguous")
+        vectors = self.onto(np.arange(len(start.points)), start.points)
+        moved = self.fitted(_Begin(start.frame, vectors, 1.0, ambiguous))
+        return _clearly_better(moved, found, _SEARCHED)
+
+
+def _clearly_better(one: _Fitted, other: _Fitted, factor: float) -> _Fitted:
+    """One fit if it has so much less energy than the other; else the other."""
+    return one if one.energy < factor * other.energy else other
+
+
+def fit_without_model(
+    template: Template, shape: Shape, config: ViscousConfig | None = None, start: Fit | None = None, mirror: bool = True
+) -> Fit:
+    """Fit a template to a repaired shape; a mesh, or a cloud. Such a fit is fair at best, for nothing was learned of what
+    corresponds.
+
+    ``start`` is a fit of another template of the same vertices to this shape, from which this one begins. With ``mirror``
+    the shape may be the mirror image of what the template shows.
     """
     config, began = config or ViscousConfig(), time.monotonic()
-    frame, samples = take_samples(shape, config.samples, np.random.default_rng(config.seed + 1))
-    resting = sample_surface(template.shape, _ALIGNED_BY, np.random.default_rng(config.seed))
-    (found,) = align(samples.first(_ALIGNED_BY), resting, "near")
-    if found.residual > _TURNED:
-        found = align(samples.first(_ALIGNED_BY), resting, "rigid")[0]
-    local = samples.to_local(found.pose).facing(system.surface(np.zeros((system.K, 3))))
-    vectors = viscous_vectors(system, local, config)
-    residual = two_way_residual(system, local, vectors)
-    judged = judge(compute_features(system, vectors, local, residual, template.labels))
+    task = _Task(template, shape, config)
+    sides = (None, _MIRROR) if mirror else (None,)
+    found = task.best(sides) if start is None else task.best_from(start)
+    system, frame, residual = task.system, found.begin.frame, found.features.residual
+    judged = judge(compute_features(system, found.vectors, found.samples, residual, template.labels))
     unsure = Reason("unsupervised", "fitted without a trained model: surfaces that lie close need not correspond")
+    notes = ("taken for the mirror image of the template",) if frame.mirrored else ()
     fit = judged_fit(
         judged,
         system,
-        frame.compose(found.pose.frame),
-        vectors,
+        frame,
+        found.vectors,
         template_hash=template.hash,
         residual=residual,
         verts=shape.verts,
         seconds=time.monotonic() - began,
         seed=config.seed,
         model=NO_MODEL,
+        notes=notes,
     )
-    return cap_verdict(fit, [unsure])
+    fit = cap_verdict(fit, [*(reason for reason in found.begin.doubts if reason.code == "ambiguous"), unsure])
+    if found.begin.trust >= _LOST:
+        return fit
+    lost = Reason("unsupervised", "no pose of the template is clearly right for this shape")
+    return replace(fit, verdict="poor", reasons=(lost, *fit.reasons), trust=min(fit.trust, found.begin.trust))

@@ -36,8 +36,10 @@ class ViscousConfig(Pairing):
     seed: int = 0
 
 
-def viscous_vectors(system: NodeSystem, samples: OrientedPoints, config: ViscousConfig) -> Float[Floats, "K 3"]:
-    """Node vectors that move the template onto the shape of the samples, which stands as it does."""
+def viscous_vectors(
+    system: NodeSystem, samples: OrientedPoints, config: ViscousConfig, start: Float[Floats, "K 3"] | None = None
+) -> Float[Floats, "K 3"]:
+    """Node vectors that move the template onto the shape of the samples, from ``start``, or from where it rests."""
     prior = ViscousGradient.over(system.verts[system.gradient_points], config.near)
     problem = Problem(system=system, terms=terms_of(samples, config), schedule=config.schedule)
-    return minimise(problem, prior, np.zeros((system.K, 3)))
+    return minimise(problem, prior, np.zeros((system.K, 3)) if start is None else start)

@@ -1,0 +1,77 @@
+"""A template fitted without a model, to shapes that are turned, mirrored or in another pose."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from meshmatch.errors import InputError
+from meshmatch.fitting import without_model
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.solve.viscous import ViscousConfig
+from meshmatch.fitting.without_model import fit_without_model, mean_shape, template_of, viscous_system
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.sides import mirrored
+from meshmatch.templates.template import Template
+from tests.fitting.test_direct import QUICK, bent, creature
+
+CONFIG = ViscousConfig(nodes=200, radius=0.2, samples=3000, back_points=1500)
+
+
+@pytest.fixture(scope="module")
+def template() -> Template:
+    return template_of(creature(3), "creature", CONFIG)
+
+
+def off(fit: Fit, shape: Shape) -> float:
+    """Mean distance of the template's vertices on a shape from the shape's own, which are the same."""
+    return float(np.linalg.norm(fit.points_in_file - shape.verts, axis=1).mean() / np.sqrt(shape.area))
+
+
+def test_a_turned_mirror_image_is_found_and_named(template: Template, monkeypatch: pytest.MonkeyPatch) -> None:
+    def nothing(*_: Any) -> Any:
+        raise InputError("it is no surface")
+
+    monkeypatch.setattr(without_model, "match_directly", nothing)
+    shape = mirrored(creature(3))
+    turn = Rotation.from_euler("xyz", (100, 20, 200), degrees=True)
+    shape = replace(shape, verts=40 * shape.verts @ turn.as_matrix().T + 5)
+    fit = fit_without_model(template, shape, CONFIG)
+    assert fit.frame.mirrored and "mirror" in fit.notes[0] and fit.verdict == "fair"
+    assert off(fit, shape) < 0.01
+    assert not fit_without_model(template, shape, CONFIG, mirror=False).frame.mirrored
+
+
+def test_another_pose_is_searched_for_and_is_where_the_mean_begins(
+    template: Template, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(without_model, "_ROUGHLY", QUICK)
+    shape = bent(creature(3), Rotation.from_euler("xyz", (70, 130, -40), degrees=True), 250.0)
+    fit = fit_without_model(template, shape, CONFIG, mirror=False)
+    assert off(fit, shape) < 0.04
+    monkeypatch.setattr(without_model, "match_directly", None)
+    again = fit_without_model(template, shape, CONFIG, start=fit)
+    assert off(again, shape) < 0.04
+
+
+def test_what_no_pose_fits_is_poor(template: Template, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(without_model, "_ROUGHLY", QUICK)
+    rod = creature(3)
+    rod = replace(rod, verts=rod.verts * [0.1, 4.0, 0.1])
+    assert fit_without_model(template, rod, CONFIG, mirror=False).verdict == "poor"
+
+
+def test_the_mean_of_poses_keeps_the_size_of_what_turns(template: Template) -> None:
+    system, fits = viscous_system(template), []
+    rest = np.asarray(template.shape.verts)
+    plain = fit_without_model(template, template.shape, CONFIG, mirror=False)
+    for angle in (-1.2, 1.2):  # a limb along y turns about the x axis, more towards its end
+        turn = Rotation.from_rotvec(angle * np.clip(rest[:, 1:2] / 0.6, 0, 1) * [1, 0, 0])
+        vectors = system.vectors_to(turn.apply(rest))
+        fits.append(replace(plain, vectors=vectors, points=system.moved(vectors)))
+    mean = mean_shape(template, fits)
+    straight = np.mean([fit.points for fit in fits], axis=0)
+    lengths = [np.ptp(points[:, 1]) for points in (rest, mean, straight)]
+    assert abs(lengths[1] / lengths[0] - 1) < 0.5 * abs(lengths[2] / lengths[0] - 1)
