@@ -65,7 +65,7 @@ def test_what_no_pose_fits_is_poor(template: Template, monkeypatch: pytest.Monke
 
 def test_the_mean_of_poses_keeps_the_size_of_what_turns(template: Template) -> None:
     system, fits = viscous_system(template), []
-    rest = np.asarray(template.shape.verts)
+    rest = np.array(template.shape.verts)
     plain = fit_without_model(template, template.shape, CONFIG, mirror=False)
     for angle in (-1.2, 1.2):  # a limb along y turns about the x axis, more towards its end
         turn = Rotation.from_rotvec(angle * np.clip(rest[:, 1:2] / 0.6, 0, 1) * [1, 0, 0])
