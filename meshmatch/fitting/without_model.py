@@ -36,7 +36,7 @@ from meshmatch.fitting.solve.viscous import ViscousConfig, viscous_vectors
 from meshmatch.geometry.frames import Frame, RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.registry import NO_MODEL
-from meshmatch.shapes.normalise import align
+from meshmatch.shapes.normalise import Align, align
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, low_mesh, make_template
@@ -52,8 +52,9 @@ _ONTO = Schedule(steps=6, prior=(1e-2, 1e-3), scale=(1.0, 1.0), damping=1e-6)
 # little (0.6 for hearts, 0.8 and more for ants in other poses), stands as the template does;
 _NEAR, _STRETCH = 0.045, 0.7
 # a pose that was searched must have so much less than the shape as it is: 0.73 of it for an ant in another pose, 0.95 for
-# one whose legs were exchanged; and so must a mirror image: 0.66 for femurs, 0.97 for ants.
-_SEARCHED, _MIRRORED = 0.9, 0.85
+# one whose legs were exchanged; and so must one that stands otherwise than the axes of the files say, or is mirrored:
+# 0.66 of mirrored femurs, 0.97 of ants, 0.88 of eggs that were turned wrongly.
+_SEARCHED, _TURNED = 0.9, 0.85
 _SHRUNK = 0.93  # area of a mean of shapes that are posed, against theirs: 0.997 of femurs, 0.87 of ants
 _LOST = 0.5  # trust of a search whose result is not believed
 
@@ -134,13 +135,13 @@ class _Task:
         vectors = viscous_vectors(self.system, samples, self.config, begin.vectors)
         return _Fitted(begin, samples, vectors, DirectFeatures.of(self.system, samples, vectors))
 
-    def turned(self, side: Frame | None) -> _Begin:
-        """The template as it rests, on the shape, or on its mirror image, turned in any way."""
+    def turned(self, side: Frame | None, how: Align = "rigid") -> _Begin:
+        """The template as it rests, on the shape, or on its mirror image, turned in any way, or near its file's axes."""
         outer = self._own if side is None else self._own.compose(side)
         normals = self._samples.normals if side is None else self._samples.normals @ side.rotation.T
         points = self._samples.points if side is None else side.apply(self._samples.points)
         samples = replace(self._samples, points=points, normals=normals).first(_ALIGNED_BY)
-        pose = align(samples, self._resting, "rigid")[0].pose
+        pose = align(samples, self._resting, how)[0].pose
         return _Begin(outer.compose(pose.frame), np.zeros((self.system.K, 3)))
 
     def searched(self, side: Frame | None) -> list[_Begin]:
@@ -172,12 +173,13 @@ class _Task:
     def best(self, sides: Sequence[Frame | None]) -> _Fitted:
         """The best fit of the shape; or of its mirror image, if that fits clearly better."""
         found = [self.fitted(self.turned(side)) for side in sides]
+        found[0] = _clearly_better(found[0], self.fitted(self.turned(None, "near")), _TURNED)
         if not any(each.alike for each in found):
             for number, side in enumerate(sides):
                 for begin in self.searched(side):
                     found[number] = _clearly_better(self.fitted(begin), found[number], _SEARCHED)
         plain, *other = found
-        return _clearly_better(other[0], plain, _MIRRORED) if other else plain
+        return _clearly_better(other[0], plain, _TURNED) if other else plain
 
     def best_from(self, start: Fit) -> _Fitted:
         """The best fit from where another template of the same vertices was fitted."""
