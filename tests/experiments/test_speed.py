@@ -41,8 +41,9 @@ def test_an_earlier_run_stands_beside_this_one(tmp_path: Path) -> None:
         speed.earlier(path)
 
 
-def test_the_numbers_of_the_last_release_are_of_all_cases() -> None:
-    assert list(speed.earlier(Path(__file__).parents[2] / "docs" / "results" / "speed.json")) == list(speed.CASES)
+def test_the_numbers_of_the_last_release_are_of_cases_that_are_still_run() -> None:
+    kept = speed.earlier(Path(__file__).parents[2] / "docs" / "results" / "speed.json")
+    assert "pair" in kept and set(kept) <= set(speed.CASES)
 
 
 def test_a_triangle_in_four() -> None:
