@@ -30,7 +30,8 @@ from meshmatch.transfer.bake import colors_of_vertices
 from meshmatch.transfer.label_files import Labels, On, labels_of, load_labels, named
 from meshmatch.transfer.landmarks import Landmarks, at_points, at_vertices, load_landmarks, push_landmarks
 from meshmatch.transfer.low_confidence import LowConfidence, replace_low_labels, replace_low_values, replace_low_weights
-from meshmatch.transfer.vertex_files import SkinWeights, checked_colors, light_of, load_weights, weights_of
+from meshmatch.transfer.value_files import checked_colors, light_of
+from meshmatch.transfer.weight_files import SkinWeights, load_weights, weights_of
 
 if TYPE_CHECKING:
     from meshmatch.api.matcher import Matcher

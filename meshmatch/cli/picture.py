@@ -209,7 +209,7 @@ def _compose(shown: PictureOptions, subjects: list[Subject], look: "Look", conso
     if shown.fit is not None:
         return _compose_fit(shown, shown.fit, shapes[0], look, console)
     if shown.values:
-        from meshmatch.transfer.vertex_files import load_values
+        from meshmatch.transfer.value_files import load_values
 
         tables = [load_values(*pair).numbers for pair in zip(shown.values, shapes, strict=True)]
         colors = all(table.ndim == 2 and table.shape[1] > 1 for table in tables)

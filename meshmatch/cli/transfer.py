@@ -41,24 +41,24 @@ def transfer_color(
     They are interpolated within the faces of SRC. The VALUE of --blank is a number, one number for each column
     (1,0,0), or a color (#ff0000).
     """
-    from meshmatch.transfer import vertex_files
+    from meshmatch.transfer import value_files
 
     if directions and values is None:
         raise OptionError("--directions needs --values", "give the vectors with --values")
     transfer = Transfer(source, target, output, maps, run, picture)
-    (vertex_files.check_color_suffix if values is None else vertex_files.check_values_suffix)(output)
+    (value_files.check_color_suffix if values is None else value_files.check_values_suffix)(output)
     with transfer.outputs(values) as (temporary,):
         a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
-        given = None if values is None else vertex_files.load_values(values, a)
-        here = vertex_files.light_of(a) if given is None else given.numbers
+        given = None if values is None else value_files.load_values(values, a)
+        here = value_files.light_of(a) if given is None else given.numbers
         columns = 1 if here.ndim == 1 else here.shape[1]
-        rule = rules.rule(None if rules.blank is None else vertex_files.parse_blank(rules.blank, columns).tolist())
+        rule = rules.rule(None if rules.blank is None else value_files.parse_blank(rules.blank, columns).tolist())
         if given is None:
             result = meshmatch.transfer_colors(a, b, transfer, rule=rule)
-            vertex_files.save_colors(temporary, b, result.data)
+            value_files.save_colors(temporary, b, result.data)
         else:
             result = meshmatch.transfer_values(a, b, given.numbers, transfer, directions=directions, rule=rule)
-            vertex_files.save_values(temporary, vertex_files.Values(result.data, given.names), b)
+            value_files.save_values(temporary, value_files.Values(result.data, given.names), b)
     low = transfer.tell_low(result.low, rule.minimum)
     what = "colors" if given is None else f"{columns} number{'s' if columns > 1 else ''} each"
     transfer.console.say(f"wrote {output}: {what} for the {b.V} vertices of {transfer.names[1]}")
@@ -149,7 +149,7 @@ def transfer_weights(
     """
     import numpy as np
 
-    from meshmatch.transfer.vertex_files import check_weights_suffix, load_weights, save_weights
+    from meshmatch.transfer.weight_files import check_weights_suffix, load_weights, save_weights
 
     transfer = Transfer(source, target, output, maps, run, picture)
     rule = meshmatch.ConfidenceRule(min_confidence, fill)

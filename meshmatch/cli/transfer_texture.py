@@ -57,7 +57,7 @@ def transfer_texture(
     as triangles.
     """
     from meshmatch.shapes import textured_files
-    from meshmatch.transfer.vertex_files import parse_color, save_colors
+    from meshmatch.transfer.value_files import parse_color, save_colors
 
     transfer = Transfer(source, target, output, maps, run, picture)
     size, uv, image = texture.size, texture.uv, texture.image

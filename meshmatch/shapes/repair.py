@@ -15,8 +15,8 @@ from meshmatch.arrays import Bools, Brief, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
+from meshmatch.shapes.denoise import without_noise
 from meshmatch.shapes.faces import duplicate_faces, find_parts, flat_faces, seams, turn_faces
-from meshmatch.shapes.noise import without_noise
 from meshmatch.shapes.shape import Shape
 
 NOT_TRUSTED = "left out, as was asked for (weight 0)"
@@ -57,7 +57,7 @@ def repair(shape: Shape) -> Repaired:
     `meshmatch.shapes.faces.OUTLIER_SHARE`; unless together they are more than a tenth of the surface: then the shape
     is made of small parts, and only those far from the rest are outliers); vertices that no face uses. Then faces are
     turned so that neighbours agree and the shape is not inside out. Open and non-manifold edges are counted, not
-    mended. Where noise is as large as the triangles, the surface is smoothed (`meshmatch.shapes.noise`).
+    mended. Where noise is as large as the triangles, the surface is smoothed (`meshmatch.shapes.denoise`).
     Of a cloud: points without a position, double ones, and outliers far from all others.
 
     `InputError` if nothing is left: no face of a mesh has any area.

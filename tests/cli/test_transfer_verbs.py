@@ -18,7 +18,8 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.transfer.label_files import load_labels
 from meshmatch.transfer.landmarks import load_landmarks
-from meshmatch.transfer.vertex_files import load_values, load_weights
+from meshmatch.transfer.value_files import load_values
+from meshmatch.transfer.weight_files import load_weights
 from tests.cli.conftest import Answer, FakeMatching, Run, refused, well
 from tests.conftest import icosphere
 from tests.transfer.known import split

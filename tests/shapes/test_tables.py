@@ -12,7 +12,7 @@ from meshmatch.maps.files import load_map
 from meshmatch.shapes.tables import is_missing, load_pairs, load_points, number, read_table, whole
 from meshmatch.transfer.label_files import load_labels
 from meshmatch.transfer.landmarks import load_landmarks
-from meshmatch.transfer.vertex_files import load_values
+from meshmatch.transfer.value_files import load_values
 from tests.conftest import icosphere
 
 SHAPE = icosphere(1)  # 42 vertices, 80 faces

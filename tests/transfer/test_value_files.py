@@ -11,7 +11,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.colors import seen
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.vertex_files import Values, light_of, load_values, parse_blank, save_colors, save_values
+from meshmatch.transfer.value_files import Values, light_of, load_values, parse_blank, save_colors, save_values
 from tests.conftest import icosphere
 
 SHAPE = icosphere(1)

@@ -13,7 +13,7 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import write_json
 from meshmatch.transfer.attributes import largest_weights
-from meshmatch.transfer.vertex_files import SkinWeights, load_weights, save_weights, weights_of
+from meshmatch.transfer.weight_files import SkinWeights, load_weights, save_weights, weights_of
 from tests.conftest import icosphere
 from tests.transfer.skinned import write_skinned_glb
 

@@ -45,7 +45,8 @@ from meshmatch.templates.template import load_template
 from meshmatch.training.datasets import registered_source
 from meshmatch.transfer.label_files import load_labels
 from meshmatch.transfer.landmarks import load_landmarks
-from meshmatch.transfer.vertex_files import load_values, load_weights
+from meshmatch.transfer.value_files import load_values
+from meshmatch.transfer.weight_files import load_weights
 
 _EGGS = Registered(
     np.empty((0, 0, 3)), np.empty((0, 3), np.int64), ("egg0", "egg1", "egg 2", "egg3"), None, {"egg4": "poor"}

@@ -31,7 +31,8 @@ from meshmatch.shapes.textured_files import save_textured
 from meshmatch.templates.location import bundled_folder
 from meshmatch.transfer.label_files import Labels, save_labels
 from meshmatch.transfer.landmarks import at_vertices, save_landmarks
-from meshmatch.transfer.vertex_files import SkinWeights, Values, save_colors, save_values, save_weights
+from meshmatch.transfer.value_files import Values, save_colors, save_values
+from meshmatch.transfer.weight_files import SkinWeights, save_weights
 
 LABEL_SUFFIXES = (".npy", ".txt", ".csv", ".json")
 IMAGES = {"png": "PNG", "jpg": "JPEG", "webp": "WEBP", "bmp": "BMP", "tga": "TGA", "tif": "TIFF"}

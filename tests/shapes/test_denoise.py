@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from meshmatch.shapes.noise import coherence, without_noise
+from meshmatch.shapes.denoise import coherence, without_noise
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 
