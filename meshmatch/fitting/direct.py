@@ -224,14 +224,15 @@ def match_directly(
     known, guess = (pairs and (frames[0].apply(pairs[0]), frames[1].apply(pairs[1])) for pairs in (known, guess))
     coarse = parallel_map(ThinMesh.of, shapes, [config.coarse] * 2)
     report(0.05)
-    proposals = _proposals(coarse, report.between(0.05, 0.4))
+    proposals = _proposals(coarse, report.stage("guesses without a model", 0.05, 0.4))
     if guess is not None:
         proposals.append(Proposal("guess", _carried(coarse[0].verts, *guess)))
     samples = sample_surface(shapes[1], config.samples, np.random.default_rng(config.seed))
     level = _Level.of(coarse[0], config.coarse_nodes, known, config.seed)
-    tried = _screened(level, proposals, samples, config, report.between(0.4, 0.75))
+    trying = report.stage(f"fits of {len(proposals)} guesses", 0.4, 0.75)
+    tried = _screened(level, proposals, samples, config, trying)
     fine = _Level.of(ThinMesh.of(shapes[0], config.fine), config.fine_nodes, known, config.seed)
-    finished = _finished(level, fine, tried, samples, config, report.between(0.75, 0.9))
+    finished = _finished(level, fine, tried, samples, config, report.stage("fits of the best guesses", 0.75, 0.9))
     best, *others = finished
     apart = [each.features.energy for each in others if differ(each.moved, best.moved) > config.unlike]
     leads = tuple(energy - best.features.energy for energy in apart)
