@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import CancelledError
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from meshmatch.api.inputs import (
     validated,
 )
 from meshmatch.api.results import MatchResult, map_of_fits, shape_of
-from meshmatch.errors import OptionError
+from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
@@ -301,7 +302,8 @@ class Matcher:
         notes = tuple(dict.fromkeys((*(words for kind in kinds for words in kind), *fits[0].notes, *fits[1].notes)))
         result = MatchResult(found, *agreed, time.monotonic() - began, notes, before, self.threads)
         if self._auto and landmarks is None and found.verdict != "good" and _both_whole(clean, agreed):
-            result = match_without_model(clean, configs, None, self.threads, self.progress, guess=result)
+            with suppress(InputError):  # one that cannot be matched directly has the model's map
+                result = match_without_model(clean, configs, None, self.threads, self.progress, guess=result)
         return replace(result, seconds=time.monotonic() - began)
 
     def _choose(

@@ -85,6 +85,24 @@ def test_a_map_of_a_model_that_is_not_good_gives_way_to_a_better_one(
     assert not taken or any("human" in note and "directly" in note for note in result.notes)
 
 
+@pytest.mark.usefixtures("quick")
+def test_what_cannot_be_matched_directly_keeps_the_map_of_its_model(
+    shapes: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = Matcher("none").match(*shapes)
+    fits = [replace(fit, verdict="fair") for fit in (plain.source_fit, plain.target_fit)]
+    unsure = replace(plain.map, verdict="fair")
+
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise InputError("its points lie on no surface")
+
+    monkeypatch.setattr(Matcher, "_choose", lambda self, clean, _: (clean, [(), ()], []))
+    monkeypatch.setattr(Matcher, "_fit_all", lambda *_: fits)
+    monkeypatch.setattr("meshmatch.api.matcher.map_of_fits", lambda *_: unsure)
+    monkeypatch.setattr("meshmatch.api.matcher.match_without_model", refuse)
+    assert Matcher("auto").match(*shapes).map is unsure
+
+
 def test_one_known_shape_of_two_is_still_told() -> None:
     card = SimpleNamespace(category="human")
     models: Any = [SimpleNamespace(card=card)]
