@@ -3,7 +3,7 @@
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
@@ -119,20 +119,23 @@ def sweep(folder: Path) -> None:
 
 
 @contextmanager
-def folder_on_success(path: str | Path) -> Iterator[Path]:
+def folder_on_success(path: str | Path, replaces: Collection[str] = ()) -> Iterator[Path]:
     """Give a temporary folder beside `path`, and rename it to `path` when the block ends well.
 
-    On any exception the temporary folder is removed with all that is in it. Nothing of the user's is ever replaced:
-    `path` must be new, or an empty folder.
+    On any exception the temporary folder is removed with all that is in it, and what was at `path` stays. Nothing of the
+    user's is ever replaced: `path` must be new, or an empty folder, or hold nothing but what the same command writes
+    (the names `replaces`).
 
-    `OutputError` if `path` is a file or holds something, its folder is missing or cannot be written, or the disk refuses.
+    `OutputError` if `path` is a file or holds something else, its folder is missing or cannot be written, or the disk
+    refuses.
     """
     path = _reached(Path(path))
     folder = path.parent
     if path.exists() and not path.is_dir():
         raise OutputError(f"cannot make the folder {path}: it is a file", "choose another name")
-    if path.is_dir() and any(path.iterdir()):
-        raise OutputError(f"the folder {path} is not empty", "choose a new one, or empty it first")
+    _only_holds(path, replaces)
+    if path.is_dir() and path.samefile(Path.cwd()):
+        raise OutputError(f"cannot make the folder {path}: it is the current folder", "give the name of a new one")
     if not folder.is_dir():
         raise OutputError(f"cannot make {path}: there is no folder {folder}", f"make it first: mkdir -p {folder}")
     temporary = folder / f".{path.name[:40]}.{os.urandom(4).hex()}"
@@ -143,10 +146,30 @@ def folder_on_success(path: str | Path) -> Iterator[Path]:
         raise OutputError(f"cannot make the folder {path}: {error.strerror}", hint) from error
     try:
         yield temporary
+        _only_holds(path, replaces)
         if path.is_dir():
-            path.rmdir()  # fails if something came into it since
-        os.replace(temporary, path)
+            _exchange(temporary, path)
+        else:
+            os.replace(temporary, path)
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror or error}", "is the disk full?") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _only_holds(path: Path, names: Collection[str]) -> None:
+    """`OutputError` if there is a folder at ``path`` that holds anything but these."""
+    if path.is_dir() and any(held.name not in names for held in path.iterdir()):
+        raise OutputError(f"the folder {path} is not empty", "choose a new one, or empty it first")
+
+
+def _exchange(new: Path, path: Path) -> None:
+    """Put the folder ``new`` in the place of the one at ``path``, which is removed; if that fails, it is put back."""
+    old = new.with_name(f"{new.name}-old")
+    os.replace(path, old)
+    try:
+        os.replace(new, path)
+    except BaseException:
+        os.replace(old, path)
+        raise
+    shutil.rmtree(old, ignore_errors=True)

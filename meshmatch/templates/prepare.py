@@ -11,7 +11,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
-from meshmatch.outputs import as_path, make_folder, replace_on_success
+from meshmatch.outputs import as_path, folder_on_success, make_folder
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.decimate import Quality, decimate
 from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
@@ -27,6 +27,8 @@ from meshmatch.templates.template import Scale, Template, save_arrays, save_temp
 
 MIN_FACES = 50
 MIN_POINTS = 100
+_ARRAYS = tuple(f"{name}.safetensors" for name in ("template", "points", "shapes"))
+_WRITTEN = (*_ARRAYS, "normalised", "prepared.json", "nodes.png")
 _MOST_SIDES = 200  # shapes among which sides are looked for: it takes a second or two a shape
 
 
@@ -73,15 +75,16 @@ def prepare(
     """Check, normalise and decimate every shape of a folder and make a template for them; or a template of one shape.
 
     Writes ``template.safetensors`` and, of a folder, ``shapes.safetensors`` (registered shapes), ``points.safetensors``
-    (samples of all shapes in the template's frame), ``normalised/NAME.ply`` and, last, ``prepared.json``. Shapes are
-    registered if all have the vertex count and triangles of the template's file.
+    (samples of all shapes in the template's frame), ``normalised/NAME.ply`` and ``prepared.json``. The folder appears
+    whole or not at all; one that an earlier call wrote is replaced. Shapes are registered if all have the vertex count
+    and triangles of the template's file.
 
     Parameters
     ----------
     shapes
         A folder of shapes, or one file.
     output
-        A new folder.
+        A new folder, or one that this wrote before.
     config
         Template, nodes and decimation.
     progress
@@ -115,9 +118,12 @@ def prepare(
     if shapes.is_dir():
         if config.labels is not None:
             raise OptionError("labels are of one shape, not of a folder", "name the shape itself")
-        if output.is_dir() and output.samefile(shapes):
+        if output.resolve() in (shapes.resolve(), *shapes.resolve().parents):
             raise OptionError(f"cannot prepare {shapes} into itself", "choose another folder with -o")
-        return _prepare_folder(shapes, output, config, Progress(progress, shapes.name).stage("checking and aligning"))
+        make_folder(output.parent)
+        stage = Progress(progress, shapes.name).stage("checking and aligning")
+        with folder_on_success(output, replaces=_WRITTEN) as folder:
+            return _prepare_folder(shapes, folder, config, stage)
     for name in ("template", "align", "landmarks"):
         if getattr(config, name) is not None:
             raise OptionError(f"{name} applies to a folder of shapes", "one shape is its own template")
@@ -139,7 +145,7 @@ def prepare(
 
 def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress: Progress) -> Prepared:
     notes: list[str] = []
-    found, marks = _read_shapes(folder, output, config, notes, progress.between(0.0, 0.5))
+    found, marks = _read_shapes(folder, config, notes, progress.between(0.0, 0.5))
     named = _named_template(folder, config, found)
     flags = _mirror_some(found, marks, config, named, notes, progress.between(0.5, 0.6))
     first, own = _template_shape(named, config, found, notes)
@@ -165,6 +171,7 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
         hint = "name one of the shapes with --template, or try another --align or --scale"
         raise InputError(f"most shapes of the folder do not resemble the template {name}: {far}", hint)
     stems = [Path(clean.original.name).stem for clean in found]
+    make_folder(output / "normalised")
     for clean, stem, frame, residual in zip(found, stems, frames, residuals, strict=True):
         label = stem if stems.count(stem) == 1 else clean.original.name
         large = clean.shape.F > config.faces
@@ -185,13 +192,12 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
     words["landmarks"] = samples.landmarks.shape[1]
     words["frames"] = [{"scale": f.scale, "rotation": f.rotation.tolist(), "center": f.center.tolist()} for f in frames]
     words |= {"apart": [round(residual, 5) for residual in residuals], "config": asdict(config.nodes)}
-    with replace_on_success(output / "prepared.json") as temporary:
-        Path(temporary).write_text(json.dumps(words, indent=1), encoding="utf-8")
+    (output / "prepared.json").write_text(json.dumps(words, indent=1), encoding="utf-8")
     return Prepared(made, stack, names, tuple(notes), how, turned, samples.landmarks.shape[1])
 
 
 def _read_shapes(
-    folder: Path, output: Path, config: PrepareConfig, notes: list[str], progress: Progress
+    folder: Path, config: PrepareConfig, notes: list[str], progress: Progress
 ) -> tuple[list[Repaired], list[Float[Floats, "L 3"] | None]]:
     """The usable shapes of a folder, repaired, and the landmarks of each."""
     files = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
@@ -199,7 +205,6 @@ def _read_shapes(
     pairs = [pair for pair in zip(files, landmark_files, strict=True) if pair[0] not in landmark_files]
     if not pairs:
         raise InputError(f"no shapes in {folder}", f"files that end in {', '.join(SUFFIXES)} are read")
-    make_folder(output / "normalised")
     found: list[Repaired] = []
     known: list[prepared_folder.KnownPoints | None] = []
     for number, (path, file) in enumerate(pairs):

@@ -1,6 +1,7 @@
 """A folder made ready: what is registered, what is left out and why, and what lies on the disk afterwards."""
 
 import json
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -164,6 +165,29 @@ def test_an_output_that_cannot_be_made_is_told(folder: Path, tmp_path: Path) -> 
     (tmp_path / "taken").write_text("a file")
     with pytest.raises(OutputError, match="cannot make the folder"):
         prepared(folder, tmp_path / "taken", FEW)
+
+
+def test_a_prepared_folder_is_replaced_whole_and_nothing_else_is(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    first = prepared(folder, out, FEW)
+    (out / "nodes.png").write_bytes(b"a picture of before")
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with monkeypatch.context() as stopped, pytest.raises(KeyboardInterrupt):
+        stopped.setattr("meshmatch.templates.prepare.save_template", lambda *_: signal.raise_signal(signal.SIGINT))
+        prepared(folder, out, FEW)
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted({"out", folder.name})
+    (folder / sorted(path.name for path in folder.iterdir())[-1]).unlink()
+    second = prepared(folder, out, FEW)
+    assert len(second.names) == len(first.names) - 1 == len(list((out / "normalised").iterdir()))
+    assert not (out / "nodes.png").exists()
+    (out / "notes.txt").write_text("the user's own")
+    with pytest.raises(OutputError, match="is not empty"):
+        prepared(folder, out, FEW)
+    with pytest.raises(OptionError, match="into itself"):
+        prepared(out / "normalised", out, FEW)
 
 
 def test_labels_are_of_one_shape_and_for_parts(folder: Path, tmp_path: Path) -> None:
