@@ -30,7 +30,19 @@ def test_symmetries_of_a_box_are_its_turns_and_reflections(folder: Path) -> None
     assert len({tuple(each) for each in found}) == 8
     exact = keypoints_of(folder, "2")
     for each in found:
-        assert error_of(folder, "2", exact[each]) == 0
+        assert error_of(folder, ("1", "2"), exact[each]) == 0
+
+
+def test_a_pair_has_the_symmetries_of_either_shape_too(folder: Path) -> None:
+    box = trimesh.creation.box((0.6, 0.6, 0.3)).subdivide()
+    save_shape(folder / "5.ply", Shape(np.asarray(box.vertices), np.asarray(box.faces)))
+    np.save(folder / "5.keypoints.npy", np.arange(CORNERS))
+    assert len(symmetries(folder)) == len(symmetries(folder, "1", "2")) == 8
+    for pair in (("5", "1"), ("1", "5")):
+        found = symmetries(folder, *pair)
+        assert len(found) == 16 and np.array_equal(found[0], np.arange(CORNERS))
+        exact = keypoints_of(folder, pair[1])
+        assert max(error_of(folder, pair, exact[each]) for each in found) == 0
 
 
 def test_pairs_of_a_file_are_swapped_together_and_rings_turn_together(folder: Path) -> None:
@@ -47,7 +59,7 @@ def test_the_error_is_along_the_surface_in_units_of_its_size(folder: Path) -> No
     wrong = keypoints_of(folder, "1").copy()
     lengths = any_shapes.distances(folder, "1")
     wrong[0] = int(lengths[0].argmax())
-    assert error_of(folder, "1", wrong) == pytest.approx(100 * lengths[0].max() / CORNERS)
+    assert error_of(folder, ("2", "1"), wrong) == pytest.approx(100 * lengths[0].max() / CORNERS)
 
 
 def test_a_row_counts_every_pair_and_names_the_worst() -> None:

@@ -1,6 +1,7 @@
 """Two shapes matched without a model: proposals, nodes on the shape itself, the energy that decides."""
 
 from dataclasses import replace
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.fitting.direct import DirectConfig, match_directly
 from meshmatch.fitting.judge.direct import DirectFeatures, judge_direct
-from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh
+from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh, shortest_tour
 from meshmatch.fitting.search.proposals import Assignments, extremity_proposals, rigid_proposals, spectral_proposals
 from meshmatch.fitting.solve.driver import minimise
 from meshmatch.fitting.solve.surface_nodes import SurfaceNodes
@@ -123,8 +124,25 @@ def test_arms_of_other_lengths_are_found_by_their_order() -> None:
     source, target = armed(np.full(6, 1.0)), armed(np.array([1.6, 0.9, 1.3, 0.8, 1.5, 1.1]))
     to = {int(arm): number for number, arm in enumerate(arms(target))}
     right = tuple(to[int(arm)] for arm in arms(source))
-    lengths, *orders = (way.index(right) if right in way else 99 for way in Assignments(source, target).candidates())
+    ways = Assignments(source, target).candidates()
+    lengths, *orders = (way.index(right) if right in way else 99 for way in ways[:3])
     assert max(orders) < 4 and min(orders) <= lengths
+    around = np.unwrap(angles[arms(target)[target.tour]], period=2 * np.pi)  # the tour goes around once
+    assert np.ptp(np.sign(np.diff(around))) == 0 and abs(around[-1] - around[0]) < 2 * np.pi
+    assert right in ways[3]
+
+
+def test_a_tour_is_the_shortest() -> None:
+    rng = np.random.default_rng(0)
+    for count in (3, 4, 5, 7):
+        lengths = rng.random((count, count))
+        lengths += lengths.T
+        tour = np.array(shortest_tour(lengths))
+        others = np.array(list(permutations(range(count))))
+        assert sorted(tour) == list(range(count))
+        assert lengths[tour, np.roll(tour, 1)].sum() == pytest.approx(
+            lengths[others, np.roll(others, 1, 1)].sum(1).min()
+        )
 
 
 def test_a_turned_copy_is_found_by_a_rigid_motion(thin: ThinMesh) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 import robust_laplacian
@@ -170,6 +171,11 @@ class Intrinsic:
         return spread
 
     @cached_property
+    def tour(self) -> list[int]:
+        """The extremities in the order in which they lie around the shape: along the shortest closed tour by `spread`."""
+        return shortest_tour(self.spread)
+
+    @cached_property
     def limbs(self) -> tuple[Float[Floats, " T"], Float[Floats, "V T"]]:
         """How far each extremity lies from the middle, and how far each vertex lies along the way there: from 0 in the
         middle, or on another limb, to 1 at the end, whatever the length of the limb (Gromov's product).
@@ -205,3 +211,27 @@ def _persistent_maxima(height: Float[Floats, " V"], graph: csr_matrix) -> list[t
             found.append((float(height[peak[lower]] - height[vertex]), int(peak[lower])))
             parent[lower] = roots[0]
     return sorted(found, reverse=True)
+
+
+def shortest_tour(lengths: Float[Floats, "T T"]) -> list[int]:
+    """The order of a shortest closed tour through all of a few places (Held and Karp's algorithm: T^2 2^T steps)."""
+    count = len(lengths)
+    if count < 4:
+        return list(range(count))
+    last = count - 1  # where the tour begins; a set of the others is a number
+    own = np.arange(last)
+    cost, before = np.full((1 << last, last), np.inf), np.zeros((1 << last, last), np.int64)
+    cost[1 << own, own] = lengths[last, own]
+    sets = np.arange(1 << last)
+    sizes = (sets[:, None] >> own & 1).sum(1)
+    for size, new in product(range(1, last), own):
+        some = sets[(sizes == size) & (sets >> new & 1 == 0)]
+        through = cost[some] + lengths[:last, new]
+        cost[some | 1 << new, new] = through.min(1)
+        before[some | 1 << new, new] = through.argmin(1)
+    at, visited = int((cost[-1] + lengths[:last, last]).argmin()), (1 << last) - 1
+    tour = [last]
+    while visited:
+        tour.append(at)
+        at, visited = int(before[visited, at]), visited & ~(1 << at)
+    return tour

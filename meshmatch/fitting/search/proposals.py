@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product, zip_longest
+from itertools import combinations, product, zip_longest
 from typing import Literal
 
 import numpy as np
@@ -57,6 +57,7 @@ class ProposalSettings:
         in each step
     maps : maps of each kind that are kept
     beam, assignments : partial assignments of extremities that are kept, and complete ones, of each search
+    turns : assignments that keep the order around the shape that are kept, of each search
     skipped : cost of an extremity without counterpart
     same : share of vertices by which two maps differ at least, where two vertices ``apart`` differ
     facing : how much the share of triangles that keep their orientation counts, against the error of distances
@@ -77,6 +78,7 @@ class ProposalSettings:
     maps: int = 16
     beam: int = 400
     assignments: int = 50
+    turns: int = 8
     skipped: float = 0.12
     same: float = 0.02
     apart: float = 0.1
@@ -278,8 +280,41 @@ class Assignments:
         self.judged: dict[Assignment, tuple[float, float, Ints]] = {}
 
     def candidates(self) -> list[list[Assignment]]:
-        """The best assignments of beam searches, one by each way to compare."""
-        return [self._searched(*costs) for costs in self._costs]
+        """The best assignments of beam searches, and of those that keep the order around the shape, one list by each way
+        to compare.
+        """
+        return [self._searched(*costs) for costs in self._costs] + self._around()
+
+    def _around(self) -> list[list[Assignment]]:
+        """Assignments that turn one tour of the extremities onto the other, in both directions: of as many as possible,
+        and of all but one.
+        """
+        few = min(self._counts)
+        tours = [[k for k in tour if k < few + 2] for tour in (self._source.tour, self._target.tour)]
+        found = []
+        for size in (few, few - 1):
+            if size < 3:
+                break
+            own, theirs = (np.array(list(combinations(tour, size))) for tour in tours)
+            turns = np.array([np.roll(range(size)[::way], by) for way in (1, -1) for by in range(size)])
+            theirs = theirs[:, turns].reshape(-1, size)
+            own, theirs = np.repeat(own, len(theirs), 0), np.tile(theirs, (len(own), 1))
+            for single, double in self._costs:
+                pairs = own[:, :, None], own[:, None], theirs[:, :, None], theirs[:, None]
+                cost = single[own, theirs].mean(1) + double[pairs].mean((1, 2))
+                best = np.argsort(cost, kind="stable")[: SETTINGS.turns]
+                found.append([self._completed(own[k], theirs[k], single) for k in best])
+        return found
+
+    def _completed(self, own: Int[Ints, " N"], theirs: Int[Ints, " N"], single: Float[Floats, "T U"]) -> Assignment:
+        """An assignment, and of the extremities that it leaves over the two that are most alike."""
+        chosen = np.full(self._counts[0], -1)
+        chosen[own] = theirs
+        rest = np.flatnonzero(chosen < 0), np.setdiff1d(np.arange(self._counts[1]), theirs)
+        if len(rest[0]) and len(rest[1]):
+            i, j = np.unravel_index(single[np.ix_(*rest)].argmin(), (len(rest[0]), len(rest[1])))
+            chosen[rest[0][i]] = rest[1][j]
+        return tuple(chosen.tolist())
 
     def _searched(self, single: Float[Floats, "T U"], double: Float[Floats, "T T U U"]) -> list[Assignment]:
         """By a beam search, extremities in the order in which they stand out."""
