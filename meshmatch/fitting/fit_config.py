@@ -142,7 +142,7 @@ class FitConfig:
         Axis of the file that the shape faces; searched if not given.
     partial
         Whether the shape may be a part: "auto" tries it where a fit of the whole leaves template without surface, "yes"
-        always, "no" never.
+        always, except where a fit of the whole is good and leaves nothing bare, "no" never.
     mirror
         Whether the shape may be the mirror image of what the model knows, such as the other hand: "auto" fits both and
         keeps the better, "no" never; by default as the model's card says.

@@ -106,9 +106,9 @@ def _as_part_if_closer(whole: Registration) -> tuple[Registration, bool]:
 def _best_part(task: FitTask) -> Registration:
     """The best fit of a part; where that is poor, also from more orientations."""
     found = fit_part(task)
-    if judge_registration(found, partial=True).verdict != "poor":
+    if found is not None and judge_registration(found, partial=True).verdict != "poor":
         return found
-    return min(found, fit_part(task, wide=True), key=_cost)
+    return min([each for each in (found, fit_part(task, wide=True)) if each is not None], key=_cost)
 
 
 def cap_verdict(fit: Fit, doubts: Sequence[Reason]) -> Fit:
@@ -122,11 +122,15 @@ def cap_verdict(fit: Fit, doubts: Sequence[Reason]) -> Fit:
 
 
 def _may_be_part(whole: Registration) -> bool:
-    """Whether a fit as a part is worth its time: asked for, or a bad fit of an open shape, or one that leaves it bare."""
-    task = whole.task
-    if task.config.partial != "auto":
-        return task.config.partial == "yes"
-    if not REFINEMENTS[task.config.refine].tries_parts:
+    """Whether a fit as a part is worth its time: asked for and the whole is not good, or a bad fit of an open shape, or one
+    that leaves the template bare.
+    """
+    task, asked = whole.task, whole.task.config.partial
+    if asked == "no":
+        return False
+    if asked == "yes" and judge_registration(whole, partial=False).verdict != "good":
+        return True
+    if asked == "auto" and not REFINEMENTS[task.config.refine].tries_parts:
         return False
     if not may_show_part(task.shape, task.config):
         return False

@@ -128,6 +128,7 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
     task = FitTask.of(model, FitConfig(samples=400, variants=1, refine="none"), open_egg)
     far, near = (RigidPose(np.eye(3), np.array([away, 0.0, 0.0])) for away in (5.0, 0.0))
     asked: set[tuple[int, int, bool]] = set()
+    patient = replace(candidates.SETTINGS, lost=np.inf)
 
     def frames(
         model: TrainedModel, samples: OrientedPoints, config: FitConfig, wide: bool
@@ -136,8 +137,9 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
         return [near if wide == wide_is_better else far], []
 
     found = {}
+    monkeypatch.setattr(candidates, "frames_of_part", frames)
     for verdict in ("fair", "poor"):
-        monkeypatch.setattr(candidates, "frames_of_part", frames)
+        monkeypatch.setattr(candidates, "SETTINGS", patient)
         monkeypatch.setattr(
             fitter,
             "judge_registration",
@@ -149,6 +151,14 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
         assert asked == ({(48, 2, False)} if verdict == "fair" else {(48, 2, False), (96, 4, True)})
     assert found["poor"] <= found["fair"]
     assert (found["poor"] < found["fair"]) or not wide_is_better
+    # where nothing is near, the wide search begins before anything is refined
+    monkeypatch.setattr(candidates, "SETTINGS", replace(patient, lost=0.15))
+    monkeypatch.setattr(
+        fitter, "judge_registration", lambda *_, **__: Judgement("fair", (), FitFeatures(residual=0.02))
+    )
+    asked.clear()
+    assert fitter._best_part(task).candidate.cost == pytest.approx(min(found.values()))
+    assert asked == ({(48, 2, False), (96, 4, True)} if wide_is_better else {(48, 2, False)})
 
 
 def test_frames_of_a_part_are_tried_along_the_body(dancer: Shape) -> None:

@@ -92,12 +92,15 @@ def fit_whole(task: FitTask) -> Registration:
     return Registration(task.on_visible_samples, REFINEMENTS[task.config.refine].whole(task, candidates))
 
 
-def fit_part(task: FitTask, wide: bool = False) -> Registration:
-    """Fit the template to a shape that may show only a part, from more orientations if the search is to be ``wide``.
+def fit_part(task: FitTask, wide: bool = False) -> Registration | None:
+    """Fit the template to a shape that may show only a part, from more orientations if the search is to be ``wide``; None
+    where another search finds nothing near.
 
     The residual is from the samples to the template only.
     """
     task, candidates = candidates_of_part(task, wide)
+    if not candidates:
+        return None
     best = REFINEMENTS[task.config.refine].part(task, candidates)
     root = float(np.sqrt(best.share))
     return Registration(task.rescaled(1 / root, scaled_to_area(task.samples, best.share)), best)
