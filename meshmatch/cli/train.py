@@ -13,7 +13,7 @@ from meshmatch.cli.options import Json, Options, Quiet, Seed, Threads, check_wri
 from meshmatch.cli.words import Console, print_json
 from meshmatch.errors import OptionError, needs
 from meshmatch.models.card import ModelCard
-from meshmatch.models.registry import read_any_card
+from meshmatch.models.registry import NO_MODEL, read_any_card
 from meshmatch.threads import set_threads
 
 if TYPE_CHECKING:
@@ -174,13 +174,16 @@ def train(
 def _by_template(output: Path, how: TrainOptions, console: Console) -> tuple[int, Callable[..., Any]]:
     """The steps of a training that deforms a template of vertices, and what runs it."""
     from meshmatch.training import train as training
-    from meshmatch.training.recipes import going_on, recipe_for
+    from meshmatch.training.recipes import going_on, recipe_for, small_data
 
     settings = (
         "field", "volume", "arap", "blend", "rate", "points", "steps", "minutes", "bf16", "workers", "threads", "seed",
     )  # fmt: skip
     fitted, start = _fits(how, console)
-    recipe = going_on(start) if start and fitted else recipe_for(how.shapes, how.preset, how.unsupervised, how.kind)
+    if fitted is None:
+        recipe = recipe_for(how.shapes, how.preset, how.unsupervised, how.kind)
+    else:
+        recipe = small_data() if start is None else going_on(start)
     recipe = recipe.changed(**{name: getattr(how, name) for name in settings})
     facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, start or how.start)
     shapes, kind = fitted or how.shapes, _generated(how)
@@ -214,7 +217,9 @@ def _implicit(output: Path, how: TrainOptions, console: Console) -> tuple[int, C
 
 
 def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None, TrainedModel | None]":
-    """The shapes of a folder of fits and the model to go on with, which is that of the fits; none of any other folder."""
+    """The shapes of a folder of fits and the model to go on with, which is that of the fits, if they are of one; none of any
+    other folder.
+    """
     from meshmatch.collections.settle import is_collection
 
     if how.shapes is None or not is_collection(how.shapes):
@@ -224,10 +229,16 @@ def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None
 
     if how.preset != "default" or how.unsupervised:
         name = "--unsupervised" if how.unsupervised else f"--preset {how.preset}"
-        raise OptionError(f"{name} does not go with fits", "training on fits continues the model that made them")
+        raise OptionError(f"{name} does not go with fits", "fits have correspondence; leave it out")
     how.refuse(("template", "poses", "characters", "identities", "bodies"), "fits, but with generated shapes")
     collection = Collection(how.shapes)
     found = collection.to_learn()
+    if collection.model == NO_MODEL:
+        if how.start is not None:
+            hint = "fit the shapes with it first (`meshmatch fit ... --model`), and train on those fits"
+            raise OptionError(f"{how.shapes} holds fits without a model, and --start goes on with one", hint)
+        console.say(f"learning from {len(found.verts)} of {len(collection.names)} fits in {how.shapes}")
+        return found, None
     start = as_model(how.start or collection.model)
     console.say(
         f"going on with {start.card.name}, from {len(found.verts)} of {len(collection.names)} fits in {how.shapes}"

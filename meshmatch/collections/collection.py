@@ -162,15 +162,14 @@ class Collection:
         Raises
         ------
         InputError
-            Fewer than three are left, or they were fitted without a model, which says nothing sure of correspondence.
+            Fewer than three are left.
         """
-        if self.model == NO_MODEL:
-            raise InputError(
-                f"the fits in {self.store.location} are of no model", "fit the shapes with a trained model"
-            )
         with self.registered() as found:
-            name = Path(self.store.location).name
-            return RegisteredShapes(self.template, np.array(found.points), name, self.model)
+            name, verts = Path(self.store.location).name, np.array(found.points)
+            if self.model != NO_MODEL:
+                return RegisteredShapes(self.template, verts, name, self.model)
+            mirror = any(self.fit_of(each).frame.mirrored for each in found.names)
+            return RegisteredShapes(self.template, verts, name, self.model, "rigid", mirror)
 
     def fit_of(self, name: str) -> Fit:
         """The fit of a shape, after all have agreed.

@@ -56,7 +56,10 @@ class ShapeSamples:
 
 @dataclass(frozen=True, eq=False)
 class RegisteredShapes:
-    """N shapes on the vertices of a template, which stand as it does: what fits of a trained model found.
+    """N shapes on the vertices of a template, which stand as it does: what fits found, of a trained model or of none.
+
+    ``orientation`` is how far fits without a model are turned, for the card of what is learned from them; ``mirror``
+    whether some of them were mirrored.
 
     `InputError` for another number of vertices than the template's, or coordinates that are no finite numbers.
     """
@@ -64,7 +67,9 @@ class RegisteredShapes:
     template: Template
     verts: Float[Floats, "N V 3"]
     name: str  # of them all
-    model: str  # its name or folder
+    model: str  # its name or folder, or "none"
+    orientation: Align | None = None
+    mirror: bool = False
 
     def __post_init__(self) -> None:
         V, shape = self.template.shape.V, np.shape(self.verts)

@@ -117,5 +117,10 @@ def lessons(
         raise OptionError("generated shapes do not go with a folder of shapes", "leave out one of the two")
     if isinstance(shapes, RegisteredShapes):
         source = deformed_source(torch.from_numpy(np.asarray(shapes.verts, np.float32)))
-        return Lessons(shapes.template, source, shapes.name, f"{len(shapes.verts)} fits of {shapes.name}")
+        known = f"{len(shapes.verts)} fits of {shapes.name}"
+        if shapes.orientation is None:
+            return Lessons(shapes.template, source, shapes.name, known)
+        frame = {"orientation": shapes.orientation, "scale": "area"}
+        sides: Mirroring = "auto" if shapes.mirror else "no"
+        return Lessons(shapes.template, source, "", f"{known}, without a model", frame, sides)
     return prepared(Path(shapes), recipe)

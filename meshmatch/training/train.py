@@ -28,7 +28,7 @@ from meshmatch.models.card import ModelCard, check_name, write_card
 from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.network import NetworkConfig
-from meshmatch.models.registry import CARD, TEMPLATE, WEIGHTS, load_model
+from meshmatch.models.registry import CARD, NO_MODEL, TEMPLATE, WEIGHTS, load_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import make_folder
 from meshmatch.progress import Progress, ProgressCallback
@@ -44,7 +44,7 @@ from meshmatch.training.facts import inherited
 from meshmatch.training.lessons import Lessons, check_start, kind_named, lessons, template_of
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.losses import LossPoints, SurfacePoints, held_out_error
-from meshmatch.training.recipes import Recipe, going_on, recipe_for
+from meshmatch.training.recipes import Recipe, going_on, recipe_for, small_data
 from meshmatch.training.scans import ScanConfig
 
 VALIDATION_SEED = 999_983
@@ -72,8 +72,8 @@ def train(
     output
         The model's folder.
     shapes
-        A folder that `prepare` made, which also has the template; or fits of a model, which goes on learning from them
-        (``Collection(FITS).to_learn()``).
+        A folder that `prepare` made, which also has the template; or fits (``Collection(FITS).to_learn()``): a
+        model that made them goes on learning from them, and what no model made is learned anew.
     kind
         Or generated shapes: "human" (the default), "quadruped", "hand" or "head"; or `Bodies` or a `Kind` with choices.
     recipe
@@ -115,11 +115,14 @@ def train(
     output, facts = Path(output), facts or CardFacts()
     facts = replace(facts, name=check_name(facts.name or output.resolve().name))
     kind = kind_named(kind) if isinstance(kind, str) else kind
-    start = facts.start or (shapes.model if isinstance(shapes, RegisteredShapes) else None)
+    of_model = shapes.model if isinstance(shapes, RegisteredShapes) and shapes.model != NO_MODEL else None
+    start = facts.start or of_model
     start = load_model(start) if isinstance(start, str | Path) else start
     facts = replace(facts, start=start)
     if not isinstance(shapes, RegisteredShapes):
         recipe = recipe or recipe_for(shapes, kind=None if kind is None else kind.name)
+    elif of_model is None:
+        recipe = recipe or small_data()
     else:
         assert start is not None
         if Path(shapes.model).resolve() == output.resolve():

@@ -86,6 +86,33 @@ def test_from_a_folder_to_a_map(run: Run, eggs: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_from_fits_without_a_model_to_a_map(run: Run, tmp_path: Path) -> None:
+    """Shapes are registered to each other first, and what is learned has correspondence."""
+    eggs = tmp_path / "eggs"
+    eggs.mkdir()
+    ball = icosphere(4)
+    for n in range(3):
+        save_shape(
+            eggs / f"egg{n}.ply", Shape(ball.verts[:, np.roll(range(3), n)] * [0.8, 1.4 + 0.1 * n, 1.0], ball.faces)
+        )
+    answer = run("fit", eggs, "-o", tmp_path / "fits", "--model", "none", "--jobs", "1", "-q")
+    assert answer.status == 0, answer.err
+    mine = ("-o", tmp_path / "mine", "--steps", "3")
+    answer = run("train", "--shapes", tmp_path / "fits", *mine, "--start", "human")
+    assert answer.status == 1 and "holds fits without a model" in answer.err
+    answer = run("train", "--shapes", tmp_path / "fits", *mine)
+    assert answer.status == 0 and "learning from 3 of 3 fits" in answer.err
+    card = read_card(tmp_path / "mine" / "card.json")
+    assert card.frame == {"orientation": "rigid", "scale": "area"} and card.correspondence
+    assert (card.category, card.data, card.steps) == ("mine", "3 fits of fits, without a model", 3)
+    answer = run(
+        "match", eggs / "egg0.ply", eggs / "egg1.ply", "-o", tmp_path / "map.npy", "--model", tmp_path / "mine"
+    )
+    assert answer.status == 0, answer.err
+    assert np.load(tmp_path / "map.npy").shape == (ball.V,)
+
+
+@pytest.mark.slow
 def test_from_few_registered_shapes_to_a_map(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small network that finds no orientation: the card says how shapes are turned."""
     folder = tmp_path / "eggs"
