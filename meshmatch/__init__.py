@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 __version__ = "0.3.0"
 
 if TYPE_CHECKING:
+    from meshmatch.api.garment import GarmentResult as GarmentResult
+    from meshmatch.api.garment import transfer_garment as transfer_garment
     from meshmatch.api.interpolation import Interpolation as Interpolation
     from meshmatch.api.interpolation import InterpolationOptions as InterpolationOptions
     from meshmatch.api.interpolation import interpolate as interpolate
@@ -56,6 +58,7 @@ if TYPE_CHECKING:
     from meshmatch.transfer.bake import BakeOptions as BakeOptions
 
 _NAMES = {
+    "api.garment": "GarmentResult transfer_garment",
     "api.interpolation": "Interpolation InterpolationOptions interpolate",
     "api.matcher": "Matcher",
     "api.matching": "match register",

@@ -16,6 +16,7 @@ from meshmatch.cli.picture import picture, view
 from meshmatch.cli.prepare import prepare
 from meshmatch.cli.train import train
 from meshmatch.cli.transfer import transfer_color, transfer_labels, transfer_landmarks, transfer_weights
+from meshmatch.cli.transfer_garment import transfer_garment
 from meshmatch.cli.transfer_texture import transfer_texture
 
 
@@ -63,7 +64,7 @@ def root(
 
 for verb in (
     *(match, register, evaluate),
-    *(transfer_texture, transfer_color, transfer_labels, transfer_weights, transfer_landmarks),
+    *(transfer_texture, transfer_color, transfer_labels, transfer_weights, transfer_landmarks, transfer_garment),
     *(fit, map, atlas),
     *(interpolate, picture, view, info, prepare, train),
 ):

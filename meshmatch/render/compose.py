@@ -239,6 +239,17 @@ def compose_points(shapes: Sequence[Shape], points: Sequence[Float[Floats, "N 3"
     return Composition(tuple(map(_with_points, shapes, points, colors, radii)))
 
 
+def compose_worn(bodies: Sequence[Shape], worn: Sequence[Shape]) -> Composition:
+    """Each body with what it wears: grey, and in the first color of labels."""
+    cloth = label_colors(np.zeros(1, np.int64))
+    panels = []
+    for body, over in zip(bodies, worn, strict=True):
+        together = np.concatenate([body.verts, over.verts]), np.concatenate([body.faces, over.faces + body.V])
+        colors = np.concatenate([np.tile(PALE, (body.V, 1)), np.tile(cloth, (over.V, 1))])
+        panels.append(Panel(Shape(*together, body.name), colors, body.name))
+    return Composition(tuple(panels))
+
+
 def _with_points(
     shape: Shape, points: Float[Floats, "N 3"], colors: Float[Floats, "N 3"], radius: float | None
 ) -> Panel:

@@ -23,9 +23,12 @@ PAIR = {
     "transfer-weights": ("out.npz", "--weights", "weights.json"),
     "transfer-landmarks": ("out.csv", "--landmarks", "points.txt"),
     "transfer-texture": ("out.glb", "--size", "32", "--samples", "1"),
+    "transfer-garment": ("out.obj",),
 }
 """Verbs of two shapes: the output, and what else each needs."""
 EVERY = PAIR | {"register": ("fitted.ply",)}
+FIRST = {"transfer-garment": ("worn.ply",)}
+"""What some verbs want before the shapes."""
 SHARED: list[tuple[tuple[str, ...], dict[str, Any], dict[str, Any]]] = [
     *((("--refine", name), {"refine": name}, {"refine": name}) for name in ("none", "latent")),
     *((("--up", axis), {"up": axis.lower()}, {"up": axis.lower()}) for axis in ("x", "-z", "Y")),
@@ -49,6 +52,7 @@ TOGETHER = [(ALL.split(), CHOSEN | {"front": "y"}, CHOSEN | {"front": "-z"})]
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sphere: Shape, torus: Shape) -> Path:
     """Two colored shapes, and everything that verbs want beside them."""
     monkeypatch.chdir(tmp_path)
+    save_shape("worn.ply", Shape(1.1 * sphere.verts, sphere.faces, "worn"))
     for name, shape in (("a.ply", sphere), ("b.ply", torus)):
         save_shape(name, Shape(shape.verts, shape.faces, name, np.full((shape.V, 4), 0.5)))
     Path("labels.txt").write_text("1\n" * sphere.V)
@@ -62,14 +66,14 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sphere: Shape, torus:
 def test_shared_options_reach_the_matching(run: Run, files: Path, stub: FakeMatching, verb: str) -> None:
     output, *rest = PAIR[verb]
     for words, source, target in SHARED if verb == "match" else TOGETHER:
-        answer = run(verb, "a.ply", "b.ply", "-o", output, *rest, *words)
+        answer = run(verb, *FIRST.get(verb, ()), "a.ply", "b.ply", "-o", output, *rest, *words)
         assert answer.status == 0, answer.err
         assert stub.called["config"] == (FitConfig(**source), FitConfig(**target)), words
         assert (stub.called["landmarks"], stub.called["threads"]) == (None, 2)
     pairs = "--pairs" if verb == "transfer-landmarks" else "--landmarks"
     more = (pairs, "pairs.txt", "--threads", "3", "--model", "./model")
     (files / "model").mkdir()
-    assert run(verb, "a.ply", "b.ply", "-o", output, *rest, *more).status == 0
+    assert run(verb, *FIRST.get(verb, ()), "a.ply", "b.ply", "-o", output, *rest, *more).status == 0
     assert [list(side) for side in stub.called["landmarks"]] == [[0, 5], [10, 11]]
     assert (stub.called["threads"], stub.called["model"]) == (3, "./model")
 
@@ -78,7 +82,8 @@ def call(verb: str, *more: str, output: str = "") -> list[str]:
     """The words of a verb that would go well; another ``output`` has the suffix that the verb wants in place of {}."""
     usual, *rest = EVERY[verb]
     output = output.format(Path(usual).suffix) or usual
-    return [verb, *["a.ply", "b.ply"][: 1 if verb == "register" else 2], "-o", output, *rest, *more]
+    shapes = ["a.ply", "b.ply"][: 1 if verb == "register" else 2]
+    return [verb, *FIRST.get(verb, ()), *shapes, "-o", output, *rest, *more]
 
 
 # Words, those of the message, and the verbs that have no such option.
@@ -181,7 +186,7 @@ def test_files_of_one_name_are_told_apart(run: Run, files: Path, stub: FakeMatch
     Path("other").mkdir()
     Path("other/a.ply").write_bytes(Path("b.ply").read_bytes())
     words = call(verb, "--json")
-    words[2] = "other/a.ply"
+    words[words.index("b.ply")] = "other/a.ply"
     record = json.loads(run(*words).out)
     assert (record["source"], record["target"]) == ("a.ply", "other/a.ply")
 

@@ -27,6 +27,7 @@ from meshmatch.shapes.shape import Shape
 _LARGEST_MTL = 10_000_000  # bytes
 _MOST_LIBRARIES = 100  # names in one line
 _COMMENT = re.compile(r"\s#.*")  # or the end of a name, such as Material #25
+_PICTURE = re.compile(r"^[ \t]*(?:map_\w+|bump|disp|decal|refl|norm)[ \t]+(\S[^\n]*)$", re.MULTILINE | re.IGNORECASE)
 _NUMBER = r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:e[+-]?\d+)?"
 _OPTION = re.compile(
     rf"(?:(-o|-s|-t)((?:\s+{_NUMBER}(?!\S)){{0,3}})|-mm\s+\S+\s+\S+|(-clamp)\s+(\S+)|"
@@ -103,6 +104,35 @@ def read_coordinates(path: Path, data: bytes, shape: Shape) -> Float[Floats, "F 
     uv, laid, _ = _coordinates(path.name, joined_lines(data), shape)
     uv[:, :, 1] = 1.0 - uv[:, :, 1]
     return uv if laid.all() else None
+
+
+def companions(path: Path, data: bytes) -> tuple[list[Path], list[str]]:
+    """The material files that an obj names and the images that these name, all in the obj's folder or below it; and the
+    names that lead nowhere.
+    """
+    found: dict[Path, None] = {}
+    missing: dict[str, None] = {}
+    [libraries] = lines_of(joined_lines(data), b"mtllib")
+    for name, _ in _words(*libraries):
+        whole = beside(path.parent, name)
+        files = [whole] if whole is not None else _named(path.parent, _uncommented(name))
+        if None in files or not files:
+            missing[name] = None
+        found |= dict.fromkeys(file for file in files if file is not None)
+    for library in list(found):
+        text = joined_lines(read_bytes(library, largest=_LARGEST_MTL)).decode("utf-8", "surrogateescape")
+        for rest in _PICTURE.findall(text):
+            try:
+                name = _map(rest.strip()).file
+            except (ValueError, LookupError):
+                name = rest.split()[-1]
+            folders = (library.parent, path.parent)
+            image = next((file for folder in folders if (file := beside(folder, name)) is not None), None)
+            if image is None:
+                missing[name] = None
+            else:
+                found[image] = None
+    return list(found), list(missing)
 
 
 def second_index(text: bytes) -> bytes:

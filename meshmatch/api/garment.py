@@ -1,0 +1,117 @@
+"""Clothes, hair and other things that sit on a shape, from one shape to another."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from meshmatch.api.results import MapPair
+from meshmatch.api.transfer import MapLike, find_maps
+from meshmatch.arrays import Brief, Float, Floats, Int, Ints
+from meshmatch.shapes.files import ShapeLike, as_shape
+from meshmatch.shapes.moved_files import save_moved
+from meshmatch.shapes.shape import Shape
+from meshmatch.threads import thread_limit
+from meshmatch.transfer.garment import carry_garment
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class GarmentResult(Brief):
+    """A garment on another body.
+
+    Attributes
+    ----------
+    shape
+        The garment's vertices and faces in their order, in the frame and unit of the target.
+    turns
+        (V, 3, 3) how each vertex was turned.
+    pushed
+        (N,) vertices that would have sunk deeper below the target's skin than below the source's, and were pushed out.
+    sunk
+        (M,) vertices that are below the target's skin all the same, and are above the source's.
+    maps
+        The maps that were followed.
+    seconds
+        Time beside the match.
+    original
+        The garment's file, if it came from one.
+
+    Examples
+    --------
+    >>> result = meshmatch.transfer_garment("shirt.obj", "templates/samples/dancer.ply", "templates/samples/climber.ply")
+    >>> result.save("climbers-shirt.obj")  # the text of shirt.obj with other positions
+    """
+
+    shape: Shape
+    turns: Float[Floats, "V 3 3"]
+    pushed: Int[Ints, " N"]
+    sunk: Int[Ints, " M"]
+    maps: MapPair
+    seconds: float
+    original: Path | None = None
+
+    def save(self, path: str | Path) -> None:
+        """Write the garment; an .obj from an .obj keeps all of its text but the positions and the directions of normals,
+        and its materials and images are copied beside it.
+
+        Parameters
+        ----------
+        path
+            Where to; its suffix chooses the format, see `save_shape`. What it cannot hold is told.
+
+        Raises
+        ------
+        OptionError
+            The suffix is unknown, or a material would replace another file.
+        OutputError
+            A file cannot be written.
+        """
+        save_moved(path, self.original, self.shape, self.turns)
+
+
+def transfer_garment(garment: ShapeLike, source: ShapeLike, target: ShapeLike, match: MapLike = None) -> GarmentResult:
+    """A mesh that sits on the source (clothes, hair, a hat, shoes), as it sits on the target.
+
+    Each vertex of the garment follows the nearest vertices of the source through the map, with its offset from them,
+    turned and scaled as the body is there. It is pushed out where it would sink below the target's skin; what is below
+    the source's skin stays as deep.
+
+    Parameters
+    ----------
+    garment
+        The mesh to carry, in the frame and unit of the source.
+    source
+        The body that it sits on: a mesh.
+    target
+        The body that it will sit on. Out of a point cloud nothing is pushed.
+    match
+        As in `find_maps`.
+
+    Returns
+    -------
+    GarmentResult
+        Its ``save("worn.obj")`` writes the garment.
+
+    Raises
+    ------
+    MeshmatchError
+        The garment is not on the source, the source is a point cloud or matches as a mirror image; or as for
+        `find_maps`.
+
+    Examples
+    --------
+    >>> body = meshmatch.load_shape("templates/samples/dancer.ply")
+    >>> glove = meshmatch.Shape(body.verts + 0.005 * body.vertex_normals, body.faces)
+    >>> meshmatch.transfer_garment(glove, body, "templates/samples/climber.ply").shape
+    """
+    original = Path(garment) if isinstance(garment, str | Path) else None
+    cloth = as_shape(garment, "garment")
+    source, target = as_shape(source, "source"), as_shape(target, "target")
+    maps = find_maps(source, target, match)
+    began = time.monotonic()
+    with thread_limit(1):
+        found = carry_garment(cloth, maps.forward, maps.source, maps.target, maps.threads)
+    shape = replace(cloth, verts=found.verts)
+    seconds = time.monotonic() - began
+    return GarmentResult(shape, found.turns, found.pushed, found.sunk, maps, seconds, original)

@@ -1,0 +1,59 @@
+"""``meshmatch transfer-garment``."""
+
+from pathlib import Path
+
+from typer import Argument
+
+import meshmatch
+from meshmatch.cli.options import RunOptions, grouped, output_option
+from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, Transfer
+
+
+@grouped
+def transfer_garment(
+    *,
+    garment: Path = Argument(..., metavar="GARMENT", help="Mesh that sits on SRC: clothes, hair, a hat, shoes."),
+    source: Source,
+    target: Target,
+    output: Path = output_option(
+        "FILE",
+        "GARMENT on TGT. An .obj from an .obj keeps everything but the positions, and its materials and images are "
+        "copied beside it; .glb, .ply and others keep less, and say what is lost.",
+    ),
+    maps: MapOptions,
+    run: RunOptions,
+    picture: Picture = None,
+) -> None:
+    """Transfer clothes, hair or other things that sit on one shape to another.
+
+    GARMENT must lie on SRC, in its place and unit. Its vertices follow SRC to TGT, with their distance from the skin
+    turned and scaled as the body is there, and are pushed out where they would sink below the skin of TGT. Vertex
+    order, polygons, texture coordinates, groups and materials stay.
+    """
+    from meshmatch.shapes.moved_files import MovedFile
+
+    transfer = Transfer(source, target, output, maps, run, picture)
+    console = transfer.console
+    worn = meshmatch.load_shape(garment)
+    plan = MovedFile.planned(output, garment)
+    plan.make_folders()
+    with transfer.outputs(garment, plan.files) as temporary:
+        a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
+        result = meshmatch.transfer_garment(worn, a, b, transfer)
+        plan.write(temporary, result.shape, result.turns)
+    if b.is_cloud:
+        console.say(f"note: {transfer.names[1]} is a point cloud: nothing was pushed out of it")
+    elif len(result.pushed):
+        share = 100 * len(result.pushed) / worn.V
+        console.say(f"{len(result.pushed)} of {worn.V} vertices ({share:.1f} %) were pushed out of {transfer.names[1]}")
+    if len(result.sunk):
+        console.warn(f"{len(result.sunk)} of {worn.V} vertices are below the skin of {transfer.names[1]}")
+    written = " ".join(str(file) for file in plan.files)
+    console.say(f"wrote {written}: {garment.name} on {transfer.names[1]} ({result.seconds:.1f} s)")
+    if picture is not None:
+        from meshmatch.render.compose import compose_worn
+
+        transfer.draw(result.maps, compose_worn((a, b), (worn, result.shape)))
+    record = {"picture": picture, "files": [str(file) for file in plan.files], "vertices": worn.V}
+    record |= {"pushed_out": len(result.pushed), "below_skin": len(result.sunk)}
+    transfer.print_record(record, result.maps, float(result.maps.forward.confidence.mean()))

@@ -1,0 +1,128 @@
+"""Meshes whose vertices have moved, in files: an obj keeps its text but for the positions, and takes its materials along."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.errors import InputError, OptionError, warn
+from meshmatch.outputs import make_folder, replace_on_success
+from meshmatch.shapes.appearance import Appearance, png_bytes
+from meshmatch.shapes.files import check_suffix, save_shape
+from meshmatch.shapes.formats import Textured, gltf_out, obj_look, obj_text
+from meshmatch.shapes.input_files import read_bytes
+from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.textured_files import find_appearance
+
+
+@dataclass(frozen=True, eq=False)
+class MovedFile:
+    """An output that is like an original file, but for where its vertices are: what is written, and copied beside it.
+
+    ``original`` is None where the mesh came from no file; ``copies`` are pairs of a new file and what it is a copy of.
+    """
+
+    output: Path
+    original: Path | None
+    copies: tuple[tuple[Path, Path], ...] = ()
+
+    @classmethod
+    def planned(cls, output: Path, original: Path | None) -> MovedFile:
+        """What will be written. Materials and images that are named and not there are told.
+
+        `OptionError`: the suffix cannot be written, or a copy would replace another file. `InputError`: a material file
+        cannot be read.
+        """
+        check_suffix(output)
+        if original is None or not (output.suffix.lower() == original.suffix.lower() == ".obj"):
+            return cls(output, original)
+        here, there = original.parent.resolve(), output.parent.resolve()
+        if here == there:
+            return cls(output, original)
+        found, missing = obj_look.companions(original, read_bytes(original))
+        if missing:
+            warn(f"{original.name} names {', '.join(missing)[:200]}, which is not there: not copied")
+        copies = []
+        for file in found:
+            copy = output.parent / file.resolve().relative_to(here)
+            if not copy.exists():
+                copies.append((copy, file))
+            elif copy.read_bytes() != file.read_bytes():
+                hint = "choose another folder for the output, or remove the file"
+                raise OptionError(f"cannot copy {file.name} beside {output.name}: another {copy} is there", hint)
+        return cls(output, original, tuple(copies))
+
+    @property
+    def files(self) -> list[Path]:
+        """What is written, the output first."""
+        return [self.output, *(copy for copy, _ in self.copies)]
+
+    def make_folders(self) -> None:
+        """Make the folders of copies that lie below the output's; `OutputError` if that cannot be."""
+        for copy, _ in self.copies:
+            if copy.parent != self.output.parent:
+                make_folder(copy.parent)
+
+    def write(self, places: Sequence[Path], shape: Shape, turns: Float[Floats, "V 3 3"]) -> None:
+        """Write the moved mesh and the copies where they wait to get the names of `files`.
+
+        The shape has the original's vertices in its order; ``turns`` is the rotation around each of them. What the format
+        does not hold is told.
+        """
+        for place, (_, file) in zip(places[1:], self.copies, strict=True):
+            place.write_bytes(read_bytes(file))
+        suffix, original = self.output.suffix.lower(), self.original
+        if original is not None and suffix == original.suffix.lower() == ".obj":
+            text = obj_text.with_positions(original.name, read_bytes(original), shape.verts_or_nan, turns)
+            places[0].write_bytes(text)
+            return
+        look = None
+        with suppress(InputError):  # an image that is not there is no reason to lose the mesh
+            look = None if original is None or shape.is_cloud else find_appearance(original, shape)
+        textured = _one_image(shape, look) if suffix == ".glb" and look is not None else None
+        if textured is not None:
+            mesh, image = textured
+            gltf_out.write_textured(places[0], self.output.stem, mesh, image)
+        else:
+            save_shape(places[0], shape)
+        if lost := _lost(original, look, textured is not None):
+            warn(f"{self.output.name} does not have {lost} of {getattr(original, 'name', '')}")
+
+
+def save_moved(path: str | Path, original: Path | None, shape: Shape, turns: Float[Floats, "V 3 3"]) -> None:
+    """Write a mesh that was read from a file and has moved; all files appear, or none. Errors as `MovedFile.planned`, and
+    `OutputError` if a file cannot be written.
+    """
+    plan = MovedFile.planned(Path(path), original)
+    plan.make_folders()
+    with ExitStack() as claims:  # the mesh, which names the others, is claimed first and so renamed last
+        plan.write([claims.enter_context(replace_on_success(file)) for file in plan.files], shape, turns)
+
+
+def _one_image(shape: Shape, look: Appearance) -> tuple[Textured, bytes] | None:
+    """The mesh with its texture, a PNG, if that is all that its look says."""
+    if len(look.materials) != 1 or look.colors is not None or look.materials[0].image is None:
+        return None
+    material = look.materials[0]
+    wrap: Literal["clamp", "repeat"] = "clamp" if material.wrap == ("clamp", "clamp") else "repeat"
+    mesh = Textured(shape.verts, shape.faces, look.uv, material.alpha, material.cutoff, wrap)
+    return mesh, png_bytes(look.materials[0].image)
+
+
+def _lost(original: Path | None, look: Appearance | None, textured: bool) -> str:
+    """What an output in this format does not have of the original, in words."""
+    if original is None:
+        return ""
+    suffix = original.suffix.lower()
+    lost = []
+    if look is not None and not textured and (look.textured or len(look.materials) > 1):
+        lost += ["the texture coordinates", "the materials"]
+    if suffix == ".obj":
+        lost += ["the polygons", "the groups"]
+    elif suffix in (".glb", ".gltf"):
+        lost += ["other maps than the base color", "skins", "morph targets", "the nodes"]
+    return " and ".join([", ".join(lost[:-1]), lost[-1]]) if len(lost) > 1 else "".join(lost)

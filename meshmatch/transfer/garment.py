@@ -1,0 +1,241 @@
+"""What sits on one body, such as clothes, hair or a hat, carried to another body.
+
+Each vertex of the garment is bound to the vertices of the body that are nearest to it and face as the nearest does. Around
+each of these the map turns and scales the body, and the offset of the garment's vertex with it; both are averaged over
+the surface around, so that an error of the map at one vertex does not dent the cloth. The garment then keeps its edges as
+they are turned and scaled there, as far as that leaves it near where it is bound: the deformation is smoothed, and not the
+garment. Where it would sink deeper below the skin than before, it is pushed out, and what is around it follows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import cg
+
+from meshmatch.arrays import Bools, Float, Floats, Int, Ints
+from meshmatch.errors import InputError, OptionError
+from meshmatch.fitting.solve.priors import nearest_rotations
+from meshmatch.geometry.trees import cKDTree
+from meshmatch.geometry.triangles import (
+    dot,
+    edge_lengths,
+    edges_of,
+    interpolate,
+    is_discontinuous,
+    same_rows,
+    triangle_vectors,
+    unit,
+)
+from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.mapped_mesh import MappedMesh, length_of
+
+# All set by hand; lengths in units of sqrt(area).
+# Over this distance turns and scales of the body are averaged.
+_SMOOTH = 0.06
+# Vertices of the body that one of the garment is bound to; those count that are not further away than the nearest by more
+# than this share of its distance.
+_NEAREST, _BLEND = 16, 0.3
+# What it counts to be where it is bound, compared with an edge that keeps its shape; and where it was pushed out.
+_BOUND, _PUSHED = 3.0, 30.0
+# How far a vertex stays above the skin if it was not closer before, and at least; how much less is let pass; rounds.
+_CLEAR, _LEAST, _SLACK, _ROUNDS = 0.0015, 2e-5, 1e-5, 4
+# A garment whose middle vertex is further from the body does not sit on it.
+_FURTHEST = 0.5
+_CHUNK = 16_384
+
+
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """A garment on another body.
+
+    ``verts`` (V, 3) in the frame and unit of that body; ``turns`` (V, 3, 3) how each vertex was turned; ``pushed`` (V,)
+    which were pushed out, and ``sunk`` (V,) which are under the skin and were not before.
+    """
+
+    verts: Float[Floats, "V 3"]
+    turns: Float[Floats, "V 3 3"]
+    pushed: Int[Ints, " N"]
+    sunk: Int[Ints, " M"]
+
+
+def carry_garment(garment: Shape, forward: VertexMap, source: Shape, target: Shape, workers: int = 1) -> Carried:
+    """Carry a garment along a map from the body that it sits on to another one.
+
+    `InputError`: the garment is not on the source, or the source is a point cloud. `OptionError`: the map turns the
+    source inside out.
+    """
+    if source.is_cloud:
+        raise InputError(f"{source.name or 'the source'} is a point cloud: nothing can be bound to it", "give a mesh")
+    bound, jacobians = _Body(forward, source, target).bind(garment, workers)
+    turns = nearest_rotations(jacobians, np.broadcast_to(np.eye(3), jacobians.shape))
+    own, back = np.unique(same_rows(garment.verts), return_inverse=True)  # seams are closed
+    cloth = _Cloth(garment.verts[own], back[garment.faces], jacobians[own])
+    places = bound[own]
+    if target.is_cloud:
+        verts, none = cloth.solve(places, np.full(len(own), _BOUND)), np.empty(0, np.int64)
+        return Carried(verts[back], turns, none, none)
+    scale = np.cbrt(np.abs(np.linalg.det(jacobians[own])))
+    before = _Skin(source).heights(cloth.at(cloth.rest), workers)[0] * cloth.at(scale[:, None])[:, 0]
+    least = np.minimum(before, _CLEAR * length_of(target))
+    least[before > 0] = np.maximum(least[before > 0], _LEAST * length_of(target))
+    verts, pushed, heights = _pushed_out(cloth, places, least, _Skin(target), workers)
+    sunk = (heights < 0) & (before[: len(own)] > 0)
+    return Carried(verts[back], turns, np.flatnonzero(pushed[back]), np.flatnonzero(sunk[back]))
+
+
+class _Body:
+    """The source, and how the map turns and scales it around each vertex."""
+
+    def __init__(self, forward: VertexMap, source: Shape, target: Shape) -> None:
+        self.verts, self.normals = source.verts, source.vertex_normals
+        self.image = forward.points(target)
+        self.size, self.name = length_of(source), source.name or "the source"
+        corners = corners_of(target.faces, forward.face, forward.index)
+        normals = unit(interpolate(target.vertex_normals, corners, forward.barycentric))
+        edges = source.edges.vertices.astype(np.int64)
+        here, there = (place[edges[:, 1]] - place[edges[:, 0]] for place in (self.verts, self.image))
+        length, now = edge_lengths(self.verts, edges), edge_lengths(self.image, edges)
+        torn = is_discontinuous(now / length_of(target), length / self.size) | (length == 0)
+        trust = np.where(torn, 0.0, forward.confidence[edges].min(axis=1)) + 1e-6
+        weight = trust / np.maximum(length, 1e-12 * self.size)
+        products = weight[:, None, None] * there[:, :, None] * here[:, None, :]
+        sums = np.zeros((source.V, 11))  # products, and lengths now and before
+        rows = np.column_stack([products.reshape(-1, 9), trust * now, trust * length])
+        for end in edges.T:
+            np.add.at(sums, end, rows)
+        scale = float(sums[:, 9].sum() / max(sums[:, 10].sum(), 1e-300))
+        if _inside_out(source, self.image, normals):
+            hint = "mirror one of the files, or match without mirror images (--mirror no)"
+            raise OptionError(f"{self.name} matches as a mirror image: a garment would be inside out", hint)
+        outwards = 0.5 * scale * sums[:, 10, None, None] * normals[:, :, None] * self.normals[:, None, :]
+        sums[:, :9] += outwards.reshape(-1, 9)
+        sums = _averaged(sums, edges, length, _SMOOTH * self.size)
+        around = sums[:, :9].reshape(-1, 3, 3)
+        turns = nearest_rotations(around, np.broadcast_to(np.eye(3), around.shape))
+        ratio = np.maximum(sums[:, 9], 0.0) / np.maximum(sums[:, 10], 1e-300)
+        self.jacobians = turns * np.where(ratio > 0, ratio, scale)[:, None, None]
+        self.trust = forward.confidence + 1e-3
+        self.step = float(np.median(length))
+        self.usable = np.flatnonzero(source.valid & (np.bincount(edges.ravel(), minlength=source.V) > 0))
+        self.tree = cKDTree(self.verts[self.usable])
+
+    def bind(self, garment: Shape, workers: int) -> tuple[Floats, Floats]:
+        """Where the garment's vertices (V, 3) are carried, and what the map does around each (V, 3, 3)."""
+        away = float(np.median(self.tree.query(garment.verts[garment.valid], workers=workers)[0]))
+        if away > _FURTHEST * self.size:
+            far = f"{garment.name or 'the garment'} is not on {self.name}: it is {away:.4g} away from it"
+            raise InputError(far, f"both need the same place and unit; {self.name} is {2 * self.size:.4g} in size")
+        places, jacobians = np.empty((garment.V, 3)), np.empty((garment.V, 3, 3))
+        for low in range(0, garment.V, _CHUNK):
+            asked = garment.verts[low : low + _CHUNK]
+            found = self.tree.query(asked, min(_NEAREST, len(self.usable)), workers=workers)
+            distance, rows = (each.reshape(len(asked), -1) for each in found)
+            near = self.usable[rows]
+            reach = _BLEND * distance[:, :1] + self.step
+            weight = np.exp((distance[:, :1] ** 2 - distance**2) / (2 * reach**2)) * self.trust[near]
+            facing = np.einsum("nkd,nd->nk", self.normals[near], self.normals[near[:, 0]])
+            weight *= np.maximum(facing, 0.0)  # not the arm beside the chest
+            weight[:, 0] += 1e-9
+            weight /= weight.sum(axis=1, keepdims=True)
+            own = self.jacobians[near]
+            moved = self.image[near] + np.einsum("nkij,nkj->nki", own, asked[:, None] - self.verts[near])
+            places[low : low + _CHUNK] = np.einsum("nk,nkd->nd", weight, moved)
+            jacobians[low : low + _CHUNK] = np.einsum("nk,nkij->nij", weight, own)
+        return places, jacobians
+
+
+class _Cloth:
+    """A garment whose edges keep their shape as well as they can; its points are its vertices and the middles of faces."""
+
+    def __init__(self, rest: Floats, faces: Ints, jacobians: Floats) -> None:
+        self.rest = rest
+        self.corners = np.concatenate([np.repeat(np.arange(len(rest))[:, None], 3, axis=1), faces])
+        edges = edges_of(faces).vertices.astype(np.int64)
+        start, end = edges.T
+        kept = np.einsum("nij,nj->ni", 0.5 * (jacobians[start] + jacobians[end]), rest[end] - rest[start])
+        self._pull = np.zeros_like(rest)
+        np.add.at(self._pull, end, kept)
+        np.add.at(self._pull, start, -kept)
+        self._laplacian = _laplacian(edges, np.ones(len(edges)), len(rest))
+
+    def at(self, values: Floats) -> Floats:
+        """Values (V, D) of the vertices at all points."""
+        return np.asarray(values[self.corners].mean(axis=1))
+
+    def solve(self, places: Floats, weights: Floats) -> Floats:
+        """Vertices near places (V, 3) that count so much (V,)."""
+        matrix = (self._laplacian + diags_array(weights)).tocsr()
+        return _solved(matrix, self._pull + weights[:, None] * places, places)
+
+
+class _Skin:
+    """A body that things can be above or below."""
+
+    def __init__(self, body: Shape) -> None:
+        self._body, self._mesh = body, MappedMesh.of(body)
+        self.slack = _SLACK * length_of(body)
+
+    def heights(self, points: Floats, workers: int) -> tuple[Floats, Floats]:
+        """Distances (N,) from the surface, negative below it; and the directions out of it (N, 3)."""
+        found = self._mesh.query(points, workers=workers)
+        corners = corners_of(self._body.faces, found.face, found.vertex)
+        foot = interpolate(self._body.verts, corners, found.barycentric)
+        outwards = unit(interpolate(self._body.vertex_normals, corners, found.barycentric))
+        below = dot(points - foot, outwards) < 0
+        return np.where(below, -1.0, 1.0) * found.distance, outwards
+
+
+def _pushed_out(cloth: _Cloth, bound: Floats, least: Floats, skin: _Skin, workers: int) -> tuple[Floats, Bools, Floats]:
+    """Vertices, which of them were pushed, and how high they are, once all points are at least so high above the skin."""
+    places, weights = bound.copy(), np.full(len(bound), _BOUND)
+    verts = cloth.solve(places, weights)
+    pushed = np.zeros(len(verts), bool)
+    for _ in range(_ROUNDS):
+        heights, outwards = skin.heights(cloth.at(verts), workers)
+        low = np.flatnonzero(heights < least - skin.slack)
+        if not len(low):
+            return verts, pushed, heights[: len(verts)]
+        low = low[np.argsort((least - heights)[low], kind="stable")]  # the largest step of each vertex is the last
+        corners = cloth.corners[low]
+        places[corners] = verts[corners] + ((least - heights)[low, None] * outwards[low])[:, None]
+        weights[corners] = _PUSHED
+        pushed[corners] = True
+        verts = cloth.solve(places, weights)
+    heights, outwards = skin.heights(verts, workers)
+    low = np.flatnonzero(heights < least[: len(verts)])
+    verts[low] += (least[low] - heights[low])[:, None] * outwards[low]  # the rest alone
+    return verts, pushed, skin.heights(verts, workers)[0]
+
+
+def _inside_out(source: Shape, image: Floats, normals: Floats) -> bool:
+    """Whether most of the source's faces look into the target where they are mapped to."""
+    moved = triangle_vectors(image, source.faces)[source.valid_faces]
+    outwards = normals[source.faces[source.valid_faces, 0]]
+    return bool(dot(moved, outwards).sum() < -0.5 * np.sqrt(dot(moved, moved)).sum())
+
+
+def _averaged(values: Floats, edges: Ints, length: Floats, radius: float) -> Floats:
+    """Values (V, D) averaged over a surface around each vertex."""
+    V = len(values)
+    degree = np.maximum(np.bincount(edges.ravel(), minlength=V), 1)
+    weight = 4.0 * (radius / np.maximum(length, 0.01 * radius)) ** 2 / degree[edges].mean(axis=1)
+    matrix = (_laplacian(edges, weight, V) + diags_array(np.ones(V))).tocsr()
+    return _solved(matrix, values, values)
+
+
+def _laplacian(edges: Ints, weight: Floats, V: int) -> csr_array:
+    start, end = edges.T
+    places = np.concatenate([start, end]), np.concatenate([end, start])
+    neighbours = csr_array((np.concatenate([weight, weight]), places), shape=(V, V))
+    return csr_array(diags_array(np.asarray(neighbours.sum(axis=1)).ravel()) - neighbours)
+
+
+def _solved(matrix: csr_array, right: Floats, start: Floats) -> Floats:
+    """Columns that solve a positive definite system, by conjugate gradients."""
+    scaled = diags_array(1.0 / matrix.diagonal())
+    columns = [cg(matrix, b, x, rtol=1e-6, maxiter=1000, M=scaled)[0] for b, x in zip(right.T, start.T, strict=True)]
+    return np.stack(columns, axis=1)
