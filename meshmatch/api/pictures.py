@@ -23,6 +23,7 @@ from meshmatch.render.viewer.looks import share_look
 from meshmatch.render.viewer.page import PageReport, write_page
 from meshmatch.shapes.appearance import Appearance, vertex_colors_alone
 from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes
+from meshmatch.shapes.formats.gltf import SUFFIXES as GLTF_SUFFIXES
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import find_appearance, load_coordinates
 from meshmatch.threads import thread_limit
@@ -224,7 +225,7 @@ def _rotations(
         return first, second
     if up is not None or front is not None:
         return facing(maps.source, up, front), None
-    if isinstance(source, str | Path) and Path(source).suffix.lower() in (".glb", ".gltf"):
+    if isinstance(source, str | Path) and Path(source).suffix.lower() in GLTF_SUFFIXES:
         return np.eye(3), None  # the format says: y up, z to the front
     return None, None
 

@@ -35,13 +35,14 @@ _FORMATS: dict[str, tuple[Callable[[Path, bytes], Raw], Callable[[Path, Shape], 
     ".stl": (stl.read, stl.write),
     ".glb": (gltf.read, gltf_out.write),
     ".gltf": (gltf.read, None),
+    ".vrm": (gltf.read, None),
     ".xyz": (plain.read_xyz, plain.write_xyz),
     ".pcd": (ply.read_pcd, None),
     ".npy": (plain.read_points, plain.write_points),
 }
 _WRITERS = {suffix: write for suffix, (_, write) in _FORMATS.items() if write is not None}
 SUFFIXES = tuple(_FORMATS)
-"""The suffixes that `load_shape` knows; `save_shape` writes all of them but .gltf and .pcd."""
+"""The suffixes that `load_shape` knows; `save_shape` writes all of them but .gltf, .vrm and .pcd."""
 check_suffix = partial(tables.check_suffix, suffixes=_WRITERS, what="shapes")
 
 Choice: TypeAlias = str | int | Sequence[str | int]
@@ -175,7 +176,7 @@ def mesh_list(path: str | Path) -> list[tuple[str, int]]:
     in the order of the vertices; none for formats without names. Errors are those of `load_shape`.
     """
     path = existing(as_path(path), suffixes=SUFFIXES)
-    if path.suffix.lower() not in (".glb", ".gltf"):
+    if path.suffix.lower() not in gltf.SUFFIXES:
         return []
     meshes = gltf.read(path, read_bytes(path)).meshes
     return [(names[0] if names else "(no name)", count) for names, count in meshes]

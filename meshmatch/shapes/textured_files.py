@@ -23,6 +23,7 @@ TEXTURED_SUFFIXES = (".glb", ".obj")
 _READERS = {  # of the look, and of texture coordinates alone
     ".glb": (gltf_attributes.read_look, gltf_attributes.read_coordinates),
     ".gltf": (gltf_attributes.read_look, gltf_attributes.read_coordinates),
+    ".vrm": (gltf_attributes.read_look, gltf_attributes.read_coordinates),
     ".obj": (obj_look.read_look, obj_look.read_coordinates),
     ".ply": (ply_look.read_look, ply_look.read_coordinates),
 }

@@ -29,14 +29,16 @@ from meshmatch.shapes.input_files import check_text, json_of, read_bytes
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
-_INSTANCES, _VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
+INSTANCES, _VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
 # What a file may require: extensions that are read, and others that change neither what is drawn nor where.
-_KNOWN = ("KHR_mesh_quantization", _INSTANCES, _VISIBILITY)
+_KNOWN = ("KHR_mesh_quantization", INSTANCES, _VISIBILITY)
 _HARMLESS = re.compile(
     r"[A-Z0-9]+_(?:materials?|textures?|lights?|techniques?|animations?|audio|xmp|node_hover|node_select|interactiv)\w*|"
     r"EXT_(?:structural_metadata|mesh_features|instance_features)|FB_ngon_encoding|MSFT_lod|VRM(?:C_\w+)?"
 )
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
+SUFFIXES = (".glb", ".gltf", ".vrm")
+"""Of files in this format: a vrm is a glb with a character."""
 MOST_NODES = 100_000
 """Nodes of a scene, and primitives that it draws: each takes up to 0.1 ms."""
 Found = TypeVar("Found")
@@ -66,8 +68,11 @@ class Document:
         self.body, self.size = b"", len(data)
         if data[:4] == b"glTF":
             data = self._chunks(data)
-        elif path.suffix.lower() == ".glb":
-            raise InputError(f"{self.name} is not a glb file: it does not begin with 'glTF'", "does the suffix fit?")
+        elif path.suffix.lower() in (".glb", ".vrm"):
+            raise InputError(
+                f"{self.name} is not a {path.suffix[1:].lower()} file: it does not begin with 'glTF'",
+                "does the suffix fit?",
+            )
         try:
             check_text(self.name, data)
             self.json = json_of(self.name, data)
@@ -118,7 +123,7 @@ class Document:
             thirds = 1 if primitive.get("mode", _TRIANGLES) in (_STRIP, _FAN) else 3
             places += vertices + (corners // thirds if primitive.get("mode", _TRIANGLES) != _POINTS else 0)
             check_places(self.name, self.size, places)
-            own = self._placed(node, primitive, place)
+            own = self.placed(node, primitive, place)
             triangles = self.triangles(primitive)
             if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(own)):
                 raise damaged(self.name, f"a face refers to vertex {int(triangles.max())} of {len(own)}")
@@ -167,51 +172,62 @@ class Document:
     def _places(self, number: int) -> Iterator[Float[Floats, "4 4"]]:
         """Where a node's mesh stands: once, or at each of its instances."""
         world = self.world[number]
-        given = self.nodes[number].get("extensions", {}).get(_INSTANCES, {}).get("attributes", {})
+        given = self.nodes[number].get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
         keys = [key for key in ("TRANSLATION", "ROTATION", "SCALE") if key in given]
         if not keys:
             yield world
             return
         self._check_many(max(self.count(given[key]) for key in keys))
         for rows in zip(*(self.accessor(given[key]) for key in keys), strict=True):
-            yield world @ _local({key.lower(): row for key, row in zip(keys, rows, strict=True)})
+            yield world @ local_matrix({key.lower(): row for key, row in zip(keys, rows, strict=True)})
 
     def _check_many(self, number: int) -> None:
         if number > MOST_NODES:
             many = f"the scene of {self.name} has over {MOST_NODES} nodes, or parts of meshes"
             raise InputError(many, "join its meshes before it is exported")
 
-    def _walk(self) -> list[int]:
-        """Node numbers, depth first, parents before children; fills `world`."""
+    def roots(self) -> list[int]:
+        """The topmost nodes of the scene."""
         scenes = self.json.get("scenes")
         if scenes:
-            roots = scenes[self.json.get("scene", 0)].get("nodes", [])
-        else:
-            roots = sorted(set(range(len(self.nodes))) - {c for n in self.nodes for c in n.get("children", [])})
-        stack = [(node, np.eye(4)) for node in reversed(roots)]
+            return list(scenes[self.json.get("scene", 0)].get("nodes", []))
+        return sorted(set(range(len(self.nodes))) - {c for n in self.nodes for c in n.get("children", [])})
+
+    def _walk(self) -> list[int]:
+        """Node numbers, depth first, parents before children; fills `world`."""
+        self.world, self.hidden = {}, set()
+        stack = [(node, np.eye(4)) for node in reversed(self.roots())]
         while stack:
             self._check_many(len(self.world))
             node, parent = stack.pop()
             if node in self.world:
                 raise damaged(self.name, f"node {node} has two parents")
-            self.world[node] = parent @ _local(self.nodes[node])
+            self.world[node] = parent @ local_matrix(self.nodes[node])
             shown = self.nodes[node].get("extensions", {}).get(_VISIBILITY, {}).get("visible", True)
             if shown is False or node in self.hidden:
                 self.hidden |= {node, *self.nodes[node].get("children", [])}
             stack += [(child, self.world[node]) for child in reversed(self.nodes[node].get("children", []))]
         return list(self.world)
 
-    def _placed(self, number: int, primitive: dict[str, Any], place: Floats) -> Floats:
+    def placed(self, number: int, primitive: dict[str, Any], place: Floats) -> Floats:
         """(V, 3) positions in the scene."""
         for extension in primitive.get("extensions", {}):  # there may be plain data as well
             if not _HARMLESS.fullmatch(extension) and not self._has_data(primitive["attributes"]["POSITION"]):
                 raise self._compressed(extension)
-        node, attributes = self.nodes[number], primitive["attributes"]
-        own = np.hstack([self.accessor(attributes["POSITION"]), np.ones((self.count(attributes["POSITION"]), 1))])
+        positions = self.accessor(primitive["attributes"]["POSITION"])
+        return self.moved(number, primitive, np.hstack([positions, np.ones((len(positions), 1))]), place)
+
+    def moved(
+        self, number: int, primitive: dict[str, Any], own: Float[Floats, "V 4"], place: Float[Floats, "4 4"]
+    ) -> Float[Floats, "V 3"]:
+        """What belongs to the vertices of a primitive, in the scene: positions (fourth number 1) or directions (0), moved by
+        the skin of its node, or else by `place`.
+        """
+        node = self.nodes[number]
         hanging = np.asarray(own @ place.T)[:, :3]
-        if "skin" not in node or "JOINTS_0" not in attributes:
+        if "skin" not in node or "JOINTS_0" not in primitive["attributes"]:
             return hanging
-        bones = self._skin(node["skin"])
+        bones = self.bones(node["skin"])
         moved, total = np.zeros((len(own), 4)), np.zeros((len(own), 1))
         for joints, weights in self.influences(primitive):
             for column in range(4):
@@ -220,7 +236,7 @@ class Document:
                 total += weight
         return np.where(total > 0, moved[:, :3] / np.where(total > 0, total, 1.0), hanging)
 
-    def _skin(self, number: int) -> Floats:
+    def bones(self, number: int) -> Floats:
         """(J, 4, 4) where the joints of a skin put what hangs from each."""
         if number not in self._bones:
             skin = self.json["skins"][number]
@@ -284,7 +300,7 @@ class Document:
         else:  # zeros, then filled sparsely
             if self._bound is None:
                 held = [k for k in range(len(self.json.get("buffers", []))) if self._held(k)]
-                self._bound = sum(len(self._buffer(k)) for k in held)
+                self._bound = sum(len(self.buffer(k)) for k in held)
             if not 0 <= count <= max(self._bound, 1):
                 raise damaged(self.name, f"it promises {count} values that it does not hold")
             values = np.zeros((count, width), kind)
@@ -305,7 +321,7 @@ class Document:
         for extension in _COMPRESSED:
             if extension in view.get("extensions", {}) and not self._held(view["buffer"]):
                 raise self._compressed(extension)
-        data = self._buffer(view["buffer"])
+        data = self.buffer(view["buffer"])
         start = view.get("byteOffset", 0) + offset
         row = width * kind.itemsize
         stride = view.get("byteStride", 0) or row
@@ -325,7 +341,8 @@ class Document:
         fallback = any(buffer.get("extensions", {}).get(each, {}).get("fallback") for each in _COMPRESSED)
         return "uri" in buffer or (number == 0 and bool(self.body) and not fallback)
 
-    def _buffer(self, number: int) -> bytes:
+    def buffer(self, number: int) -> bytes:
+        """The data of a buffer; `InputError` where it is missing."""
         if number not in self.buffers:
             uri = self.json["buffers"][number].get("uri")
             if uri is None and number:
@@ -365,7 +382,7 @@ def _data_of(uri: str) -> bytes:
     return base64.b64decode(data + b"=" * (-len(data) % 4), validate=True)
 
 
-def _local(node: dict[str, Any]) -> Floats:
+def local_matrix(node: dict[str, Any]) -> Floats:
     """(4, 4) matrix of a node: given by columns, or translation, rotation (x y z w) and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T

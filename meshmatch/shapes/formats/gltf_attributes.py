@@ -151,9 +151,13 @@ class _Look:
         return np.asarray(turned + np.array(transform.get("offset", (0.0, 0.0)), np.float64))
 
 
+def joint_nodes(document: Document) -> list[int]:
+    """The nodes that are joints of any skin, in the order of `read_skin`."""
+    return sorted({int(joint) for skin in document.json.get("skins", []) for joint in skin["joints"]})
+
+
 def _skin(document: Document) -> tuple[csr_array, tuple[str, ...]]:
-    skins = document.json.get("skins", [])
-    nodes = sorted({int(joint) for skin in skins for joint in skin["joints"]})
+    skins, nodes = document.json.get("skins", []), joint_nodes(document)
     if not nodes:
         raise InputError(f"{document.name} has no skin", "give the weights in a file: --weights weights.npz")
     place = {node: k for k, node in enumerate(nodes)}

@@ -35,13 +35,18 @@ _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
 
 def write(path: Path, shape: Shape) -> None:
+    """A mesh or a cloud, see `glb_of`."""
+    path.write_bytes(glb_of(shape))
+
+
+def glb_of(shape: Shape) -> bytes:
     """A mesh or a cloud; 32-bit floats, 32-bit indices, linear vertex colors."""
     attributes = {"POSITION": shape.verts}
     if not shape.is_cloud:
         attributes["NORMAL"] = smooth_normals(shape.verts, shape.faces)
     if shape.colors is not None:
         attributes["COLOR_0"] = light(shape.colors)
-    _write(path, shape.name, attributes, shape.faces, {}, b"")
+    return _glb(shape.name, attributes, shape.faces, {}, b"")
 
 
 def write_morphs(path: Path, shape: Shape, targets: Mapping[str, Float[Floats, "V 3"]]) -> None:
@@ -51,7 +56,8 @@ def write_morphs(path: Path, shape: Shape, targets: Mapping[str, Float[Floats, "
         name: {"POSITION": verts - shape.verts, "NORMAL": smooth_normals(verts, shape.faces) - normals}
         for name, verts in targets.items()
     }
-    _write(path, shape.name, {"POSITION": shape.verts, "NORMAL": normals}, shape.faces, {}, b"", moves)
+    attributes = {"POSITION": shape.verts, "NORMAL": normals}
+    path.write_bytes(_glb(shape.name, attributes, shape.faces, {}, b"", moves))
 
 
 def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
@@ -70,7 +76,7 @@ def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
     sampler = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPS, **dict.fromkeys(("wrapS", "wrapT"), _WRAPS[mesh.wrap])}
     look = {"materials": [material], "textures": [{"sampler": 0, "source": 0}], "samplers": [sampler]}
     attributes = {"POSITION": mesh.verts[vertex], "NORMAL": normals[vertex], "TEXCOORD_0": uv}
-    _write(path, name, attributes, faces, look, png)
+    path.write_bytes(_glb(name, attributes, faces, look, png))
 
 
 def center_of(verts: Float[Floats, "V 3"]) -> Float[Floats, " 3"]:
@@ -88,15 +94,14 @@ def center_of(verts: Float[Floats, "V 3"]) -> Float[Floats, " 3"]:
     return np.asarray(np.round(middle / step) * step if step > 0 else middle)
 
 
-def _write(
-    path: Path,
+def _glb(
     name: str,
     attributes: dict[str, Floats],
     faces: Ints,
     look: dict[str, Any],
     png: bytes,
     moves: Mapping[str, dict[str, Floats]] | None = None,
-) -> None:
+) -> bytes:
     """Arrays and an image one after the other, each at a multiple of four bytes, behind what describes them."""
     center = center_of(attributes["POSITION"])
     attributes = attributes | {"POSITION": attributes["POSITION"] - center}
@@ -139,7 +144,7 @@ def _write(
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     head = b"glTF" + np.array([2, 28 + len(text) + starts[-1], len(text)], "<u4").tobytes() + b"JSON"
-    path.write_bytes(b"".join([head, text, np.array([starts[-1]], "<u4").tobytes(), b"BIN\0", *padded]))
+    return b"".join([head, text, np.array([starts[-1]], "<u4").tobytes(), b"BIN\0", *padded])
 
 
 def smooth_normals(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Float[Floats, "V 3"]:

@@ -1,0 +1,226 @@
+"""A glTF scene with a skeleton added to it, which moves all that is drawn: nodes, materials and vertices stay as they are.
+
+Specification: Khronos glTF 2.0, sections 3.7.3 and 3.11.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
+from meshmatch.errors import InputError
+from meshmatch.shapes.formats.gltf import INSTANCES, Document
+from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor
+from meshmatch.shapes.formats.gltf_rig import Clip, Rig
+
+_SAME = 1e-6  # of the size of a mesh: vertices that a skin moves by less than this are not moved
+_DIRECTIONS = ("NORMAL", "TANGENT")
+
+
+def rigged(
+    document: Document,
+    rig: Rig,
+    bind: Float[Floats, "N 4 4"],
+    joints: Int[NDArray[np.int32], "V K"],
+    weights: Float[Floats32, "V K"],
+    turn: Float[Floats, "3 3"],
+) -> tuple[bytes, int]:
+    """The scene as a glb, moved by a skeleton; and how many joints of its own move it no more: these become plain nodes,
+    and their clips are left out.
+
+    Vertices are stored as they are, unless a skin of their own bends them: then as they stand.
+
+    Parameters
+    ----------
+    document
+        The scene.
+    rig
+        The skeleton as it is to stand, below its first node, with its clips.
+    bind
+        Where its nodes stand when every vertex is where it was, but for the turn.
+    joints
+        Numbers in ``rig.joints`` of up to four joints for each vertex, in the order of the scene.
+    weights
+        How much each of them moves the vertex.
+    turn
+        What turns the scene upright.
+    """
+    editor = Editor(document)
+    names = _add_nodes(editor, document, rig)
+    where = _four(joints).astype("<u1" if len(rig.joints) <= 256 else "<u2")
+    shares, back = _four(weights), np.linalg.inv(bind[rig.joints])
+    skins: dict[bytes, int] = {}
+    uses = Counter(node["mesh"] for node in document.nodes if "mesh" in node)
+    before: set[int] = set()
+    seen = 0
+    for number, parts in _drawn(document).items():
+        node = editor.json["nodes"][number]
+        frame = _frame(document, number, parts)
+        if uses[node["mesh"]] > 1:  # other weights for each node
+            uses[node["mesh"]] -= 1
+            node["mesh"] = editor.add("meshes", copy.deepcopy(editor.json["meshes"][node["mesh"]]))
+        for k, part in parts.items():
+            own = editor.json["meshes"][node["mesh"]]["primitives"][k]
+            if frame is None:
+                _straighten(editor, document, number, part, own)
+            attributes = own["attributes"]
+            for key in [key for key in attributes if key.startswith(("JOINTS_", "WEIGHTS_"))]:
+                del attributes[key]
+            some = slice(seen, seen + document.count(part["attributes"]["POSITION"]))
+            attributes["JOINTS_0"] = editor.add_array(where[some], target=VERTICES)
+            attributes["WEIGHTS_0"] = editor.add_array(shares[some], target=VERTICES)
+            seen = some.stop
+        standing = np.eye(4) if frame is None else frame.copy()
+        standing[:3] = turn @ standing[:3]
+        if standing.tobytes() not in skins:
+            inverse = (back @ standing).swapaxes(1, 2).reshape(-1, 16)
+            entry: dict[str, Any] = {"name": rig.names[0], "joints": [names[joint] for joint in rig.joints.tolist()]}
+            entry |= {"inverseBindMatrices": editor.add_array(inverse.astype("<f4")), "skeleton": names[0]}
+            skins[standing.tobytes()] = editor.add("skins", entry)
+        if "skin" in node:
+            before.add(node["skin"])
+        node["skin"] = skins[standing.tobytes()]
+    gone = _drop_skins(editor, before)
+    arrays: dict[bytes, int] = {}
+    for clip in rig.clips:
+        _add_clip(editor, clip, names, arrays)
+    return editor.to_bytes(), gone
+
+
+def _drawn(document: Document) -> dict[int, dict[int, dict[str, Any]]]:
+    """Nodes that draw something, in the order of the scene, with the numbers of the primitives that they draw."""
+    place = {id(part): k for mesh in document.json["meshes"] for k, part in enumerate(mesh["primitives"])}
+    found: dict[int, dict[int, dict[str, Any]]] = {}
+    for number, part, _ in document.primitives():
+        if INSTANCES in document.nodes[number].get("extensions", {}):
+            copies = f"{document.name} draws copies of one mesh ({INSTANCES}), which joints cannot move apart"
+            raise InputError(copies, "export each copy as an object of its own")
+        found.setdefault(number, {})[place[id(part)]] = part
+    return found
+
+
+def hanging_groups(document: Document) -> list[Ints]:
+    """Vertices, in the order of the scene, of each node that hangs from a joint and is not bent by a skin: they are to
+    stay rigid.
+    """
+    drawn = _drawn(document)
+    joints = {int(joint) for skin in document.json.get("skins", []) for joint in skin["joints"]}
+    below = set(joints)
+    for node in document.world:
+        if node in below:
+            below.update(document.nodes[node].get("children", []))
+    found, seen = [], 0
+    for number, parts in drawn.items():
+        V = sum(document.count(part["attributes"]["POSITION"]) for part in parts.values())
+        if number in below and "skin" not in document.nodes[number]:
+            found.append(np.arange(seen, seen + V))
+        seen += V
+    return found
+
+
+def _four(values: NDArray[Any]) -> NDArray[Any]:
+    return np.pad(values, ((0, 0), (0, 4 - values.shape[1])))
+
+
+def _add_nodes(editor: Editor, document: Document, rig: Rig) -> list[int]:
+    """The numbers of the skeleton's nodes in the document."""
+    names = [editor.add_node(*each) for each in zip(rig.names, rig.rotations, rig.translations, strict=True)]
+    for node, parent in enumerate(rig.parents.tolist()):
+        if parent >= 0:
+            editor.json["nodes"][names[parent]].setdefault("children", []).append(names[node])
+    if editor.json.get("scenes"):
+        editor.json["scenes"][editor.json.get("scene", 0)].setdefault("nodes", []).append(names[0])
+    else:
+        editor.json |= {"scenes": [{"nodes": [*document.roots(), names[0]]}], "scene": 0}
+    return names
+
+
+def _frame(document: Document, number: int, parts: dict[int, dict[str, Any]]) -> Float[Floats, "4 4"] | None:
+    """What puts the vertices of a node where they stand in the scene; None where a skin bends them."""
+    place = document.world[number]
+    if "skin" not in document.nodes[number]:
+        return place
+    bones = document.bones(document.nodes[number]["skin"])
+    frame = None
+    for part in parts.values():
+        positions, standing = document.accessor(part["attributes"]["POSITION"]), document.placed(number, part, place)
+        if frame is None:
+            frame = place
+            if "JOINTS_0" in part["attributes"]:
+                joints, weights = next(document.influences(part))
+                frame = bones[int(joints[0, weights[0].argmax()])]
+        off = np.abs(positions @ frame[:3, :3].T + frame[:3, 3] - standing)
+        if not off.max() <= _SAME * max(float(np.ptp(standing, axis=0).max()), float(np.abs(standing).max())):
+            return None
+    return frame
+
+
+def _straighten(editor: Editor, document: Document, number: int, part: dict[str, Any], own: dict[str, Any]) -> None:
+    """Store the vertices of a primitive where a skin puts them, and turn what belongs to them."""
+    place = document.world[number]
+
+    def turned(accessor: int, unit: bool) -> Floats:
+        values = document.accessor(accessor)
+        directions = np.hstack([values[:, :3], np.zeros((len(values), 1))])
+        found = document.moved(number, part, directions, place)
+        if unit:
+            found = found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-30)
+        return np.hstack([found, values[:, 3:]])
+
+    attributes = own["attributes"]
+    standing = document.placed(number, part, place).astype("<f4")
+    attributes["POSITION"] = editor.add_array(standing, bounds=True, target=VERTICES)
+    for key in [key for key in _DIRECTIONS if key in attributes]:
+        attributes[key] = editor.add_array(turned(attributes[key], True).astype("<f4"), target=VERTICES)
+    for target in own.get("targets", []):
+        for key in [key for key in ("POSITION", *_DIRECTIONS) if key in target]:
+            target[key] = editor.add_array(turned(target[key], False).astype("<f4"), bounds=key == "POSITION")
+
+
+def _drop_skins(editor: Editor, before: set[int]) -> int:
+    """Remove skins that move nothing any more, and what moves their joints; returns how many joints these are."""
+    nodes, skins = editor.json["nodes"], editor.json["skins"]
+    used = {node["skin"] for node in nodes if "skin" in node}
+    gone = before - used
+    kept = [k for k in range(len(skins)) if k not in gone]
+    joints = {joint for k in gone for joint in skins[k]["joints"]} - {
+        joint for k in kept for joint in skins[k]["joints"]
+    }
+    number = {old: new for new, old in enumerate(kept)}
+    for node in nodes:
+        if "skin" in node:
+            node["skin"] = number[node["skin"]]
+    editor.json["skins"] = [skins[k] for k in kept]
+    for animation in editor.json.get("animations", []):
+        channels = animation["channels"]
+        animation["channels"] = [each for each in channels if each["target"].get("node") not in joints]
+    if "animations" in editor.json:
+        editor.json["animations"] = [each for each in editor.json["animations"] if each["channels"]]
+        if not editor.json["animations"]:
+            del editor.json["animations"]
+    return len(joints)
+
+
+def _add_clip(editor: Editor, clip: Clip, names: list[int], arrays: dict[bytes, int]) -> None:
+    """Add an animation; ``arrays`` are accessors of those that were added before, for many share their times."""
+    entry: dict[str, Any] = {"name": clip.name, "samplers": [], "channels": []}
+
+    def once(values: Floats, bounds: bool) -> int:
+        short = values.astype("<f4")
+        key = b"%d %d " % (bounds, values[0].size) + short.tobytes()
+        if key not in arrays:
+            arrays[key] = editor.add_array(short, bounds=bounds)
+        return arrays[key]
+
+    for track in clip.tracks:
+        sampler: dict[str, Any] = {"input": once(track.times, True), "output": once(track.values, False)}
+        sampler["interpolation"] = track.interpolation
+        target = {"node": names[track.node], "path": track.moves}
+        entry["channels"].append({"sampler": len(entry["samplers"]), "target": target})
+        entry["samplers"].append(sampler)
+    editor.add("animations", entry)
