@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from meshmatch.api.results import MatchResult as MatchResult
     from meshmatch.api.results import Transferred as Transferred
     from meshmatch.api.results import evaluate as evaluate
+    from meshmatch.api.rig import RiggedResult as RiggedResult
+    from meshmatch.api.rig import transfer_rig as transfer_rig
     from meshmatch.api.texture import TexturedResult as TexturedResult
     from meshmatch.api.texture import transfer_texture as transfer_texture
     from meshmatch.api.transfer import find_maps as find_maps
@@ -64,6 +66,7 @@ _NAMES = {
     "api.matching": "match register",
     "api.pictures": "picture view",
     "api.results": "ConfidenceRule MatchResult Transferred evaluate",
+    "api.rig": "RiggedResult transfer_rig",
     "api.texture": "TexturedResult transfer_texture",
     "api.transfer": "find_maps transfer_colors transfer_labels transfer_landmarks transfer_values transfer_weights",
     "collections.atlas": "Atlas",

@@ -17,6 +17,7 @@ from meshmatch.cli.prepare import prepare
 from meshmatch.cli.train import train
 from meshmatch.cli.transfer import transfer_color, transfer_labels, transfer_landmarks, transfer_weights
 from meshmatch.cli.transfer_garment import transfer_garment
+from meshmatch.cli.transfer_rig import transfer_rig
 from meshmatch.cli.transfer_texture import transfer_texture
 
 
@@ -64,7 +65,8 @@ def root(
 
 for verb in (
     *(match, register, evaluate),
-    *(transfer_texture, transfer_color, transfer_labels, transfer_weights, transfer_landmarks, transfer_garment),
+    *(transfer_texture, transfer_color, transfer_labels, transfer_weights),
+    *(transfer_rig, transfer_landmarks, transfer_garment),
     *(fit, map, atlas),
     *(interpolate, picture, view, info, prepare, train),
 ):

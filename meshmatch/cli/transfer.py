@@ -137,7 +137,7 @@ def transfer_weights(
     output: Path = output_option("FILE", "Skin weights of TGT: .npz or .json."),
     maps: MapOptions,
     run: RunOptions,
-    weights: Path | None = optional("FILE", "Skin weights of SRC: .npz, .json or .glb. Default: the skin in SRC."),
+    weights: Path | None = optional("FILE", "Skin weights of SRC: .npz, .json, .glb or .vrm. Default: the skin in SRC."),
     influences: int = Option(4, min=1, help="Maximum number of joints per vertex."),
     fill: bool = Option(False, "--fill", help="Replace weights of low confidence by those of their neighbours."),
     min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Minimum confidence for weights to be trusted."),
@@ -149,6 +149,7 @@ def transfer_weights(
     """
     import numpy as np
 
+    from meshmatch.shapes.formats.gltf import SUFFIXES as GLTF_SUFFIXES
     from meshmatch.transfer.weight_files import check_weights_suffix, load_weights, save_weights
 
     transfer = Transfer(source, target, output, maps, run, picture)
@@ -156,7 +157,7 @@ def transfer_weights(
     check_weights_suffix(output)
     with transfer.outputs(weights) as (temporary,):
         a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
-        if weights is None and source.suffix.lower() not in (".glb", ".gltf"):
+        if weights is None and source.suffix.lower() not in GLTF_SUFFIXES:
             raise InputError(f"{a.name} has no skin weights", "give them in a file: --weights weights.npz")
         given = load_weights(weights or source, a)
         result = meshmatch.transfer_weights(a, b, given, transfer, influences=influences, rule=rule)

@@ -8,9 +8,10 @@ are numbers from 0, and `NO_LABEL` for none; one for each vertex of the source o
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import triangle_areas
 from meshmatch.maps.vertex_map import VertexMap, corners_of
@@ -198,3 +199,17 @@ def largest_weights(weights: csr_array, limit: int) -> csr_array:
     rows, data = rows[order], weights.data[order]
     data = data / np.bincount(rows, data, weights.shape[0])[rows]
     return csr_array((data, (rows, weights.indices[order])), shape=weights.shape)
+
+
+def joint_table(weights: csr_array) -> tuple[Int[NDArray[np.int32], "V N"], Float[Floats32, "V N"]]:
+    """Joints of each vertex, the heaviest first, and their weights; 0 and 0 behind the last."""
+    weights = csr_array(weights)
+    V = weights.shape[0]
+    rows = np.repeat(np.arange(V), np.diff(weights.indptr))
+    order = np.lexsort((weights.indices, -weights.data, rows))
+    place = np.arange(len(order)) - weights.indptr[rows[order]]
+    N = int(np.diff(weights.indptr).max(initial=1))
+    joints, shares = np.zeros((V, N), np.int32), np.zeros((V, N), np.float32)
+    joints[rows[order], place] = weights.indices[order]
+    shares[rows[order], place] = weights.data[order]
+    return joints, shares

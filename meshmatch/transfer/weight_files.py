@@ -18,6 +18,7 @@ from meshmatch.outputs import plain_text
 from meshmatch.shapes import tables
 from meshmatch.shapes.input_files import read_bytes, read_json, read_npz
 from meshmatch.shapes.shape import LARGEST, Shape
+from meshmatch.transfer.attributes import joint_table
 
 WEIGHT_SUFFIXES = (".npz", ".json")
 check_weights_suffix = partial(tables.check_suffix, suffixes=WEIGHT_SUFFIXES, what="skin weights")
@@ -35,7 +36,7 @@ class SkinWeights(Brief):
 
 
 def load_weights(path: str | Path, shape: Shape) -> SkinWeights:
-    """Skin weights of the vertices of `shape`, from .npz, .json, .glb or .gltf; `InputError` if not its own."""
+    """Skin weights of the vertices of `shape`, from .npz, .json, .glb, .gltf or .vrm; `InputError` if not its own."""
     from meshmatch.shapes.formats.gltf_attributes import read_skin
 
     readers = {
@@ -43,6 +44,7 @@ def load_weights(path: str | Path, shape: Shape) -> SkinWeights:
         ".json": lambda path: _from_record(read_json(path)),
         ".glb": lambda path: read_skin(path, read_bytes(path)),
         ".gltf": lambda path: read_skin(path, read_bytes(path)),
+        ".vrm": lambda path: read_skin(path, read_bytes(path)),
     }
     matrix, names = tables.read_by_suffix(path, readers, "skin weights", _WEIGHTS_HINT)
     return SkinWeights(_normalized(Path(path).name, matrix, shape), names)
@@ -118,15 +120,7 @@ def _normalized(name: str, matrix: csr_array, shape: Shape) -> csr_array:
 def save_weights(path: Path, weights: SkinWeights) -> None:
     """Write skin weights; `OptionError` if the suffix is not one of `WEIGHT_SUFFIXES`."""
     suffix = check_weights_suffix(path)
-    matrix = csr_array(weights.matrix)
-    V = matrix.shape[0]
-    rows = np.repeat(np.arange(V), np.diff(matrix.indptr))
-    order = np.lexsort((matrix.indices, -matrix.data, rows))
-    place = np.arange(len(order)) - matrix.indptr[rows[order]]
-    N = int(np.diff(matrix.indptr).max(initial=1))
-    joints, shares = np.zeros((V, N), np.int32), np.zeros((V, N), np.float32)
-    joints[rows[order], place] = matrix.indices[order]
-    shares[rows[order], place] = matrix.data[order]
+    joints, shares = joint_table(weights.matrix)
     if suffix == ".npz":
         names = np.array(weights.names, np.str_)
         tables.write_npz(path, {"format": _WEIGHTS_FORMAT, "names": names, "joints": joints, "weights": shares})

@@ -1,0 +1,159 @@
+"""Skeletons with their clips from one shape to another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from meshmatch.api.results import MapPair
+from meshmatch.api.transfer import MapLike, find_maps
+from meshmatch.arrays import Brief, Floats
+from meshmatch.errors import InputError, OptionError
+from meshmatch.outputs import as_path, replace_on_success
+from meshmatch.shapes import tables
+from meshmatch.shapes.files import ShapeLike, as_shape, load_shape
+from meshmatch.shapes.formats import gltf, gltf_out
+from meshmatch.shapes.formats.gltf_rig import Rig, read_rig
+from meshmatch.shapes.formats.gltf_rigged import hanging_groups, rigged
+from meshmatch.shapes.input_files import read_bytes
+from meshmatch.shapes.shape import Shape
+from meshmatch.threads import thread_limit
+from meshmatch.transfer.attributes import joint_table, pull_weights
+from meshmatch.transfer.carry_rig import UP, carry, standing_clips, upright
+from meshmatch.transfer.clean_weights import clean_weights, rigid
+from meshmatch.transfer.weight_files import SkinWeights, load_weights
+
+Pose = Literal["rest", "source"]
+"""How a rigged target stands: as it came, or as the source does."""
+INFLUENCES = 4
+"""Joints that may move a vertex: what all programs read."""
+check_rig_suffix = partial(tables.check_suffix, suffixes=(".glb",), what="rigs")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RiggedResult(Brief):
+    """The target with the source's skeleton.
+
+    Attributes
+    ----------
+    rig
+        The skeleton as it stands in the file: ``names``, ``parents``, ``joints``, ``clips``, and ``worlds()``, (N, 4, 4).
+        The first node is new and bears the name of the source's file.
+    weights
+        Of each vertex of the target, for the joints.
+    unused
+        Joints that move vertices of the source and none of the target.
+    replaced
+        How many joints of a skeleton that the target had take no part any more.
+    maps
+        The maps that were followed.
+    glb
+        The file.
+
+    Examples
+    --------
+    >>> result = meshmatch.transfer_rig("soldier.glb", "templates/samples/climber.ply")
+    >>> result.rig.names, result.unused
+    >>> result.save("rigged.glb")
+    """
+
+    rig: Rig
+    weights: SkinWeights
+    unused: tuple[str, ...]
+    replaced: int
+    maps: MapPair
+    glb: bytes
+
+    def save(self, path: str | Path) -> None:
+        """Write the glb.
+
+        Parameters
+        ----------
+        path
+            Where to.
+
+        Raises
+        ------
+        OptionError
+            The suffix is another one.
+        OutputError
+            The file cannot be written.
+        """
+        path = as_path(path)
+        check_rig_suffix(path)
+        with replace_on_success(path) as temporary:
+            temporary.write_bytes(self.glb)
+
+
+def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *, pose: Pose = "rest") -> RiggedResult:
+    """The target as it came, with the skeleton, skin weights and animation clips of the source.
+
+    Joints follow the skin around them. Weights are freed of strays, holes and tears. Clips keep the source's rotations, so
+    that a target in any pose plays them; what they move from place to place is scaled.
+
+    Parameters
+    ----------
+    source
+        A rigged .glb, .gltf or .vrm.
+    target
+        The shape that receives the rig. Of a .glb, .gltf or .vrm everything is kept but a skeleton of its own; another
+        shape is turned upright by the skeleton.
+    match
+        As in `find_maps`.
+    pose
+        Let the target stand as it came ("rest"), or as the source stands ("source").
+
+    Returns
+    -------
+    RiggedResult
+        Its ``save("rigged.glb")`` writes the file.
+
+    Raises
+    ------
+    MeshmatchError
+        The source has no skeleton, or the target draws copies of a mesh; or as for `find_maps`.
+
+    Examples
+    --------
+    >>> result = meshmatch.transfer_rig("soldier.glb", "templates/samples/climber.ply")
+    >>> result.save("rigged.glb")
+    """
+    if pose not in get_args(Pose):
+        raise OptionError(f"invalid pose {pose!r}", f"choose one of {', '.join(get_args(Pose))}")
+    source = as_path(source)
+    a = load_shape(source)
+    if source.suffix.lower() not in gltf.SUFFIXES:
+        raise InputError(f"{a.name} has no skeleton", f"rigs come in {', '.join(gltf.SUFFIXES)}")
+    rig, weights = read_rig(source, read_bytes(source)), load_weights(source, a)
+    b = as_shape(target, "target")
+    file = as_path(target) if isinstance(target, str | Path) else None
+    in_gltf = file is not None and file.suffix.lower() in gltf.SUFFIXES
+    path = file if file is not None and in_gltf else Path(b.name or "target").with_suffix(".glb")
+    data = read_bytes(path) if in_gltf else gltf_out.glb_of(b)
+    hanging = gltf.understood(path, data, "scene makes", hanging_groups)
+    maps = find_maps(a, b, match)
+    with thread_limit(1):
+        points, trust = maps.forward.points(b), _trust(a, maps)
+        turn = np.eye(3) if in_gltf else upright(a, points, trust)
+        ground = float((b.verts[b.valid] @ turn.T)[:, UP].min())
+        carried = carry(rig, weights.matrix, a, points @ turn.T, trust, ground)
+        pulled = pull_weights(maps.backward, weights.matrix, INFLUENCES)
+        found = rigid(clean_weights(pulled, b, INFLUENCES), hanging)
+        standing = carried.source_pose if pose == "source" else replace(carried.bind, clips=standing_clips(carried))
+        bind, (joints, shares) = carried.bind.worlds(), joint_table(found)
+        glb, replaced = gltf.understood(
+            path, data, "scene makes", lambda document: rigged(document, standing, bind, joints, shares, turn)
+        )
+    before, after = (np.asarray(each.sum(axis=0)).ravel() > 0 for each in (weights.matrix, found))
+    unused = tuple(weights.names[joint] for joint in np.flatnonzero(before & ~after))
+    return RiggedResult(standing, SkinWeights(found, weights.names), unused, replaced, maps, glb)
+
+
+def _trust(source: Shape, maps: MapPair) -> Floats:
+    """How much each vertex of the source counts: by its area, and the confidence of the map."""
+    share = source.vertex_areas / max(source.area, 1e-300) * source.V
+    return np.where(source.valid, (share + 1e-3) * (maps.forward.confidence + 1e-3), 0.0)

@@ -1,0 +1,63 @@
+"""``meshmatch transfer-rig``."""
+
+from pathlib import Path
+from typing import Literal
+
+from typer import Option
+
+import meshmatch
+from meshmatch.cli.options import RunOptions, grouped, output_option
+from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, Transfer
+
+_NAMED = 8  # joints that a note lists
+
+
+@grouped
+def transfer_rig(
+    *,
+    source: Source,
+    target: Target,
+    output: Path = output_option("FILE", "TGT with the rig: .glb."),
+    maps: MapOptions,
+    run: RunOptions,
+    pose: Literal["rest", "source"] = Option(
+        "rest", help="How TGT stands in the file. rest: as it came; source: as SRC stands."
+    ),
+    picture: Picture = None,
+) -> None:
+    """Transfer a rig: skeleton, skin weights and animation clips.
+
+    SRC is a rigged .glb, .gltf or .vrm. Of a TGT in these formats everything is kept but a skeleton of its own; another TGT
+    is turned upright. The skeleton has the bones and names of SRC; its clips play on TGT in whatever pose it came.
+    """
+    from meshmatch.api.rig import check_rig_suffix
+
+    transfer = Transfer(source, target, output, maps, run, picture)
+    console = transfer.console
+    check_rig_suffix(output)
+    with transfer.outputs() as (temporary,):
+        result = meshmatch.transfer_rig(source, target, transfer, pose=pose)
+        temporary.write_bytes(result.glb)
+    joints, clips = len(result.rig.joints), [clip.name for clip in result.rig.clips]
+    if result.unused:
+        many = len(result.unused)
+        names = ", ".join(result.unused[:_NAMED]) + (", ..." if many > _NAMED else "")
+        have = "joint that moves" if many == 1 else "joints that move"
+        console.warn(
+            f"{many} {have} {transfer.names[0]} {'has' if many == 1 else 'have'} no vertex on the target: {names}"
+        )
+    if result.replaced:
+        console.say(f"note: a skeleton of {result.replaced} joints that {transfer.names[1]} had moves it no more")
+    played = f", {len(clips)} clip{'s' if len(clips) != 1 else ''}" if clips else ""
+    console.say(f"wrote {output}: {transfer.names[1]} with {joints} joints{played}")
+    if picture is not None:
+        from meshmatch.render.compose import compose_labels
+        from meshmatch.transfer.attributes import most_votes
+        from meshmatch.transfer.weight_files import load_weights
+
+        a, b = result.maps.source, result.maps.target
+        heaviest = most_votes(load_weights(source, a).matrix), most_votes(result.weights.matrix)
+        transfer.draw(result.maps, compose_labels((a, b), heaviest, result.weights.names))
+    record = {"picture": picture, "pose": pose, "joints": joints, "clips": clips, "unused_joints": list(result.unused)}
+    record |= {"replaced_joints": result.replaced}
+    transfer.print_record(record, result.maps, float(result.maps.forward.confidence.mean()))

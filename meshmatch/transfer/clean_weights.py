@@ -1,0 +1,122 @@
+"""Skin weights that a character can be animated with: without strays, holes and tears, four joints a vertex.
+
+Where limbs touch, a map takes some vertices to the wrong one; a single vertex that follows another limb is a spike.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
+
+from meshmatch.arrays import Int, Ints
+from meshmatch.geometry.trees import cKDTree
+from meshmatch.shapes.faces import seams
+from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.attributes import joint_table, largest_weights
+from meshmatch.transfer.low_confidence import replace_low_weights, vertex_graph
+
+# All set by hand. Weights below the first do not join vertices; of a joint's regions on one part of a mesh, those of less
+# than this share of the largest one are strays; a vertex that keeps less than this of its weight is a hole.
+_JOINING, _STRAY, _HOLE = 0.02, 0.25, 0.5
+# Two neighbours of which less than this part of the weight is common are a tear, mended in so many steps.
+_TEAR, _STEPS = 0.1, 3
+_LEAST = 1e-3  # of the weight of a vertex: less moves nothing that can be seen
+
+
+def clean_weights(weights: csr_array, target: Shape, influences: int = 4) -> csr_array:
+    """Weights (V, J) of the target; every row sums to 1. Vertices of a seam at one place get the same.
+
+    Of each joint the main region stays on every connected part of the mesh, holes are filled in from their surroundings, and
+    neighbours that have nearly nothing in common are smoothed. Vertices that no joint moves go with the nearest others.
+    """
+    graph = vertex_graph(target)
+    twin = np.arange(target.V) if target.is_cloud else seams(target.verts, target.faces)
+    weights = _same_at(twin, largest_weights(weights, influences))
+    kept = _without_strays(weights, graph)
+    sums = np.asarray(kept.sum(axis=1)).ravel()
+    filled, _ = replace_low_weights(kept, sums < _HOLE, target, True, influences)
+    smooth = largest_weights(_same_at(twin, _mended(_same_at(twin, filled), graph)), influences)
+    smooth.data[smooth.data < _LEAST] = 0.0
+    return _nearest_for_empty(largest_weights(smooth, influences), target)
+
+
+def _same_at(twin: Ints, weights: csr_array) -> csr_array:
+    """The mean weights of all vertices with one twin, for each of them."""
+    V = len(twin)
+    together = csr_array((np.ones(V), (np.arange(V), twin)), (V, V))
+    share = diags_array(1.0 / np.maximum(np.bincount(twin, minlength=V), 1))
+    return csr_array(together @ (share @ (together.T @ weights)))
+
+
+def _without_strays(weights: csr_array, graph: csr_array) -> csr_array:
+    """Weights without those regions of a joint that are far smaller than its main one on the same part of the mesh."""
+    joints, shares = joint_table(weights)
+    V, N = joints.shape
+    part = connected_components(graph, directed=False)[1]
+    edges = coo_array(graph)
+    rows, columns = edges.row[edges.row < edges.col], edges.col[edges.row < edges.col]
+    begins, ends = [], []
+    for a in range(N):
+        for b in range(N):
+            joined = (
+                (joints[rows, a] == joints[columns, b]) & (shares[rows, a] > _JOINING) & (shares[columns, b] > _JOINING)
+            )
+            begins.append(N * rows[joined] + a)
+            ends.append(N * columns[joined] + b)
+    begin, end = np.concatenate(begins), np.concatenate(ends)
+    links = coo_array((np.ones(len(begin), np.int8), (begin, end)), (V * N, V * N))
+    region = connected_components(links, directed=False)[1]
+    amount = np.bincount(region, shares.ravel())
+    where = part.repeat(N) * (int(joints.max(initial=0)) + 1) + joints.ravel()
+    _, place = np.unique(where, return_inverse=True)
+    largest = np.zeros(int(place.max(initial=0)) + 1)
+    np.maximum.at(largest, place, amount[region])
+    good = (amount[region] >= _STRAY * largest[place]) & (shares.ravel() > 0)
+    at = np.flatnonzero(good)
+    return csr_array((shares.ravel()[at].astype(np.float64), (at // N, joints.ravel()[at])), weights.shape)
+
+
+def _mended(weights: csr_array, graph: csr_array) -> csr_array:
+    """Weights smoothed around edges whose ends have nearly nothing in common."""
+    edges = coo_array(graph)
+    apart = 0.5 * np.asarray(abs(weights[edges.row] - weights[edges.col]).sum(axis=1)).ravel() > 1.0 - _TEAR
+    torn = np.zeros(weights.shape[0])
+    torn[edges.row[apart]] = 1.0
+    around = (torn > 0) | (np.asarray(graph @ torn) > 0)
+    rows = np.flatnonzero(around)
+    if not len(rows):
+        return weights
+    links = csr_array(graph[rows])
+    links.data = np.ones_like(links.data)
+    mean = csr_array(diags_array(0.5 / np.maximum(np.diff(links.indptr), 1)) @ links)
+    own = csr_array((np.full(len(rows), 0.5), (np.arange(len(rows)), rows)), mean.shape)
+    blend = csr_array(own + mean)
+    back = csr_array((np.ones(len(rows)), (rows, np.arange(len(rows)))), (weights.shape[0], len(rows)))
+    others = diags_array((~around).astype(np.float64))
+    for _ in range(_STEPS):
+        weights = csr_array(others @ weights + back @ (blend @ weights))
+    return weights
+
+
+def _nearest_for_empty(weights: csr_array, target: Shape) -> csr_array:
+    """The same, and in empty rows those of the nearest vertex that has weights."""
+    empty = np.diff(weights.indptr) == 0
+    if not empty.any() or empty.all():
+        return weights
+    full = np.flatnonzero(~empty)
+    rows = np.arange(len(empty))
+    rows[empty] = full[cKDTree(target.verts[full]).query(target.verts[empty])[1]]
+    return csr_array(weights[rows])
+
+
+def rigid(weights: csr_array, groups: list[Int[Ints, " N"]]) -> csr_array:
+    """The same, but each group of vertices moves as one: with the joint that has most of their weight."""
+    rows = np.arange(weights.shape[0])
+    chosen = np.full(len(rows), -1)
+    for group in groups:
+        chosen[group] = int(np.asarray(weights[group].sum(axis=0)).ravel().argmax())
+    stiff = chosen >= 0
+    others = csr_array(diags_array((~stiff).astype(np.float64)) @ weights)
+    one = csr_array((np.ones(int(stiff.sum())), (rows[stiff], chosen[stiff])), weights.shape)
+    return csr_array(others + one)

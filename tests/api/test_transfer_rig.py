@@ -1,0 +1,249 @@
+"""Rigs on other shapes: maps are made by construction."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import meshmatch
+from meshmatch.errors import InputError, OptionError
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.formats.gltf_rig import read_rig
+from meshmatch.shapes.shape import Shape
+from tests.shapes.painted import encoded, quarters, write_document
+from tests.transfer.rigs import BEND, NODES, played, tube, volume, write_tube
+
+JOINTS = ("root", "hip", "knee", "foot")
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    path = tmp_path / "source.glb"
+    write_tube(path)
+    return path
+
+
+def same_order(source: Path, target: Path) -> VertexMap:
+    """Vertex i to vertex i, round and round."""
+    a, b = load_shape(source), load_shape(target)
+    return VertexMap.between(a, b, np.arange(a.V) % b.V, verdict="good")
+
+
+def rigged(source: Path, target: Path, **options: Any) -> tuple[Path, meshmatch.RiggedResult]:
+    result = meshmatch.transfer_rig(source, target, same_order(source, target), **options)
+    out = target.with_name("rigged.glb")
+    result.save(out)
+    return out, result
+
+
+def joints_of(path: Path) -> dict[str, np.ndarray]:
+    rig = read_rig(path, path.read_bytes())
+    return dict(zip(rig.names, rig.worlds(), strict=True))
+
+
+def test_a_larger_tube_that_lies_and_faces_elsewhere(source: Path) -> None:
+    """The ply is z-up: it stands afterwards, its joints are where they belong, and it bends as the source does."""
+    heading = Rotation.from_euler("y", 25, degrees=True).as_matrix()
+    lying = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    shift = np.array([3.0, -2.0, 5.0])
+    shape, target = tube(), source.with_name("target.ply")
+    stands = 2 * shape.verts @ heading.T + shift
+    save_shape(target, Shape(stands @ lying.T, shape.faces, "target"))
+    out, result = rigged(source, target)
+    raw = Document(out, out.read_bytes())
+    assert np.allclose(raw.accessor(0), stands @ lying.T, atol=1e-5)  # the vertices are those of the file
+    assert np.abs(played(out) - stands).max() < 1e-5
+    before, after = joints_of(source), joints_of(out)
+    assert list(after) == ["source", *NODES[:-1]]
+    assert [after[name][:3, 3].tolist() for name in JOINTS] == [
+        pytest.approx((2 * heading @ before[name][:3, 3] + shift).tolist(), abs=1e-5) for name in JOINTS
+    ]
+    rig = read_rig(out, out.read_bytes())
+    assert [rig.names[parent] for parent in rig.parents[1:]] == ["source", "armature", "root", "hip", "knee", "root"]
+    for time in (0.0, 0.5, 1.0):
+        expected = 2 * played(source, "bend", time) @ heading.T + shift
+        assert np.abs(played(out, "bend", time) - expected).max() < 1e-4
+    assert result.unused == ()
+    assert np.allclose(result.weights.matrix.sum(axis=1), 1)
+
+
+def test_a_target_in_another_pose_plays_the_same_clips(source: Path) -> None:
+    """It stands as it came, or as the source; bends from straight; and keeps its volume, its foot on the leg."""
+    shape, target = tube(), source.with_name("target.ply")
+    bent = played(source, "bend", 1.0)
+    save_shape(target, Shape(bent, shape.faces, "target"))
+    out, _ = rigged(source, target)
+    assert np.abs(played(out) - bent).max() < 1e-5
+    straight = played(out, "bend", 0.0)
+    assert np.linalg.norm(straight - shape.verts, axis=1).mean() < 0.03
+    assert np.linalg.norm(played(out, "bend", 1.0) - bent, axis=1).mean() < 0.03
+    assert volume(straight, shape.faces) > 0.95 * volume(shape.verts, shape.faces) > 0
+    out, result = rigged(source, target, pose="source")
+    assert np.abs(played(out) - straight).max() < 1e-5
+    assert {track.node for clip in result.rig.clips for track in clip.tracks} == {4, 6}  # the source's own alone
+    angle = Rotation.from_matrix(result.rig.worlds()[4, :3, :3] @ result.rig.worlds()[3, :3, :3].T).magnitude()
+    assert angle < np.radians(1)
+    assert BEND == 60
+
+
+def two_parts(path: Path, hanging: bool = False) -> dict[str, Any]:
+    """A glb or gltf with one mesh in two places, a material with an image, and more that is to stay; its document."""
+    shape = tube()
+    uv = np.random.default_rng(0).random((shape.V, 2))
+    arrays = [shape.verts.astype("f4"), shape.faces.ravel().astype("u2"), uv.astype("f4")]
+    arrays.append(np.frombuffer(encoded(quarters()), "u1"))
+    primitive = {"attributes": {"POSITION": 0, "TEXCOORD_0": 2}, "indices": 1, "material": 0}
+    document: dict[str, Any] = {
+        "scene": 0,
+        "scenes": [{"name": "all", "nodes": [0, 3]}],
+        "nodes": [
+            {"name": "holder", "translation": [0, 0.5, 0], "children": [1, 2], "extras": {"kept": True}},
+            {"name": "left", "mesh": 0, "scale": [2, 2, 2]},
+            {"name": "right", "mesh": 0, "translation": [1, 0, 0]},
+            {"name": "lamp"},
+        ],
+        "meshes": [{"name": "part", "primitives": [primitive]}],
+        "materials": [
+            {"name": "paint", "doubleSided": True, "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+        ],
+        "textures": [{"source": 0}],
+        "images": [{"name": "four", "bufferView": 3, "mimeType": "image/png"}],
+    }
+    if hanging:
+        document["skins"] = [{"joints": [3]}]
+        document["nodes"][3]["children"] = [2]
+        document["nodes"][0]["children"] = [1]
+    write_document(path, document, *arrays)
+    return Document(path, path.read_bytes()).json
+
+
+def test_a_glb_stays_as_it_came(source: Path) -> None:
+    """Nodes, materials, images, arrays and their bytes; a mesh that stands twice is there twice, for its weights differ."""
+    target = source.with_name("target.glb")
+    before = two_parts(target)
+    shape = load_shape(target)
+    out, _ = rigged(source, target)
+    after = Document(out, out.read_bytes())
+    for kind in ("materials", "textures", "images", "asset"):
+        assert after.json[kind] == before[kind]
+    for kind in ("accessors", "bufferViews"):
+        assert after.json[kind][: len(before[kind])] == before[kind]
+    for old, new in zip(before["nodes"], after.json["nodes"], strict=False):
+        assert new == old | {key: new[key] for key in ("mesh", "skin") if "mesh" in old}
+    assert after.json["scenes"] == [{"name": "all", "nodes": [0, 3, 4]}]
+    assert len(after.json["meshes"]) == 2
+    for mesh in after.json["meshes"]:
+        attributes = mesh["primitives"][0]["attributes"]
+        assert attributes.pop("JOINTS_0") >= len(before["accessors"]) <= attributes.pop("WEIGHTS_0")
+        assert mesh == before["meshes"][0]
+    assert after.body.startswith(Document(target, target.read_bytes()).body)
+    assert np.abs(load_shape(out).verts - shape.verts).max() < 1e-5
+    assert np.array_equal(load_shape(out).faces, shape.faces)
+
+
+def test_a_gltf_becomes_a_glb_that_needs_no_other_file(source: Path) -> None:
+    target = source.with_name("target.gltf")
+    two_parts(target)
+    image = encoded(quarters())
+    words = json.loads(target.read_text())
+    words["images"] = [{"uri": "four.png"}, {"uri": "four.png", "name": "again"}]
+    target.write_text(json.dumps(words))
+    with pytest.raises(InputError, match=r"needs the file four\.png"):
+        rigged(source, target)
+    target.with_name("four.png").write_bytes(image)
+    shape = load_shape(target)
+    out, _ = rigged(source, target)
+    target.with_name("four.png").unlink()
+    found = Document(out, out.read_bytes())
+    assert [found.view_bytes(entry["bufferView"]) for entry in found.json["images"]] == [image, image]
+    assert "uri" not in json.dumps(found.json)
+    assert np.abs(load_shape(out).verts - shape.verts).max() < 1e-5
+
+
+def test_what_hangs_from_a_joint_stays_rigid(source: Path) -> None:
+    target = source.with_name("target.glb")
+    two_parts(target, hanging=True)
+    V = tube().V
+    _, result = rigged(source, target)
+    matrix = result.weights.matrix.toarray()
+    assert len(np.unique(matrix[V:], axis=0)) == 1 and sorted(matrix[V]) == [0, 0, 0, 1]
+    assert len(np.unique(matrix[:V], axis=0)) > 10
+
+
+@pytest.mark.parametrize("stands", [0.0, 40.0])
+def test_a_skeleton_of_its_own_is_replaced(source: Path, stands: float) -> None:
+    """Vertices that it bends are stored as they stand; its clips go, and those of other nodes stay."""
+    target = source.with_name("target.glb")
+    write_tube(target, stands=stands)
+    document = Document(target, target.read_bytes()).json
+    animation = document["animations"][0]
+    animation["name"] = "old"
+    samplers = [animation["samplers"][0]] * 2
+    channels = [{"sampler": k, "target": {"node": node, "path": "rotation"}} for k, node in enumerate((3, 6))]
+    write_tube(
+        target, stands=stands, animations=[animation, {"name": "mesh", "samplers": samplers, "channels": channels}]
+    )
+    shape = load_shape(target)
+    out, result = rigged(source, target)
+    found = Document(out, out.read_bytes())
+    assert result.replaced == 4
+    assert len(found.json["skins"]) == 1
+    assert [(each["name"], len(each["channels"])) for each in found.json["animations"]][:1] == [("mesh", 1)]
+    assert [each["name"] for each in found.json["animations"]][1:] == ["bend"]
+    assert np.abs(load_shape(out).verts - shape.verts).max() < 1e-5
+    same = found.json["meshes"][0]["primitives"][0]["attributes"]["POSITION"] == 0
+    assert same == (stands == 0.0)
+    assert np.linalg.norm(played(out, "bend", 0.0) - tube().verts, axis=1).mean() < 0.03
+
+
+def test_a_cloud_is_rigged_too(source: Path) -> None:
+    target = source.with_name("target.ply")
+    save_shape(target, Shape(tube().verts, np.empty((0, 3), int), "cloud"))
+    out, _ = rigged(source, target)
+    assert load_shape(out).is_cloud
+    assert np.abs(played(out, "bend", 1.0) - played(source, "bend", 1.0)).max() < 0.02
+
+
+def test_joints_without_a_vertex_are_named(source: Path) -> None:
+    """The target is the lower half of the source."""
+    shape, target = tube(), source.with_name("target.ply")
+    half = shape.faces[(shape.verts[shape.faces, 1] < 1.5).all(axis=1)]
+    used, faces = np.unique(half, return_inverse=True)
+    save_shape(target, Shape(shape.verts[used], faces.reshape(-1, 3)))
+    a, b = load_shape(source), load_shape(target)
+    nearest = np.linalg.norm(a.verts[:, None] - b.verts[None], axis=2).argmin(axis=1)
+    sure = (a.verts[:, 1] < 1.5).astype("f4")
+    result = meshmatch.transfer_rig(source, target, VertexMap.between(a, b, nearest, confidence=sure))
+    assert result.unused == ("foot",)
+    assert [result.rig.names[joint] for joint in result.rig.joints] == list(JOINTS)
+
+
+def test_what_cannot_be_rigged_is_told(source: Path) -> None:
+    target = source.with_name("target.ply")
+    save_shape(target, tube())
+    with pytest.raises(InputError, match=r"target\.ply has no skeleton"):
+        meshmatch.transfer_rig(target, target)
+    with pytest.raises(OptionError, match="invalid pose"):
+        meshmatch.transfer_rig(source, target, pose="sitting")  # type: ignore[arg-type]
+    plain = source.with_name("plain.glb")
+    two_parts(plain)
+    with pytest.raises(InputError, match=r"plain\.glb has no skin"):
+        meshmatch.transfer_rig(plain, target)
+    copies = source.with_name("copies.glb")
+    document = two_parts(copies)
+    document["nodes"][1]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 3}}}
+    del document["accessors"], document["bufferViews"], document["buffers"], document["images"], document["textures"]
+    shape = tube()
+    uv = np.zeros((shape.V, 2), "f4")
+    write_document(
+        copies, document, shape.verts.astype("f4"), shape.faces.ravel().astype("u2"), uv, np.eye(3, dtype="f4")
+    )
+    with pytest.raises(InputError, match="draws copies of one mesh"):
+        meshmatch.transfer_rig(source, copies)
+    with pytest.raises(OptionError, match="not a format for rigs"):
+        rigged(source, target)[1].save("out.obj")
