@@ -137,7 +137,9 @@ def transfer_weights(
     output: Path = output_option("FILE", "Skin weights of TGT: .npz or .json."),
     maps: MapOptions,
     run: RunOptions,
-    weights: Path | None = optional("FILE", "Skin weights of SRC: .npz, .json, .glb or .vrm. Default: the skin in SRC."),
+    weights: Path | None = optional(
+        "FILE", "Skin weights of SRC: .npz, .json, .glb or .vrm. Default: the skin in SRC."
+    ),
     influences: int = Option(4, min=1, help="Maximum number of joints per vertex."),
     fill: bool = Option(False, "--fill", help="Replace weights of low confidence by those of their neighbours."),
     min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Minimum confidence for weights to be trusted."),
