@@ -52,6 +52,8 @@ def match_without_model(
         if pairs is not None:
             mapped = judged_by_pairs(mapped, target.original, pairs, fits[1].frame.scale)
     notes = direct_notes(clean, configs, unknown)
+    if fits[1].frame.mirrored:
+        notes = (*notes, f"{target.shape.name}: taken for a mirror image of {source.shape.name}")
     if guess is not None:
         notes = (_BETTER.format(guess.source_fit.model), *notes)
     return MatchResult(mapped, fits[0], fits[1], fits[1].seconds, notes, (fits[0], fits[1]), threads)
@@ -68,14 +70,15 @@ def fit_to_first(
     """Fits of two or more repaired shapes, whose template is the first of them, and how it was matched to the second; errors
     as `match_without_model`. ``known`` are pairs of positions on these two, and ``guess`` what a model says of them.
     """
-    from meshmatch.fitting.direct import DirectConfig, match_directly
+    from meshmatch.fitting.direct import DirectConfig, match_directly, match_either_side
 
     for each in clean:
         refuse_far_parts(each)
     first, *others = clean
     config = DirectConfig(seed=configs[0].seed)
     with thread_limit(1), worker_slot(threading.Semaphore(threads)):
-        found = [match_directly(first.shape, each.shape, config, known, progress, guess) for each in others]
+        match = match_directly if configs[0].mirror == "no" else match_either_side
+        found = [match(first.shape, each.shape, config, known, progress, guess) for each in others]
     fits = [replace(found[0].source, repaired=first)]
     fits += [replace(each.target, repaired=own) for each, own in zip(found, others, strict=True)]
     return fits, found[0]

@@ -18,7 +18,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.derived import derived
 from meshmatch.errors import InputError
 from meshmatch.fields.shape_functions import build_field
-from meshmatch.fitting.direct import DirectConfig, match_directly
+from meshmatch.fitting.direct import MIRROR, MIRRORED_SHARE, DirectConfig, match_directly
 from meshmatch.fitting.fit import Fit, judged_fit
 from meshmatch.fitting.fit_config import Schedule
 from meshmatch.fitting.fitter import cap_verdict
@@ -44,7 +44,6 @@ from meshmatch.templates.sides import mirrored
 from meshmatch.templates.template import Template
 
 _ALIGNED_BY = 2400  # samples
-_MIRROR = Frame(1.0, np.diag([-1.0, 1.0, 1.0]), np.zeros(3))
 # Where the template roughly belongs is all that is asked of a search.
 _ROUGHLY = DirectConfig(coarse=1200, fine=2400, samples=3000, few=1200, fewer=700, better=8, best=3)
 _ONTO = Schedule(steps=6, prior=(1e-2, 1e-3), scale=(1.0, 1.0), damping=1e-6)
@@ -54,7 +53,7 @@ _NEAR, _STRETCH = 0.045, 0.7
 # a pose that was searched must have so much less than the shape as it is: 0.73 of it for an ant in another pose, 0.95 for
 # one whose legs were exchanged; and so must one that stands otherwise than the axes of the files say, or is mirrored:
 # 0.66 of mirrored femurs, 0.97 of ants, 0.88 of eggs that were turned wrongly.
-_SEARCHED, _TURNED = 0.9, 0.85
+_SEARCHED, _TURNED = 0.9, MIRRORED_SHARE
 _SHRUNK = 0.93  # area of a mean of shapes that are posed, against theirs: 0.997 of femurs, 0.87 of ants
 _LOST = 0.5  # trust of a search whose result is not believed
 
@@ -208,7 +207,7 @@ def fit_without_model(
     """
     config, began = config or ViscousConfig(), time.monotonic()
     task = _Task(template, shape, config)
-    sides = (None, _MIRROR) if mirror else (None,)
+    sides = (None, MIRROR) if mirror else (None,)
     found = task.best(sides) if start is None else task.best_from(start)
     system, frame, residual = task.system, found.begin.frame, found.features.residual
     judged = judge(compute_features(system, found.vectors, found.samples, residual, template.labels))

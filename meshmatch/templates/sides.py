@@ -78,6 +78,15 @@ def is_other_side(shape: Repaired, others: Sequence[Repaired], scale: Scale, see
     return evidence < 0
 
 
+def nearer_mirrored(source: Shape, target: Shape, seed: int) -> float:
+    """How much nearer the mirror image of the target comes to the source than the target itself, both turned as they fit
+    best: the logarithm of the ratio of their distances.
+    """
+    one, other = (_samples(shape, "area", [seed, number]) for number, shape in enumerate((source, target)))
+    same, image = (align(each, one, "rigid")[0].residual for each in (other, _image(other)))
+    return float(np.log(same / image))
+
+
 def _samples(shape: Shape, scale: Scale, seed: list[int]) -> OrientedPoints:
     return sample_surface(shape, _SAMPLES, np.random.default_rng(seed)).in_frame(unit_frame(shape, scale, 0.5))
 

@@ -32,7 +32,7 @@ from meshmatch.api.matcher import Matcher
 from meshmatch.api.results import map_of_fits
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.experiments import runner
-from meshmatch.fitting.direct import DirectConfig, match_directly
+from meshmatch.fitting.direct import DirectConfig, match_either_side
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.calibration import DirectCalibration
 from meshmatch.models.registry import NO_MODEL
@@ -145,7 +145,7 @@ def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[
     began, evidence = time.process_time(), {}
     if model == NO_MODEL:
         clean = usable(source), usable(target)
-        found = match_directly(clean[0].shape, clean[1].shape, DirectConfig(seed=seed))
+        found = match_either_side(clean[0].shape, clean[1].shape, DirectConfig(seed=seed))
         fits = replace(found.source, repaired=clean[0]), replace(found.target, repaired=clean[1])
         mapped = map_of_fits(fits, fits, 1)
         evidence = {"energy": found.tried[0][1].energy, "leads": found.leads}
