@@ -23,8 +23,9 @@ from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.attributes import joint_table, pull_weights
-from meshmatch.transfer.carry_rig import UP, carry, standing_clips, upright
+from meshmatch.transfer.carry_rig import UP, carry, upright
 from meshmatch.transfer.clean_weights import clean_weights, rigid
+from meshmatch.transfer.retarget_clips import standing_clips
 from meshmatch.transfer.weight_files import SkinWeights, load_weights
 
 Pose = Literal["rest", "source"]
@@ -93,7 +94,8 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     """The target as it came, with the skeleton, skin weights and animation clips of the source.
 
     Joints follow the skin around them. Weights are freed of strays, holes and tears. Clips keep the source's rotations, so
-    that a target in any pose plays them; what they move from place to place is scaled.
+    that a target in any pose plays them; what they move from place to place is scaled, and feet that hang from the root stay
+    on their legs.
 
     Parameters
     ----------
@@ -143,7 +145,8 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
         carried = carry(rig, weights.matrix, a, points @ turn.T, trust, ground)
         pulled = pull_weights(maps.backward, weights.matrix, INFLUENCES)
         found = rigid(clean_weights(pulled, b, INFLUENCES), hanging)
-        standing = carried.source_pose if pose == "source" else replace(carried.bind, clips=standing_clips(carried))
+        standing, posed = carried.bind, carried.source_pose
+        standing = posed if pose == "source" else replace(standing, clips=standing_clips(standing, posed))
         bind, (joints, shares) = carried.bind.worlds(), joint_table(found)
         glb, replaced = gltf.understood(
             path, data, "scene makes", lambda document: rigged(document, standing, bind, joints, shares, turn)

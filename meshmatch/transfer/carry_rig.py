@@ -4,8 +4,8 @@ Every joint follows the skin around it: by the similarity that takes the source'
 target, and turned as the skin that the joint moves is turned. Nodes above all joints that move vertices stay upright
 and on the ground, in the size of the target.
 
-Clips keep the source's rotations, so that a body in any pose can play them. Where the parent of a joint moves no
-vertex, as of feet that hang from the root, the joint follows its neighbour on the skin into the source's pose.
+Where the parent of a joint moves no vertex, as of feet that hang from the root, the joint follows its neighbour on the
+skin into the source's pose, and in clips.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, Int, Ints
 from meshmatch.geometry.frames import RigidPose, kabsch
-from meshmatch.shapes.formats.gltf_rig import Clip, Moved, Rig, Track
+from meshmatch.shapes.formats.gltf_rig import Rig
 from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.retarget_clips import retargeted
 
 UP = 1
 """glTF stands along y."""
@@ -29,7 +30,6 @@ _LEAST = 3.0
 _NEAREST, _NEAR, _REACH = 20, 0.03, 1.5
 # A parent's own skin is asked too where it reaches as near to the joint, but for this factor, as the joint's does.
 _ALIKE = 2.0
-_SAME = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -136,28 +136,9 @@ def carry(
             moved[node] = moved[anchor] + turned[anchor] @ offset
     posed = _posed(rig, turned, moved)
     lengths = scale * np.cbrt(np.abs(np.linalg.det(worlds[:, :3, :3])))
-    clips = tuple(_retargeted(clip, rig, posed, lengths) for clip in rig.clips)
+    loose = {node: int(skin.anchors[node]) for node in skin.order if skin.anchors[node] not in (-1, parents[node])}
+    clips = tuple(retargeted(clip, rig, posed, lengths, loose) for clip in rig.clips)
     return CarriedRig(replace(bind, clips=()), replace(posed, clips=clips))
-
-
-def standing_clips(carried: CarriedRig) -> tuple[Clip, ...]:
-    """The clips for a skeleton that stands as the target does: what they leave alone is held as the source has it."""
-    bind, posed = carried.bind, carried.source_pose
-    found = []
-    for clip in posed.clips:
-        moved = {(track.node, track.moves) for track in clip.tracks}
-        poses: tuple[tuple[Moved, Floats, Floats], ...] = (
-            ("rotation", bind.rotations, posed.rotations),
-            ("translation", bind.translations, posed.translations),
-        )
-        held = [
-            Track(node, moves, np.zeros(1), there[node : node + 1], "LINEAR")
-            for moves, here, there in poses
-            for node in np.flatnonzero(np.abs(here - there).max(axis=1) > _SAME).tolist()
-            if (node, moves) not in moved
-        ]
-        found.append(replace(clip, tracks=(*clip.tracks, *held)))
-    return tuple(found)
 
 
 def _below_a_root(rig: Rig, name: str) -> Rig:
@@ -273,20 +254,3 @@ def _heading(rotation: Float[Floats, "3 3"]) -> Float[Floats, "3 3"]:
     """The turn about y that is nearest to a rotation."""
     angle = np.arctan2(rotation[0, 2] - rotation[2, 0], rotation[0, 0] + rotation[2, 2])
     return np.asarray(Rotation.from_euler("y", angle).as_matrix())
-
-
-def _retargeted(clip: Clip, rig: Rig, posed: Rig, lengths: Float[Floats, " N"]) -> Clip:
-    """A clip for the skeleton that stands in the source's pose: rotations as they are, translations scaled from there."""
-    tracks = []
-    for track in clip.tracks:
-        node, values = track.node, track.values
-        if track.moves == "translation":
-            values = values * lengths[rig.parents[node]]
-            shift = posed.translations[node] - rig.translations[node] * lengths[rig.parents[node]]
-            values[slice(1, None, 3) if track.interpolation == "CUBICSPLINE" else slice(None)] += shift
-        elif track.moves == "scale":
-            if not rig.scales[node].all():
-                continue
-            values = values / rig.scales[node]
-        tracks.append(replace(track, values=values))
-    return replace(clip, tracks=tuple(tracks))

@@ -13,10 +13,11 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_rig import read_rig
 from meshmatch.shapes.shape import Shape
 from tests.shapes.painted import encoded, quarters, write_document
-from tests.transfer.rigs import BEND, NODES, played, tube, volume, write_tube
+from tests.transfer.rigs import BEND, KNEE, NODES, played, tube, volume, write_tube
 
 JOINTS = ("root", "hip", "knee", "foot")
 
@@ -88,7 +89,44 @@ def test_a_target_in_another_pose_plays_the_same_clips(source: Path) -> None:
     assert {track.node for clip in result.rig.clips for track in clip.tracks} == {4, 6}  # the source's own alone
     angle = Rotation.from_matrix(result.rig.worlds()[4, :3, :3] @ result.rig.worlds()[3, :3, :3].T).magnitude()
     assert angle < np.radians(1)
-    assert BEND == 60
+
+
+def test_a_foot_that_hangs_from_the_root_stays_on_a_shorter_leg(source: Path) -> None:
+    """Though the clip moves it as far as that of the source."""
+    shape, target = tube(), source.with_name("target.ply")
+    short = shape.verts.copy()
+    short[:, 1] = np.where(short[:, 1] > 1, 1 + (short[:, 1] - 1) / 2, short[:, 1])
+    save_shape(target, Shape(short, shape.faces, "target"))
+    out, _ = rigged(source, target)
+    for time in (0.0, 0.37, 1.0):
+        turn = Rotation.from_euler("x", BEND * time, degrees=True)
+        assert np.linalg.norm(played(out, "bend", time)[-1] - KNEE - turn.apply([0, 0.5, 0])) < 0.04
+
+
+@pytest.mark.parametrize("interpolation", ["STEP", "CUBICSPLINE"])
+def test_other_interpolations_are_kept(source: Path, interpolation: str) -> None:
+    """The foot, which follows the knee, gets keys of its own."""
+    document = Document(source, source.read_bytes())
+    editor = Editor(document)
+    for sampler in editor.json["animations"][0]["samplers"]:
+        sampler["interpolation"] = interpolation
+        if interpolation == "CUBICSPLINE":
+            values = document.accessor(sampler["output"])
+            slopes = np.gradient(values, axis=0) * (len(values) - 1)
+            sampler["output"] = editor.add_array(
+                np.stack([slopes, values, slopes], 1).reshape(-1, values.shape[1]).astype("f4")
+            )
+    source.write_bytes(editor.to_bytes())
+    target = source.with_name("target.ply")
+    save_shape(target, Shape(2 * tube().verts, tube().faces, "target"))
+    _, result = rigged(source, target)
+    before = read_rig(source, source.read_bytes()).clips[0].tracks
+    after = result.rig.clips[0].tracks
+    assert [track.interpolation for track in after[:2]] == [interpolation] * 2
+    assert np.allclose(after[0].values, before[0].values, atol=1e-6)
+    foot = next(track for track in after if track.moves == "translation" and result.rig.names[track.node] == "foot")
+    values = before[2].values[1::3] if interpolation == "CUBICSPLINE" else before[2].values
+    assert np.allclose(foot.values, 200 * values, atol=0.02)
 
 
 def two_parts(path: Path, hanging: bool = False) -> dict[str, Any]:

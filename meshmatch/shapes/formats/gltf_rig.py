@@ -24,6 +24,7 @@ _INTERPOLATIONS = ("LINEAR", "STEP", "CUBICSPLINE")
 _FEW_KEYS = 3_500_000
 """Keys of clips that a file of any size may have; and one more for every 4 of its bytes: several may share theirs."""
 MOST_JOINTS = 4096
+_MOST_NODES = 4  # for each of them, with those above and below
 _LARGEST = 1e18  # of a number: its square is still a 32-bit float
 
 
@@ -91,6 +92,8 @@ def _rig(document: Document) -> Rig:
         raise InputError(f"{document.name} has {len(joints)} joints, of {MOST_JOINTS} at most", "export one character")
     list(document.primitives())  # walks through the scene
     chosen = _nodes(document, joints)
+    if len(chosen) > _MOST_NODES * MOST_JOINTS:
+        raise InputError(f"the skeleton of {document.name} has {len(chosen)} nodes, too many", "export one character")
     place = {node: k for k, node in enumerate(chosen)}
     parent = {int(child): node for node in chosen for child in document.nodes[node].get("children", [])}
     rotations, translations, scales = np.zeros((len(chosen), 4)), np.zeros((len(chosen), 3)), np.ones((len(chosen), 3))
