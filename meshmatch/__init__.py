@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from meshmatch.api.transfer import transfer_landmarks as transfer_landmarks
     from meshmatch.api.transfer import transfer_values as transfer_values
     from meshmatch.api.transfer import transfer_weights as transfer_weights
+    from meshmatch.api.wrap import WrapResult as WrapResult
+    from meshmatch.api.wrap import wrap as wrap
     from meshmatch.collections.atlas import Atlas as Atlas
     from meshmatch.collections.collection import Collection as Collection
     from meshmatch.collections.measures import measure_atlas as measure_atlas
@@ -69,6 +71,7 @@ _NAMES = {
     "api.rig": "RiggedResult transfer_rig",
     "api.texture": "TexturedResult transfer_texture",
     "api.transfer": "find_maps transfer_colors transfer_labels transfer_landmarks transfer_values transfer_weights",
+    "api.wrap": "WrapResult wrap",
     "collections.atlas": "Atlas",
     "collections.collection": "Collection",
     "collections.measures": "measure_atlas",

@@ -3,8 +3,8 @@
 import os
 import re
 import shutil
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
@@ -107,6 +107,13 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
         raise OutputError(f"cannot write {path}: {why}", "is the disk full?") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def replace_all_on_success(paths: Sequence[str | Path]) -> Iterator[list[Path]]:
+    """As `replace_on_success` for several files that belong together; the first, which names the others, is renamed last."""
+    with ExitStack() as claims:
+        yield [claims.enter_context(replace_on_success(path)) for path in paths]
 
 
 def sweep(folder: Path) -> None:

@@ -19,6 +19,7 @@ from meshmatch.cli.transfer import transfer_color, transfer_labels, transfer_lan
 from meshmatch.cli.transfer_garment import transfer_garment
 from meshmatch.cli.transfer_rig import transfer_rig
 from meshmatch.cli.transfer_texture import transfer_texture
+from meshmatch.cli.wrap import wrap
 
 
 class _Verbs(TyperGroup):
@@ -64,7 +65,7 @@ def root(
 
 
 for verb in (
-    *(match, register, evaluate),
+    *(match, register, wrap, evaluate),
     *(transfer_texture, transfer_color, transfer_labels, transfer_weights),
     *(transfer_rig, transfer_landmarks, transfer_garment),
     *(fit, map, atlas),

@@ -265,15 +265,19 @@ class PairOptions(FitOptions):
         source = self.source_up or self.up, self.source_front or self.front
         return source, (self.target_up or self.up, self.target_front or self.front)
 
+    def pairs(self) -> tuple[Ints, Ints] | None:
+        """Vertices that are known to correspond."""
+        from meshmatch.shapes.tables import load_pairs
+
+        return None if self.known_pairs is None else load_pairs(self.known_pairs)
+
     def match(
         self, source: meshmatch.Shape, target: meshmatch.Shape, run: RunOptions, console: Console
     ) -> meshmatch.MatchResult:
         """Match two shapes, with bars."""
-        from meshmatch.shapes.tables import load_pairs
-
-        pairs = None if self.known_pairs is None else load_pairs(self.known_pairs)
         from meshmatch.api.matching import match
 
+        pairs = self.pairs()
         with console.progress() as report:
             return match(
                 source, target, model=self.model, config=self.configs(), landmarks=pairs, threads=run.threads,

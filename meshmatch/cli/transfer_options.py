@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -15,7 +15,7 @@ from meshmatch.cli import words
 from meshmatch.cli.options import PAIRS_HELP, PairOptions, RunOptions, check_outputs
 from meshmatch.cli.words import Console, Json, print_json
 from meshmatch.models.registry import check_model
-from meshmatch.outputs import replace_on_success
+from meshmatch.outputs import replace_all_on_success
 
 if TYPE_CHECKING:
     from meshmatch.api.results import MapPair
@@ -85,8 +85,7 @@ class Transfer:
             hint = "it controls matching, but --map supplies the map: leave one of them out"
             self.options.refuse(self.options.for_matching, "--map", hint)
         check_outputs([self.source, self.target, self.options.map, read], *files, picture=self.picture)
-        with ExitStack() as claims:  # the first is renamed last: it names the others
-            temporary = [claims.enter_context(replace_on_success(file)) for file in files]
+        with replace_all_on_success(files) as temporary:
             if self.options.map is None:
                 check_model(self.options.model)  # a mistyped name is told before the long work
             yield temporary

@@ -38,8 +38,8 @@ _LOCAL_GROUPS = ("arm", "breast", "buttocks", "foot", "ankle", "hand", "wrist", 
 class Rig:
     """A family of bodies that share one skeleton and one triangulation.
 
-    ``rest`` vertices (float16) and ``heads``, the joints, of N identities in the rest pose, metres; skin ``weights``, whose
-    rows sum to one; the parent of every joint, -1 for the root, and parents come first.
+    ``rest`` vertices (float16, or float32 where digits count) and ``heads``, the joints, of N identities in the rest pose,
+    metres; skin ``weights``, whose rows sum to one; the parent of every joint, -1 for the root, and parents come first.
     """
 
     rest: Float[Tensor, "N V 3"]
@@ -97,8 +97,8 @@ def _sample_local_changes(labels: list[str], B: int, rng: np.random.Generator, p
     return changes
 
 
-def body_model() -> Any:
-    """anny's body model. `OptionError` if the extra ``train`` is not installed."""
+def body_model(topology: str = "notoes") -> Any:
+    """anny's body model, with the vertices of a topology. `OptionError` if the extra ``train`` is not installed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -107,7 +107,7 @@ def body_model() -> Any:
             hint = "pip install 'meshmatch[train]'"
             raise OptionError("generated human bodies need the package anny", hint) from error
         choices = dict.fromkeys(("phenotypes", "local_changes", "facial_actions"), "all")
-        return anny.Anny(topology="notoes", skinning_method="lbs", **choices)
+        return anny.Anny(topology=topology, skinning_method="lbs", **choices)
 
 
 def build_rig(
@@ -116,12 +116,14 @@ def build_rig(
     progress: Progress | None = None,
     keep: Int[Ints, " K"] | None = None,
     people: People | None = None,
+    topology: str = "notoes",
+    dtype: torch.dtype = torch.float16,
 ) -> Rig:
     """Sample identities from anny's phenotype space; of ``keep``, the vertices, alone if given. `OptionError` if the extra
     ``train`` is not installed.
     """
     people = people or People()
-    model = body_model()
+    model = body_model(topology)
     rng = np.random.default_rng(seed)
     faces = model.get_triangular_faces()
     chosen = torch.arange(int(faces.max()) + 1) if keep is None else torch.from_numpy(keep)
@@ -132,14 +134,14 @@ def build_rig(
         changes = _sample_local_changes(model.local_change_labels, B, rng, people)
         with torch.no_grad():
             out = model(phenotype_kwargs=phenotypes, local_changes_kwargs=changes)
-        rest.append((out["rest_vertices"][:, chosen] @ to_frame(out["rest_vertices"]).T).half())
+        rest.append((out["rest_vertices"][:, chosen] @ to_frame(out["rest_vertices"]).T).to(dtype))
         heads.append((out["rest_bone_heads"] @ to_frame(out["rest_bone_heads"]).T).float())
         if progress is not None:
             progress((start + B) / identities)
     weights = model.dense_vertex_bone_weights.float()[chosen]
     weights = weights / weights.sum(1, keepdim=True)
     parents, names = tuple(int(parent) for parent in model.bone_parents), tuple(model.bone_labels)
-    own = torch.full((int(faces.max()) + 1,), -1)
+    own = torch.full((max(int(faces.max()), int(chosen.max())) + 1,), -1)
     own[chosen] = torch.arange(len(chosen))
     faces = own[faces]
     return Rig(torch.cat(rest), torch.cat(heads), weights, parents, names, faces[(faces >= 0).all(1)])

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError, warn
-from meshmatch.outputs import make_folder, replace_on_success
+from meshmatch.outputs import make_folder, replace_all_on_success
 from meshmatch.shapes.appearance import Appearance, png_bytes
 from meshmatch.shapes.files import check_suffix, save_shape
 from meshmatch.shapes.formats import Textured, gltf_out, obj_look, obj_text
@@ -99,8 +99,8 @@ def save_moved(path: str | Path, original: Path | None, shape: Shape, turns: Flo
     """
     plan = MovedFile.planned(Path(path), original)
     plan.make_folders()
-    with ExitStack() as claims:  # the mesh, which names the others, is claimed first and so renamed last
-        plan.write([claims.enter_context(replace_on_success(file)) for file in plan.files], shape, turns)
+    with replace_all_on_success(plan.files) as places:
+        plan.write(places, shape, turns)
 
 
 def _one_image(shape: Shape, look: Appearance) -> tuple[Textured, bytes] | None:

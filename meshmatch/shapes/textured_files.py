@@ -5,14 +5,13 @@ to files: one glb, or an obj with its mtl and png. All of these appear whole, or
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
-from meshmatch.outputs import replace_on_success
+from meshmatch.outputs import replace_all_on_success
 from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Appearance, ImageReader, Pixels, png_bytes
 from meshmatch.shapes.formats import Textured, gltf_attributes, gltf_out, obj, obj_look, ply_look
@@ -110,6 +109,5 @@ def save_textured(path: str | Path, mesh: Textured, image: Pixels) -> None:
     """
     path = Path(path)
     check_textured(path)
-    with ExitStack() as claims:  # the obj, which names the others, is claimed first and so renamed last
-        places = [claims.enter_context(replace_on_success(file)) for file in files_of(path)]
+    with replace_all_on_success(files_of(path)) as places:
         write_textured(path, places, mesh, image)

@@ -12,12 +12,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import cg
+from scipy.sparse import diags_array
 
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.solve.priors import nearest_rotations
+from meshmatch.geometry.smoothing import averaged, laplacian, solved
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import (
     dot,
@@ -113,7 +113,7 @@ class _Body:
             raise OptionError(f"{self.name} matches as a mirror image: a garment would be inside out", hint)
         outwards = 0.5 * scale * sums[:, 10, None, None] * normals[:, :, None] * self.normals[:, None, :]
         sums[:, :9] += outwards.reshape(-1, 9)
-        sums = _averaged(sums, edges, length, _SMOOTH * self.size)
+        sums = averaged(sums, np.ones(source.V), edges, length, _SMOOTH * self.size)
         around = sums[:, :9].reshape(-1, 3, 3)
         turns = nearest_rotations(around, np.broadcast_to(np.eye(3), around.shape))
         ratio = np.maximum(sums[:, 9], 0.0) / np.maximum(sums[:, 10], 1e-300)
@@ -160,7 +160,7 @@ class _Cloth:
         self._pull = np.zeros_like(rest)
         np.add.at(self._pull, end, kept)
         np.add.at(self._pull, start, -kept)
-        self._laplacian = _laplacian(edges, np.ones(len(edges)), len(rest))
+        self._laplacian = laplacian(edges, np.ones(len(edges)), len(rest))
 
     def at(self, values: Floats) -> Floats:
         """Values (V, D) of the vertices at all points."""
@@ -169,7 +169,7 @@ class _Cloth:
     def solve(self, places: Floats, weights: Floats) -> Floats:
         """Vertices near places (V, 3) that count so much (V,)."""
         matrix = (self._laplacian + diags_array(weights)).tocsr()
-        return _solved(matrix, self._pull + weights[:, None] * places, places)
+        return solved(matrix, self._pull + weights[:, None] * places, places)
 
 
 class _Skin:
@@ -216,26 +216,3 @@ def _inside_out(source: Shape, image: Floats, normals: Floats) -> bool:
     moved = triangle_vectors(image, source.faces)[source.valid_faces]
     outwards = normals[source.faces[source.valid_faces, 0]]
     return bool(dot(moved, outwards).sum() < -0.5 * np.sqrt(dot(moved, moved)).sum())
-
-
-def _averaged(values: Floats, edges: Ints, length: Floats, radius: float) -> Floats:
-    """Values (V, D) averaged over a surface around each vertex."""
-    V = len(values)
-    degree = np.maximum(np.bincount(edges.ravel(), minlength=V), 1)
-    weight = 4.0 * (radius / np.maximum(length, 0.01 * radius)) ** 2 / degree[edges].mean(axis=1)
-    matrix = (_laplacian(edges, weight, V) + diags_array(np.ones(V))).tocsr()
-    return _solved(matrix, values, values)
-
-
-def _laplacian(edges: Ints, weight: Floats, V: int) -> csr_array:
-    start, end = edges.T
-    places = np.concatenate([start, end]), np.concatenate([end, start])
-    neighbours = csr_array((np.concatenate([weight, weight]), places), shape=(V, V))
-    return csr_array(diags_array(np.asarray(neighbours.sum(axis=1)).ravel()) - neighbours)
-
-
-def _solved(matrix: csr_array, right: Floats, start: Floats) -> Floats:
-    """Columns that solve a positive definite system, by conjugate gradients."""
-    scaled = diags_array(1.0 / matrix.diagonal())
-    columns = [cg(matrix, b, x, rtol=1e-6, maxiter=1000, M=scaled)[0] for b, x in zip(right.T, start.T, strict=True)]
-    return np.stack(columns, axis=1)

@@ -106,6 +106,7 @@ class FakeMatching:
         fits = self.make_fit(a, self.verdict), self.make_fit(b, self.verdict)
         result = MatchResult(found, *fits, 2.5, ("a.ply: 3 faces dropped",), fits)
         object.__setattr__(result, "backward", lambda: self.make_map(b, a))
+        object.__setattr__(result, "deformed_source", lambda: a)
         return result
 
     def fit_all(self, matcher: matching.Matcher, shapes: Any, config: Any = None) -> list[Fit]:

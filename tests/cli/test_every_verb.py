@@ -24,6 +24,7 @@ PAIR = {
     "transfer-landmarks": ("out.csv", "--landmarks", "points.txt"),
     "transfer-texture": ("out.glb", "--size", "32", "--samples", "1"),
     "transfer-garment": ("out.obj",),
+    "wrap": ("out.obj",),
 }
 """Verbs of two shapes: the output, and what else each needs."""
 EVERY = PAIR | {"register": ("fitted.ply",)}
@@ -98,15 +99,15 @@ WRONG: list[tuple[str, str, tuple[str, ...]]] = [
     ("--picture p.jpg", "a picture is a PNG", ("view",)),
     ("--picture nowhere/p.png", "there is no folder nowhere", ("view",)),
     ("--picture folder.png", "is a folder", ("view",)),
-    ("--map in{} -o in{}", "is an input of this command", ("match", "register")),
-    ("--map gone.npz", "there is no file gone.npz", ("match", "register")),
-    ("--map back.npz", "runs the wrong way", ("match", "register")),
-    ("--map other.npz", "made for another target", ("match", "register")),
-    ("--map short.npy", "made for another source", ("match", "register")),
-    ("--map broken.npz", "does not hold arrays", ("match", "register")),
-    ("--map m.xyz", "is not a format for maps", ("match", "register")),
+    ("--map in{} -o in{}", "is an input of this command", ("match", "register", "wrap")),
+    ("--map gone.npz", "there is no file gone.npz", ("match", "register", "wrap")),
+    ("--map back.npz", "runs the wrong way", ("match", "register", "wrap")),
+    ("--map other.npz", "made for another target", ("match", "register", "wrap")),
+    ("--map short.npy", "made for another source", ("match", "register", "wrap")),
+    ("--map broken.npz", "does not hold arrays", ("match", "register", "wrap")),
+    ("--map m.xyz", "is not a format for maps", ("match", "register", "wrap")),
     *(
-        (f"--map ab.npz {words}", f"{words.split()[0]} does not go with --map", ("match", "register"))
+        (f"--map ab.npz {words}", f"{words.split()[0]} does not go with --map", ("match", "register", "wrap"))
         for words in ("--partial", "--source-up y", "--target-front x", "--mirror no", "--only 1")
     ),
 ]

@@ -1,0 +1,166 @@
+"""A mesh of one's own on the surface of a scan."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from meshmatch.api import matching
+from meshmatch.api.inputs import LandmarkPairs
+from meshmatch.api.results import MatchResult
+from meshmatch.arrays import Bool, Bools, Brief, Float, Floats
+from meshmatch.errors import InputError, OptionError
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.models.registry import AUTO
+from meshmatch.models.trained import TrainedModel
+from meshmatch.progress import ProgressCallback
+from meshmatch.shapes.files import ShapeLike, as_shape
+from meshmatch.shapes.moved_files import save_moved
+from meshmatch.shapes.shape import Shape
+from meshmatch.threads import thread_limit
+from meshmatch.transfer.wrap import wrap_onto
+
+if TYPE_CHECKING:
+    from meshmatch.implicit.model import ImplicitModel
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class WrapResult(Brief):
+    """A base on a scan.
+
+    Attributes
+    ----------
+    shape
+        The base's vertices and faces in their order, in the frame and unit of the scan.
+    turns
+        (V, 3, 3) how each vertex was turned.
+    distance
+        (V,) of each vertex to the scan's surface, unit of the scan.
+    free
+        (V,) True for a vertex that kept its shape and was not laid onto the scan.
+    match
+        The match of base and scan.
+    seconds
+        Time of the projection.
+    original
+        The base's file, if it came from one.
+
+    Examples
+    --------
+    >>> wrapped = meshmatch.wrap("templates/samples/dancer.ply", "templates/samples/climber.ply")
+    >>> wrapped.distance.mean(), wrapped.distance.max()  # unit of the climber's file
+    >>> wrapped.save("wrapped.ply")
+    """
+
+    shape: Shape
+    turns: Float[Floats, "V 3 3"]
+    distance: Float[Floats, " V"]
+    free: Bool[Bools, " V"]
+    match: MatchResult
+    seconds: float
+    original: Path | None = None
+
+    def save(self, path: str | Path) -> None:
+        """Write the wrapped mesh; an .obj from an .obj keeps all of its text but the positions and the directions of
+        normals, and its materials and images are copied beside it.
+
+        Parameters
+        ----------
+        path
+            Where to; its suffix chooses the format, see `save_shape`. What it cannot hold is told.
+
+        Raises
+        ------
+        OptionError
+            The suffix is unknown, or a material would replace another file.
+        OutputError
+            A file cannot be written.
+        """
+        save_moved(path, self.original, self.shape, self.turns)
+
+
+def wrap(
+    base: ShapeLike,
+    scan: ShapeLike,
+    *,
+    free: ArrayLike = (),
+    model: str | Path | TrainedModel | ImplicitModel = AUTO,
+    config: FitConfig | Sequence[FitConfig] | None = None,
+    landmarks: LandmarkPairs | None = None,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+) -> WrapResult:
+    """Lay a mesh of your own onto the surface of a scan: same vertices, same faces, the scan's form.
+
+    Both are matched, the base is deformed as the match says, and then drawn to the closest points of the scan that face
+    as it does, with a displacement that is smooth at first and ever finer.
+
+    Parameters
+    ----------
+    base
+        The mesh to be laid on.
+    scan
+        A mesh or point cloud of the same kind of shape.
+    free
+        Numbers of the base's vertices (N,) that keep their shape and follow those around them, such as eyes and the
+        inside of a mouth.
+    model
+        As in `match`, but for implicit models.
+    config
+        As in `match`.
+    landmarks
+        As in `match`.
+    threads
+        As in `match`.
+    progress
+        As in `match`.
+
+    Returns
+    -------
+    WrapResult
+        Its ``save("wrapped.obj")`` writes the mesh.
+
+    Raises
+    ------
+    MeshmatchError
+        The base is a point cloud, matches as a mirror image, or does not have a vertex that is free; or as for `match`.
+
+    Examples
+    --------
+    >>> wrapped = meshmatch.wrap("templates/samples/dancer.ply", "templates/samples/climber.ply", free=[0, 1, 2])
+    >>> wrapped.shape.verts  # (V, 3), on the climber
+    """
+    original = Path(base) if isinstance(base, str | Path) else None
+    mesh, surface = as_shape(base, "base"), as_shape(scan, "scan")
+    if mesh.is_cloud:
+        raise OptionError(f"{mesh.name or 'the base'} has no faces, and only a mesh can be wrapped", "give a mesh")
+    kept = _free(mesh, free)
+    found = matching.match(
+        mesh, surface, model=model, config=config, landmarks=landmarks, threads=threads, progress=progress
+    )  # fmt: skip
+    began = time.monotonic()
+    near = found.deformed_source()
+    if not np.array_equal(near.faces, mesh.faces):
+        hint = "mirror one of the files, or match without mirror images (--mirror no)"
+        raise OptionError(f"{mesh.name or 'the base'} matches as a mirror image: it would be inside out", hint)
+    with thread_limit(1):
+        wrapped = wrap_onto(mesh, near.verts, surface, kept, found.threads)
+    shape = replace(mesh, verts=wrapped.verts)
+    return WrapResult(shape, wrapped.turns, wrapped.distance, kept, found, time.monotonic() - began, original)
+
+
+def _free(base: Shape, numbers: ArrayLike) -> Bools:
+    """(V,) True for these vertices."""
+    rows = np.asarray(numbers)
+    if rows.size and (rows.ndim != 1 or rows.dtype.kind not in "iu" or rows.min() < 0 or rows.max() >= base.V):
+        hint = f"{base.name or 'the base'} has vertices 0 to {base.V - 1}"
+        raise InputError("free must be a list of numbers of vertices", hint)
+    free = np.zeros(base.V, bool)
+    free[rows.astype(np.int64)] = True
+    return free

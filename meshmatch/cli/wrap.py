@@ -1,0 +1,99 @@
+"""``meshmatch wrap``."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from typer import Argument
+
+import meshmatch
+from meshmatch.cli import words
+from meshmatch.cli.options import PairOptions, RunOptions, check_outputs, grouped, optional, output_option
+from meshmatch.cli.transfer_options import Picture
+from meshmatch.cli.words import Console, print_json
+from meshmatch.models.registry import check_model
+
+if TYPE_CHECKING:
+    from meshmatch.arrays import Ints
+
+
+@grouped
+def wrap(
+    *,
+    base: Path = Argument(..., metavar="BASE", help="Your mesh."),
+    scan: Path = Argument(..., metavar="SCAN", help="The shape whose surface it is laid on."),
+    output: Path = output_option(
+        "FILE",
+        "BASE on SCAN. An .obj from an .obj keeps everything but the positions, and its materials and images are "
+        "copied beside it; .glb, .ply and others keep less, and say what is lost.",
+    ),
+    how: PairOptions,
+    run: RunOptions,
+    free: Path | None = optional(
+        "FILE",
+        "Vertices of BASE that keep their shape and follow those around them, such as eyes and the inside of the mouth: "
+        'a number per line, counted from 0 (.txt, .csv or .npy), or the members of each part, {"eyes": [17, 18]} (.json).',
+    ),
+    picture: Picture = None,
+) -> None:
+    """Lay a mesh of your own onto a scan, with its vertex order, polygons, texture coordinates and groups.
+
+    BASE is matched to SCAN, deformed, and drawn onto the surface, smoothly at first and ever finer. Its distance from
+    the surface is printed, in the unit of SCAN.
+    """
+    import numpy as np
+
+    from meshmatch.outputs import replace_all_on_success
+    from meshmatch.shapes.moved_files import MovedFile
+
+    how.check()
+    how.refuse(["model"] if how.implicit else [], "wrap", "choose another model, or none")
+    console, names = Console(run.quiet), words.names_of([base, scan])
+    check_outputs([base, scan, how.known_pairs, free], output, picture=picture)
+    plan = MovedFile.planned(output, base)
+    check_outputs([base, scan, how.known_pairs, free], *plan.files, picture=picture)
+    plan.make_folders()
+    with replace_all_on_success(plan.files) as temporary:
+        check_model(how.model)
+        a, b = how.load(base, scan)
+        rows = _members(free, a)
+        pairs = how.pairs()
+        with console.progress() as report:
+            result = meshmatch.wrap(
+                a, b, free=rows, model=how.model, config=how.configs(), landmarks=pairs, threads=run.threads,
+                progress=report,
+            )  # fmt: skip
+        found = result.match.map
+        words.refuse_poor(run.strict, found.verdict, found.reasons, "the map")
+        plan.write(temporary, result.shape, result.turns)
+    words.tell_match(console, result.match, names)
+    words.tell_verdict(console, found.verdict, found.reasons, "the map")
+    apart = result.distance[~result.free & a.valid]
+    numbers = {"mean": apart.mean(), "95 %": np.quantile(apart, 0.95), "worst": apart.max()} if len(apart) else {}
+    told = ", ".join(f"{what} {value:.4g}" for what, value in numbers.items())
+    kept = f"; {len(np.unique(rows))} vertices kept their shape" if len(rows) else ""
+    console.say(f"distance to {names[1]} (its size is {np.sqrt(b.area):.4g}): {told}{kept}")
+    console.say(f"wrote {' '.join(map(str, plan.files))}: {names[0]} on {names[1]} ({result.seconds:.1f} s)")
+    if picture is not None:
+        from meshmatch.render.compose import compose_fit
+
+        compose_fit(b, result.shape, result.match.rotations[1], what=f"the mesh of {names[0]}").render(picture)
+        console.say(f"drew {picture}: the mesh over {names[1]}, and their distance")
+    if run.json:
+        record = {"output": output, "files": [str(file) for file in plan.files], "picture": picture, "vertices": a.V}
+        record |= {"free": int(result.free.sum()), "distance": {key: float(each) for key, each in numbers.items()}}
+        record |= words.map_record(found, names) | how.record(result.match.source_fit)
+        print_json(record | {"notes": list(result.match.notes), "seconds": round(result.seconds, 3)})
+
+
+def _members(file: Path | None, base: "meshmatch.Shape") -> "Ints":
+    """The vertices that a file names, alone or in parts."""
+    import numpy as np
+
+    from meshmatch.shapes.tables import load_points
+    from meshmatch.transfer.label_files import load_labels
+
+    if file is None:
+        return np.empty(0, np.int64)
+    if file.suffix.lower() == ".json":
+        return np.flatnonzero(load_labels(file, base, "vertices").codes >= 0)
+    return load_points(file)

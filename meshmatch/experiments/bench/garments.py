@@ -1,0 +1,187 @@
+"""Clothes, hair, hats and shoes from person to person, beside their exact refit.
+
+MakeHuman's clothes (`.mhclo`) bind each vertex to a triangle of its body and an offset, so that the refit on any body of
+that family is exact; in another pose it follows the joints as its triangles do. Bodies are generated: people at rest, as
+they were bound, and in a pose. Each person lends the garments to the next one, whose body is cut into other triangles.
+
+The distance is that of each vertex from its exact place, in centimetres. Under the skin is what lies inside the target and
+not inside the source; the exact refit has such vertices too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import numpy as np
+import torch
+from typer import Option
+
+from meshmatch.api.matcher import Matcher
+from meshmatch.api.results import MatchResult
+from meshmatch.arrays import Bools, Floats, Ints
+from meshmatch.errors import InputError
+from meshmatch.experiments import runner
+from meshmatch.experiments.makers.other_triangles import other_triangles
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.generators.bodies import sample_free_pose
+from meshmatch.generators.rig import build_rig, skin
+from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.garment import carry_garment
+
+Pose = Literal["rest", "posed"]
+_VERTICES = 19_158  # of MakeHuman's base mesh; those of its body come first
+_TOPOLOGY = "makehuman-noeyes-notongue-tris"
+_FACES = 18_000  # of a target
+COLUMNS = {
+    "garment": "garment", "target": "pose", "pairs": "pairs:d", "mean cm": "mean_cm:.2f", "95 %": "high_cm:.2f",
+    "worst": "worst_cm:.1f", "under the skin": "under:.2%", "exact refit": "truth_under:.2%",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Bound:
+    """A garment (.mhclo) or body (.proxy) of MakeHuman: its mesh; of each vertex three vertices of the base mesh, their
+    weights, and an offset.
+
+    ``scales`` are the two vertices whose distance along an axis, divided by a number, stretches offsets along it.
+    """
+
+    mesh: Shape
+    corners: Ints
+    weights: Floats
+    offsets: Floats
+    scales: tuple[tuple[int, int, float], ...]
+
+    @classmethod
+    def read(cls, path: Path) -> Bound:
+        """A file with its .obj beside it; `InputError` if they do not belong together."""
+        words = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
+        starts = {row[0]: k for k, row in enumerate(words) if row}
+        scales = [words[starts[f"{axis}_scale"]] for axis in "xyz"]
+        rows = []
+        for row in words[starts["verts"] + 1 :]:
+            if len(row) not in (1, 9):
+                break
+            rows.append([float(word) for word in row] if len(row) == 9 else [float(row[0]), 0, 0, 1, 0, 0, 0, 0, 0])
+        table, mesh = np.array(rows), load_shape(path.with_suffix(".obj"))
+        if len(table) != mesh.V:
+            raise InputError(f"{path.name} binds {len(table)} vertices, and its mesh has {mesh.V}")
+        corners = table[:, :3].astype(np.int64)
+        known = tuple((int(a), int(b), float(size)) for _, a, b, size in scales)
+        return cls(mesh, corners, table[:, 3:6], table[:, 6:], known)
+
+    def on(self, base: Floats) -> Shape:
+        """The garment on a base mesh (V, 3) at rest, in metres."""
+        axes = enumerate(self.scales)  # both are in decimetres: the ratio has the unit of the base
+        stretch = np.array([abs(base[a, k] - base[b, k]) / size for k, (a, b, size) in axes])
+        return self._with(np.einsum("nk,nkd->nd", self.weights, base[self.corners]) + self.offsets * stretch)
+
+    def posed(self, base: Floats, moves: Floats) -> Shape:
+        """The same when each vertex of the base mesh moved by an affine map (V, 3, 4)."""
+        share = np.maximum(self.weights, 0.0)
+        own = np.einsum("nk,nkij->nij", share / share.sum(axis=1, keepdims=True), moves[self.corners])
+        return self._with(np.einsum("nij,nj->ni", own[:, :, :3], self.on(base).verts) + own[:, :, 3])
+
+    def _with(self, verts: Floats) -> Shape:
+        return Shape(verts, self.mesh.faces, self.mesh.name)
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """Base mesh at rest (V, 3) and in a pose, and how each of its vertices moved (V, 3, 4)."""
+
+    rest: Floats
+    posed: Floats
+    moves: Floats
+
+    def wears(self, garment: Bound, pose: Pose) -> Shape:
+        return garment.on(self.rest) if pose == "rest" else garment.posed(self.rest, self.moves)
+
+
+def people(count: int, seed: int) -> tuple[list[Person], Ints]:
+    """Generated people, and the triangles of their bodies."""
+    rig = build_rig(count, seed, keep=np.arange(_VERTICES), topology=_TOPOLOGY, dtype=torch.float32)
+    world, offset = sample_free_pose(rig, rig.heads, torch.Generator().manual_seed(seed))
+    posed = skin(rig, rig.rest, world, offset)
+    moves = torch.einsum("vj,bjik->bvik", rig.weights, torch.cat([world, offset[..., None]], dim=-1))
+    arrays = [each.double().numpy() for each in (rig.rest, posed, moves)]
+    return [Person(*each) for each in zip(*arrays, strict=True)], rig.faces.numpy()
+
+
+def body_of(base: Floats, faces: Ints, name: str, cut: bool) -> Shape:
+    """The body alone, as it is or in other triangles."""
+    body = base[: int(faces.max()) + 1]
+    if not cut:
+        return Shape(body, faces, name)
+    weights, fine = other_triangles(faces, len(body))
+    return decimate(Shape(weights @ body, fine, name), _FACES)
+
+
+def measured(
+    garment: Bound, source: Person, target: Person, pose: Pose, found: MatchResult, bodies: tuple[Shape, Shape]
+) -> Any:
+    """Distances from the exact refit, in centimetres, and what lies under the skin."""
+    worn, true = source.wears(garment, "rest"), target.wears(garment, pose)
+    carried = carry_garment(worn, found.map, *bodies)
+    out = ~inside(bodies[0], worn.verts)
+    return {
+        "cm": 100 * np.linalg.norm(carried.verts - true.verts, axis=1),
+        "under": inside(bodies[1], carried.verts) & out,
+        "truth_under": inside(bodies[1], true.verts) & out,
+    }
+
+
+def inside(body: Shape, points: Floats) -> Bools:
+    """Which points (N,) are inside a body, by rays through it."""
+    return np.asarray(body.to_trimesh().contains(points))
+
+
+def rows_of(garments: dict[str, Bound], pose: Pose, count: int, matcher: Matcher, seed: int) -> list[dict[str, Any]]:
+    """A row for each garment, over all pairs of neighbours in a circle of people; and one for all together."""
+    crowd, faces = people(count, seed)
+    found: dict[str, list[Any]] = {name: [] for name in garments}
+    for k in runner.track(range(count), pose):
+        source, target = crowd[k], crowd[(k + 1) % count]
+        bodies = (
+            body_of(source.rest, faces, f"person {k}", cut=False),
+            body_of(target.rest if pose == "rest" else target.posed, faces, f"person {(k + 1) % count}", cut=True),
+        )
+        match = matcher.match(*bodies)
+        for name, garment in garments.items():
+            found[name].append(measured(garment, source, target, pose, match, bodies))
+    rows = [_row(name, pose, each) for name, each in found.items()]
+    return [*rows, _row("all", pose, [each for several in found.values() for each in several])]
+
+
+def _row(name: str, pose: Pose, found: list[Any]) -> dict[str, Any]:
+    joined = {key: np.concatenate([each[key] for each in found]) for key in found[0]}
+    return {
+        **{"garment": name, "pose": pose, "pairs": len(found)},
+        "mean_cm": float(np.mean([each["cm"].mean() for each in found])),
+        **{"high_cm": float(np.quantile(joined["cm"], 0.95)), "worst_cm": float(joined["cm"].max())},
+        **{key: float(joined[key].mean()) for key in ("under", "truth_under")},
+    }
+
+
+@runner.command
+def main(
+    data: runner.Data = runner.DATA,
+    poses: Annotated[str, Option(help=f"of {', '.join(get_args(Pose))}")] = ",".join(get_args(Pose)),
+    count: Annotated[int, Option(min=2, help="generated people")] = 4,
+    model: runner.Model = "human",
+    threads: runner.Threads = 1,
+    seed: runner.Seed = 0,
+) -> runner.Report:
+    files = sorted((data / "garments").glob("*.mhclo"))
+    if not files:
+        raise InputError(f"there are no .mhclo files in {data / 'garments'}", "name the folder with --data")
+    garments = {file.stem: Bound.read(file) for file in files}
+    matcher = Matcher(model, FitConfig(), threads)
+    chosen: list[Any] = runner.names_of(poses, get_args(Pose), "pose")
+    rows = [row for pose in chosen for row in rows_of(garments, pose, count, matcher, seed)]
+    title = f"Garments from person to person with {matcher.model.card.name}"
+    return runner.Report({"rows": rows}, [runner.table(title, rows, COLUMNS)])

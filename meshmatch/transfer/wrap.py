@@ -1,0 +1,113 @@
+"""A mesh that lies near a scan, laid onto its surface: projected with a smooth displacement, which gets finer by rounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
+from meshmatch.fitting.solve.priors import nearest_rotations
+from meshmatch.geometry.smoothing import averaged
+from meshmatch.geometry.trees import cKDTree
+from meshmatch.geometry.triangles import dot, edge_lengths, interpolate, same_rows, unit, vertex_normals
+from meshmatch.maps.deformed import surface_rotations
+from meshmatch.maps.vertex_map import corners_of
+from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.mapped_mesh import MappedMesh, known_normals, length_of
+
+# All set by hand; lengths in units of sqrt(area).
+# Displacements are averaged over these distances, one after the other.
+_RADII = (0.03, 0.015, 0.008, 0.004, 0.002)
+# A point of the scan that is further away counts little: 1/e here.
+_REACH = 0.03
+# What counts where nothing is known, so that everything follows what is around it.
+_FLOOR = 1e-4
+# Vertices that a free part follows where it hangs on nothing else.
+_AROUND = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Wrapped:
+    """A base on a scan.
+
+    ``verts`` (V, 3) in the frame and unit of the scan; ``turns`` (V, 3, 3) how each vertex was turned; ``distance`` (V,) of
+    each vertex to the scan's surface.
+    """
+
+    verts: Float[Floats, "V 3"]
+    turns: Float[Floats, "V 3 3"]
+    distance: Float[Floats, " V"]
+
+
+def wrap_onto(
+    base: Shape, near: Float[Floats, "V 3"], scan: Shape, free: Bool[Bools, " V"], workers: int = 1
+) -> Wrapped:
+    """Lay a base, whose vertices are ``near`` a scan already, onto it; ``free`` ones keep their shape and follow the others.
+
+    A vertex is drawn to the closest point of the scan that faces as it does, unless that is on the rim of a hole.
+    """
+    own, back = np.unique(same_rows(base.verts), return_inverse=True)  # seams stay closed
+    faces, bound = back[base.faces], ~free[own]
+    mesh = Shape(base.verts[own], faces, base.name)
+    edges = mesh.edges.vertices.astype(np.int64)
+    surface, unit_length = _Scan(scan, workers), length_of(scan)
+    verts = near[own]
+    for radius in _RADII:
+        step, trust = surface.towards(verts, vertex_normals(verts, faces))
+        trust = np.where(bound & mesh.valid, trust, 0.0) + _FLOOR
+        verts = verts + averaged(step, trust, edges, edge_lengths(verts, edges), radius * unit_length)
+    if not bound.all():
+        verts = _with_free_parts(mesh, near[own], verts, bound)
+    turns = surface_rotations(mesh.verts, verts, faces)
+    return Wrapped(verts[back], turns[back], surface.distance(verts)[back])
+
+
+class _Scan:
+    """The surface that is wrapped."""
+
+    def __init__(self, scan: Shape, workers: int) -> None:
+        self._scan, self._mesh, self._workers = scan, MappedMesh.of(scan), workers
+        self._normals = known_normals(scan)
+        self._rim = np.zeros(scan.V, bool)
+        self._rim[scan.edges.vertices[scan.edges.sizes == 1]] = True
+        self._reach = _REACH * length_of(scan)
+
+    def towards(self, points: Floats, normals: Floats) -> tuple[Floats, Floats]:
+        """Steps (N, 3) onto the surface, and how far each is to be trusted (N,)."""
+        found = self._mesh.query(points, normals, self._workers)
+        corners = corners_of(self._scan.faces, found.face, found.vertex)
+        foot = interpolate(self._scan.verts, corners, found.barycentric)
+        trust = np.exp(-np.square(found.distance / self._reach))
+        if not self._scan.is_cloud:
+            facing = unit(interpolate(self._normals, corners, found.barycentric))
+            trust *= np.maximum(dot(facing, normals), 0.0)
+            on_rim = (self._rim[corners] | (found.barycentric < 1e-9)).all(axis=1)
+            trust[on_rim] = 0.0
+        return foot - points, trust
+
+    def distance(self, points: Floats) -> Floats:
+        return self._mesh.query(points, workers=self._workers).distance
+
+
+def _with_free_parts(mesh: Shape, near: Floats, verts: Floats, bound: Bools) -> Floats:
+    """Vertices of which the free ones keep the shape that they had before the projection.
+
+    Those that hang on others have followed these already; a part that is wholly free, such as an eyeball, moves as the
+    nearest vertices that are not: turned, scaled and shifted as a whole from where the base has it.
+    """
+    verts = verts.copy()
+    known = np.flatnonzero(bound)
+    alone = np.setdiff1d(np.unique(mesh.vertex_parts), mesh.vertex_parts[known])
+    if not len(known):
+        return near
+    tree = cKDTree(mesh.verts[known])
+    for part in alone.tolist():
+        rows = np.flatnonzero(mesh.vertex_parts == part)
+        around: Ints = known[np.unique(tree.query(mesh.verts[rows], min(_AROUND, len(known)))[1])]
+        here, there = mesh.verts[around], verts[around]
+        a, b = here - here.mean(axis=0), there - there.mean(axis=0)
+        turn = nearest_rotations((b.T @ a)[None], np.eye(3)[None])[0]
+        scale = np.sqrt(np.square(b).sum() / max(np.square(a).sum(), 1e-300))
+        verts[rows] = scale * (mesh.verts[rows] - here.mean(axis=0)) @ turn.T + there.mean(axis=0)
+    return verts

@@ -1,0 +1,59 @@
+"""wrap through the program's only door; the match is made up."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.shapes.files import load_shape, save_shape
+from tests.cli.conftest import FakeMatching, Run, refused, well
+from tests.transfer.worn import rod, tube
+
+
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stub: FakeMatching) -> Path:
+    """A rod with groups in its file, and a thicker one to wrap it onto."""
+    monkeypatch.chdir(tmp_path)
+    save_shape("base.obj", rod())
+    Path("base.obj").write_text(Path("base.obj").read_text().replace("# meshmatch\n", "# mine\ng rod\n"))
+    fine = tube(0.21, 2.0, 48, 81, "scan", closed=True)
+    save_shape("scan.ply", fine)
+    return tmp_path
+
+
+def test_the_text_stays_and_the_distance_is_printed(run: Run, files: Path) -> None:
+    answer = well(run("wrap", "base.obj", "scan.ply", "-o", "out.obj", "--json", "--picture", "p.png"))
+    record = json.loads(answer.out)
+    assert set(record["distance"]) == {"mean", "95 %", "worst"}
+    assert record["distance"]["95 %"] < 0.003
+    assert (record["files"], record["free"], record["vertices"]) == (["out.obj"], 0, rod().V)
+    assert "distance to scan.ply (its size is" in answer.err
+    lines, before = (Path(name).read_text().splitlines() for name in ("out.obj", "base.obj"))
+    assert [line for line in lines if line[:2] != "v "] == [line for line in before if line[:2] != "v "]
+    radius = np.linalg.norm(load_shape("out.obj").verts[:-2, [0, 2]], axis=1)
+    assert np.quantile(np.abs(radius - 0.21), 0.9) < 0.003
+    assert Path("p.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("free.txt", "500\n501\n"), ("free.json", json.dumps({"eyes": [500], "mouth": [501]}))]
+)
+def test_free_vertices_by_number_or_part(run: Run, files: Path, name: str, text: str) -> None:
+    Path(name).write_text(text)
+    answer = well(run("wrap", "base.obj", "scan.ply", "-o", "out.obj", "--free", name, "--json"))
+    assert json.loads(answer.out)["free"] == 2
+    assert "2 vertices kept their shape" in answer.err
+
+
+def test_what_cannot_be_is_told(run: Run, files: Path, stub: FakeMatching) -> None:
+    Path("free.txt").write_text("99999\n")
+    save_shape("cloud.ply", replace(rod(), faces=np.empty((0, 3), np.int64)))
+    before = {path.name for path in files.iterdir()}
+    answer = run("wrap", "base.obj", "scan.ply", "-o", "out.obj", "--free", "free.txt")
+    assert (answer.status, stub.called) == (1, {})
+    assert "base.obj has vertices 0 to 985" in answer.err
+    refused(run("wrap", "cloud.ply", "scan.ply", "-o", "out.obj"), "only a mesh can be wrapped", files, before)
+    refused(run("wrap", "base.obj", "scan.ply", "-o", "base.obj"), "is an input of this command", files, before)
+    refused(run("wrap", "base.obj", "scan.ply", "-o", "out.pcd"), "out.pcd", files, before)
