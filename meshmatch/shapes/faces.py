@@ -86,9 +86,12 @@ def _handed(faces: Ints) -> Bools:
 
 
 def find_parts(
-    verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], cross: Float[Floats, "F 3"]
+    verts: Float[Floats, "V 3"],
+    faces: Int[Ints, "F 3"],
+    cross: Float[Floats, "F 3"],
+    spared: Bool[Bools, " V"] | None = None,
 ) -> tuple[Bool[Bools, " F"], int, int, int, float]:
-    """Judge the connected parts of a mesh; `cross` as in `flat_faces`.
+    """Judge the connected parts of a mesh; `cross` as in `flat_faces`. A part with a `spared` vertex is no outlier.
 
     Returns the faces of outlier parts; how many parts are outliers, and how many are not; how many of the latter are
     big but lie far from the rest; and the share of the surface that these have, in 0..1.
@@ -114,6 +117,8 @@ def find_parts(
     if areas[small].sum() > 0.1 * areas.sum():
         gap, diagonal = _gaps(verts, faces, face_areas, part, big, np.flatnonzero(small))
         outlier &= gap > _NEAR * diagonal
+    if spared is not None:
+        outlier[part[spared[faces].any(axis=1)]] = False
     many = int(outlier.sum())
     return outlier[part], many, len(areas) - many, len(far), float(areas[far].sum() / areas.sum())
 

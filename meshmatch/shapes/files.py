@@ -160,7 +160,8 @@ def _read(path: str | Path) -> tuple[Shape, Raw]:
     with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are judged below
         raw = _FORMATS[suffix][0](path, data)
     name = plain_text(path.name)
-    return Shape.with_invalid(raw.verts, raw.faces, name, _visible(name, raw.colors)), raw
+    shape = Shape.with_invalid(raw.verts, raw.faces, name, _visible(name, raw.colors))
+    return (shape if raw.skinned is None else replace(shape, skinned=raw.skinned)), raw
 
 
 def _visible(name: str, colors: Floats | None) -> Floats | None:

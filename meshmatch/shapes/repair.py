@@ -55,9 +55,10 @@ def repair(shape: Shape) -> Repaired:
     corner of an stl; two layers that merely touch stay apart); faces without area; faces that occur twice (both of
     them, where they are a flap of no volume on a closed surface); outlier parts (see
     `meshmatch.shapes.faces.OUTLIER_SHARE`; unless together they are more than a tenth of the surface: then the shape
-    is made of small parts, and only those far from the rest are outliers); vertices that no face uses. Then faces are
-    turned so that neighbours agree and the shape is not inside out. Open and non-manifold edges are counted, not
-    mended. Where noise is as large as the triangles, the surface is smoothed (`meshmatch.shapes.denoise`).
+    is made of small parts, and only those far from the rest are outliers; never what joints move, such as the shells of
+    a robot's fingers); vertices that no face uses. Then faces are turned so that neighbours agree and the shape is not
+    inside out. Open and non-manifold edges are counted, not mended. Where noise is as large as the triangles, the
+    surface is smoothed (`meshmatch.shapes.denoise`).
     Of a cloud: points without a position, double ones, and outliers far from all others.
 
     `InputError` if nothing is left: no face of a mesh has any area.
@@ -106,7 +107,7 @@ def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     faces, cross, which = _without(double, faces, cross, which)
     if len(faces) == 0:
         raise InputError(f"{shape.name or 'the shape'} has no face with any area", "is it a mesh at all?")
-    outlier, outlier_parts, parts, far, far_share = find_parts(shape.verts, faces, cross)
+    outlier, outlier_parts, parts, far, far_share = find_parts(shape.verts, faces, cross, shape.skinned)
     what = f"dropped ({outlier.sum():,} {'face' if outlier.sum() == 1 else 'faces'})"
     _note(notes, outlier_parts, "outlier part", what)
     faces, cross, which = _without(outlier, faces, cross, which)

@@ -42,6 +42,8 @@ class Shape(Pickled):
         answers for it too), but its ``verts`` row is only a stand-in, and faces that touch it have no area.
     weights
         (V,) how far a fit trusts each vertex, from 0 (not at all) to 1; fully where not given.
+    skinned
+        (V,) True for a vertex that joints of its file move: no part with one is ever dropped as dirt.
 
     Raises
     ------
@@ -61,6 +63,7 @@ class Shape(Pickled):
     colors: Float[Floats, "V 4"] | None = None
     invalid: Bool[Bools, " V"] | None = None
     weights: Float[Floats, " V"] | None = None
+    skinned: Bool[Bools, " V"] | None = None
 
     def __post_init__(self) -> None:
         label = self.name or "the shape"
@@ -87,6 +90,7 @@ class Shape(Pickled):
         object.__setattr__(self, "verts", verts)
         object.__setattr__(self, "faces", faces)
         kinds = {"colors": (np.float64, (V, 4)), "invalid": (np.bool_, (V,)), "weights": (np.float64, (V,))}
+        kinds["skinned"] = (np.bool_, (V,))
         for name, (kind, shape) in kinds.items():
             if (values := getattr(self, name)) is not None:
                 array = read_only(values, kind, label)

@@ -140,3 +140,14 @@ def test_editing_keeps_what_is_there(tmp_path: Path) -> None:
     assert np.allclose(load_shape(made).verts, write_tube(path).verts, atol=1e-6)
     rig = read_rig(made, made.read_bytes())
     assert rig.names == NODES[:-1] and len(rig.clips) == 1
+
+
+def test_a_shape_knows_what_joints_move(tmp_path: Path) -> None:
+    path = tmp_path / "tube.gltf"
+    write_tube(path)
+    assert load_shape(path).skinned is not None and load_shape(path).skinned.all()
+    changed(path, lambda document: document["nodes"].append({"mesh": 0}) or document["scenes"][0]["nodes"].append(7))
+    shape = load_shape(path)
+    assert shape.skinned.tolist() == [True] * (shape.V // 2) + [False] * (shape.V // 2)
+    changed(path, lambda document: document["nodes"][6].pop("skin"))
+    assert load_shape(path).skinned is None

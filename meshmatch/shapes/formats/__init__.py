@@ -24,7 +24,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.errors import InputError, OutputError, warn
 from meshmatch.shapes.colors import light, seen
 
@@ -49,6 +49,7 @@ class Raw:
     verts: Float[Floats, "V 3"]
     faces: Int[Ints, "F 3"]
     colors: Float[Floats, "V 4"] | None = None
+    skinned: Bool[Bools, " V"] | None = None  # vertices that joints of the file move
     meshes: tuple[tuple[tuple[str, ...], int], ...] = ()  # of a scene, in order: names (of node and mesh), vertices
 
 

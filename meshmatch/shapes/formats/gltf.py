@@ -18,7 +18,7 @@ from urllib.parse import unquote_to_bytes
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.errors import InputError, warn
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import to_srgb
@@ -114,6 +114,7 @@ class Document:
         verts: list[Floats] = []
         faces: list[Ints] = [NO_FACES]
         colors: list[Floats | None] = []
+        skinned: list[Bools] = []
         meshes: list[tuple[tuple[str, ...], int]] = []
         places = seen = 0
         # One mesh may stand in a scene a thousand times, so that a small file can promise any number.
@@ -131,6 +132,7 @@ class Document:
             verts.append(own)
             colors.append(self.colors(primitive))
             meshes.append((self._names(node), len(own)))
+            skinned.append(np.full(len(own), "skin" in self.nodes[node] and "JOINTS_0" in primitive["attributes"]))
             seen += len(own)
         self._tell_hidden()
         if not verts:
@@ -138,7 +140,8 @@ class Document:
         painted = joined_colors(colors, [len(own) for own in verts])
         if painted is not None:
             painted[:, :3] = to_srgb(painted[:, :3])
-        return Raw(np.vstack(verts), np.vstack(faces), painted, tuple(meshes))
+        bound = np.concatenate(skinned)
+        return Raw(np.vstack(verts), np.vstack(faces), painted, bound if bound.any() else None, tuple(meshes))
 
     def _names(self, number: int) -> tuple[str, ...]:
         """What a node and its mesh are called."""
