@@ -5,7 +5,8 @@ that family is exact; in another pose it follows the joints as its triangles do.
 they were bound, and in a pose. Each person lends the garments to the next one, whose body is cut into other triangles.
 
 The distance is that of each vertex from its exact place, in centimetres. Under the skin is what lies inside the target and
-not inside the source; the exact refit has such vertices too.
+not inside the source; the exact refit has such vertices too. ``--exact-map`` carries along the true map instead of a match,
+and so shows what remains without the match's errors.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ import torch
 from typer import Option
 
 from meshmatch.api.matcher import Matcher
-from meshmatch.api.results import MatchResult
 from meshmatch.arrays import Bools, Floats, Ints
 from meshmatch.errors import InputError
 from meshmatch.experiments import runner
@@ -27,10 +27,12 @@ from meshmatch.experiments.makers.other_triangles import other_triangles
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.generators.bodies import sample_free_pose
 from meshmatch.generators.rig import build_rig, skin
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.garment import carry_garment
+from meshmatch.transfer.mapped_mesh import MappedMesh
 
 Pose = Literal["rest", "posed"]
 _VERTICES = 19_158  # of MakeHuman's base mesh; those of its body come first
@@ -122,11 +124,11 @@ def body_of(base: Floats, faces: Ints, name: str, cut: bool) -> Shape:
 
 
 def measured(
-    garment: Bound, source: Person, target: Person, pose: Pose, found: MatchResult, bodies: tuple[Shape, Shape]
+    garment: Bound, source: Person, target: Person, pose: Pose, found: VertexMap, bodies: tuple[Shape, Shape]
 ) -> Any:
     """Distances from the exact refit, in centimetres, and what lies under the skin."""
     worn, true = source.wears(garment, "rest"), target.wears(garment, pose)
-    carried = carry_garment(worn, found.map, *bodies)
+    carried = carry_garment(worn, found, *bodies)
     out = ~inside(bodies[0], worn.verts)
     return {
         "cm": 100 * np.linalg.norm(carried.verts - true.verts, axis=1),
@@ -135,24 +137,33 @@ def measured(
     }
 
 
+def true_map(source: Shape, places: Floats, target: Shape) -> VertexMap:
+    """The map to a target whose surface passes through the true places (V, 3) of the source's vertices."""
+    found = MappedMesh.of(target).query(places)
+    return VertexMap.between(source, target, found.vertex, face=found.face, barycentric=found.barycentric)
+
+
 def inside(body: Shape, points: Floats) -> Bools:
     """Which points (N,) are inside a body, by rays through it."""
     return np.asarray(body.to_trimesh().contains(points))
 
 
-def rows_of(garments: dict[str, Bound], pose: Pose, count: int, matcher: Matcher, seed: int) -> list[dict[str, Any]]:
-    """A row for each garment, over all pairs of neighbours in a circle of people; and one for all together."""
+def rows_of(
+    garments: dict[str, Bound], pose: Pose, count: int, matcher: Matcher | None, seed: int
+) -> list[dict[str, Any]]:
+    """A row for each garment, over all pairs of neighbours in a circle of people; and one for all together. Without a
+    matcher, along the true map.
+    """
     crowd, faces = people(count, seed)
     found: dict[str, list[Any]] = {name: [] for name in garments}
     for k in runner.track(range(count), pose):
         source, target = crowd[k], crowd[(k + 1) % count]
-        bodies = (
-            body_of(source.rest, faces, f"person {k}", cut=False),
-            body_of(target.rest if pose == "rest" else target.posed, faces, f"person {(k + 1) % count}", cut=True),
-        )
-        match = matcher.match(*bodies)
+        there = target.rest if pose == "rest" else target.posed
+        bodies = body_of(source.rest, faces, f"person {k}", cut=False), body_of(there, faces, "the next", cut=True)
+        exact = true_map(bodies[0], there[: bodies[0].V], bodies[1])
+        way = exact if matcher is None else matcher.match(*bodies).map
         for name, garment in garments.items():
-            found[name].append(measured(garment, source, target, pose, match, bodies))
+            found[name].append(measured(garment, source, target, pose, way, bodies))
     rows = [_row(name, pose, each) for name, each in found.items()]
     return [*rows, _row("all", pose, [each for several in found.values() for each in several])]
 
@@ -172,6 +183,7 @@ def main(
     data: runner.Data = runner.DATA,
     poses: Annotated[str, Option(help=f"of {', '.join(get_args(Pose))}")] = ",".join(get_args(Pose)),
     count: Annotated[int, Option(min=2, help="generated people")] = 4,
+    exact_map: Annotated[bool, Option("--exact-map", help="carry along the true map")] = False,
     model: runner.Model = "human",
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
@@ -180,8 +192,8 @@ def main(
     if not files:
         raise InputError(f"there are no .mhclo files in {data / 'garments'}", "name the folder with --data")
     garments = {file.stem: Bound.read(file) for file in files}
-    matcher = Matcher(model, FitConfig(), threads)
+    matcher = None if exact_map else Matcher(model, FitConfig(), threads)
     chosen: list[Any] = runner.names_of(poses, get_args(Pose), "pose")
     rows = [row for pose in chosen for row in rows_of(garments, pose, count, matcher, seed)]
-    title = f"Garments from person to person with {matcher.model.card.name}"
+    title = f"Garments from person to person with {'the true map' if exact_map else model}"
     return runner.Report({"rows": rows}, [runner.table(title, rows, COLUMNS)])

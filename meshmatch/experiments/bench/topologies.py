@@ -25,6 +25,15 @@ COLUMNS = {
 }  # fmt: skip
 
 
+def _row(name: str, pose: str, centimetres: Any, pairs: int) -> dict[str, Any]:
+    away, scan, truth = centimetres
+    return {
+        **{"topology": name, "pose": pose, "pairs": pairs, "mean_cm": away.mean(), "high_cm": np.quantile(away, 0.95)},
+        **{"scan_cm": scan.mean(), "scan_high_cm": np.quantile(scan, 0.95), "scan_worst_cm": scan.max()},
+        "truth_cm": truth.mean(),
+    }
+
+
 @runner.command
 def main(
     data: runner.Data = runner.DATA,
@@ -51,12 +60,3 @@ def main(
                 found.append(100 * np.stack([away, wrapped.distance, MappedMesh.of(scan).query(truth).distance]))
             rows.append(_row(file.stem, pose, np.concatenate(found, axis=1), count))
     return runner.Report({"rows": rows}, [runner.table("Bodies in other topologies, wrapped", rows, COLUMNS)])
-
-
-def _row(name: str, pose: str, centimetres: Any, pairs: int) -> dict[str, Any]:
-    away, scan, truth = centimetres
-    return {
-        **{"topology": name, "pose": pose, "pairs": pairs, "mean_cm": away.mean(), "high_cm": np.quantile(away, 0.95)},
-        **{"scan_cm": scan.mean(), "scan_high_cm": np.quantile(scan, 0.95), "scan_worst_cm": scan.max()},
-        "truth_cm": truth.mean(),
-    }
