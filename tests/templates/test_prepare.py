@@ -1,7 +1,6 @@
 """A folder made ready: what is registered, what is left out and why, and what lies on the disk afterwards."""
 
 import json
-import signal
 from pathlib import Path
 
 import numpy as np
@@ -174,8 +173,12 @@ def test_a_prepared_folder_is_replaced_whole_and_nothing_else_is(
     first = prepared(folder, out, FEW)
     (out / "nodes.png").write_bytes(b"a picture of before")
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
     with monkeypatch.context() as stopped, pytest.raises(KeyboardInterrupt):
-        stopped.setattr("meshmatch.templates.prepare.save_template", lambda *_: signal.raise_signal(signal.SIGINT))
+        stopped.setattr("meshmatch.templates.prepare.save_template", stop)
         prepared(folder, out, FEW)
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted({"out", folder.name})
