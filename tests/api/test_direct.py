@@ -86,6 +86,19 @@ def test_a_map_of_a_model_that_is_not_good_gives_way_to_a_better_one(
 
 
 @pytest.mark.usefixtures("quick")
+def test_a_mirror_image_is_taken_unless_it_is_not_wanted(
+    shapes: tuple[Shape, Shape], found: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame = direct.MIRROR.compose(found.target.frame)
+    image = replace(found, target=replace(found.target, frame=frame))
+    monkeypatch.setattr(direct, "match_either_side", lambda *_: image)
+    monkeypatch.setattr(direct, "match_directly", lambda *_: found)
+    clean = [usable(shape) for shape in shapes]
+    for mirror, said in ((None, True), ("no", False)):
+        result = match_without_model(clean, [meshmatch.FitConfig(mirror=mirror)] * 2, None, 1, None)
+        assert ("target: taken for a mirror image of source" in result.notes) == said
+
+
 def test_what_cannot_be_matched_directly_keeps_the_map_of_its_model(
     shapes: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,7 +9,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from meshmatch.fitting.direct import DirectConfig, match_directly
+from meshmatch.fitting.direct import DirectConfig, match_directly, match_either_side
+from meshmatch.fitting.fit import axis_name
 from meshmatch.fitting.judge.direct import DirectFeatures, judge_direct
 from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh, shortest_tour
 from meshmatch.fitting.search.proposals import Assignments, extremity_proposals, rigid_proposals, spectral_proposals
@@ -17,6 +18,7 @@ from meshmatch.fitting.solve.driver import minimise
 from meshmatch.fitting.solve.surface_nodes import SurfaceNodes
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.sides import mirrored, nearer_mirrored
 
 QUICK = DirectConfig(coarse=900, fine=1800, samples=2500, few=1000, fewer=600, better=6, best=3)
 # limbs of a creature: where they point, how long and how wide they are
@@ -202,6 +204,24 @@ def test_a_bent_turned_and_scaled_shape_is_found(pair: tuple[Shape, Shape]) -> N
     assert energies == sorted(energies) and len(energies) > 1
     again = match_directly(source, target, QUICK)
     assert np.array_equal(again.target.points, found.target.points)
+
+
+def test_a_mirror_image_is_found_where_it_fits_clearly_better() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    x, y, z = (np.asarray(ball.vertices) * [0.5, 1.3, 0.35]).T  # bent and curled, as no mirror image of it is
+    curl = np.stack([x + 0.5 * y**2, y + 0.2 * x, z + 0.5 * y**3 + 0.4 * x * y], 1)
+    source = Shape(curl, np.asarray(ball.faces), "curl")
+    turn = Rotation.from_euler("xyz", (70, 130, -40), degrees=True)
+    plain = Shape(turn.apply(curl), source.faces, "turned")
+    target = mirrored(plain)
+    assert nearer_mirrored(source, plain, 0) < 0 < 0.5 < nearer_mirrored(source, target, 0)
+    finer = replace(QUICK, fine=5000, samples=8000, better=4, best=2)
+    found = match_either_side(source, target, finer, known=(source.verts[:3], target.verts[:3])).target
+    assert found.frame.mirrored and np.array_equal(found.verts, target.verts)
+    assert (found.up, found.front) == tuple(axis_name(found.frame.rotation[row]) for row in (1, 2))
+    at = ThinMesh.of(frame_applied(source), finer.fine).kept
+    error = np.linalg.norm(found.points_in_file - target.verts[at], axis=1) / np.sqrt(target.area)
+    assert error.mean() < 0.02
 
 
 def test_a_guess_is_much_the_same_as_what_is_found_or_is_left_behind(pair: tuple[Shape, Shape]) -> None:

@@ -63,7 +63,7 @@ class CandidateSettings:
     shares : shares of the surface that a part may show
     min_share : the smallest share that a shape is taken to show
     lost : residual from which on the candidates of a narrow search are not worth refining: of parts of people that are found
-        it is 0.024 to 0.030
+        it is 0.020 to 0.030
     wide_shares : shares for which a wide search tries all frames
     ranking_samples : samples by which frames are ranked
     careful, careful_if_wide : candidates of each share that are fitted with care, in a narrow and in a wide search
