@@ -6,18 +6,16 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from meshmatch.api.results import MapPair
+from meshmatch.api.results import MapPair, MovedMesh
 from meshmatch.api.transfer import MapLike, find_maps
-from meshmatch.arrays import Brief, Float, Floats, Int, Ints
+from meshmatch.arrays import Int, Ints
 from meshmatch.shapes.files import ShapeLike, as_shape
-from meshmatch.shapes.moved_files import save_moved
-from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.garment import carry_garment
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class GarmentResult(Brief):
+class GarmentResult(MovedMesh):
     """A garment on another body.
 
     Attributes
@@ -43,31 +41,10 @@ class GarmentResult(Brief):
     >>> result.save("climbers-shirt.obj")  # the text of shirt.obj with other positions
     """
 
-    shape: Shape
-    turns: Float[Floats, "V 3 3"]
     pushed: Int[Ints, " N"]
     sunk: Int[Ints, " M"]
     maps: MapPair
     seconds: float
-    original: Path | None = None
-
-    def save(self, path: str | Path) -> None:
-        """Write the garment; an .obj from an .obj keeps all of its text but the positions and the directions of normals,
-        and its materials and images are copied beside it.
-
-        Parameters
-        ----------
-        path
-            Where to; its suffix chooses the format, see `save_shape`. What it cannot hold is told.
-
-        Raises
-        ------
-        OptionError
-            The suffix is unknown, or a material would replace another file.
-        OutputError
-            A file cannot be written.
-        """
-        save_moved(path, self.original, self.shape, self.turns)
 
 
 def transfer_garment(garment: ShapeLike, source: ShapeLike, target: ShapeLike, match: MapLike = None) -> GarmentResult:
@@ -114,4 +91,4 @@ def transfer_garment(garment: ShapeLike, source: ShapeLike, target: ShapeLike, m
         found = carry_garment(cloth, maps.forward, maps.source, maps.target, maps.threads)
     shape = replace(cloth, verts=found.verts)
     seconds = time.monotonic() - began
-    return GarmentResult(shape, found.turns, found.pushed, found.sunk, maps, seconds, original)
+    return GarmentResult(shape, found.turns, found.pushed, found.sunk, maps, seconds, original=original)

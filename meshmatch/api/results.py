@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
 from pathlib import Path
@@ -21,6 +21,7 @@ from meshmatch.maps.files import load_map
 from meshmatch.maps.places import Places
 from meshmatch.maps.vertex_map import VertexMap, check_map
 from meshmatch.shapes.files import ShapeLike, as_shape
+from meshmatch.shapes.moved_files import save_moved
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
@@ -31,6 +32,43 @@ if TYPE_CHECKING:
     from meshmatch.implicit.fit import ImplicitFit
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MovedMesh(Brief):
+    """A mesh whose vertices have moved: what `transfer_garment` and `wrap` give back.
+
+    Attributes
+    ----------
+    shape
+        Vertices and faces in their order, where they are now.
+    turns
+        (V, 3, 3) how each vertex was turned.
+    original
+        The mesh's file, if it came from one.
+    """
+
+    shape: Shape
+    turns: Float[Floats, "V 3 3"]
+    original: Path | None = field(default=None, kw_only=True)
+
+    def save(self, path: str | Path) -> None:
+        """Write the mesh; an .obj from an .obj keeps all of its text but the positions and the directions of normals, and
+        its materials and images are copied beside it.
+
+        Parameters
+        ----------
+        path
+            Where to; its suffix chooses the format, see `save_shape`. What it cannot hold is told.
+
+        Raises
+        ------
+        OptionError
+            The suffix is unknown, or a material would replace another file.
+        OutputError
+            A file cannot be written.
+        """
+        save_moved(path, self.original, self.shape, self.turns)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,15 +13,14 @@ from numpy.typing import ArrayLike
 
 from meshmatch.api import matching
 from meshmatch.api.inputs import LandmarkPairs
-from meshmatch.api.results import MatchResult
-from meshmatch.arrays import Bool, Bools, Brief, Float, Floats
+from meshmatch.api.results import MatchResult, MovedMesh
+from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.models.registry import AUTO
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
-from meshmatch.shapes.moved_files import save_moved
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.wrap import wrap_onto
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class WrapResult(Brief):
+class WrapResult(MovedMesh):
     """A base on a scan.
 
     Attributes
@@ -58,31 +57,10 @@ class WrapResult(Brief):
     >>> wrapped.save("wrapped.ply")
     """
 
-    shape: Shape
-    turns: Float[Floats, "V 3 3"]
     distance: Float[Floats, " V"]
     free: Bool[Bools, " V"]
     match: MatchResult
     seconds: float
-    original: Path | None = None
-
-    def save(self, path: str | Path) -> None:
-        """Write the wrapped mesh; an .obj from an .obj keeps all of its text but the positions and the directions of
-        normals, and its materials and images are copied beside it.
-
-        Parameters
-        ----------
-        path
-            Where to; its suffix chooses the format, see `save_shape`. What it cannot hold is told.
-
-        Raises
-        ------
-        OptionError
-            The suffix is unknown, or a material would replace another file.
-        OutputError
-            A file cannot be written.
-        """
-        save_moved(path, self.original, self.shape, self.turns)
 
 
 def wrap(
@@ -152,7 +130,7 @@ def wrap(
     with thread_limit(1):
         wrapped = wrap_onto(mesh, near.verts, surface, kept, found.threads)
     shape = replace(mesh, verts=wrapped.verts)
-    return WrapResult(shape, wrapped.turns, wrapped.distance, kept, found, time.monotonic() - began, original)
+    return WrapResult(shape, wrapped.turns, wrapped.distance, kept, found, time.monotonic() - began, original=original)
 
 
 def _free(base: Shape, numbers: ArrayLike) -> Bools:

@@ -196,6 +196,15 @@ def names_of(words: str, known: Iterable[str], what: str) -> list[str]:
     return names
 
 
+def files_in(folder: Path, pattern: str, least: int = 1) -> list[Path]:
+    """The files of a folder of data, sorted; `InputError` where there are fewer than this."""
+    files = sorted(folder.glob(pattern))
+    if len(files) < least:
+        few = f"there are {len(files) or 'no'} {pattern} files in {folder}"
+        raise InputError(few if least == 1 else f"{few}, not {least} or more", "name the data's folder with --data")
+    return files
+
+
 def spread(items: Sequence[T], count: int | None) -> list[T]:
     """``count`` items, evenly spread over a sequence and always the same ones; all of them for None or a large count."""
     if count is None or count >= len(items):

@@ -131,7 +131,7 @@ def test_the_command_speaks_of_the_users_mistakes(
     small: Path, kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["--data", str(tmp_path)]) == 1
-    assert "no shapes in" in " ".join(capsys.readouterr().err.split())
+    assert "there are no *.ply files" in " ".join(capsys.readouterr().err.split())
     assert main(["--data", str(small), "--sets", "tosca"]) == 1
     assert "unknown set 'tosca'" in capsys.readouterr().err
 

@@ -64,7 +64,7 @@ def with_landmarks(values: np.ndarray) -> Callable[[Path], None]:
         (with_landmarks(np.arange(3)), "different numbers of landmarks"),
         (with_landmarks(np.arange(BODY.V) + 0.5), "not integers"),
         (lambda data: save_shape(data / "shrec19" / "1.ply", Shape(BODY.verts, np.empty((0, 3), int))), "has no faces"),
-        (without("*"), "no shapes"),
+        (without("*"), "no *.ply"),
     ],
 )
 def test_something_lacks(

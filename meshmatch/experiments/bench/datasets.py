@@ -81,9 +81,7 @@ def checked_truth(path: Path, layout: Layout, shape: Shape) -> int:
 
 def check_shapes(name: str, layout: Layout, folder: Path) -> dict[str, Any]:
     """What is in a folder of ply files; "pairs" where the benchmark has a protocol for it."""
-    files = sorted((folder / name).glob("*.ply"))
-    if not files:
-        raise InputError(f"no shapes in {folder / name}")
+    files = runner.files_in(folder / name, "*.ply")
     shapes = [load_shape(file) for file in runner.track(files, name)]
     if flat := [file.name for file, shape in zip(files, shapes, strict=True) if shape.is_cloud]:
         raise InputError(f"{folder / name / flat[0]} has no faces")

@@ -188,10 +188,7 @@ def main(
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
 ) -> runner.Report:
-    files = sorted((data / "garments").glob("*.mhclo"))
-    if not files:
-        raise InputError(f"there are no .mhclo files in {data / 'garments'}", "name the folder with --data")
-    garments = {file.stem: Bound.read(file) for file in files}
+    garments = {file.stem: Bound.read(file) for file in runner.files_in(data / "garments", "*.mhclo")}
     matcher = None if exact_map else Matcher(model, FitConfig(), threads)
     chosen: list[Any] = runner.names_of(poses, get_args(Pose), "pose")
     rows = [row for pose in chosen for row in rows_of(garments, pose, count, matcher, seed)]

@@ -17,7 +17,6 @@ from typer import Option
 
 import meshmatch
 from meshmatch.api.matcher import Matcher
-from meshmatch.errors import InputError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.pairs import VERDICTS
 from meshmatch.experiments.bench.sets import ordered_pairs
@@ -91,9 +90,7 @@ def main(
 ) -> runner.Report:
     rows, each = [], {}
     for folder in folders.split(","):
-        files = sorted((data / "rigs" / folder).glob("*.glb"))
-        if len(files) < 2:
-            raise InputError(f"there are no two glb files in {data / 'rigs' / folder}", "see the README of the data")
+        files = runner.files_in(data / "rigs" / folder, "*.glb", 2)
         cast, matcher = {file.stem: _Character(file) for file in files}, Matcher(threads=threads)
         pairs = runner.spread(ordered_pairs(cast), limit_pairs)
         each[folder] = [measured(cast[a], cast[b], matcher) for a, b in runner.track(pairs, folder)]

@@ -30,7 +30,7 @@ import numpy as np
 
 from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError, OptionError
-from meshmatch.experiments.runner import spread
+from meshmatch.experiments.runner import files_in, spread
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 
@@ -99,9 +99,7 @@ def load_set(name: str, data: Path) -> BenchSet:
         clouds = tuple(load_clouds(Path(data)))
         return BenchSet(name, Path(data), clouds, tuple(permutations(clouds, 2)))
     folder = Path(data) / ("scape" if name == CLOUD_SET else name)
-    shapes = tuple(sorted((path.stem for path in folder.glob("*.ply")), key=_by_number))
-    if not shapes:
-        raise InputError(f"no shapes in {folder}", f"--data names the folder that holds {', '.join(SET_NAMES)}")
+    shapes = tuple(sorted((path.stem for path in files_in(folder, "*.ply")), key=_by_number))
     if name == "shrec19":
         try:
             lines = (folder / "pairs.txt").read_text(encoding="ascii").split("\n")
@@ -170,9 +168,7 @@ def load_folder(folder: Path, suffix: str) -> tuple[dict[str, Shape], Mapping[st
     InputError
         The folder is not there, or a shape lacks its truth.
     """
-    files = sorted(folder.glob("*.ply"))
-    if not files:
-        raise InputError(f"no shapes in {folder}", "--data names the folder that holds the benchmark")
+    files = files_in(folder, "*.ply")
     paths = {file.stem: file.with_name(file.stem + suffix) for file in files}
     if missing := [name for name, path in paths.items() if not path.is_file()]:
         raise InputError(f"{missing[0]} has no {suffix}")

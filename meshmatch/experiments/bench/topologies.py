@@ -13,7 +13,6 @@ import numpy as np
 from typer import Option
 
 from meshmatch.api.wrap import wrap
-from meshmatch.errors import InputError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.garments import Bound, Pose, body_of, people
 from meshmatch.transfer.mapped_mesh import MappedMesh
@@ -43,9 +42,7 @@ def main(
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
 ) -> runner.Report:
-    files = sorted((data / "topologies").glob("*.proxy"))
-    if not files:
-        raise InputError(f"there are no .proxy files in {data / 'topologies'}", "name the folder with --data")
+    files = runner.files_in(data / "topologies", "*.proxy")
     crowd, faces = people(count, seed)
     rows = []
     for pose in runner.names_of(poses, get_args(Pose), "pose"):
