@@ -64,15 +64,21 @@ class Fitter:
         notes: tuple[str, ...] = ()
         doubts: list[Reason] = []
         both = (self.config.mirror or card.mirror) != "no" and mirror_of(self.model) is None
-        wholes = []
-        for k, mirrored in enumerate((False, True) if both else (False,)):
-            stretch = progress.between(k / 2, (k + 1) / 2) if both else progress
-            task = FitTask.of(self.model, self.config, shape, landmarks, stretch, mirrored)
-            wholes.append(fit_whole(task))
+        stretches = [progress.between(k / 2, (k + 1) / 2) for k in range(2)] if both else [progress]
+
+        def whole(config: FitConfig, mirrored: bool) -> Registration:
+            return fit_whole(FitTask.of(self.model, config, shape, landmarks, stretches[mirrored], mirrored))
+
+        # What is said to be a part is tried as a whole with little effort, and in full only where it is none.
+        said = self.config.partial == "yes"
+        quick = replace(self.config, finalists=1) if said else self.config
+        wholes = [whole(quick, mirrored) for mirrored in ((False, True) if both else (False,))]
         # If either handedness fits the whole shape, the other is not tried as a part.
         parts = landmarks is None and _may_be_part(min(wholes, key=_cost))
-        sides = [_as_part_if_closer(whole) if parts else (whole, False) for whole in wholes]
+        sides = [_as_part_if_closer(each) if parts else (each, False) for each in wholes]
         (found, partial), *others = sorted(sides, key=lambda side: _cost(side[0]))
+        if said and not partial:
+            found = whole(self.config, found.core_frame.mirrored)
         if found.core_frame.mirrored:
             notes = (f"{shape.name}: taken for the mirror image of what {card.name} knows",)
         if others and _cost(found) > _SURE_SIDE * _cost(others[0][0]):
