@@ -11,7 +11,8 @@ import numpy as np
 
 from meshmatch.api.results import MapPair
 from meshmatch.api.transfer import MapLike, find_maps
-from meshmatch.arrays import Brief, Floats
+from meshmatch.api.upright import trust
+from meshmatch.arrays import Brief
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.shapes import tables
@@ -20,7 +21,6 @@ from meshmatch.shapes.formats import gltf, gltf_out
 from meshmatch.shapes.formats.gltf_rig import Rig, read_rig
 from meshmatch.shapes.formats.gltf_rigged import hanging_groups, rigged
 from meshmatch.shapes.input_files import read_bytes
-from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.attributes import joint_table, pull_weights
 from meshmatch.transfer.carry_rig import UP, carry, upright
@@ -139,10 +139,10 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     hanging = gltf.understood(path, data, "scene makes", hanging_groups)
     maps = find_maps(a, b, match)
     with thread_limit(1):
-        points, trust = maps.forward.points(b), _trust(a, maps)
-        turn = np.eye(3) if in_gltf else upright(a, points, trust)
+        points, share = maps.forward.points(b), trust(a, maps)
+        turn = np.eye(3) if in_gltf else upright(a, points, share)
         ground = float((b.verts[b.valid] @ turn.T)[:, UP].min())
-        carried = carry(rig, weights.matrix, a, points @ turn.T, trust, ground)
+        carried = carry(rig, weights.matrix, a, points @ turn.T, share, ground)
         pulled = pull_weights(maps.backward, weights.matrix, INFLUENCES)
         found = rigid(clean_weights(pulled, b, INFLUENCES), hanging)
         standing, posed = carried.bind, carried.source_pose
@@ -154,9 +154,3 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     before, after = (np.asarray(each.sum(axis=0)).ravel() > 0 for each in (weights.matrix, found))
     unused = tuple(weights.names[joint] for joint in np.flatnonzero(before & ~after))
     return RiggedResult(standing, SkinWeights(found, weights.names), unused, replaced, maps, glb)
-
-
-def _trust(source: Shape, maps: MapPair) -> Floats:
-    """How much each vertex of the source counts: by its area, and the confidence of the map."""
-    share = source.vertex_areas / max(source.area, 1e-300) * source.V
-    return np.where(source.valid, (share + 1e-3) * (maps.forward.confidence + 1e-3), 0.0)

@@ -7,15 +7,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
+
 from meshmatch.api.results import MapPair
 from meshmatch.api.transfer import MapLike, find_maps
+from meshmatch.api.upright import turn_upright
 from meshmatch.arrays import Brief
 from meshmatch.errors import InputError, OptionError
+from meshmatch.outputs import as_path
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.appearance import Appearance, vertex_colors_alone
+from meshmatch.shapes.dressed_files import Dressed
 from meshmatch.shapes.files import ShapeLike, as_shape
-from meshmatch.shapes.formats import Textured
-from meshmatch.shapes.textured_files import load_appearance, load_coordinates, save_textured
+from meshmatch.shapes.formats import gltf, obj_text
+from meshmatch.shapes.input_files import read_bytes
+from meshmatch.shapes.textured_files import load_appearance, load_coordinates
 from meshmatch.threads import thread_limit
 from meshmatch.transfer import bake
 from meshmatch.transfer.bake import Baked, BakeOptions
@@ -28,11 +34,11 @@ class TexturedResult(Brief):
 
     Attributes
     ----------
-    mesh
-        The target with its texture coordinates.
+    dressed
+        The target with what was baked: ``uv`` (F, 3, 2), ``material``, and the ``turn`` that lets it stand upright in a glb.
     baked
-        What was baked: ``image`` (size, size, 4) uint8, and the shares of the surface that are not trusted or
-        discontinuous.
+        What was baked: ``material``, its ``image`` (size, size, 4) uint8, and the shares of the surface that are not trusted
+        or discontinuous.
     atlas
         The texture coordinates, and why the target's own were not used.
     maps
@@ -47,7 +53,7 @@ class TexturedResult(Brief):
     >>> result.save("dressed.obj")  # with dressed.mtl and dressed.png
     """
 
-    mesh: Textured
+    dressed: Dressed
     baked: Baked
     atlas: Atlas
     maps: MapPair
@@ -55,6 +61,8 @@ class TexturedResult(Brief):
 
     def save(self, path: str | Path) -> None:
         """Write a .glb, or an .obj with an .mtl and a .png of the same name.
+
+        A target of the same format stays the file that it was, but for its texture.
 
         Parameters
         ----------
@@ -68,7 +76,7 @@ class TexturedResult(Brief):
         OutputError
             A file cannot be written.
         """
-        save_textured(path, self.mesh, self.baked.image)
+        self.dressed.save(as_path(path))
 
 
 def transfer_texture(
@@ -137,13 +145,21 @@ def transfer_texture(
             raise InputError(f"{shape.name or 'the source'} has neither a texture nor colors", hint)
         else:
             look = vertex_colors_alone(shape)
+    file = as_path(target) if isinstance(target, str | Path) else None
+    polygons = None
+    if file is not None and file.suffix.lower() == ".obj" and not mesh.is_cloud:
+        polygons = obj_text.polygons_of(file.name, read_bytes(file), mesh.verts_or_nan).of_triangles
     began = time.monotonic()
     with thread_limit(1):
-        atlas = atlas_of(mesh, own, options.size, options.padding, uv)
+        atlas = atlas_of(mesh, own, options.size, options.padding, uv, polygons)
     unwrapped = time.monotonic() - began
     maps = find_maps(shape, mesh, match)
     began = time.monotonic() - unwrapped
     report = Progress(progress, mesh.name, "baking")
     with thread_limit(1):
         baked = bake.transfer_texture(shape, look, mesh, maps.backward, atlas, options, report)
-    return TexturedResult(baked.mesh, baked, atlas, maps, time.monotonic() - began)
+    turn = np.eye(3)
+    if file is None or file.suffix.lower() not in gltf.SUFFIXES:
+        turn = turn_upright(maps, Path(shape.name).suffix.lower() in gltf.SUFFIXES)
+    dressed = Dressed(mesh, file, atlas.uv, atlas.own, baked.material, turn)
+    return TexturedResult(dressed, baked, atlas, maps, time.monotonic() - began)

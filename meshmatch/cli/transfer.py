@@ -41,6 +41,9 @@ def transfer_color(
     They are interpolated within the faces of SRC. The VALUE of --blank is a number, one number for each column
     (1,0,0), or a color (#ff0000).
     """
+    from meshmatch.api.upright import turn_upright
+    from meshmatch.shapes.dressed_files import tell_lost
+    from meshmatch.shapes.formats.gltf import SUFFIXES as GLTF_SUFFIXES
     from meshmatch.transfer import value_files
 
     if directions and values is None:
@@ -55,7 +58,9 @@ def transfer_color(
         rule = rules.rule(None if rules.blank is None else value_files.parse_blank(rules.blank, columns).tolist())
         if given is None:
             result = meshmatch.transfer_colors(a, b, transfer, rule=rule)
-            value_files.save_colors(temporary, b, result.data)
+            turn = turn_upright(result.maps, source.suffix.lower() in GLTF_SUFFIXES)
+            value_files.save_colors(temporary, b, result.data, target, turn)
+            tell_lost(target, output)
         else:
             result = meshmatch.transfer_values(a, b, given.numbers, transfer, directions=directions, rule=rule)
             value_files.save_values(temporary, value_files.Values(result.data, given.names), b)

@@ -52,11 +52,11 @@ def transfer_texture(
     """Transfer the texture of one shape to another.
 
     Each texel takes the color of the corresponding point of SRC, from its materials and images or from its vertex
-    colors. The VALUE of --blank is a color such as #808080, or 0 for transparent. A glb begins with the vertices of
-    TGT in their order, followed by copies at texture seams; an obj has exactly the vertices of TGT, and its polygons
-    as triangles.
+    colors. The VALUE of --blank is a color such as #808080, or 0 for transparent. A glb or an obj keeps everything else
+    of a TGT in the same format: nodes, skins, clips, groups, polygons. Another TGT is turned upright in a glb.
     """
     from meshmatch.shapes import textured_files
+    from meshmatch.shapes.dressed_files import tell_lost
     from meshmatch.transfer.value_files import parse_color, save_colors
 
     transfer = Transfer(source, target, output, maps, run, picture)
@@ -77,15 +77,18 @@ def transfer_texture(
         look = textured_files.load_appearance(source, a, image)
         if painted:
             done = meshmatch.transfer_colors(a, b, transfer, colors=look, rule=rule)
-            save_colors(temporary[0], b, done.data)
+            save_colors(temporary[0], b, done.data, target)
+            tell_lost(target, output)
             record, pair = transfer.tell_low(done.low, rule.minimum), done.maps
         else:
             with transfer.console.progress() as report:
                 made = meshmatch.transfer_texture(
                     a, target, transfer, uv=uv, options=baking, look=look, progress=report
                 )
-            textured_files.write_textured(output, temporary, made.mesh, made.baked.image)
+            made.dressed.write(output, temporary)
             record, pair = _tell_baked(transfer.console, made, rule, size), made.maps
+            if made.dressed.turned and output.suffix.lower() == ".glb":
+                transfer.console.say(f"note: a node turns {b.name} upright, along y")
     what = "with vertex colors" if painted else f"with a texture of {size} x {size}"
     transfer.console.say(f"wrote {' '.join(str(file) for file in files)}: {transfer.names[1]} {what}")
     if picture is not None:
@@ -114,4 +117,9 @@ def _tell_baked(
     uv = {"size": size, "uv": "own" if atlas.own else "new", "uv_note": atlas.note, "used": baked.used}
     low = {"min_confidence": rule.minimum, "low_confidence_share": baked.low}
     low |= {"blank_share": baked.low * (rule.blank is not None), "filled_share": baked.low * rule.fill}
-    return uv | {"alpha": baked.alpha} | low | {"torn_share": baked.torn, "baking_seconds": round(made.seconds, 3)}
+    return (
+        uv
+        | {"alpha": baked.material.alpha}
+        | low
+        | {"torn_share": baked.torn, "baking_seconds": round(made.seconds, 3)}
+    )

@@ -57,6 +57,49 @@ class Material:
 
 
 @dataclass(frozen=True, eq=False)
+class BakedMaterial:
+    """One material for a whole surface, whose images lie on one set of coordinates.
+
+    Attributes
+    ----------
+    color
+        (H, W, 4) sRGB colors and plain alpha, which means what ``alpha`` and ``cutoff`` say, as in `Material`.
+    name
+        Of the material.
+    double_sided
+        Faces are seen from both sides.
+    unlit
+        The color is all there is: no light falls on the surface.
+    normal
+        (H, W, 4) directions in the frame of the surface, as glTF has them: red along u, green against v, blue outwards.
+    surface
+        (H, W, 4): red is occlusion if it is ``occluded``, green roughness, blue metal.
+    roughness
+        In 0..1; multiplies the image, if there is one.
+    metal
+        The same.
+    glow
+        (H, W, 4) sRGB colors of the light that the surface sends out.
+    light
+        Linear red, green and blue; multiplies ``glow``, if there is one. May be above 1.
+    """
+
+    color: Pixels
+    alpha: Alpha = "opaque"
+    cutoff: float = 0.5
+    name: str = ""
+    double_sided: bool = True
+    unlit: bool = False
+    normal: Pixels | None = None
+    surface: Pixels | None = None
+    occluded: bool = False
+    roughness: float = 1.0
+    metal: float = 0.0
+    glow: Pixels | None = None
+    light: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
 class Appearance:
     """What lies on the faces of one shape.
 

@@ -1,20 +1,16 @@
-"""Appearances from files: materials and images of glb, gltf, obj and ply, vertex colors of all others; and textured meshes
-to files: one glb, or an obj with its mtl and png. All of these appear whole, or none does.
-"""
+"""Appearances from files: materials and images of glb, gltf, obj and ply, vertex colors of all others."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
-from meshmatch.outputs import replace_all_on_success
 from meshmatch.shapes import appearance
-from meshmatch.shapes.appearance import Appearance, ImageReader, Pixels, png_bytes
-from meshmatch.shapes.formats import Textured, gltf_attributes, gltf_out, obj, obj_look, ply_look
+from meshmatch.shapes.appearance import Appearance, ImageReader
+from meshmatch.shapes.formats import gltf_attributes, obj_look, ply_look
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
@@ -88,26 +84,3 @@ def check_textured(path: Path, colored: tuple[str, ...] = ()) -> None:
         hint = f", or in {' or '.join(colored)} for vertex colors" if colored else ""
         unknown = f"{path.name}: cannot write a texture as {path.suffix or '(no suffix)'}"
         raise OptionError(unknown, f"end the name in {' or '.join(TEXTURED_SUFFIXES)}{hint}")
-
-
-def write_textured(path: Path, places: Sequence[Path], mesh: Textured, image: Pixels) -> None:
-    """Write the `files_of` an output where they wait to get their names."""
-    png, name = png_bytes(image), path.stem
-    if len(places) == 1:
-        gltf_out.write_textured(places[0], name, mesh, png)
-        return
-    files, material = files_of(path), "_".join(name.split()) or "texture"
-    obj.write_textured(places[0], mesh, files[1].name, material)
-    obj.write_material(places[1], material, files[2].name, mesh)
-    places[2].write_bytes(png)
-
-
-def save_textured(path: str | Path, mesh: Textured, image: Pixels) -> None:
-    """Write a mesh that wears `image` (H, W, 4) as glb, or as obj with an mtl and a png of the same name.
-
-    `OptionError` if the suffix is neither .glb nor .obj, `OutputError` if a file cannot be written.
-    """
-    path = Path(path)
-    check_textured(path)
-    with replace_all_on_success(files_of(path)) as places:
-        write_textured(path, places, mesh, image)

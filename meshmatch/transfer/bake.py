@@ -17,9 +17,8 @@ import numpy as np
 from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32
 from meshmatch.errors import OptionError
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.appearance import Alpha, Appearance, Pixels
+from meshmatch.shapes.appearance import Alpha, Appearance, BakedMaterial, Pixels
 from meshmatch.shapes.colors import bytes_of
-from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map
 from meshmatch.transfer.surface_walk import PointWalker, SurfaceWalker
@@ -96,15 +95,17 @@ class BakeOptions:
 
 @dataclass(frozen=True, eq=False)
 class Baked:
-    """A finished texture."""
+    """A finished material."""
 
-    mesh: Textured  # the target with it, ready to be written (`meshmatch.shapes.textured_files`)
-    image: Pixels  # (size, size, 4) uint8
-    alpha: Alpha  # what its alpha means, with `cutoff`
-    cutoff: float
+    material: BakedMaterial
     used: float  # share of its texels that lie on the surface
     low: float  # share of the surface that is of low confidence
     torn: float  # share on triangles where the map is discontinuous
+
+    @property
+    def image(self) -> Pixels:
+        """(size, size, 4) colors and alpha."""
+        return self.material.color
 
 
 def transfer_texture(
@@ -135,9 +136,14 @@ def transfer_texture(
         image[..., 3] = 255
     progress(1.0)
     torn = float(target.face_areas[locator.discontinuous].sum()) / max(target.area, 1e-300)
-    mesh = Textured(target.verts, target.faces, uv, alpha, sampler.cutoff)
-    used = float((inside >= 0).mean())
-    return Baked(mesh, image, alpha, sampler.cutoff, used, _share_of_surface(target, inside.reshape(-1), low), torn)
+    material = BakedMaterial(image, alpha, sampler.cutoff, _name_of(look))
+    return Baked(material, float((inside >= 0).mean()), _share_of_surface(target, inside.reshape(-1), low), torn)
+
+
+def _name_of(look: Appearance) -> str:
+    """The name of the material, if there is one for all faces."""
+    names = {look.materials[k].name for k in np.unique(look.material).tolist()}
+    return names.pop() if len(names) == 1 else ""
 
 
 def colors_of_vertices(source: Shape, look: Appearance, target: Shape, back: VertexMap) -> Floats:

@@ -62,7 +62,11 @@ def _similarity(here: Float[Floats, "V 3"], there: Float[Floats, "V 3"], weights
 
 def upright(source: Shape, points: Float[Floats, "V 3"], trust: Float[Floats, " V"]) -> Float[Floats, "3 3"]:
     """The turn about one axis, by right angles, after which the places of the source's vertices stand along y as it does."""
-    up = kabsch(source.verts, points, trust).rotation[:, UP]
+    return turn_of(kabsch(source.verts, points, trust).rotation[:, UP])
+
+
+def turn_of(up: Float[Floats, " 3"]) -> Float[Floats, "3 3"]:
+    """The turn about one axis, by right angles, that takes the axis nearest to a direction to y."""
     axis = int(np.abs(up).argmax())
     if axis == UP:
         return np.eye(3) if up[UP] > 0 else np.diag([1.0, -1.0, -1.0])

@@ -15,6 +15,7 @@ import numpy as np
 import xatlas
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.transfer.whole_polygons import whole_polygons
 
 # Charts are packed on a grid of at most this size, at several densities; the best result is taken.
 _GRID, _DENSITIES = 1024, (0.6, 0.5, 0.4)
@@ -24,14 +25,20 @@ _PROGRAM = f"import sys; sys.path[:] = sys.argv[1:]; from {__name__} import main
 
 
 def new_charts(
-    verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], size: int, padding: int
+    verts: Float[Floats, "V 3"],
+    faces: Int[Ints, "F 3"],
+    size: int,
+    padding: int,
+    polygons: Int[Ints, " F"] | None = None,
 ) -> tuple[Float[Floats, "N 2"], Int[Ints, "F 3"]]:
     """Coordinates in 0..1, and the three of each face, for an image of `size` with `padding` texels between charts.
 
-    `verts` in units of sqrt(area). `RuntimeError` with the reason if xatlas cannot make them.
+    `verts` in units of sqrt(area). No seam crosses one of the `polygons` that triangles are parts of.
+    `RuntimeError` with the reason if xatlas cannot make them.
     """
     question = io.BytesIO()
-    np.savez(question, verts=verts, faces=faces, size=size, padding=padding)
+    polygons = np.arange(len(faces)) if polygons is None else polygons
+    np.savez(question, verts=verts, faces=faces, polygons=polygons, size=size, padding=padding)
     command = [sys.executable, "-I", "-c", _PROGRAM, *sys.path]
     done = subprocess.run(command, input=question.getvalue(), capture_output=True, check=False)
     if done.returncode:
@@ -53,8 +60,8 @@ def main() -> None:
     atlases: list[xatlas.Atlas] = []
     try:
         with np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False) as question:
-            verts, faces = question["verts"], question["faces"]
-            uv, corners = _made(verts, faces, int(question["size"]), int(question["padding"]), atlases)
+            verts, faces, polygons = (question[key] for key in ("verts", "faces", "polygons"))
+            uv, corners = _made(verts, faces, polygons, int(question["size"]), int(question["padding"]), atlases)
         np.savez(sys.stdout.buffer, uv=uv, faces=corners)
     except Exception as error:
         print(error, file=sys.stderr)
@@ -64,7 +71,9 @@ def main() -> None:
     os._exit(status)
 
 
-def _made(verts: Floats, corners: Ints, size: int, padding: int, atlases: list[xatlas.Atlas]) -> tuple[Floats, Ints]:
+def _made(
+    verts: Floats, corners: Ints, polygons: Ints, size: int, padding: int, atlases: list[xatlas.Atlas]
+) -> tuple[Floats, Ints]:
     maker, pack = xatlas.Atlas(), xatlas.PackOptions()
     atlases.append(maker)
     pack.resolution, pack.padding = 256, 0
@@ -76,8 +85,9 @@ def _made(verts: Floats, corners: Ints, size: int, padding: int, atlases: list[x
     if not np.array_equal(origin[faces], corners):
         raise RuntimeError("faces were lost")
     charts = uv * (np.array([maker.width, maker.height]) / maker.texels_per_unit)
+    charts, faces = whole_polygons(verts, corners, charts, faces.astype(np.int64), polygons)
     grid = min(size, _GRID)
-    return _packed(charts, faces, grid, padding * grid / size, atlases), faces.astype(np.int64)
+    return _packed(charts, faces, grid, padding * grid / size, atlases), faces
 
 
 def _packed(charts: Floats, faces: Ints, grid: int, padding: float, atlases: list[xatlas.Atlas]) -> Floats:

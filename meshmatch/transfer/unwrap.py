@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.new_charts import flat_areas, new_charts
@@ -34,9 +34,12 @@ class Atlas:
     note: str = ""  # why the file's own are not used; empty if they are, or if there are none
 
 
-def atlas_of(shape: Shape, own: Floats | None, size: int, padding: int, keep: Keep = "auto") -> Atlas:
+def atlas_of(
+    shape: Shape, own: Floats | None, size: int, padding: int, keep: Keep = "auto", polygons: Ints | None = None
+) -> Atlas:
     """The coordinates to bake an image of `size` with: the file's own (F, 3, 2) where they are valid ("auto"), these or
-    an error ("keep"), or new ones, with at least `padding` texels between charts.
+    an error ("keep"), or new ones, with at least `padding` texels between charts, and no seam across one of the
+    `polygons` that triangles (F,) are parts of.
 
     `OptionError` for a cloud, or coordinates to keep that are not valid; `InputError` without area, or if xatlas fails.
     """
@@ -55,7 +58,7 @@ def atlas_of(shape: Shape, own: Floats | None, size: int, padding: int, keep: Ke
         note = f"{words}; new ones were made"
     if keep == "keep":
         raise OptionError(words, "leave out --uv keep: new ones are made")
-    return Atlas(unwrapped(shape, size, padding), False, note)
+    return Atlas(unwrapped(shape, size, padding, polygons), False, note)
 
 
 def _checked(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str]:
@@ -85,7 +88,7 @@ def _checked(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str]:
     return uv, f"they overlap on {100 * share:.1f} % of their texels" if share > _OVERLAP else ""
 
 
-def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
+def unwrapped(shape: Shape, size: int, padding: int, polygons: Ints | None = None) -> Floats:
     """(F, 3, 2) new coordinates; `InputError` if none can be made."""
     real = np.flatnonzero(shape.face_areas > 0)
     used, corners = np.unique(shape.faces[real], return_inverse=True)
@@ -96,7 +99,7 @@ def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
     try:
         if np.sqrt((edges**2).sum(axis=2).max()) > _MAX_EDGE:
             raise RuntimeError("it has triangles as thin as a thread")
-        uv, faces = new_charts(verts, corners, size, padding)
+        uv, faces = new_charts(verts, corners, size, padding, None if polygons is None else polygons[real])
     except RuntimeError as error:
         problem = f"{shape.name or 'the target'} cannot be unwrapped ({error})"
         raise InputError(problem, "unwrap it in a modelling program, and use --uv keep") from error

@@ -17,7 +17,7 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes import tables
 from meshmatch.shapes.colors import light
-from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.dressed_files import save_colored
 from meshmatch.shapes.input_files import read_npy
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import read_table
@@ -157,9 +157,19 @@ def parse_color(text: str | None) -> tuple[float, float, float, float] | None:
     return red, green, blue, alpha
 
 
-def save_colors(path: Path, shape: Shape, colors: Float[Floats, "V 4"]) -> None:
-    """Write `shape` with vertex colors as screens show them; or the colors alone."""
+def save_colors(
+    path: Path,
+    shape: Shape,
+    colors: Float[Floats, "V 4"],
+    file: Path | None = None,
+    turn: Float[Floats, "3 3"] | None = None,
+) -> None:
+    """Write `shape` with vertex colors as screens show them; or the colors alone.
+
+    `file` and `turn` as in `save_colored`.
+    """
     if check_color_suffix(path) in (".npy", ".csv"):
         save_values(path, Values(colors, ("red", "green", "blue", "alpha")), shape)
     else:
-        save_shape(path, Shape(shape.verts, shape.faces, shape.name, colors, shape.invalid))
+        painted = Shape(shape.verts, shape.faces, shape.name, colors, shape.invalid)
+        save_colored(path, painted, file, np.eye(3) if turn is None else turn)

@@ -11,12 +11,13 @@ import pytest
 
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes import textured_files
+from meshmatch.shapes import dressed_files
 from meshmatch.shapes.appearance import Appearance, png_bytes
+from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.textured_files import load_appearance, save_textured
+from meshmatch.shapes.textured_files import load_appearance
 from meshmatch.templates.location import bundled_folder
 from meshmatch.transfer.texels import faces_on
 from meshmatch.transfer.unwrap import unwrapped
@@ -317,7 +318,7 @@ def test_a_full_disk_leaves_nothing(run: Run, pair: Path, monkeypatch: pytest.Mo
         raise OSError(28, "No space left on device")
 
     before = {path.name for path in pair.iterdir()}
-    monkeypatch.setattr(textured_files.gltf_out, "write_textured", full)
+    monkeypatch.setattr(dressed_files, "dressed", full)
     refused(run(*call("-q")), "No space left on device", pair, before)
 
 
@@ -337,9 +338,9 @@ def test_without_a_map_the_two_are_matched(run: Run, tmp_path: Path, monkeypatch
     assert record["model"] == "human" and record["seed"] == 1
     shape = load_shape("out.glb")
     look = load_appearance("out.glb", shape)
-    # striped socks on the lowest part, hair on top: the climber's up is z
+    # striped socks on the lowest part, hair on top: the glb stands along y, which the climber's file does not
     middle = shape.verts[shape.faces].mean(axis=1)
-    top = middle[:, 2] > np.quantile(shape.verts[:, 2], 0.995)
+    top = middle[:, 1] > np.quantile(shape.verts[:, 1], 0.995)
     image = look.materials[0].image
     assert image is not None
     uv = look.uv[top].mean(axis=1)

@@ -12,11 +12,12 @@ from meshmatch.api.texture import transfer_texture
 from meshmatch.errors import MeshmatchWarning, OutputError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.picture import Look
+from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.formats.gltf_out import center_of, write_morphs
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.textured_files import load_appearance, save_textured
+from meshmatch.shapes.textured_files import load_appearance
 from meshmatch.transfer.bake import BakeOptions
 from tests.render.pairs import Pair, bump, stirred
 from tests.render.test_page import page_of

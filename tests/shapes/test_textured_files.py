@@ -9,14 +9,15 @@ from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError, OutputError
 from meshmatch.geometry.triangles import closest_on_triangles, same_rows, unit
-from meshmatch.shapes import textured_files
+from meshmatch.shapes import dressed_files
 from meshmatch.shapes.appearance import png_bytes
 from meshmatch.shapes.colors import LINEAR_OF_BYTE
+from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats import Textured
-from meshmatch.shapes.formats.gltf_out import split_at_seams
+from meshmatch.shapes.formats import Textured, gltf_out
+from meshmatch.shapes.formats.seams import split_at_seams
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.textured_files import files_of, load_appearance, load_coordinates, save_textured
+from meshmatch.shapes.textured_files import files_of, load_appearance, load_coordinates
 from meshmatch.transfer.texels import Pyramid
 from tests.shapes.painted import CORNERS, FACES, UV, quarters
 
@@ -33,12 +34,12 @@ def ball(sphere: Shape) -> tuple[Textured, np.ndarray]:
 
 def test_vertices_are_split_at_seams_alone() -> None:
     uv = UV[FACES].copy()
-    same = split_at_seams(Textured(CORNERS, FACES, uv))
+    same = split_at_seams(len(CORNERS), FACES, uv)
     np.testing.assert_array_equal(same[0], np.arange(len(CORNERS)))
     np.testing.assert_array_equal(same[1], UV)
     np.testing.assert_array_equal(same[2], FACES)
     uv[1, 0] = (0.5, 0.5)  # corner 0 now lies on two places
-    vertex, places, faces = split_at_seams(Textured(CORNERS, FACES, uv))
+    vertex, places, faces = split_at_seams(len(CORNERS), FACES, uv)
     np.testing.assert_array_equal(vertex, [*range(len(CORNERS)), 0])
     assert sorted(places[[0, 4]].tolist()) == [[0.0, 1.0], [0.5, 0.5]]
     np.testing.assert_array_equal(places[faces], uv)
@@ -46,7 +47,7 @@ def test_vertices_are_split_at_seams_alone() -> None:
 
 def test_split_vertices_keep_their_order_and_their_places(ball: tuple[Textured, np.ndarray]) -> None:
     mesh, _ = ball
-    vertex, uv, faces = split_at_seams(mesh)
+    vertex, uv, faces = split_at_seams(len(mesh.verts), mesh.faces, mesh.uv)
     V = len(mesh.verts)
     np.testing.assert_array_equal(vertex[:V], np.arange(V))
     verts = mesh.verts[vertex]
@@ -56,7 +57,7 @@ def test_split_vertices_keep_their_order_and_their_places(ball: tuple[Textured, 
 
 
 def test_vertices_without_a_face_stay() -> None:
-    vertex, uv, _ = split_at_seams(Textured(np.concatenate([CORNERS, [[9, 9, 9]]]), FACES, UV[FACES]))
+    vertex, uv, _ = split_at_seams(5, FACES, UV[FACES])
     assert vertex[4] == 4 and uv[4].tolist() == [0, 0]
 
 
@@ -84,7 +85,7 @@ def test_written_and_read_again(tmp_path: Path, ball: tuple[Textured, np.ndarray
 @pytest.mark.parametrize("alpha", ["opaque", "mask", "blend"])
 def test_the_meaning_of_alpha_is_written(tmp_path: Path, alpha: str) -> None:
     mesh = Textured(CORNERS, FACES, UV[FACES], alpha, 0.25, "repeat")  # type: ignore[arg-type]
-    save_textured(tmp_path / "a.glb", mesh, quarters())
+    gltf_out.write_textured(tmp_path / "a.glb", "a", mesh, png_bytes(quarters()))
     found = load_appearance(tmp_path / "a.glb", load_shape(tmp_path / "a.glb")).materials[0]
     assert found.alpha == alpha and found.wrap == ("repeat", "repeat")
     assert found.cutoff == (0.25 if alpha == "mask" else 0.5)
@@ -148,7 +149,7 @@ def test_all_files_appear_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(textured_files.obj, "write_material", full)
+        patch.setattr(dressed_files.obj, "write_materials", full)
         with pytest.raises(OutputError):
             save_textured(tmp_path / "a.obj", mesh, quarters())
     assert [file.name for file in tmp_path.iterdir()] == ["a.mtl"]

@@ -154,5 +154,28 @@ def test_what_goes_wrong_in_the_other_process_is_told(monkeypatch: pytest.Monkey
 
 def test_no_atlas_is_freed_before_the_process_ends(torus: Shape) -> None:
     alive: list[object] = []
-    new_charts._made(torus.verts, torus.faces, 64, 2, alive)
+    new_charts._made(torus.verts, torus.faces, np.arange(torus.F), 64, 2, alive)
     assert len(alive) == 1 + len(new_charts._DENSITIES)
+
+
+def test_no_seam_crosses_a_polygon() -> None:
+    """The quads of a rough ball, which seams of triangles would cut."""
+    around, along = 24, 12
+    angle, height = np.meshgrid(np.arange(around) * 2 * np.pi / around, np.linspace(-0.45, 0.45, along) * np.pi)
+    rough = 1 + np.random.default_rng(0).normal(0, 0.15, angle.shape)
+    verts = np.stack([np.cos(angle) * np.cos(height), np.sin(height), np.sin(angle) * np.cos(height)], -1)
+    verts = (rough[..., None] * verts).reshape(-1, 3)
+    k = (np.arange(along - 1)[:, None] * around + np.arange(around)).ravel()
+    right = k - k % around + (k + 1) % around
+    faces = np.stack([k, right, right + around, k, right + around, k + around], axis=1).reshape(-1, 3)
+    shape, polygons = Shape(verts, faces, "quads"), np.repeat(np.arange(len(k)), 2)
+
+    def cut(uv: np.ndarray) -> int:
+        diagonal = uv[0::2, [0, 2]] != uv[1::2, [0, 1]]
+        return int(diagonal.any(axis=(1, 2)).sum())
+
+    assert cut(unwrapped(shape, 512, 4)) > 0
+    whole = unwrapped(shape, 512, 4, polygons)
+    assert cut(whole) == 0
+    found, twice = faces_on(whole * 512, 512)
+    assert twice < 0.001 * (found >= 0).sum() and len(np.unique(found)) == shape.F + 1

@@ -28,10 +28,10 @@ from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.card import IMPLICIT
 from meshmatch.models.registry import HOME_VARIABLE
+from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.textured_files import save_textured
 from meshmatch.templates.location import bundled_folder
 
 Files = Callable[[Path], None]

@@ -24,10 +24,10 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.card import IMPLICIT, ImplicitCard, write_card
 from meshmatch.models.checkpoint import save_weights as save_network
 from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.textured_files import save_textured
 from meshmatch.templates.location import bundled_folder
 from meshmatch.transfer.label_files import Labels, save_labels
 from meshmatch.transfer.landmarks import at_vertices, save_landmarks

@@ -92,7 +92,8 @@ def _transferred(
         except InputError:  # it has no area, or cannot be unwrapped
             pass
         else:
-            texture = Material("", baked.image, wrap=("clamp", "clamp"), alpha=baked.alpha, cutoff=baked.cutoff)
+            made = baked.material
+            texture = Material("", made.color, wrap=("clamp", "clamp"), alpha=made.alpha, cutoff=made.cutoff)
             return Appearance((texture,), material, atlas.uv)
     colors = colors_of_vertices(source, look, target, back)
     return Appearance((Material(),), material, np.zeros((target.F, 3, 2)), colors)

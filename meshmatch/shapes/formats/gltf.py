@@ -26,9 +26,9 @@ from meshmatch.shapes.companions import beside
 from meshmatch.shapes.formats import NO_FACES, WRONG_SUFFIX, Raw, check_places, damaged, joined_colors
 from meshmatch.shapes.input_files import check_text, json_of, read_bytes
 
-_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-_COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 INSTANCES, _VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
 # What a file may require: extensions that are read, and others that change neither what is drawn nor where.
 _KNOWN = ("KHR_mesh_quantization", INSTANCES, _VISIBILITY)
@@ -83,7 +83,7 @@ class Document:
         if str(self.json["asset"].get("version", "")).split(".")[0] != "2":
             raise InputError(f"{self.name} is not glTF version 2", "export it as glTF 2.0")
         for extension in self.json.get("extensionsRequired", []):
-            if extension in _COMPRESSED:
+            if extension in COMPRESSED:
                 raise self._compressed(extension)
             if extension not in _KNOWN and not _HARMLESS.fullmatch(extension):
                 unknown = f"{self.name} requires the glTF extension {extension[:80]}, which meshmatch does not read"
@@ -188,6 +188,23 @@ class Document:
         if number > MOST_NODES:
             many = f"the scene of {self.name} has over {MOST_NODES} nodes, or parts of meshes"
             raise InputError(many, "join its meshes before it is exported")
+
+    def draws_copies(self) -> bool:
+        """Whether a mesh stands in the scene many times, by one node (`INSTANCES`)."""
+        return any(INSTANCES in self.nodes[node].get("extensions", {}) for node, _, _ in self.primitives())
+
+    def beyond_triangles(self) -> list[str]:
+        """What there is besides the triangles of one mesh and its material, in words."""
+        parts = [part for mesh in self.json.get("meshes", []) for part in mesh["primitives"]]
+        there = {
+            "nodes": len(self.nodes) > 1,
+            "materials": len(self.json.get("materials", [])) > 1,
+            "normals": any("NORMAL" in part.get("attributes", {}) for part in parts),
+            "skins": bool(self.json.get("skins")),
+            "clips": bool(self.json.get("animations")),
+            "morph targets": any("targets" in part for part in parts),
+        }
+        return [word for word, known in there.items() if known]
 
     def roots(self) -> list[int]:
         """The topmost nodes of the scene."""
@@ -297,7 +314,7 @@ class Document:
         """(count, width) values; whole numbers that stand for 0..1 or -1..1 are divided unless `whole`."""
         accessor = self.json["accessors"][number]
         count, width = int(accessor["count"]), _WIDTHS[accessor["type"]]
-        kind = np.dtype(_COMPONENTS[accessor["componentType"]])
+        kind = np.dtype(COMPONENTS[accessor["componentType"]])
         if "bufferView" in accessor:
             values = self._view(accessor, count, width, kind)
         else:  # zeros, then filled sparsely
@@ -310,7 +327,7 @@ class Document:
         if "sparse" in accessor:
             sparse = accessor["sparse"]
             where, many = sparse["indices"], int(sparse["count"])
-            rows = self._view(where, many, 1, np.dtype(_COMPONENTS[where["componentType"]]))
+            rows = self._view(where, many, 1, np.dtype(COMPONENTS[where["componentType"]]))
             values = values.copy()
             values[rows[:, 0]] = self._view(sparse["values"], many, width, kind)
         out = values.astype(np.float64)
@@ -321,7 +338,7 @@ class Document:
     def _view(self, entry: dict[str, Any], count: int, width: int, kind: np.dtype[Any]) -> NDArray[Any]:
         """(count, width) values from the place in a buffer view that an entry names."""
         view, offset = self.json["bufferViews"][entry["bufferView"]], entry.get("byteOffset", 0)
-        for extension in _COMPRESSED:
+        for extension in COMPRESSED:
             if extension in view.get("extensions", {}) and not self._held(view["buffer"]):
                 raise self._compressed(extension)
         data = self.buffer(view["buffer"])
@@ -341,7 +358,7 @@ class Document:
     def _held(self, number: int) -> bool:
         """Whether the data of a buffer is anywhere: that of plain data beside compressed need not be."""
         buffer = self.json["buffers"][number]
-        fallback = any(buffer.get("extensions", {}).get(each, {}).get("fallback") for each in _COMPRESSED)
+        fallback = any(buffer.get("extensions", {}).get(each, {}).get("fallback") for each in COMPRESSED)
         return "uri" in buffer or (number == 0 and bool(self.body) and not fallback)
 
     def buffer(self, number: int) -> bytes:

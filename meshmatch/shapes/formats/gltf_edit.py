@@ -8,21 +8,24 @@ from __future__ import annotations
 
 import copy
 import json
+from collections import Counter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from meshmatch.arrays import Float, Floats
-from meshmatch.errors import OutputError
-from meshmatch.shapes.formats.gltf import Document, embedded
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.errors import InputError, OutputError
+from meshmatch.shapes.formats.gltf import COMPONENTS, INSTANCES, Document, embedded
+from meshmatch.shapes.formats.gltf_prune import prune, unused
 
 _COMPONENTS = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _IMAGES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "image/webp", b"\xabKTX": "image/ktx2"}
 _LARGEST = 2**32 - 1
-VERTICES = 34962
-"""The target of a buffer view that holds attributes of vertices."""
+VERTICES, INDICES = 34962, 34963
+"""The targets of buffer views that hold attributes of vertices, and triangles."""
 
 
 class Editor:
@@ -32,6 +35,7 @@ class Editor:
         self.name, self.json = document.name, copy.deepcopy(document.json)
         self._chunks: list[bytes] = []
         self._size = 0
+        self._uses = Counter(node["mesh"] for node in document.nodes if "mesh" in node)
         files: dict[str, int] = {}  # a thousand buffers, or images, may name one file
         starts = []
         for k, buffer in enumerate(self.json.get("buffers", [])):
@@ -51,7 +55,7 @@ class Editor:
                 if uri not in views:
                     data = document.resource(uri)
                     kind = next((kind for magic, kind in _IMAGES.items() if data.startswith(magic)), "image/png")
-                    views[uri] = self._add_view(data), kind
+                    views[uri] = self.add_view(data), kind
                 del image["uri"]
                 image["bufferView"], kind = views[uri]
                 image.setdefault("mimeType", kind)
@@ -64,7 +68,8 @@ class Editor:
         self._size += len(padded)
         return start
 
-    def _add_view(self, data: bytes, target: int | None = None) -> int:
+    def add_view(self, data: bytes, target: int | None = None) -> int:
+        """The number of a new buffer view."""
         view = {"buffer": 0, "byteOffset": self._append(data), "byteLength": len(data)}
         return self.add("bufferViews", view if target is None else view | {"target": target})
 
@@ -81,12 +86,46 @@ class Editor:
         table = np.ascontiguousarray(values).reshape(len(values), -1)
         kind = _COMPONENTS[table.dtype.str[1:]]
         entry: dict[str, Any] = {
-            "bufferView": self._add_view(table.astype(table.dtype.newbyteorder("<")).tobytes(), target)
+            "bufferView": self.add_view(table.astype(table.dtype.newbyteorder("<")).tobytes(), target)
         }
         entry |= {"componentType": kind, "count": len(table), "type": _TYPES[table.shape[1]]}
         if bounds:
             entry |= {"min": table.min(axis=0).tolist(), "max": table.max(axis=0).tolist()}
         return self.add("accessors", entry)
+
+    def add_rows(self, document: Document, number: int, rows: Int[Ints, " N"]) -> int:
+        """The number of a new accessor of vertices: some rows of one of the document, as they are stored there."""
+        old = document.json["accessors"][number]
+        values = document.accessor(number, whole=True)[rows].astype(COMPONENTS[old["componentType"]])
+        size = values.shape[1] * values.itemsize
+        stride = size + -size % 4  # as vertices must be
+        table = np.zeros((len(values), stride), np.uint8)
+        table[:, :size] = np.ascontiguousarray(values).view(np.uint8)
+        view = self.add_view(table.tobytes(), VERTICES)
+        if stride > size:
+            self.json["bufferViews"][view]["byteStride"] = stride
+        kept = {key: old[key] for key in ("componentType", "type", "normalized", "min", "max", "name") if key in old}
+        return self.add("accessors", kept | {"bufferView": view, "count": len(values)})
+
+    def add_indices(self, faces: Int[Ints, "F 3"], V: int) -> int:
+        """The number of a new accessor for triangles among V vertices."""
+        return self.add_array(faces.astype("<u2" if V < 65_535 else "<u4").reshape(-1), target=INDICES)
+
+    def turn(self, rotation: Float[Floats, "3 3"]) -> None:
+        """Turn the scene, by a node above all others."""
+        scene = self.json["scenes"][self.json.get("scene", 0)]
+        node = self.add_node("upright", Rotation.from_matrix(rotation).as_quat(), np.zeros(3))
+        self.json["nodes"][node]["children"], scene["nodes"] = scene["nodes"], [node]
+
+    def own_mesh(self, number: int) -> dict[str, Any]:
+        """The mesh of a node, which other nodes draw no more: it can be changed."""
+        node = self.json["nodes"][number]
+        if self._uses[node["mesh"]] > 1:
+            self._uses[node["mesh"]] -= 1
+            node["mesh"] = self.add("meshes", copy.deepcopy(self.json["meshes"][node["mesh"]]))
+            self._uses[node["mesh"]] = 1
+        found: dict[str, Any] = self.json["meshes"][node["mesh"]]
+        return found
 
     def add_node(self, name: str, rotation: Float[Floats, " 4"], translation: Float[Floats, " 3"]) -> int:
         """The number of a new node, which hangs from nothing yet; the rotation is x, y, z, w."""
@@ -96,6 +135,23 @@ class Editor:
         if not np.array_equal(rotation, (0, 0, 0, 1)):
             entry["rotation"] = rotation.tolist()
         return self.add("nodes", entry)
+
+    def prune(self, document: Document) -> None:
+        """Take out what was used in the document, and is not any more."""
+        if not prune(self.json, unused(document.json)):
+            return
+        views = self.json.get("bufferViews", [])
+        spans = {(view.get("byteOffset", 0), view["byteLength"]) for view in views}
+        if sum(length for _, length in spans) > self._size:  # they lie over each other
+            return
+        whole = b"".join(self._chunks)
+        self._chunks, self._size = [], 0
+        places: dict[tuple[int, int], int] = {}
+        for start, length in sorted(spans):
+            shift = start % 4  # accessors are aligned within
+            places[start, length] = self._append(bytes(shift) + whole[start : start + length]) + shift
+        for view in views:
+            view["byteOffset"] = places[view.get("byteOffset", 0), view["byteLength"]]
 
     def to_bytes(self) -> bytes:
         """The glb. `OutputError` where it would be larger than a glb can be."""
@@ -108,3 +164,15 @@ class Editor:
             raise OutputError(f"{self.name} becomes larger than a glb can be (4 GiB)", "decimate it first")
         head = b"glTF" + np.array([2, size, len(text)], "<u4").tobytes() + b"JSON"
         return b"".join([head, text, np.array([self._size], "<u4").tobytes(), b"BIN\0", *self._chunks])
+
+
+def drawn(document: Document) -> dict[int, dict[int, dict[str, Any]]]:
+    """Nodes that draw something, in the order of the scene, with the numbers of the primitives that they draw."""
+    place = {id(part): k for mesh in document.json["meshes"] for k, part in enumerate(mesh["primitives"])}
+    found: dict[int, dict[int, dict[str, Any]]] = {}
+    for number, part, _ in document.primitives():
+        if INSTANCES in document.nodes[number].get("extensions", {}):
+            copies = f"{document.name} draws copies of one mesh ({INSTANCES}), which cannot move apart"
+            raise InputError(copies, "export each copy as an object of its own")
+        found.setdefault(number, {})[place[id(part)]] = part
+    return found

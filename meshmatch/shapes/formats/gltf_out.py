@@ -20,6 +20,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import dot, same_rows, vertex_normals
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.formats import Textured, as_float32
+from meshmatch.shapes.formats.seams import split_at_seams
 from meshmatch.shapes.shape import Shape
 
 # Coincident vertices whose normals are further than this cosine (32 degrees) from their mean are an edge of the shape,
@@ -65,7 +66,7 @@ def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
 
     The material is plain paint (metallic 0, roughness 1), seen from both sides; the sampler asks for mip levels.
     """
-    vertex, uv, faces = split_at_seams(mesh)
+    vertex, uv, faces = split_at_seams(len(mesh.verts), mesh.faces, mesh.uv)
     normals = smooth_normals(mesh.verts, mesh.faces)
     paint = {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
     material: dict[str, Any] = {"name": name, "doubleSided": True, "pbrMetallicRoughness": paint}
@@ -157,25 +158,3 @@ def smooth_normals(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Floa
     normals = np.where((dot(own, shared) > _SHARP)[:, None], shared, own)
     normals[~normals.any(axis=1)] = (0.0, 0.0, 1.0)
     return normals
-
-
-def split_at_seams(mesh: Textured) -> tuple[Int[Ints, " N"], Float[Floats, "N 2"], Int[Ints, "F 3"]]:
-    """Vertices with one pair of coordinates each: which vertex of the mesh each is, coordinates, and faces over them.
-
-    The first V are those of the mesh in their order (zero coordinates where no face uses one); then come the copies
-    that seams need. Coordinates that are one 32-bit float are one.
-    """
-    V = len(mesh.verts)
-    corner = mesh.faces.reshape(-1)
-    pairs = np.ascontiguousarray(mesh.uv.reshape(-1, 2).astype("<f4") + np.float32(0))  # no -0
-    order = np.lexsort((pairs[:, 1], pairs[:, 0], corner))
-    fresh_vertex = np.diff(corner[order], prepend=-1) != 0
-    fresh = fresh_vertex.copy()
-    fresh[1:] |= (pairs[order][1:] != pairs[order][:-1]).any(axis=1)
-    copies = fresh & ~fresh_vertex
-    number = np.where(fresh_vertex, corner[order], V - 1 + np.cumsum(copies))
-    new = np.empty(len(corner), np.int64)
-    new[order] = number[fresh][np.cumsum(fresh) - 1]
-    uv = np.zeros((V + int(copies.sum()), 2), np.float64)
-    uv[new] = pairs
-    return np.concatenate([np.arange(V), corner[order][copies]]), uv, new.reshape(-1, 3)

@@ -5,17 +5,14 @@ Specification: Khronos glTF 2.0, sections 3.7.3 and 3.11.
 
 from __future__ import annotations
 
-import copy
-from collections import Counter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
-from meshmatch.errors import InputError
-from meshmatch.shapes.formats.gltf import INSTANCES, Document
-from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor
+from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor, drawn
 from meshmatch.shapes.formats.gltf_rig import Clip, Rig
 
 _SAME = 1e-6  # of the size of a mesh: vertices that a skin moves by less than this are not moved
@@ -55,17 +52,14 @@ def rigged(
     where = _four(joints).astype("<u1" if len(rig.joints) <= 256 else "<u2")
     shares, back = _four(weights), np.linalg.inv(bind[rig.joints])
     skins: dict[bytes, int] = {}
-    uses = Counter(node["mesh"] for node in document.nodes if "mesh" in node)
     before: set[int] = set()
     seen = 0
-    for number, parts in _drawn(document).items():
+    for number, parts in drawn(document).items():
         node = editor.json["nodes"][number]
         frame = _frame(document, number, parts)
-        if uses[node["mesh"]] > 1:  # other weights for each node
-            uses[node["mesh"]] -= 1
-            node["mesh"] = editor.add("meshes", copy.deepcopy(editor.json["meshes"][node["mesh"]]))
+        mesh = editor.own_mesh(number)  # other weights for each node
         for k, part in parts.items():
-            own = editor.json["meshes"][node["mesh"]]["primitives"][k]
+            own = mesh["primitives"][k]
             if frame is None:
                 _straighten(editor, document, number, part, own)
             attributes = own["attributes"]
@@ -92,30 +86,17 @@ def rigged(
     return editor.to_bytes(), gone
 
 
-def _drawn(document: Document) -> dict[int, dict[int, dict[str, Any]]]:
-    """Nodes that draw something, in the order of the scene, with the numbers of the primitives that they draw."""
-    place = {id(part): k for mesh in document.json["meshes"] for k, part in enumerate(mesh["primitives"])}
-    found: dict[int, dict[int, dict[str, Any]]] = {}
-    for number, part, _ in document.primitives():
-        if INSTANCES in document.nodes[number].get("extensions", {}):
-            copies = f"{document.name} draws copies of one mesh ({INSTANCES}), which joints cannot move apart"
-            raise InputError(copies, "export each copy as an object of its own")
-        found.setdefault(number, {})[place[id(part)]] = part
-    return found
-
-
 def hanging_groups(document: Document) -> list[Ints]:
     """Vertices, in the order of the scene, of each node that hangs from a joint and is not bent by a skin: they are to
     stay rigid.
     """
-    drawn = _drawn(document)
     joints = {int(joint) for skin in document.json.get("skins", []) for joint in skin["joints"]}
     below = set(joints)
     for node in document.world:
         if node in below:
             below.update(document.nodes[node].get("children", []))
     found, seen = [], 0
-    for number, parts in drawn.items():
+    for number, parts in drawn(document).items():
         V = sum(document.count(part["attributes"]["POSITION"]) for part in parts.values())
         if number in below and "skin" not in document.nodes[number]:
             found.append(np.arange(seen, seen + V))

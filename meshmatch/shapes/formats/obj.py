@@ -5,6 +5,7 @@ shape is read, so seams split nothing; what lies on the faces is read by `meshma
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, warn
 from meshmatch.shapes import formats
+from meshmatch.shapes.appearance import BakedMaterial
 from meshmatch.shapes.formats import Raw, columns, damaged, numbers, words_per_line
 from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.input_files import check_text
@@ -25,7 +27,7 @@ _ENDS_IN_BACKSLASH = re.compile(rb"\\[ \t]*(?:\n|\Z)")
 _LINE_THAT_GOES_ON = re.compile(rb"^[^\n]*\\[ \t]*$", re.MULTILINE)
 _GOES_ON = re.compile(rb"\\[ \t]*\n(?![ \t]*(?:" + _ENTRIES + rb")[ \t])", re.IGNORECASE)
 _COMMENT = re.compile(rb"(?:^|[ \t])#")
-_SLASH_APART = re.compile(rb"(?<![ \t])[ \t]++(//?)[ \t]*+")
+SLASH_APART = re.compile(rb"(?<![ \t])[ \t]++(//?)[ \t]*+")
 _MIXED_CORNERS = re.compile(rb"/[ \t]++[^\s/]++(?!/)")
 _POLYPAINT = re.compile(rb"(?:[0-9a-fA-F]{8})+")
 
@@ -134,7 +136,7 @@ def entries_and_faces(name: str, data: bytes, word: bytes) -> tuple[bytes, Ints,
     if len(old_lines):
         faces, lines = faces + b"\n" + old, np.concatenate([lines, old_lines])
     if b" /" in faces or b"\t/" in faces:  # 1 / 2 is the corner 1/2
-        faces = _SLASH_APART.sub(rb"\1", faces)
+        faces = SLASH_APART.sub(rb"\1", faces)
     if (b"/ " in faces or b"/\t" in faces) and _MIXED_CORNERS.search(faces):
         raise damaged(name, "a face has a slash at the end of one corner, and none at the next: where do they end?")
     sizes = words_per_line(faces)
@@ -183,11 +185,23 @@ def write_textured(path: Path, mesh: formats.Textured, mtl: str, material: str) 
     _write(path, [*lines, f"usemtl {material}", *faces])
 
 
-def write_material(path: Path, material: str, image: str, mesh: formats.Textured) -> None:
-    """The mtl: plain paint in the colors of the image. No options of maps: not every reader knows them."""
-    paint = [f"newmtl {material}", "Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 1", f"map_Kd {image}"]
-    _write(path, paint if mesh.alpha == "opaque" else [*paint, f"map_d {image}"])
-
-
 def _write(path: Path, lines: list[str]) -> None:
     path.write_text("\n".join(["# meshmatch", *lines, ""]), encoding="utf-8", errors="surrogateescape")
+
+
+def write_materials(path: Path, names: Iterable[str], material: BakedMaterial, images: Mapping[str, str]) -> None:
+    """The mtl: materials of these names that are all the same. ``images`` has file names by what they show: "color", and
+    maybe "normal", "roughness", "metal" and "emission".
+
+    Metal, roughness, light and normals as most programs read them. No options of maps: not every reader knows them.
+    """
+    paint = ["Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 1", f"map_Kd {images['color']}"]
+    if material.alpha != "opaque":
+        paint.append(f"map_d {images['color']}")
+    if (material.roughness, material.metal) != (1.0, 0.0) or "roughness" in images:
+        paint += [f"Pr {material.roughness:.6g}", f"Pm {material.metal:.6g}"]
+    if max(material.light) > 0:
+        paint.append("Ke {:.6g} {:.6g} {:.6g}".format(*material.light))
+    words = (("roughness", "map_Pr"), ("metal", "map_Pm"), ("emission", "map_Ke"), ("normal", "norm"))
+    paint += [f"{word} {images[what]}" for what, word in (*words, ("normal", "map_Bump")) if what in images]
+    _write(path, [line for name in names for line in (f"newmtl {name}", *paint)])

@@ -1,0 +1,33 @@
+"""How a target stands in its file, which its format does not say."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from meshmatch.api.results import MapPair
+from meshmatch.arrays import Float, Floats
+from meshmatch.fitting.fit import Fit
+from meshmatch.shapes.shape import Shape
+from meshmatch.threads import thread_limit
+from meshmatch.transfer.carry_rig import turn_of, upright
+
+
+def trust(source: Shape, maps: MapPair) -> Float[Floats, " V"]:
+    """How much each vertex of the source counts: by its area, and the confidence of the map."""
+    share = source.vertex_areas / max(source.area, 1e-300) * source.V
+    return np.where(source.valid, (share + 1e-3) * (maps.forward.confidence + 1e-3), 0.0)
+
+
+def turn_upright(maps: MapPair, along_y: bool) -> Float[Floats, "3 3"]:
+    """The turn about one axis, by right angles, after which the target stands along y: by its fit, or else as the source
+    does, if that stands ``along_y``; where neither is known, none.
+    """
+    fit = None if maps.match is None else maps.match.target_fit
+    if isinstance(fit, Fit):
+        up = np.zeros(3)
+        up["xyz".index(fit.up[1])] = -1.0 if fit.up[0] == "-" else 1.0
+        return turn_of(up)
+    if not along_y:
+        return np.eye(3)
+    with thread_limit(1):
+        return upright(maps.source, maps.forward.points(maps.target), trust(maps.source, maps))

@@ -1,0 +1,144 @@
+"""Meshes that wear a baked material, in files: a glb or an obj stays what it was, but for what is laid on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.errors import warn
+from meshmatch.outputs import replace_all_on_success
+from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
+from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.formats import Textured, gltf, gltf_out, obj, obj_text
+from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.formats.gltf_dressed import colored, dressed
+from meshmatch.shapes.input_files import read_bytes
+from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.textured_files import check_textured, files_of
+
+
+@dataclass(frozen=True, eq=False)
+class Dressed:
+    """A mesh that wears a baked material.
+
+    ``file`` is what it was read from, None where it came from arrays; ``uv`` are texture coordinates of each corner, v down,
+    ``own`` if they are those of the file; ``turn`` is what turns a file without axes upright in a format that has them.
+    """
+
+    shape: Shape
+    file: Path | None
+    uv: Float[Floats, "F 3 2"]
+    own: bool
+    material: BakedMaterial
+    turn: Float[Floats, "3 3"] = field(default_factory=lambda: np.eye(3))
+
+    @property
+    def turned(self) -> bool:
+        """Whether the file stands along another axis than y."""
+        return not np.array_equal(self.turn, np.eye(3))
+
+    def save(self, path: Path) -> None:
+        """Write a glb, or an obj with its material files; all of them, or none.
+
+        `OptionError` if the suffix is neither .glb nor .obj, `OutputError` if a file cannot be written.
+        """
+        check_textured(path)
+        with replace_all_on_success(files_of(path)) as places:
+            self.write(path, places)
+
+    def write(self, path: Path, places: Sequence[Path]) -> None:
+        """Write the `files_of` an output where they wait to get their names. What it does not hold is told."""
+        if len(places) == 1:
+            places[0].write_bytes(self._glb())
+        else:
+            self._write_obj(path, places)
+        tell_lost(self.file, path)
+
+    def _glb(self) -> bytes:
+        path, data, kept = glb_base(self.file, self.shape)
+        if kept:
+            uv, own, turn = self.uv, self.own, np.eye(3)
+        else:
+            uv, own, turn = self.uv[self.shape.valid_faces], False, self.turn
+        return gltf.understood(
+            path, data, "scene makes", lambda document: dressed(document, uv, own, self.material, turn)
+        )
+
+    def _write_obj(self, path: Path, places: Sequence[Path]) -> None:
+        files, name = files_of(path), "_".join((self.material.name or path.stem).split()) or "texture"
+        if self.file is not None and self.file.suffix.lower() == ".obj":
+            text, names = self._kept_text(self.file, files[1].name, name)
+            places[0].write_bytes(text)
+        else:
+            real = self.shape.valid_faces
+            mesh = Textured(self.shape.verts, self.shape.faces[real], self.uv[real])
+            obj.write_textured(places[0], mesh, files[1].name, name)
+            names = [name]
+        obj.write_materials(places[1], names, self.material, {"color": files[2].name})
+        places[2].write_bytes(png_bytes(self.material.color))
+
+    def _kept_text(self, file: Path, library: str, name: str) -> tuple[bytes, list[str]]:
+        data = read_bytes(file)
+        if self.own:
+            return obj_text.with_material(data, library, name, None)
+        polygons = obj_text.polygons_of(file.name, data, self.shape.verts_or_nan)
+        corners = np.zeros((int(polygons.sizes.sum()), 2))
+        corners[polygons.triangles] = self.uv
+        corners[:, 1] = 1.0 - corners[:, 1]
+        return obj_text.with_material(data, library, name, corners)
+
+
+def save_textured(path: str | Path, mesh: Textured, image: Pixels) -> None:
+    """Write a mesh that wears `image` (H, W, 4) as glb, or as obj with an mtl and a png of the same name; errors as
+    `Dressed.save`.
+    """
+    path = Path(path)
+    material = BakedMaterial(image, mesh.alpha, mesh.cutoff, path.stem)
+    Dressed(Shape(mesh.verts, mesh.faces, path.stem), None, mesh.uv, False, material).save(path)
+
+
+def save_colored(path: Path, shape: Shape, file: Path | None, turn: Float[Floats, "3 3"]) -> None:
+    """Write a shape with its colors. A glb or an obj that it was read from stays what it was, but for the colors; a file
+    without axes is turned upright in a glb. What the format does not hold is told.
+    """
+    suffix, colors = path.suffix.lower(), shape.colors
+    assert colors is not None
+    if suffix == ".glb":
+        name, data, kept = glb_base(file, shape)
+        turned = np.eye(3) if kept else turn
+        path.write_bytes(gltf.understood(name, data, "scene makes", lambda doc: colored(doc, colors, turned)))
+    elif suffix == ".obj" and file is not None and file.suffix.lower() == ".obj":
+        path.write_bytes(obj_text.with_colors(file.name, read_bytes(file), colors))
+    else:
+        save_shape(path, shape)
+
+
+def glb_base(file: Path | None, shape: Shape) -> tuple[Path, bytes, bool]:
+    """The glb or gltf that something is added to: name and bytes, and whether it is the file, not one made of the shape."""
+    if file is not None and file.suffix.lower() in gltf.SUFFIXES:
+        data = read_bytes(file)
+        if not gltf.understood(file, data, "scene makes", Document.draws_copies):
+            return file, data, True
+        warn(f"{file.name} draws copies of one mesh, which would have to differ: all becomes one mesh")
+    name = Path(shape.name or "target").stem
+    bare = Shape(shape.verts, shape.faces[shape.valid_faces], name)
+    return Path(f"{name}.glb"), gltf_out.glb_of(bare), False
+
+
+def tell_lost(file: Path | None, path: Path) -> None:
+    """Say what an output in this format does not have of the file that it was made of."""
+    before, after = ("" if each is None else each.suffix.lower() for each in (file, path))
+    if file is None or before == after or after not in (".glb", ".obj", ".ply", ".off"):
+        return
+    lost: list[str] = []
+    if before in gltf.SUFFIXES and after != ".glb":
+        lost = gltf.understood(file, read_bytes(file), "scene makes", Document.beyond_triangles)
+    elif before == ".obj":
+        lost = obj_text.beyond_triangles(file.name, read_bytes(file))
+    if lost:
+        several = f"{', '.join(lost[:-1])} and {lost[-1]}" if lost[1:] else lost[0]
+        warn(f"{path.name} does not have the {several} of {file.name}")

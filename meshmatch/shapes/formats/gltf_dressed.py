@@ -1,0 +1,259 @@
+"""A glTF scene that wears one baked material: nodes, skins, clips, morph targets and vertices stay as they are.
+
+Specification: Khronos glTF 2.0, sections 3.7.2 and 3.9; KHR_materials_emissive_strength, KHR_materials_unlit.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from meshmatch.arrays import Float, Floats, Ints
+from meshmatch.geometry.triangles import unit
+from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
+from meshmatch.shapes.colors import light
+from meshmatch.shapes.formats.gltf import COMPRESSED, Document
+from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor, drawn
+from meshmatch.shapes.formats.gltf_prune import textures_in
+from meshmatch.shapes.formats.seams import split_at_seams, vertex_tangents
+
+_LINEAR, _LINEAR_MIPS, _REPEAT, _CLAMP = 9729, 9987, 10497, 33071
+_GLOW, _UNLIT = "KHR_materials_emissive_strength", "KHR_materials_unlit"
+_GLOSS, _VARIANTS = "KHR_materials_pbrSpecularGlossiness", "KHR_materials_variants"
+_TRANSFORM = "KHR_texture_transform"
+_SLACK = 1e-5
+
+
+def dressed(
+    document: Document, uv: Float[Floats, "F 3 2"], own: bool, material: BakedMaterial, turn: Float[Floats, "3 3"]
+) -> bytes:
+    """The scene as a glb that wears a material.
+
+    Parameters
+    ----------
+    document
+        The scene.
+    uv
+        Texture coordinates of each corner of its triangles, in the order of the scene, v down.
+    own
+        They are those that it has. Else they become its first ones, and what was the first becomes the last; vertices at
+        seams are copied, behind the others.
+    material
+        Takes the place of color, metal, roughness, light and transparency of the materials of all that is drawn. Names and
+        everything else stay, also a normal or an occlusion map where the new material has none.
+    turn
+        What turns the scene upright.
+    """
+    editor = Editor(document)
+    wardrobe = _Wardrobe(editor, document, material, own)
+    seen = 0
+    for number, parts in drawn(document).items():
+        mesh = editor.own_mesh(number)  # each has its own place in the image
+        for k, part in parts.items():
+            faces = document.triangles(part)
+            corners = uv[seen : seen + len(faces)]
+            seen += len(faces)
+            if not len(faces):
+                continue
+            primitive = mesh["primitives"][k]
+            V = document.count(part["attributes"]["POSITION"])
+            if own:
+                laid = np.arange(V), document.accessor(part["attributes"]["TEXCOORD_0"]), faces
+            else:
+                laid = split_at_seams(V, faces, corners)
+            moved_to = None if own else _lay(editor, document, V, primitive, laid)
+            _untint(document, part, primitive)
+            if material.normal is not None and "NORMAL" in part["attributes"]:
+                _add_tangents(editor, document, part, primitive, laid)
+            wardrobe.dress(primitive, moved_to)
+    if not np.array_equal(turn, np.eye(3)):
+        editor.turn(turn)
+    wardrobe.list_extensions()
+    editor.prune(document)
+    return editor.to_bytes()
+
+
+def colored(document: Document, colors: Float[Floats, "V 4"], turn: Float[Floats, "3 3"]) -> bytes:
+    """The scene as a glb with other colors of its vertices (sRGB and alpha, 0..1), and turned."""
+    editor = Editor(document)
+    seen = 0
+    for number, parts in drawn(document).items():
+        mesh = editor.own_mesh(number)
+        for k, part in parts.items():
+            V = document.count(part["attributes"]["POSITION"])
+            amounts = light(colors[seen : seen + V]).astype("<f4")
+            mesh["primitives"][k]["attributes"]["COLOR_0"] = editor.add_array(amounts, target=VERTICES)
+            seen += V
+    if not np.array_equal(turn, np.eye(3)):
+        editor.turn(turn)
+    editor.prune(document)
+    return editor.to_bytes()
+
+
+Laid: TypeAlias = tuple[Ints, Floats, Ints]
+"""Of the vertices of a primitive after it was split: which one each was, its coordinates; and triangles over them."""
+
+
+def _lay(editor: Editor, document: Document, V: int, primitive: dict[str, Any], laid: Laid) -> int | None:
+    """Give a primitive of V vertices new first coordinates; returns which the former first ones are now, if any."""
+    vertex, coordinates, faces = laid
+    attributes = primitive["attributes"]
+    sets = sum(key.startswith("TEXCOORD_") for key in attributes)
+    if sets:
+        attributes[f"TEXCOORD_{sets}"] = attributes.pop("TEXCOORD_0")
+    if len(vertex) > V:
+        for held in (attributes, *primitive.get("targets", [])):
+            for key in held:
+                held[key] = editor.add_rows(document, held[key], vertex)
+    attributes["TEXCOORD_0"] = editor.add_array(coordinates.astype("<f4"), target=VERTICES)
+    if len(vertex) > V or "indices" not in primitive or primitive.get("mode", 4) != 4:
+        primitive["indices"] = editor.add_indices(faces, len(vertex))
+        primitive.pop("mode", None)
+    for extension in COMPRESSED:  # the plain data that was beside it counts now
+        primitive.get("extensions", {}).pop(extension, None)
+    return sets or None
+
+
+def _untint(document: Document, part: dict[str, Any], primitive: dict[str, Any]) -> None:
+    """Keep colors of vertices, which would be multiplied with the image, under a name that no program draws."""
+    colors = document.colors(part)
+    if colors is not None and (colors != 1.0).any():
+        primitive["attributes"]["_COLOR_0"] = primitive["attributes"].pop("COLOR_0")
+
+
+def _add_tangents(
+    editor: Editor, document: Document, part: dict[str, Any], primitive: dict[str, Any], laid: Laid
+) -> None:
+    """The tangents that the normal map was baked for."""
+    vertex, coordinates, faces = laid
+    places, normals = (document.accessor(part["attributes"][key])[vertex] for key in ("POSITION", "NORMAL"))
+    tangents = vertex_tangents(places, unit(normals), faces, coordinates)
+    primitive["attributes"]["TANGENT"] = editor.add_array(tangents.astype("<f4"), target=VERTICES)
+    for target in primitive.get("targets", []):
+        target.pop("TANGENT", None)
+
+
+class _Wardrobe:
+    """The materials of a scene, which wear a baked one; each as often as it is needed."""
+
+    def __init__(self, editor: Editor, document: Document, material: BakedMaterial, own: bool) -> None:
+        self.editor, self.baked = editor, material
+        self.before = copy.deepcopy(editor.json.get("materials", []))
+        parts = [part for parts in drawn(document).values() for part in parts.values()]
+        seen = {id(part) for part in parts}
+        others = (part for mesh in document.json["meshes"] for part in mesh["primitives"] if id(part) not in seen)
+        self.worn_elsewhere = {number for part in others for number in _materials_of(part)}
+        self.made: dict[tuple[int | None, int | None], int] = {}
+        wrap = _CLAMP
+        if own and any(_leaves(document.accessor(part["attributes"]["TEXCOORD_0"])) for part in parts):
+            wrap = _REPEAT
+        sampler = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPS, "wrapS": wrap, "wrapT": wrap}
+        self.sampler = editor.add("samplers", sampler)
+        self.color = self._texture(material.color, "")
+        self.normal, self.surface, self.glow = (
+            None if image is None else self._texture(image, f" {what}")
+            for image, what in (
+                (material.normal, "normal"),
+                (material.surface, "occlusion, roughness, metal"),
+                (material.glow, "emission"),
+            )
+        )
+
+    def _texture(self, image: Pixels, what: str) -> int:
+        view = self.editor.add_view(png_bytes(image))
+        entry = {"bufferView": view, "mimeType": "image/png", "name": f"{self.baked.name}{what}".strip()}
+        return self.editor.add("textures", {"sampler": self.sampler, "source": self.editor.add("images", entry)})
+
+    def dress(self, primitive: dict[str, Any], moved_to: int | None) -> None:
+        """Give a primitive, and its variants, the baked material; ``moved_to`` is where its former coordinates are."""
+        primitive["material"] = self._worn(primitive.get("material"), moved_to)
+        for mapping in primitive.get("extensions", {}).get(_VARIANTS, {}).get("mappings", []):
+            mapping["material"] = self._worn(mapping["material"], moved_to)
+
+    def _worn(self, number: int | None, moved_to: int | None) -> int:
+        key = number, moved_to
+        if key not in self.made:
+            if number is None:
+                entry: dict[str, Any] = {"name": self.baked.name} if self.baked.name else {}
+                entry |= {"doubleSided": True} if self.baked.double_sided else {}
+            else:
+                entry = copy.deepcopy(self.before[number])
+            self._lay_on(entry, moved_to)
+            first = number is not None and number not in self.worn_elsewhere
+            first &= all(each != number for each, _ in self.made)
+            if number is not None and first:
+                self.editor.json["materials"][number], self.made[key] = entry, number
+            else:
+                self.made[key] = self.editor.add("materials", entry)
+        return self.made[key]
+
+    def _lay_on(self, entry: dict[str, Any], moved_to: int | None) -> None:
+        """Replace in a material what the baked one has."""
+        baked, extensions = self.baked, entry.setdefault("extensions", {})
+        for key in (_GLOSS, _GLOW, _UNLIT):
+            extensions.pop(key, None)
+        for key in ("alphaMode", "alphaCutoff", "emissiveTexture", "emissiveFactor"):
+            entry.pop(key, None)
+        if self.normal is not None:
+            entry.pop("normalTexture", None)
+        if baked.occluded:
+            entry.pop("occlusionTexture", None)
+        paint = entry.setdefault("pbrMetallicRoughness", {})
+        for key in ("baseColorTexture", "baseColorFactor", "metallicRoughnessTexture"):
+            paint.pop(key, None)
+        if moved_to is not None:
+            _move_textures(entry, moved_to)
+        paint |= {"metallicFactor": baked.metal, "roughnessFactor": baked.roughness}
+        for where, key, texture in (
+            (paint, "baseColorTexture", self.color),
+            (paint, "metallicRoughnessTexture", self.surface),
+            (entry, "occlusionTexture", self.surface if baked.occluded else None),
+            (entry, "normalTexture", self.normal),
+            (entry, "emissiveTexture", self.glow),
+        ):
+            if texture is not None:
+                where[key] = {"index": texture}
+        strength = max(baked.light)
+        if strength > 0:
+            entry["emissiveFactor"] = [share / max(strength, 1.0) for share in baked.light]
+        if strength > 1.0:
+            extensions[_GLOW] = {"emissiveStrength": strength}
+        if baked.alpha != "opaque":
+            entry["alphaMode"] = baked.alpha.upper()
+        if baked.alpha == "mask":
+            entry["alphaCutoff"] = baked.cutoff
+        if baked.unlit:
+            extensions[_UNLIT] = {}
+        if not extensions:
+            del entry["extensions"]
+
+    def list_extensions(self) -> None:
+        """Say which extensions the materials use."""
+        used = {key for entry in self.editor.json["materials"] for key in entry.get("extensions", {})}
+        listed = self.editor.json.get("extensionsUsed", [])
+        if added := [key for key in (_GLOW, _UNLIT) if key in used and key not in listed]:
+            self.editor.json["extensionsUsed"] = [*listed, *added]
+
+
+def _leaves(uv: Floats) -> bool:
+    """Whether coordinates leave the image."""
+    return bool(len(uv) and (uv.min() < -_SLACK or uv.max() > 1.0 + _SLACK))
+
+
+def _materials_of(primitive: dict[str, Any]) -> Iterator[int]:
+    if "material" in primitive:
+        yield primitive["material"]
+    for mapping in primitive.get("extensions", {}).get(_VARIANTS, {}).get("mappings", []):
+        yield mapping["material"]
+
+
+def _move_textures(entry: dict[str, Any], moved_to: int) -> None:
+    """Let what is left of a material's textures lie on the former first coordinates."""
+    for texture in textures_in(entry):
+        held = texture.get("extensions", {}).get(_TRANSFORM, {})
+        where = held if "texCoord" in held else texture
+        if where.get("texCoord", 0) == 0:
+            where["texCoord"] = moved_to

@@ -1,0 +1,87 @@
+"""What a glTF document refers to no more, taken out of it: accessors, buffer views, textures and images."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+# Extensions that refer to nothing but textures of materials, or what is found below; with others nothing is taken out.
+_KNOWN = re.compile(
+    r"KHR_(?:materials_\w+|texture_transform|mesh_quantization|lights_punctual|node_visibility)|EXT_texture_webp"
+)
+_KINDS = ("textures", "images", "samplers", "accessors", "bufferViews")
+Json = dict[str, Any]
+
+
+def unused(json: Json) -> dict[str, set[int]]:
+    """Of each kind, the numbers that nothing refers to."""
+    found = {kind: set(range(len(json.get(kind, [])))) for kind in _KINDS}
+    for kind, holder, key in _references(json):
+        found[kind].discard(holder[key])
+    return found
+
+
+def prune(json: Json, before: dict[str, set[int]]) -> bool:
+    """Take out what is not used, but for what was not used ``before``; returns whether there was any."""
+    if not all(_KNOWN.fullmatch(name) for name in json.get("extensionsUsed", [])):
+        return False
+    some = False
+    for kind in _KINDS:
+        gone = unused(json)[kind] - before[kind]
+        if gone:
+            some = True
+            number = {old: new for new, old in enumerate(k for k in range(len(json[kind])) if k not in gone)}
+            for _, holder, key in [each for each in _references(json) if each[0] == kind]:
+                holder[key] = number.get(holder[key], holder[key])
+            json[kind] = [json[kind][old] for old in number]
+            if not json[kind]:
+                del json[kind]
+    return some
+
+
+def _references(json: Json) -> Iterator[tuple[str, Any, Any]]:
+    """Kind, holder and key of all numbers of a document that stand for one of the kinds."""
+    for mesh in json.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            for held in (primitive.get("attributes", {}), *primitive.get("targets", [])):
+                yield from (("accessors", held, key) for key in held)
+            if "indices" in primitive:
+                yield "accessors", primitive, "indices"
+    for skin in json.get("skins", []):
+        if "inverseBindMatrices" in skin:
+            yield "accessors", skin, "inverseBindMatrices"
+    for animation in json.get("animations", []):
+        for sampler in animation["samplers"]:
+            yield from (("accessors", sampler, key) for key in ("input", "output"))
+    yield from _inner_references(json)
+    for entry in json.get("materials", []):
+        yield from (("textures", texture, "index") for texture in textures_in(entry))
+
+
+def _inner_references(json: Json) -> Iterator[tuple[str, Any, Any]]:
+    """Those of accessors, images and textures."""
+    for accessor in json.get("accessors", []):
+        sparse = accessor.get("sparse", {})
+        for held in (accessor, sparse.get("indices", {}), sparse.get("values", {})):
+            if "bufferView" in held:
+                yield "bufferViews", held, "bufferView"
+    for image in json.get("images", []):
+        if "bufferView" in image:
+            yield "bufferViews", image, "bufferView"
+    for texture in json.get("textures", []):
+        if "sampler" in texture:
+            yield "samplers", texture, "sampler"
+        for held in (texture, *texture.get("extensions", {}).values()):
+            if "source" in held:
+                yield "images", held, "source"
+
+
+def textures_in(entry: Json) -> Iterator[Json]:
+    """All references to textures in a material and its extensions."""
+    for key, value in entry.items():
+        if isinstance(value, dict):
+            if key.endswith("Texture") and "index" in value:
+                yield value
+            else:
+                yield from textures_in(value)
