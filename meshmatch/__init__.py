@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 __version__ = "0.3.0"
 
 if TYPE_CHECKING:
+    from meshmatch.api.blend_shapes import BlendShapesResult as BlendShapesResult
+    from meshmatch.api.blend_shapes import transfer_shapes as transfer_shapes
     from meshmatch.api.garment import GarmentResult as GarmentResult
     from meshmatch.api.garment import transfer_garment as transfer_garment
     from meshmatch.api.interpolation import Interpolation as Interpolation
@@ -62,6 +64,7 @@ if TYPE_CHECKING:
     from meshmatch.transfer.bake import BakeOptions as BakeOptions
 
 _NAMES = {
+    "api.blend_shapes": "BlendShapesResult transfer_shapes",
     "api.garment": "GarmentResult transfer_garment",
     "api.interpolation": "Interpolation InterpolationOptions interpolate",
     "api.matcher": "Matcher",

@@ -16,8 +16,8 @@ from meshmatch.arrays import Brief
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.shapes import tables
-from meshmatch.shapes.files import ShapeLike, as_shape, load_shape
-from meshmatch.shapes.formats import gltf, gltf_out
+from meshmatch.shapes.files import ShapeLike, as_scene, as_shape, load_shape
+from meshmatch.shapes.formats import gltf
 from meshmatch.shapes.formats.gltf_rig import Rig, read_rig
 from meshmatch.shapes.formats.gltf_rigged import hanging_groups, rigged
 from meshmatch.shapes.input_files import read_bytes
@@ -132,10 +132,7 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
         raise InputError(f"{a.name} has no skeleton", f"rigs come in {', '.join(gltf.SUFFIXES)}")
     rig, weights = read_rig(source, read_bytes(source)), load_weights(source, a)
     b = as_shape(target, "target")
-    file = as_path(target) if isinstance(target, str | Path) else None
-    in_gltf = file is not None and file.suffix.lower() in gltf.SUFFIXES
-    path = file if file is not None and in_gltf else Path(b.name or "target").with_suffix(".glb")
-    data = read_bytes(path) if in_gltf else gltf_out.glb_of(b)
+    path, data, in_gltf = as_scene(target, b)
     hanging = gltf.understood(path, data, "scene makes", hanging_groups)
     maps = find_maps(a, b, match)
     with thread_limit(1):

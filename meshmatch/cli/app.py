@@ -18,6 +18,7 @@ from meshmatch.cli.train import train
 from meshmatch.cli.transfer import transfer_color, transfer_labels, transfer_landmarks, transfer_weights
 from meshmatch.cli.transfer_garment import transfer_garment
 from meshmatch.cli.transfer_rig import transfer_rig
+from meshmatch.cli.transfer_shapes import transfer_shapes
 from meshmatch.cli.transfer_texture import transfer_texture
 from meshmatch.cli.wrap import wrap
 
@@ -67,7 +68,7 @@ def root(
 for verb in (
     *(match, register, wrap, evaluate),
     *(transfer_texture, transfer_color, transfer_labels, transfer_weights),
-    *(transfer_rig, transfer_landmarks, transfer_garment),
+    *(transfer_rig, transfer_shapes, transfer_landmarks, transfer_garment),
     *(fit, map, atlas),
     *(interpolate, picture, view, info, prepare, train),
 ):

@@ -37,7 +37,7 @@ def transfer_garment(
     worn = meshmatch.load_shape(garment)
     plan = MovedFile.planned(output, garment)
     plan.make_folders()
-    with transfer.outputs(garment, plan.files) as temporary:
+    with transfer.outputs(garment, files=plan.files) as temporary:
         a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
         result = meshmatch.transfer_garment(worn, a, b, transfer)
         plan.write(temporary, result.shape, result.turns)

@@ -74,17 +74,17 @@ class Transfer:
         self.names = words.names_of([self.source, self.target])
 
     @contextmanager
-    def outputs(self, read: Path | None = None, files: Sequence[Path] = ()) -> Iterator[list[Path]]:
+    def outputs(self, *read: Path | None, files: Sequence[Path] | None = None) -> Iterator[list[Path]]:
         """Temporary paths that become the output, or its ``files``, when all went well.
 
-        What cannot be written, and options that do not go together, are told before the work; ``read`` is another input.
+        What cannot be written, and options that do not go together, are told before the work; ``read`` are other inputs.
         """
-        files = files or [self.output]
+        files = [self.output] if files is None else files
         self.options.check()
         if self.options.map is not None:
             hint = "it controls matching, but --map supplies the map: leave one of them out"
             self.options.refuse(self.options.for_matching, "--map", hint)
-        check_outputs([self.source, self.target, self.options.map, read], *files, picture=self.picture)
+        check_outputs([self.source, self.target, self.options.map, *read], *files, picture=self.picture)
         with replace_all_on_success(files) as temporary:
             if self.options.map is None:
                 check_model(self.options.model)  # a mistyped name is told before the long work

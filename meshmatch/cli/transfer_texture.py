@@ -73,7 +73,7 @@ def transfer_texture(
         hint = "leave out --uv keep" if b.is_cloud else "end the output in .glb or .obj for a texture"
         raise OptionError(f"{b.name} gets vertex colors, which need no texture coordinates", hint)
     files = [output] if painted else textured_files.files_of(output)
-    with transfer.outputs(image, files) as temporary:
+    with transfer.outputs(image, files=files) as temporary:
         look = textured_files.load_appearance(source, a, image)
         if painted:
             done = meshmatch.transfer_colors(a, b, transfer, colors=look, rule=rule)

@@ -41,6 +41,18 @@ def unit(vectors: Float[Floats, "N D"]) -> Float[Floats, "N D"]:
     return np.asarray(vectors / np.where(lengths > 0, lengths, 1.0)[:, None])
 
 
+def shortest_turns(before: Float[Floats, "N 3"], after: Float[Floats, "N 3"]) -> Float[Floats, "N 3 3"]:
+    """The rotations that take unit vectors to others the shortest way; none where one of the two is zero."""
+    axis = np.cross(before, after)  # as long as the sine of the angle
+    cosine = np.where(squared_lengths(before) * squared_lengths(after) > 0, dot(before, after), 1.0)
+    turns = axis[:, :, None] * axis[:, None, :] / np.maximum(1.0 + cosine, 1e-6)[:, None, None]
+    turns += cosine[:, None, None] * np.eye(3)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        turns[:, i, j] -= axis[:, k]
+        turns[:, j, i] += axis[:, k]
+    return turns
+
+
 def triangle_vectors(verts: Float[NDArray[Any], "V 3"], faces: Int[NDArray[Any], "F 3"]) -> Float[Floats, "F 3"]:
     """Normal of each triangle by the right-hand rule, twice its area long."""
     a, b, c = (verts.take(faces[:, k], 0) for k in range(3))

@@ -222,6 +222,16 @@ def save_shape(path: str | Path, shape: ShapeLike) -> None:
         _WRITERS[suffix](temporary, shape)
 
 
+def as_scene(source: ShapeLike, shape: Shape) -> tuple[Path, bytes, bool]:
+    """A shape as a glTF scene that can be edited: the path and the bytes of its file, and True, if it came from such a file;
+    else those of a glb with one mesh.
+    """
+    file = as_path(source) if isinstance(source, str | Path) else None
+    if file is not None and file.suffix.lower() in gltf.SUFFIXES:
+        return file, read_bytes(file), True
+    return Path(shape.name or "target").with_suffix(".glb"), gltf_out.glb_of(shape), False
+
+
 @runtime_checkable
 class HasVertices(Protocol):
     """A mesh or a point cloud of another library: ``vertices`` (V, 3) and, for a mesh, ``faces`` (F, 3)."""

@@ -32,16 +32,16 @@ def clean_weights(weights: csr_array, target: Shape, influences: int = 4) -> csr
     """
     graph = vertex_graph(target)
     twin = np.arange(target.V) if target.is_cloud else seams(target.verts, target.faces)
-    weights = _same_at(twin, largest_weights(weights, influences))
+    weights = same_at(twin, largest_weights(weights, influences))
     kept = _without_strays(weights, graph)
     sums = np.asarray(kept.sum(axis=1)).ravel()
     filled, _ = replace_low_weights(kept, sums < _HOLE, target, True, influences)
-    smooth = largest_weights(_same_at(twin, _mended(_same_at(twin, filled), graph)), influences)
+    smooth = largest_weights(same_at(twin, _mended(same_at(twin, filled), graph)), influences)
     smooth.data[smooth.data < _LEAST] = 0.0
     return _nearest_for_empty(largest_weights(smooth, influences), target)
 
 
-def _same_at(twin: Ints, weights: csr_array) -> csr_array:
+def same_at(twin: Int[Ints, " V"], weights: csr_array) -> csr_array:
     """The mean weights of all vertices with one twin, for each of them."""
     V = len(twin)
     together = csr_array((np.ones(V), (np.arange(V), twin)), (V, V))

@@ -15,27 +15,17 @@ import numpy as np
 from scipy.sparse import diags_array
 
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError
 from meshmatch.fitting.solve.priors import nearest_rotations
-from meshmatch.geometry.smoothing import averaged, laplacian, solved
+from meshmatch.geometry.smoothing import laplacian, solved
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.geometry.triangles import (
-    dot,
-    edge_lengths,
-    edges_of,
-    interpolate,
-    is_discontinuous,
-    same_rows,
-    triangle_vectors,
-    unit,
-)
+from meshmatch.geometry.triangles import dot, edge_lengths, edges_of, interpolate, same_rows, unit
 from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.local_frames import local_frames
 from meshmatch.transfer.mapped_mesh import MappedMesh, length_of
 
 # All set by hand; lengths in units of sqrt(area).
-# Over this distance turns and scales of the body are averaged.
-_SMOOTH = 0.06
 # Vertices of the body that one of the garment is bound to; those count that are not further away than the nearest by more
 # than this share of its distance.
 _NEAREST, _BLEND = 16, 0.3
@@ -94,32 +84,11 @@ class _Body:
         self.verts, self.normals = source.verts, source.vertex_normals
         self.image = forward.points(target)
         self.size, self.name = length_of(source), source.name or "the source"
-        corners = corners_of(target.faces, forward.face, forward.index)
-        normals = unit(interpolate(target.vertex_normals, corners, forward.barycentric))
-        edges = source.edges.vertices.astype(np.int64)
-        here, there = (place[edges[:, 1]] - place[edges[:, 0]] for place in (self.verts, self.image))
-        length, now = edge_lengths(self.verts, edges), edge_lengths(self.image, edges)
-        torn = is_discontinuous(now / length_of(target), length / self.size) | (length == 0)
-        trust = np.where(torn, 0.0, forward.confidence[edges].min(axis=1)) + 1e-6
-        weight = trust / np.maximum(length, 1e-12 * self.size)
-        products = weight[:, None, None] * there[:, :, None] * here[:, None, :]
-        sums = np.zeros((source.V, 11))  # products, and lengths now and before
-        rows = np.column_stack([products.reshape(-1, 9), trust * now, trust * length])
-        for end in edges.T:
-            np.add.at(sums, end, rows)
-        scale = float(sums[:, 9].sum() / max(sums[:, 10].sum(), 1e-300))
-        if _inside_out(source, self.image, normals):
-            hint = "mirror one of the files, or match without mirror images (--mirror no)"
-            raise OptionError(f"{self.name} matches as a mirror image: a garment would be inside out", hint)
-        outwards = 0.5 * scale * sums[:, 10, None, None] * normals[:, :, None] * self.normals[:, None, :]
-        sums[:, :9] += outwards.reshape(-1, 9)
-        sums = averaged(sums, np.ones(source.V), edges, length, _SMOOTH * self.size)
-        around = sums[:, :9].reshape(-1, 3, 3)
-        turns = nearest_rotations(around, np.broadcast_to(np.eye(3), around.shape))
-        ratio = np.maximum(sums[:, 9], 0.0) / np.maximum(sums[:, 10], 1e-300)
-        self.jacobians = turns * np.where(ratio > 0, ratio, scale)[:, None, None]
+        turns, scale = local_frames(forward, source, target)
+        self.jacobians = turns * scale[:, None, None]
         self.trust = forward.confidence + 1e-3
-        self.step = float(np.median(length))
+        edges = source.edges.vertices
+        self.step = float(np.median(edge_lengths(source.verts, edges)))
         self.usable = np.flatnonzero(source.valid & (np.bincount(edges.ravel(), minlength=source.V) > 0))
         self.tree = cKDTree(self.verts[self.usable])
 
@@ -209,10 +178,3 @@ def _pushed_out(cloth: _Cloth, bound: Floats, least: Floats, skin: _Skin, worker
     low = np.flatnonzero(heights < least[: len(verts)])
     verts[low] += (least[low] - heights[low])[:, None] * outwards[low]  # the rest alone
     return verts, pushed, skin.heights(verts, workers)[0]
-
-
-def _inside_out(source: Shape, image: Floats, normals: Floats) -> bool:
-    """Whether most of the source's faces look into the target where they are mapped to."""
-    moved = triangle_vectors(image, source.faces)[source.valid_faces]
-    outwards = normals[source.faces[source.valid_faces, 0]]
-    return bool(dot(moved, outwards).sum() < -0.5 * np.sqrt(dot(moved, moved)).sum())

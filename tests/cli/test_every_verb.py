@@ -24,6 +24,7 @@ PAIR = {
     "transfer-landmarks": ("out.csv", "--landmarks", "points.txt"),
     "transfer-texture": ("out.glb", "--size", "32", "--samples", "1"),
     "transfer-garment": ("out.obj",),
+    "transfer-shapes": ("out.npz", "--shapes", "moved.ply"),
     "wrap": ("out.obj",),
 }
 """Verbs of two shapes: the output, and what else each needs."""
@@ -54,6 +55,7 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sphere: Shape, torus:
     """Two colored shapes, and everything that verbs want beside them."""
     monkeypatch.chdir(tmp_path)
     save_shape("worn.ply", Shape(1.1 * sphere.verts, sphere.faces, "worn"))
+    save_shape("moved.ply", Shape(sphere.verts + 0.1, sphere.faces, "moved"))
     for name, shape in (("a.ply", sphere), ("b.ply", torus)):
         save_shape(name, Shape(shape.verts, shape.faces, name, np.full((shape.V, 4), 0.5)))
     Path("labels.txt").write_text("1\n" * sphere.V)
@@ -95,7 +97,7 @@ WRONG: list[tuple[str, str, tuple[str, ...]]] = [
     ("-o nowhere/out{}", "there is no folder nowhere", ()),
     ("-o folder{}", "is a folder", ()),
     ("-o out.bad", ".bad", ()),
-    ("-o out", "", ()),  # a name without a suffix
+    ("-o out", "", ("transfer-shapes",)),  # a name without a suffix
     ("--picture p.jpg", "a picture is a PNG", ("view",)),
     ("--picture nowhere/p.png", "there is no folder nowhere", ("view",)),
     ("--picture folder.png", "is a folder", ("view",)),

@@ -117,6 +117,24 @@ class Editor:
         node = self.add_node("upright", Rotation.from_matrix(rotation).as_quat(), np.zeros(3))
         self.json["nodes"][node]["children"], scene["nodes"] = scene["nodes"], [node]
 
+    def add_sparse(self, values: Float[NDArray[np.float32], "V D"], *, bounds: bool = False) -> int:
+        """The same for values that are mostly zeros: only the others are stored, where that takes less space."""
+        rows = np.flatnonzero(values.any(axis=1))
+        numbers = rows.astype("<u2" if len(values) <= 2**16 else "<u4")
+        if numbers.nbytes + values[rows].nbytes + 64 > values.nbytes:  # there are two views to describe
+            return self.add_array(values, bounds=bounds)
+        entry: dict[str, Any] = {"componentType": 5126, "count": len(values), "type": _TYPES[values.shape[1]]}
+        if len(rows):
+            indices = {
+                "bufferView": self.add_view(numbers.tobytes()),
+                "componentType": _COMPONENTS[numbers.dtype.str[1:]],
+            }
+            stored = {"bufferView": self.add_view(values[rows].astype("<f4").tobytes())}
+            entry["sparse"] = {"count": len(rows), "indices": indices, "values": stored}
+        if bounds:
+            entry |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+        return self.add("accessors", entry)
+
     def own_mesh(self, number: int) -> dict[str, Any]:
         """The mesh of a node, which other nodes draw no more: it can be changed."""
         node = self.json["nodes"][number]
@@ -176,3 +194,10 @@ def drawn(document: Document) -> dict[int, dict[int, dict[str, Any]]]:
             raise InputError(copies, "export each copy as an object of its own")
         found.setdefault(number, {})[place[id(part)]] = part
     return found
+
+
+def frames_of(document: Document, number: int, part: dict[str, Any]) -> Float[Floats, "V 3 3"]:
+    """What takes directions at each vertex of a primitive into the scene: its skin, or else its node."""
+    V, place = document.count(part["attributes"]["POSITION"]), document.world[number]
+    axes = [document.moved(number, part, np.tile(axis, (V, 1)), place) for axis in np.eye(4)[:3]]
+    return np.stack(axes, axis=2)

@@ -1,0 +1,202 @@
+"""Blendshapes from one shape to another."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count, islice
+from pathlib import Path
+
+import numpy as np
+
+from meshmatch.api.results import MapPair
+from meshmatch.api.transfer import MapLike, find_maps
+from meshmatch.api.upright import turn_upright
+from meshmatch.arrays import Brief
+from meshmatch.errors import InputError
+from meshmatch.geometry.triangles import shortest_turns
+from meshmatch.outputs import as_path, make_folder, replace_all_on_success, replace_on_success
+from meshmatch.shapes import tables
+from meshmatch.shapes.blend_shape_files import load_blend_shapes, save_blend_shapes
+from meshmatch.shapes.blend_shapes import BlendShapes, shape_normals
+from meshmatch.shapes.files import ShapeLike, as_scene, as_shape
+from meshmatch.shapes.formats import gltf
+from meshmatch.shapes.formats.gltf_morphs import with_morphs
+from meshmatch.shapes.moved_files import MovedFile
+from meshmatch.shapes.shape import Shape
+from meshmatch.threads import thread_limit
+from meshmatch.transfer.blend_shapes import carry_moves
+
+check_suffix = partial(tables.check_suffix, suffixes=(".glb", ".npz"), what="blendshapes")
+_PLAIN = re.compile(r"[^\w .+-]")
+_LONGEST = 100  # letters of a file's name
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BlendShapesResult(Brief):
+    """The blendshapes of the source on the target.
+
+    Attributes
+    ----------
+    shapes
+        ``names`` (K,), ``moves`` (K, V_target, 3) in the frame and unit of the target, ``weights`` and ``clips``.
+    given
+        Those of the source.
+    still
+        Names of shapes that move vertices of the source, and none of the target.
+    target
+        The target.
+    maps
+        The maps that were followed.
+    seconds
+        Time beside the match.
+    stands_along_y
+        Whether the source comes from a glTF file: the target then stands upright in a glb.
+    original
+        The target's file, if it came from one.
+
+    Examples
+    --------
+    >>> result = meshmatch.transfer_shapes("face.glb", "scan.ply")
+    >>> smiling = result.target.verts + result.shapes.moves[result.shapes.names.index("smile")]
+    >>> result.save("face-of-the-scan.glb")
+    """
+
+    shapes: BlendShapes
+    given: BlendShapes
+    still: tuple[str, ...]
+    target: Shape
+    maps: MapPair
+    seconds: float
+    stands_along_y: bool = False
+    original: Path | None = None
+
+    def save(self, path: str | Path) -> None:
+        """Write the target with its shapes.
+
+        Parameters
+        ----------
+        path
+            A .glb: the target as it came, with morph targets and the clips that animate them. An .npz: ``names`` (K,) and
+            ``moves`` (K, V, 3). Or a folder, which gets an .obj for each shape: the target's own text with other positions,
+            if it came as .obj.
+
+        Raises
+        ------
+        OptionError
+            The suffix is another one.
+        OutputError
+            A file cannot be written, or the folder holds something else.
+        """
+        path = as_path(path)
+        suffix = check_shapes_output(path)
+        if suffix:
+            with replace_on_success(path) as temporary:
+                if suffix == ".npz":
+                    save_blend_shapes(temporary, self.shapes)
+                else:
+                    temporary.write_bytes(self._to_glb())
+            return
+        make_folder(path)
+        plans = self._plans(path)
+        with replace_all_on_success([file for plan in plans for file in plan.files]) as places:
+            self._write_meshes(plans, places)
+
+    def _to_glb(self) -> bytes:
+        """The target as it came, with morph targets."""
+        path, data, in_gltf = as_scene(self.original or self.target, self.target)
+        turn = np.eye(3) if in_gltf else turn_upright(self.maps, self.stands_along_y)
+        adding = partial(with_morphs, shape=self.target, added=self.shapes, turn=turn)
+        return gltf.understood(path, data, "scene makes", adding)
+
+    def _plans(self, folder: Path) -> list[MovedFile]:
+        """The files of a folder of meshes: an .obj for each shape, and what an .obj takes along, once."""
+        taken: set[str] = set()
+        plans: list[MovedFile] = []
+        for name in self.shapes.names:
+            plain = _PLAIN.sub("_", name)[:_LONGEST].strip(". ") or "shape"
+            stem = next(word for word in _numbered(plain) if word.lower() not in taken)
+            taken.add(stem.lower())
+            planned = MovedFile.planned(folder / f"{stem}.obj", self.original if not plans else None)
+            plans.append(replace(planned, original=self.original))
+        return plans
+
+    def _write_meshes(self, plans: Sequence[MovedFile], places: Sequence[Path]) -> None:
+        """Write the files of `plans` where they wait to get their names."""
+        normals = shape_normals(self.target, self.shapes.moves)
+        waiting = iter(places)
+        for move, plan, now in zip(self.shapes.moves, plans, normals[1:], strict=True):
+            shape = replace(self.target, verts=self.target.verts + move)
+            plan.write(list(islice(waiting, len(plan.files))), shape, shortest_turns(normals[0], now))
+
+
+def check_shapes_output(path: Path) -> str:
+    """The suffix of an output, "" for a folder; `OptionError` for one that holds no blendshapes."""
+    return check_suffix(path) if path.suffix else ""
+
+
+def _numbered(word: str) -> Iterator[str]:
+    yield word
+    for number in count(2):
+        yield f"{word}-{number}"
+
+
+def transfer_shapes(
+    source: ShapeLike,
+    target: ShapeLike,
+    match: MapLike = None,
+    *,
+    shapes: BlendShapes | str | Path | Sequence[str | Path] | None = None,
+) -> BlendShapesResult:
+    """Blendshapes (morph targets) of the source on the target: expressions of a face, corrections of a pose.
+
+    Parameters
+    ----------
+    source
+        As in `find_maps`: a mesh at rest.
+    target
+        As in `find_maps`: a mesh.
+    match
+        As in `find_maps`.
+    shapes
+        The blendshapes, if they are not in the source's own file: a glTF scene, an .npz, or meshes with the source's own
+        vertices, as a list of files or a folder.
+
+    Returns
+    -------
+    BlendShapesResult
+        Its ``save("face.glb")`` writes the target with them.
+
+    Raises
+    ------
+    MeshmatchError
+        There are no blendshapes, or those of another mesh; one of the two is a point cloud; or as for `find_maps`.
+
+    Examples
+    --------
+    >>> dancer = meshmatch.load_shape("templates/samples/dancer.ply")
+    >>> meshmatch.transfer_shapes(dancer, "templates/samples/climber.ply", shapes="dancers-shapes").save("climber.glb")
+    """
+    file = Path(source) if isinstance(source, str | Path) else None
+    a, b = as_shape(source, "source"), as_shape(target, "target")
+    for each in (a, b):
+        if each.is_cloud:
+            raise InputError(f"{each.name or 'the shape'} is a point cloud, and blendshapes move meshes", "give a mesh")
+    in_gltf = file is not None and file.suffix.lower() in gltf.SUFFIXES
+    if shapes is None:
+        if file is None or not in_gltf:
+            raise InputError(f"{a.name or 'the source'} has no blendshapes", "give them as files: --shapes FOLDER")
+        shapes = file
+    given = shapes if isinstance(shapes, BlendShapes) else load_blend_shapes(shapes, a)
+    maps = find_maps(a, b, match)
+    began = time.monotonic()
+    with thread_limit(1):
+        moves = carry_moves(given.moves, maps.forward, maps.backward, a, b)
+    stopped = [bool(old.any()) and not new.any() for old, new in zip(given.moves, moves, strict=True)]
+    still = tuple(name for name, gone in zip(given.names, stopped, strict=True) if gone)
+    original = Path(target) if isinstance(target, str | Path) else None
+    seconds = time.monotonic() - began
+    return BlendShapesResult(replace(given, moves=moves), given, still, b, maps, seconds, in_gltf, original)

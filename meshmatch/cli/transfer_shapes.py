@@ -1,0 +1,65 @@
+"""``meshmatch transfer-shapes``."""
+
+from pathlib import Path
+
+from typer import Option
+
+import meshmatch
+from meshmatch.cli.options import RunOptions, grouped, output_option
+from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, Transfer
+
+_NAMED = 8  # shapes that a warning lists
+
+
+@grouped
+def transfer_shapes(
+    *,
+    source: Source,
+    target: Target,
+    output: Path = output_option(
+        "FILE",
+        "TGT with the blendshapes: .glb. Or .npz for their names and displacements; or a folder (a name without a suffix), "
+        "which gets an .obj for each shape.",
+    ),
+    shapes: list[Path] | None = Option(
+        None,
+        metavar="FILE",
+        help="The blendshapes, if they are not in SRC: a folder of meshes with the vertices of SRC, each named as its shape "
+        "is; or .npz or .glb. May be repeated, a mesh each.",
+    ),
+    maps: MapOptions,
+    run: RunOptions,
+    picture: Picture = None,
+) -> None:
+    """Transfer blendshapes (morph targets), such as the expressions of a face.
+
+    SRC is a .glb, .gltf or .vrm with morph targets, or any mesh with --shapes. Displacements turn and grow with the
+    surface; eyes, teeth and other separate parts move with what surrounds them; closed lips and lids stay closed. Of a TGT
+    in these formats everything is kept; clips that animate the shapes come along.
+    """
+    import numpy as np
+
+    from meshmatch.api.blend_shapes import check_shapes_output
+
+    transfer = Transfer(source, target, output, maps, run, picture)
+    console = transfer.console
+    suffix = check_shapes_output(output)
+    with transfer.outputs(*(shapes or ()), files=[output] if suffix else ()) as temporary:
+        given = None if shapes is None else shapes[0] if len(shapes) == 1 else shapes
+        result = meshmatch.transfer_shapes(source, target, transfer, shapes=given)
+        result.save(*temporary or [output])
+    names, clips = result.shapes.names, [clip.name for clip in result.shapes.clips]
+    if result.still:
+        listed = ", ".join(result.still[:_NAMED]) + (", ..." if len(result.still) > _NAMED else "")
+        console.warn(f"{len(result.still)} of {len(names)} shapes move no vertex of {transfer.names[1]}: {listed}")
+    played = f", {len(clips)} clip{'s' if len(clips) != 1 else ''}" if clips else ""
+    many = f"{len(names)} blendshape{'s' if len(names) != 1 else ''}"
+    console.say(f"wrote {output}: {transfer.names[1]} with {many}{played} ({result.seconds:.1f} s)")
+    if picture is not None:
+        from meshmatch.render.compose import compose_values
+
+        moved = [np.linalg.norm(each.moves, axis=2).max(axis=0) for each in (result.given, result.shapes)]
+        bodies = result.maps.source, result.target
+        transfer.draw(result.maps, compose_values(bodies, moved, "largest displacement of a shape"))
+    record = {"picture": picture, "shapes": list(names), "still": list(result.still), "clips": clips}
+    transfer.print_record(record, result.maps, float(result.maps.backward.confidence.mean()))

@@ -1,0 +1,63 @@
+"""How a map turns and scales the source around each of its vertices."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.errors import InputError, OptionError
+from meshmatch.fitting.solve.priors import nearest_rotations
+from meshmatch.geometry.smoothing import averaged
+from meshmatch.geometry.triangles import dot, edge_lengths, interpolate, is_discontinuous, triangle_vectors, unit
+from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.mapped_mesh import length_of
+
+# Set by hand, in units of sqrt(area): over this distance turns and scales are averaged.
+_SMOOTH = 0.06
+
+
+def local_frames(
+    forward: VertexMap, source: Shape, target: Shape
+) -> tuple[Float[Floats, "V 3 3"], Float[Floats, " V"]]:
+    """Of each vertex of the source, the rotation from the source to the target there, and the scale; both averaged over
+    the surface around, so that an error of the map at one vertex counts for little.
+
+    `InputError`: the source is a point cloud. `OptionError`: the map turns it inside out.
+    """
+    name = source.name or "the source"
+    if source.is_cloud:
+        raise InputError(f"{name} is a point cloud: its surface turns nothing", "give a mesh")
+    image = forward.points(target)
+    normals = unit(
+        interpolate(target.vertex_normals, corners_of(target.faces, forward.face, forward.index), forward.barycentric)
+    )
+    if _inside_out(source, image, normals):
+        hint = "mirror one of the files, or match without mirror images (--mirror no)"
+        raise OptionError(f"{name} matches as a mirror image: what is carried would be inside out", hint)
+    edges = source.edges.vertices.astype(np.int64)
+    here, there = (place[edges[:, 1]] - place[edges[:, 0]] for place in (source.verts, image))
+    length, now = edge_lengths(source.verts, edges), edge_lengths(image, edges)
+    torn = is_discontinuous(now / length_of(target), length / length_of(source)) | (length == 0)
+    trust = np.where(torn, 0.0, forward.confidence[edges].min(axis=1)) + 1e-6
+    weight = trust / np.maximum(length, 1e-12 * length_of(source))
+    products = weight[:, None, None] * there[:, :, None] * here[:, None, :]
+    sums = np.zeros((source.V, 11))  # products, and lengths now and before
+    rows = np.column_stack([products.reshape(-1, 9), trust * now, trust * length])
+    for end in edges.T:
+        np.add.at(sums, end, rows)
+    scale = float(sums[:, 9].sum() / max(sums[:, 10].sum(), 1e-300))
+    outwards = 0.5 * scale * sums[:, 10, None, None] * normals[:, :, None] * source.vertex_normals[:, None, :]
+    sums[:, :9] += outwards.reshape(-1, 9)
+    sums = averaged(sums, np.ones(source.V), edges, length, _SMOOTH * length_of(source))
+    around = sums[:, :9].reshape(-1, 3, 3)
+    turns = nearest_rotations(around, np.broadcast_to(np.eye(3), around.shape))
+    ratio = np.maximum(sums[:, 9], 0.0) / np.maximum(sums[:, 10], 1e-300)
+    return turns, np.where(ratio > 0, ratio, scale)
+
+
+def _inside_out(source: Shape, image: Floats, normals: Floats) -> bool:
+    """Whether most of the source's faces look into the target where they are mapped to."""
+    moved = triangle_vectors(image, source.faces)[source.valid_faces]
+    outwards = normals[source.faces[source.valid_faces, 0]]
+    return bool(dot(moved, outwards).sum() < -0.5 * np.sqrt(dot(moved, moved)).sum())
