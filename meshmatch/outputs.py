@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
+from meshmatch import blender
 from meshmatch.errors import InputError, OutputError
 
 _TEMPORARY = re.compile(r"\..*\.[0-9a-f]{8}(\.[^.]*)?")  # the names that `replace_on_success` gives
@@ -66,6 +67,26 @@ def _reached(path: Path) -> Path:
 
 @contextmanager
 def replace_on_success(path: str | Path) -> Iterator[Path]:
+    """As `_replacing`. Of a file that Blender writes (`meshmatch.blender`) the temporary path is that of a glb, which is
+    converted when the block ends well; `OptionError` if there is no Blender.
+    """
+    path = Path(path)
+    if not blender.is_converted(path):
+        with _replacing(path) as temporary:
+            yield temporary
+        return
+    blender.check_written(path)
+    with _replacing(path) as converted:
+        glb = converted.with_suffix(".glb")
+        try:
+            yield glb
+            blender.from_glb(glb, converted, path)
+        finally:
+            glb.unlink(missing_ok=True)
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
     """Give a temporary path beside `path`, and rename it to `path` when the block ends well.
 
     The temporary name keeps the suffix, so writers that choose a format by it still do. On any exception, Ctrl-C
@@ -74,7 +95,6 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
 
     `OutputError` if the folder is missing or cannot be written, `path` is a folder or write-protected, or the disk refuses.
     """
-    path = Path(path)
     final = _reached(path)
     folder = final.parent
     if path.is_dir():

@@ -100,7 +100,7 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     Parameters
     ----------
     source
-        A rigged .glb, .gltf or .vrm.
+        A rigged .glb, .gltf or .vrm, or a file that Blender reads.
     target
         The shape that receives the rig. Of a .glb, .gltf or .vrm everything is kept but a skeleton of its own; another
         shape is turned upright by the skeleton.

@@ -17,7 +17,9 @@ def transfer_rig(
     *,
     source: Source,
     target: Target,
-    output: Path = output_option("FILE", "TGT with the rig: .glb."),
+    output: Path = output_option(
+        "FILE", "TGT with the rig: .glb or, with Blender installed, .fbx, .usdz, .dae or .blend."
+    ),
     maps: MapOptions,
     run: RunOptions,
     pose: Literal["rest", "source"] = Option(
@@ -27,8 +29,9 @@ def transfer_rig(
 ) -> None:
     """Transfer a rig: skeleton, skin weights and animation clips.
 
-    SRC is a rigged .glb, .gltf or .vrm. Of a TGT in these formats everything is kept but a skeleton of its own; another TGT
-    is turned upright. The skeleton has the bones and names of SRC; its clips play on TGT in whatever pose it came.
+    SRC is a rigged .glb, .gltf or .vrm, or a file that Blender reads. Of a TGT in these formats everything is kept but a
+    skeleton of its own; another TGT is turned upright. The skeleton has the bones and names of SRC; its clips play on TGT
+    in whatever pose it came.
     """
     from meshmatch.api.rig import check_rig_suffix
 

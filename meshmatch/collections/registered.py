@@ -16,7 +16,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.superimpose import Scale
 from meshmatch.errors import InputError
-from meshmatch.shapes.files import SUFFIXES, load_shape
+from meshmatch.shapes.files import PLAIN_SUFFIXES, load_shape
 from meshmatch.shapes.input_files import read_text
 from meshmatch.shapes.tables import read_by_suffix
 
@@ -52,7 +52,7 @@ def registered_meshes(folder: str | Path) -> Iterator[Registered]:
 
     `InputError`: fewer than three meshes, two of one name, or meshes that do not share vertices and faces.
     """
-    files = sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    files = sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in PLAIN_SUFFIXES and path.is_file())
     names = tuple(path.stem for path in files)
     if len(files) < 3:
         raise InputError(f"{folder} holds {len(files)} meshes", "an atlas needs three or more, registered")

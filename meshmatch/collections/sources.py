@@ -8,13 +8,14 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
+from meshmatch import blender
 from meshmatch.collections.setting import Source
 from meshmatch.collections.stores import Store, is_url
 from meshmatch.errors import InputError
 from meshmatch.outputs import as_path
 from meshmatch.shapes.files import SUFFIXES
 
-_ARRAYS = ".npy"  # a cloud, or whatever else somebody keeps beside his shapes
+_BESIDE = {".npy", *blender.SUFFIXES}  # arrays, and works of an artist, that somebody may keep beside shapes
 _PATTERN = "*?["
 
 
@@ -22,7 +23,7 @@ def find_sources(shapes: str | Path | Sequence[str | Path], output: Store) -> li
     """The shapes of files, folders, patterns and URLs of folders, sorted by name.
 
     A shape of a folder is called by its path in it, without the suffix; any other by its file's name. What lies in the
-    folder of the fits is left out, and arrays (.npy) of a folder that holds shapes of another format.
+    folder of the fits is left out; so are arrays (.npy), and files that Blender reads, of a folder that holds other shapes.
 
     `InputError` if there is nothing, or two shapes have one name.
     """
@@ -65,6 +66,5 @@ def _sources(given: str | Path, output: Store) -> Iterable[Source]:
 def _of_folder(folder: Store, output: Store) -> list[Source]:
     files = [PurePosixPath(name) for name in folder.names() if PurePosixPath(name).suffix.lower() in SUFFIXES]
     files = [file for file in files if not f"{folder.location}/{file}".startswith(f"{output.location}/")]
-    if any(file.suffix.lower() != _ARRAYS for file in files):
-        files = [file for file in files if file.suffix.lower() != _ARRAYS]
+    files = [file for file in files if file.suffix.lower() not in _BESIDE] or files
     return [Source(str(file.with_suffix("")), folder, str(file)) for file in files]

@@ -17,7 +17,7 @@ from meshmatch.errors import InputError
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import is_watertight
-from meshmatch.shapes.files import SUFFIXES, load_shape
+from meshmatch.shapes.files import PLAIN_SUFFIXES, load_shape
 from meshmatch.shapes.input_files import existing, read_npz
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
@@ -31,7 +31,7 @@ _DENSE, _MOST, _ALL = 40_000, 16_384, 40_000_000  # surface points; samples of a
 _HUGE = 1e100  # whose square is a number
 _BEYOND = 1e30  # half sides of the cube, still a float32
 _NEAR = 0.05  # deviation of the free points that lie near a surface
-_KINDS = {*SUFFIXES, ".npz"} - {".npy"}  # arrays beside shapes are labels or landmarks
+_KINDS = {*PLAIN_SUFFIXES, ".npz"} - {".npy"}  # arrays beside shapes are labels or landmarks
 
 
 @dataclass(frozen=True, eq=False)

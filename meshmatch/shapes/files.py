@@ -17,6 +17,7 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from meshmatch import blender
 from meshmatch.arrays import Bool, Bools, Floats, as_numbers, off_torch
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import as_path, plain_text, replace_on_success
@@ -34,15 +35,16 @@ _FORMATS: dict[str, tuple[Callable[[Path, bytes], Raw], Callable[[Path, Shape], 
     ".off": (off.read, off.write),
     ".stl": (stl.read, stl.write),
     ".glb": (gltf.read, gltf_out.write),
-    ".gltf": (gltf.read, None),
-    ".vrm": (gltf.read, None),
+    **dict.fromkeys(gltf.SUFFIXES[1:], (gltf.read, None)),
     ".xyz": (plain.read_xyz, plain.write_xyz),
     ".pcd": (ply.read_pcd, None),
     ".npy": (plain.read_points, plain.write_points),
 }
 _WRITERS = {suffix: write for suffix, (_, write) in _FORMATS.items() if write is not None}
 SUFFIXES = tuple(_FORMATS)
-"""The suffixes that `load_shape` knows; `save_shape` writes all of them but .gltf, .vrm and .pcd."""
+"""The suffixes that `load_shape` knows."""
+PLAIN_SUFFIXES = tuple(suffix for suffix in SUFFIXES if suffix not in blender.SUFFIXES)
+"""Those that need no Blender: what is looked for in a folder."""
 check_suffix = partial(tables.check_suffix, suffixes=_WRITERS, what="shapes")
 
 Choice: TypeAlias = str | int | Sequence[str | int]

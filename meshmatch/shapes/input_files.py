@@ -19,6 +19,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
+from meshmatch import blender
 from meshmatch.errors import InputError, warn
 
 LARGEST_FILE = 1 << 32
@@ -74,11 +75,14 @@ def _similar(path: Path, suffixes: tuple[str, ...]) -> str:
 
 def read_bytes(path: Path, largest: int = LARGEST_FILE) -> bytes:
     """All of a file, of text without the mark of its encoding (`_unmarked`); `InputError` as `existing`, for one of text
-    that is larger than that, or if reading fails.
+    that is larger than that, or if reading fails. Of a file that Blender reads (`meshmatch.blender`) it is the glb that
+    it becomes.
     """
     try:
         if existing(path).stat().st_size > largest:
             raise _much_text(path.name, path.stat().st_size, largest)
+        if blender.is_converted(path):
+            return blender.glb_of(path)
         data = path.read_bytes()
         return _unmarked(path.name, data) if path.suffix.lower() in _MAYBE_TEXT else data
     except OSError as error:

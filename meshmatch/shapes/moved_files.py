@@ -75,7 +75,7 @@ class MovedFile:
         """
         for place, (_, file) in zip(places[1:], self.copies, strict=True):
             place.write_bytes(read_bytes(file))
-        suffix, original = self.output.suffix.lower(), self.original
+        suffix, original = places[0].suffix.lower(), self.original
         if original is not None and suffix == original.suffix.lower() == ".obj":
             text = obj_text.with_positions(original.name, read_bytes(original), shape.verts_or_nan, turns)
             places[0].write_bytes(text)

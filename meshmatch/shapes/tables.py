@@ -27,6 +27,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from meshmatch import blender
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.outputs import as_path, plain_text
@@ -380,9 +381,15 @@ def _one_column(text: str, whole: bool) -> bool | None:
 
 
 def check_suffix(path: str | Path, suffixes: Iterable[str], what: str) -> str:
-    """The suffix in small letters, if it is one of `suffixes`; `OptionError` otherwise. Ask before long work."""
+    """The suffix in small letters, if it is one of `suffixes`; `OptionError` otherwise. Ask before long work.
+
+    Where a glb may be written, so may what Blender makes of one, whose suffix counts as .glb.
+    """
     path = as_path(path)
     suffix = path.suffix.lower()
+    if blender.is_converted(path) and ".glb" in suffixes:
+        blender.check_written(path)
+        return ".glb"
     if suffix not in suffixes:
         given = f"'{suffix}'" if suffix else "a name without a suffix"
         unknown = f"{path.name}: {given} is not a format for {what}"

@@ -6,19 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
+from meshmatch import blender
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Appearance, ImageReader
-from meshmatch.shapes.formats import gltf_attributes, obj_look, ply_look
+from meshmatch.shapes.formats import gltf, gltf_attributes, obj_look, ply_look
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
 TEXTURED_SUFFIXES = (".glb", ".obj")
 _READERS = {  # of the look, and of texture coordinates alone
-    ".glb": (gltf_attributes.read_look, gltf_attributes.read_coordinates),
-    ".gltf": (gltf_attributes.read_look, gltf_attributes.read_coordinates),
-    ".vrm": (gltf_attributes.read_look, gltf_attributes.read_coordinates),
+    **dict.fromkeys(gltf.SUFFIXES, (gltf_attributes.read_look, gltf_attributes.read_coordinates)),
     ".obj": (obj_look.read_look, obj_look.read_coordinates),
     ".ply": (ply_look.read_look, ply_look.read_coordinates),
 }
@@ -80,7 +79,9 @@ def files_of(path: Path) -> list[Path]:
 
 def check_textured(path: Path, colored: tuple[str, ...] = ()) -> None:
     """Refuse a suffix that holds no texture (`OptionError`), nor is one of those `colored` by vertex."""
-    if path.suffix.lower() not in (*TEXTURED_SUFFIXES, *colored):
+    if blender.is_converted(path):
+        blender.check_written(path)
+    elif path.suffix.lower() not in (*TEXTURED_SUFFIXES, *colored):
         hint = f", or in {' or '.join(colored)} for vertex colors" if colored else ""
         unknown = f"{path.name}: cannot write a texture as {path.suffix or '(no suffix)'}"
         raise OptionError(unknown, f"end the name in {' or '.join(TEXTURED_SUFFIXES)}{hint}")

@@ -36,15 +36,14 @@ class SkinWeights(Brief):
 
 
 def load_weights(path: str | Path, shape: Shape) -> SkinWeights:
-    """Skin weights of the vertices of `shape`, from .npz, .json, .glb, .gltf or .vrm; `InputError` if not its own."""
+    """Skin weights of the vertices of `shape`, from .npz, .json, or a skin, as of .glb; `InputError` if not its own."""
+    from meshmatch.shapes.formats.gltf import SUFFIXES
     from meshmatch.shapes.formats.gltf_attributes import read_skin
 
     readers = {
         ".npz": lambda path: _from_record(read_npz(path, ("format", "names", "joints", "weights"))),
         ".json": lambda path: _from_record(read_json(path)),
-        ".glb": lambda path: read_skin(path, read_bytes(path)),
-        ".gltf": lambda path: read_skin(path, read_bytes(path)),
-        ".vrm": lambda path: read_skin(path, read_bytes(path)),
+        **dict.fromkeys(SUFFIXES, lambda path: read_skin(path, read_bytes(path))),
     }
     matrix, names = tables.read_by_suffix(path, readers, "skin weights", _WEIGHTS_HINT)
     return SkinWeights(_normalized(Path(path).name, matrix, shape), names)

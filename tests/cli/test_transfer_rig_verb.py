@@ -98,7 +98,7 @@ def test_what_cannot_be_is_told_in_a_line(run: Run, pair: Path, no_fit: None, wo
 OTHERS = [
     ("transfer-rig b.ply b.ply -o rigged.glb", "b.ply has no skeleton"),
     ("transfer-rig plain.glb b.ply -o rigged.glb", "plain.glb has no skin"),
-    ("transfer-rig a.glb b.ply -o rigged.fbx", "not a format for rigs"),
+    ("transfer-rig a.glb b.ply -o rigged.ply", "not a format for rigs"),
     ("transfer-rig a.glb b.ply -o a.glb", "is an input of this command"),
     ("transfer-rig a.glb b.ply -o nowhere/out.glb", "there is no folder nowhere"),
     ("transfer-rig a.glb cut.glb -o rigged.glb", "cut.glb"),

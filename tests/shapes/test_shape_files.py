@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from meshmatch.errors import InputError, OptionError, OutputError
-from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
+from meshmatch.shapes.files import PLAIN_SUFFIXES, load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from tests.shapes.painted import write_document
 
@@ -479,9 +479,9 @@ BINARY = PLY_HEADER.format(format="binary_little_endian").encode() + bytes(60)
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        *[(f"a{suffix}", b"", "0 bytes") for suffix in SUFFIXES],
-        *[(f"a{suffix}", b"\x89PNG\r\n\x1a\n" + bytes(500), "") for suffix in SUFFIXES],
-        *[(f"a{suffix}", b"<html><body>Not found</body></html>\n", "") for suffix in SUFFIXES],
+        *[(f"a{suffix}", b"", "0 bytes") for suffix in PLAIN_SUFFIXES],
+        *[(f"a{suffix}", b"\x89PNG\r\n\x1a\n" + bytes(500), "") for suffix in PLAIN_SUFFIXES],
+        *[(f"a{suffix}", b"<html><body>Not found</body></html>\n", "") for suffix in PLAIN_SUFFIXES],
         ("a.txt", b"1 2 3", "unsupported file format .txt"),
         ("a", b"1 2 3", "unsupported file format (no suffix)"),
         ("a.ply", HUGE.format("binary_little_endian", 10**9).encode() + bytes(24), "fewer vertex rows"),

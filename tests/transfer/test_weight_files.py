@@ -154,7 +154,7 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "huge joints": ("a.json", json_of(joints=[[1e300]] * SHAPE.V), "too large"),
     "no joints": ("a.json", json_of(joints=None), "'joints' is not a table"),
     "ragged names": ("a.json", json_of(names=[["a"], ["b", "c"]]), "can be read"),
-    "a suffix": ("a.fbx", lambda path: path.write_text("x"), "not read from '.fbx'"),
+    "a suffix": ("a.abc", lambda path: path.write_text("x"), "not read from '.abc'"),
     "no skin": ("a.glb", glb_without_skin, "has no skin"),
 }
 

@@ -18,6 +18,7 @@ from urllib.parse import unquote_to_bytes
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch import blender
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.errors import InputError, warn
 from meshmatch.outputs import plain_text
@@ -37,8 +38,8 @@ _HARMLESS = re.compile(
     r"EXT_(?:structural_metadata|mesh_features|instance_features)|FB_ngon_encoding|MSFT_lod|VRM(?:C_\w+)?"
 )
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
-SUFFIXES = (".glb", ".gltf", ".vrm")
-"""Of files in this format: a vrm is a glb with a character."""
+SUFFIXES = (".glb", ".gltf", ".vrm", *blender.SUFFIXES)
+"""Of files in this format: a vrm is a glb with a character, and Blender turns others into a glb."""
 MOST_NODES = 100_000
 """Nodes of a scene, and primitives that it draws: each takes up to 0.1 ms."""
 Found = TypeVar("Found")
@@ -68,7 +69,7 @@ class Document:
         self.body, self.size = b"", len(data)
         if data[:4] == b"glTF":
             data = self._chunks(data)
-        elif path.suffix.lower() in (".glb", ".vrm"):
+        elif path.suffix.lower() != ".gltf":
             raise InputError(
                 f"{self.name} is not a {path.suffix[1:].lower()} file: it does not begin with 'glTF'",
                 "does the suffix fit?",

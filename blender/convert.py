@@ -1,0 +1,161 @@
+"""Run by Blender: a file that it reads becomes a glb, or a glb a file that it writes.
+
+    blender --background --factory-startup --python convert.py -- INPUT OUTPUT
+    python convert.py INPUT OUTPUT          # a Python that has the package bpy
+
+INPUT may come from anybody: its scripts and drivers do not run, memory and output are bounded, and images and libraries
+that lie outside its folder are left out. What the user should know goes to stdout, in lines that begin with "note: ".
+"""
+
+import contextlib
+import os
+import sys
+
+import bpy
+
+MEMORY = 8 << 30  # bytes of address space
+LARGEST = 1 << 32  # bytes of the output
+
+
+def bound():
+    """Bound what this process may take, where the system can."""
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (LARGEST, LARGEST))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def note(text):
+    print(f"note: {text}", flush=True)
+
+
+def start():
+    """An empty scene, in which no file may run scripts."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.context.preferences.filepaths.use_scripts_auto_execute = False
+    bpy.context.preferences.filepaths.use_file_compression = True
+
+
+def operator(*names):
+    """The first of the operators that this Blender has."""
+    for name in names:
+        group, _, own = name.partition(".")
+        if own in dir(getattr(bpy.ops, group)):
+            return getattr(getattr(bpy.ops, group), own)
+    raise SystemExit(f"Blender {bpy.app.version_string} has no {names[-1]}")
+
+
+def call(found, **options):
+    """Call an operator with those of the options that this Blender knows."""
+    known = found.get_rna_type().properties.keys()
+    found(**{name: value for name, value in options.items() if name in known})
+
+
+def read(path):
+    suffix = os.path.splitext(path)[1].lower()
+    if suffix == ".blend":
+        bpy.ops.wm.open_mainfile(filepath=path, load_ui=False, use_scripts=False)
+    elif suffix == ".fbx":
+        call(operator("import_scene.fbx"), filepath=path, use_image_search=False, ignore_leaf_bones=False)
+    elif suffix == ".dae":
+        call(operator("wm.collada_import"), filepath=path, keep_bind_info=True)
+    elif suffix in (".usd", ".usda", ".usdc", ".usdz"):
+        call(
+            operator("wm.usd_import"), filepath=path, import_textures_mode="IMPORT_PACK", support_scene_instancing=False
+        )
+    else:
+        call(operator("import_scene.gltf"), filepath=path, disable_bone_shape=True, guess_original_bind_pose=False)
+
+
+def leave_out_strangers(folder):
+    """Remove images and libraries from outside the folder of the file, and such as are not there."""
+    names = {}
+    for kind in (bpy.data.libraries, bpy.data.images):
+        for each in list(kind):
+            if getattr(each, "packed_file", None) or getattr(each, "source", "FILE") not in (
+                "FILE",
+                "SEQUENCE",
+                "TILED",
+            ):
+                continue
+            real = os.path.realpath(bpy.path.abspath(each.filepath))
+            inside = real.startswith(os.path.join(os.path.realpath(folder), ""))
+            if not inside or not os.path.isfile(real.replace("<UDIM>", "1001")):
+                names[os.path.basename(real)] = None
+                kind.remove(each)
+    if names:
+        first = ", ".join(list(names)[:6]) + (", ..." if len(names) > 6 else "")
+        note(f"left out {len(names)} files that it names and that are not in its folder: {first}")
+
+
+def shown():
+    """The meshes of the scene that are not hidden."""
+    return [each for each in bpy.context.scene.objects if each.type == "MESH" and not each.hide_render]
+
+
+def prepare():
+    """Make ready for the exporters what they would lose."""
+    with_shapes = [each for each in shown() if each.data.shape_keys]
+    modified = [each.name for each in with_shapes if any(one.type != "ARMATURE" for one in each.modifiers)]
+    if modified:
+        note(f"modifiers are not applied, because {', '.join(modified[:4])} has shape keys")
+    return not with_shapes
+
+
+def write(path, apply):
+    suffix = os.path.splitext(path)[1].lower()
+    if suffix == ".glb":
+        call(
+            operator("export_scene.gltf"), filepath=path, export_format="GLB", export_yup=True, export_apply=apply,
+            export_animations=True, export_skins=True, export_morph=True, export_all_influences=True,
+            export_tangents=False, export_extras=False, use_renderable=True, export_optimize_animation_size=False,
+        )  # fmt: skip
+    elif suffix == ".fbx":
+        call(
+            operator("export_scene.fbx"), filepath=path, path_mode="COPY", embed_textures=True, add_leaf_bones=False,
+            bake_anim_use_all_bones=True, bake_anim_simplify_factor=0.0, use_mesh_modifiers=apply,
+        )  # fmt: skip
+    elif suffix == ".dae":
+        stem = os.path.splitext(os.path.basename(path))[0]
+        for image in bpy.data.images:  # its file lies beside the dae, among others
+            image.name = f"{stem}-{image.name}"
+        call(operator("wm.collada_export"), filepath=path, use_texture_copies=True, apply_modifiers=apply)
+    elif suffix == ".blend":
+        bpy.ops.file.pack_all()
+        bpy.ops.wm.save_as_mainfile(filepath=path, compress=True)
+    else:
+        call(
+            operator("wm.usd_export"), filepath=path, export_animation=True, export_armatures=True,
+            export_shapekeys=True, export_textures_mode="NEW", generate_preview_surface=True,
+            convert_orientation=True,
+        )  # fmt: skip
+
+
+def main(source, output):
+    bound()
+    start()
+    read(source)
+    if not shown():
+        raise SystemExit("there is no mesh in it")
+    leave_out_strangers(os.path.dirname(source))
+    write(output, prepare())
+    if not os.path.isfile(output):
+        raise SystemExit("Blender wrote nothing")
+
+
+def run():
+    """The exit status. Why there is no output is the last line."""
+    try:
+        words = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
+        main(*map(os.path.abspath, words))
+    except BaseException as error:
+        print(f"Error: {error}")
+        return 1
+    return 0
+
+
+status = run()
+sys.stdout.flush()
+os._exit(status)  # where a file's drivers were refused, Blender does not end by itself

@@ -1,0 +1,129 @@
+"""Files that Blender turns into glb, and glb into: fbx, blend, dae and usd.
+
+Blender is large, global, and its readers were not made for files of strangers: it runs as a process of its own, which may
+take only so much time and memory, and runs no scripts of a file (``blender/convert.py``).
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from collections import OrderedDict
+from pathlib import Path
+
+from meshmatch.errors import InputError, OptionError, OutputError, warn
+
+SUFFIXES = (".fbx", ".usdz", ".usd", ".usda", ".usdc", ".dae", ".blend")
+"""Files that are read by way of a glb."""
+WRITTEN = (".fbx", ".usdz", ".dae", ".blend")
+"""Files that are written by way of a glb: all but .dae hold their images."""
+VARIABLE = "MESHMATCH_BLENDER"
+"""The environment variable that names Blender, or a Python that has the package bpy."""
+_LARGEST = 1 << 30  # bytes of a file that is read
+_SECONDS = 300
+_KEPT = 4  # files that are not converted again while the process lasts: a verb reads each several times
+_MAC = "/Applications/Blender.app/Contents/MacOS/Blender"
+_HINT = (
+    f"install Blender (blender.org), or `pip install bpy` for a Python 3.11 of its own, and set {VARIABLE} to that "
+    "program"
+)
+_done: OrderedDict[tuple[str, int, int], bytes] = OrderedDict()
+_lock = threading.Lock()
+
+
+def is_converted(path: Path) -> bool:
+    """Whether a file is read or written by way of a glb."""
+    return path.suffix.lower() in SUFFIXES
+
+
+def scripts_folder() -> Path:
+    """The folder of what runs inside Blender: ``meshmatch/_blender`` of a wheel, ``blender/`` beside a checkout."""
+    package = Path(__file__).resolve().parent
+    installed = package / "_blender"
+    return installed if installed.is_dir() else package.parent / "blender"
+
+
+def command(name: str) -> list[str]:
+    """How Blender is started with a script; `OptionError`, which names the file that needs it, if it is not there."""
+    named = os.environ.get(VARIABLE, "")
+    program = shutil.which(named) if named else shutil.which("blender") or shutil.which(_MAC)
+    if named and program is None:
+        raise OptionError(f"there is no program {named} ({VARIABLE})", _HINT)
+    if program is None and importlib.util.find_spec("bpy") is not None:
+        program = sys.executable
+    if program is None:
+        raise OptionError(f"{name}: a {Path(name).suffix.lower()} file needs Blender, which is not found", _HINT)
+    if Path(program).stem.lower().startswith("python"):
+        return [program, "-I"]
+    return [program, "--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1", "--python"]
+
+
+def glb_of(path: Path) -> bytes:
+    """The glb that a file becomes: in meters, y up, with materials, skeletons, clips and morph targets.
+
+    `InputError` if Blender cannot read it, `OptionError` if there is no Blender.
+    """
+    found = path.stat()
+    key = os.path.realpath(path), found.st_mtime_ns, found.st_size
+    with _lock:
+        if key not in _done:
+            if found.st_size > _LARGEST:
+                raise InputError(f"{path.name} is larger than {_LARGEST >> 30} GiB", "export it as .glb")
+            with tempfile.TemporaryDirectory(prefix="meshmatch-") as folder:
+                glb = Path(folder, "converted.glb")
+                if (why := _run(path, glb)) is not None:
+                    raise InputError(f"{path.name} cannot be read: {why}", "is it damaged? export it as .glb")
+                _done[key] = glb.read_bytes()
+        _done.move_to_end(key)
+        while len(_done) > _KEPT:
+            _done.popitem(last=False)
+        return _done[key]
+
+
+def check_written(path: Path) -> None:
+    """Refuse, before the work, a file that Blender cannot write, or if there is no Blender (`OptionError`)."""
+    if path.suffix.lower() not in WRITTEN:
+        raise OptionError(f"{path.name}: {path.suffix} files are only read", f"write one of {', '.join(WRITTEN)}")
+    command(path.name)
+
+
+def from_glb(glb: Path, place: Path, path: Path) -> None:
+    """Write to ``place`` what a glb becomes as the file ``path``; images of a dae come beside it, with its name before
+    theirs. `OutputError` if Blender cannot, `OptionError` if there is none.
+    """
+    with tempfile.TemporaryDirectory(prefix="meshmatch-") as folder:
+        output = Path(folder, path.name)
+        if (why := _run(glb, output)) is not None:
+            raise OutputError(f"cannot write {path}: {why}", "write a .glb, and open that in the other program")
+        for file in sorted(Path(folder).iterdir()):
+            shutil.copyfile(file, place if file == output else path.parent / file.name)
+
+
+def _run(source: Path, output: Path) -> str | None:
+    """Let Blender convert a file; why it did not, None if it did. What it leaves out is told."""
+    script = scripts_folder() / "convert.py"
+    words = [*command((source if output.suffix == ".glb" else output).name), str(script)]
+    words += ["--", str(source.absolute()), str(output.absolute())]
+    with tempfile.TemporaryFile() as said:
+        try:
+            done = subprocess.run(
+                words, stdin=subprocess.DEVNULL, stdout=said, stderr=subprocess.STDOUT, timeout=_SECONDS, check=False
+            )
+        except subprocess.TimeoutExpired:
+            return f"Blender took longer than {_SECONDS // 60} minutes"
+        except OSError as error:
+            return f"Blender cannot be started: {error.strerror}"
+        said.seek(max(0, said.tell() - 100_000))
+        lines = said.read().decode(errors="replace").splitlines()
+    if done.returncode:
+        worth = [line.strip() for line in lines if line.strip() and not line.startswith((" ", "note: "))]
+        return (worth or [f"Blender ended with status {done.returncode}"])[-1].split("Error: ")[-1]
+    notes = dict.fromkeys(line.removeprefix("note: ") for line in lines if line.startswith("note: "))
+    for line in list(notes)[:8]:
+        warn(f"{source.name}: {line}")
+    return None

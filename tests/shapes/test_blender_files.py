@@ -1,0 +1,219 @@
+"""Files that Blender reads and writes: by a stand-in that copies glb, and, where there is a Blender, by that."""
+
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import meshmatch
+from meshmatch import blender
+from meshmatch.errors import InputError, MeshmatchWarning, OptionError, OutputError
+from meshmatch.shapes.dressed_files import save_textured
+from meshmatch.shapes.formats import gltf_out
+from meshmatch.shapes.formats.gltf_rig import read_rig
+from meshmatch.shapes.input_files import read_bytes
+from meshmatch.shapes.textured_files import load_appearance
+from meshmatch.transfer.weight_files import load_weights
+from tests.blender_at_hand import needs_blender, run_inside, stand_in
+from tests.transfer.rigs import tube, write_tube
+
+HOSTILE = """
+import bpy, os, sys
+output, touched = sys.argv[sys.argv.index("--") + 1 :]
+bpy.ops.wm.read_factory_settings(use_empty=True)
+mesh = bpy.data.meshes.new("mesh")
+mesh.from_pydata([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], [], [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)])
+thing = bpy.data.objects.new("thing", mesh)
+bpy.context.scene.collection.objects.link(thing)
+text = bpy.data.texts.new("startup.py")
+text.write(f"open({touched + '-text'!r}, 'w').close()")
+text.use_module = True
+driver = thing.driver_add("location", 0).driver
+driver.type, driver.expression = "SCRIPTED", f"(open({touched + '-driver'!r}, 'w').close(), 0.0)[1]"
+bpy.data.libraries.write(output, {bpy.context.scene, text}, fake_user=True)
+sys.stdout.flush()
+os._exit(0)
+"""
+TRUSTING = """
+import bpy, os, sys
+bpy.context.preferences.filepaths.use_scripts_auto_execute = True
+bpy.ops.wm.open_mainfile(filepath=sys.argv[sys.argv.index("--") + 1], use_scripts=True)
+os._exit(0)
+"""
+
+
+def test_a_file_goes_through_a_glb_both_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(tmp_path, monkeypatch)
+    for suffix in blender.WRITTEN:
+        meshmatch.save_shape(tmp_path / f"tube{suffix}", tube())
+        assert (tmp_path / f"tube{suffix}").read_bytes()[:4] == b"glTF"
+        back = meshmatch.load_shape(tmp_path / f"tube{suffix}")
+        np.testing.assert_allclose(back.verts, tube().verts, atol=1e-6)
+        np.testing.assert_array_equal(back.faces, tube().faces)
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_skin_look_and_skeleton_come_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(tmp_path, monkeypatch)
+    write_tube(tmp_path / "tube.glb")
+    (tmp_path / "tube.glb").rename(tmp_path / "tube.FBX")
+    path = tmp_path / "tube.FBX"
+    shape = meshmatch.load_shape(path)
+    assert load_weights(path, shape).names == ("root", "hip", "knee", "foot")
+    assert [clip.name for clip in read_rig(path, read_bytes(path)).clips] == ["bend"]
+    dancer = Path("templates/samples/dancer-textured.glb")
+    (tmp_path / "dancer.usdz").write_bytes(dancer.read_bytes())
+    look = load_appearance(tmp_path / "dancer.usdz", meshmatch.load_shape(tmp_path / "dancer.usdz"))
+    assert look.materials[0].image is not None
+
+
+def test_a_file_is_converted_once_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = tmp_path / "log"
+    stand_in(tmp_path, monkeypatch, f"open({str(log)!r}, 'a').write('x'); shutil.copyfile(source, output)")
+    path = tmp_path / "a.fbx"
+    path.write_bytes(gltf_out.glb_of(tube()))
+    for _ in range(3):
+        meshmatch.load_shape(path)
+    assert log.read_text() == "x"
+    moved = meshmatch.Shape(tube().verts + 1.0, tube().faces)
+    path.write_bytes(gltf_out.glb_of(moved) + b"    ")
+    assert meshmatch.load_shape(path).verts.max() > tube().verts.max() + 0.5
+    assert log.read_text() == "xx"
+
+
+def test_without_blender_the_line_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(blender.VARIABLE, raising=False)
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    path = tmp_path / "a.fbx"
+    path.write_bytes(b"Kaydara FBX Binary  ")
+    with pytest.raises(OptionError, match="needs Blender") as error:
+        meshmatch.load_shape(path)
+    assert "pip install bpy" in error.value.hint and blender.VARIABLE in error.value.hint
+    with pytest.raises(OptionError, match="needs Blender"):
+        meshmatch.save_shape(tmp_path / "b.blend", tube())
+    monkeypatch.setenv(blender.VARIABLE, "/no/such/blender")
+    with pytest.raises(OptionError, match="there is no program"):
+        meshmatch.load_shape(path)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["a.fbx"]
+
+
+@pytest.mark.parametrize(
+    ("does", "words"),
+    [
+        ("print('Error: no DNA block'); sys.exit(1)", "no DNA block"),
+        ("sys.exit(3)", "status 3"),
+        ("time.sleep(60)", "took longer"),
+        ("open(output, 'w').write('nothing')", "does not begin with"),
+    ],
+)
+def test_trouble_in_blender_is_one_line(does: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(tmp_path, monkeypatch, does)
+    monkeypatch.setattr(blender, "_SECONDS", 5 if "sleep" not in does else 1)
+    (tmp_path / "a.fbx").write_bytes(b"x")
+    began = time.monotonic()
+    with pytest.raises(InputError, match=words):
+        meshmatch.load_shape(tmp_path / "a.fbx")
+    assert time.monotonic() - began < 30
+
+
+def test_what_cannot_be_written_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(tmp_path, monkeypatch, "print('Error: no room'); sys.exit(1)")
+    (tmp_path / "a.fbx").write_bytes(b"before")
+    with pytest.raises(OutputError, match="no room"):
+        meshmatch.save_shape(tmp_path / "a.fbx", tube())
+    assert (tmp_path / "a.fbx").read_bytes() == b"before"
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["a.fbx", "blender"]
+    with pytest.raises(OptionError, match="only read"):
+        meshmatch.save_shape(tmp_path / "a.usda", tube())
+
+
+def test_what_is_left_out_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(tmp_path, monkeypatch, "print('note: left out skin.png'); shutil.copyfile(source, output)")
+    (tmp_path / "a.fbx").write_bytes(gltf_out.glb_of(tube()))
+    with pytest.warns(MeshmatchWarning, match=r"a\.fbx: left out skin\.png"):
+        meshmatch.load_shape(tmp_path / "a.fbx")
+
+
+def test_works_of_an_artist_beside_shapes_of_a_folder_are_left_alone(tmp_path: Path) -> None:
+    from meshmatch.collections.sources import find_sources
+    from meshmatch.collections.stores import Store
+
+    for name in ("a.fbx", "a.blend", "b.fbx"):
+        (tmp_path / name).write_bytes(b"x")
+    fits = Store.of(tmp_path / "fits")
+    with pytest.raises(InputError, match="two shapes are called a"):
+        find_sources(tmp_path, fits)
+    (tmp_path / "a.blend").unlink()
+    assert [source.file for source in find_sources(tmp_path, fits)] == ["a.fbx", "b.fbx"]
+    (tmp_path / "c.ply").write_bytes(b"x")
+    assert [source.file for source in find_sources(tmp_path, fits)] == ["c.ply"]
+
+
+@needs_blender
+@pytest.mark.parametrize("suffix", blender.WRITTEN)
+def test_blender_keeps_place_skeleton_and_weights(suffix: str, tmp_path: Path) -> None:
+    before = write_tube(tmp_path / "tube.glb", clips=suffix != ".dae")  # whose joints stand as a clip begins
+    path = tmp_path / f"tube{suffix}"
+    blender.from_glb(tmp_path / "tube.glb", path, path)
+    shape, old = meshmatch.load_shape(path), meshmatch.load_shape(tmp_path / "tube.glb")
+    assert len(shape.faces) == len(before.faces)
+    np.testing.assert_allclose(shape.verts.min(0), old.verts.min(0), atol=3e-3)
+    np.testing.assert_allclose(shape.verts.max(0), old.verts.max(0), atol=3e-3)
+    names = load_weights(path, shape).names
+    assert {"root", "hip", "knee", "foot"} <= set(names)
+    rig, given = read_rig(path, read_bytes(path)), read_rig(tmp_path / "tube.glb", read_bytes(tmp_path / "tube.glb"))
+    places = dict(zip(rig.names, rig.worlds()[:, :3, 3], strict=True))
+    for joint in given.joints:
+        np.testing.assert_allclose(places[given.names[joint]], given.worlds()[joint, :3, 3], atol=2e-3)
+
+
+@needs_blender
+@pytest.mark.parametrize("suffix", blender.WRITTEN)
+def test_blender_keeps_an_image(suffix: str, tmp_path: Path) -> None:
+    sample = Path("templates/samples/dancer-textured.glb")
+    path = tmp_path / f"dancer{suffix}"
+    blender.from_glb(sample, path, path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        look = load_appearance(path, meshmatch.load_shape(path))
+    old = load_appearance(sample, meshmatch.load_shape(sample))
+    assert look.materials[0].image is not None and old.materials[0].image is not None
+    assert look.materials[0].image.shape == old.materials[0].image.shape
+    beside = {"dancer-dancer-textured.png"} if suffix == ".dae" else set()
+    assert {each.name for each in tmp_path.iterdir()} == {path.name} | beside
+
+
+@needs_blender
+def test_blender_writes_a_textured_mesh_as_fbx(tmp_path: Path) -> None:
+    from meshmatch.shapes.formats import Textured
+
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    mesh = Textured(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros((2, 3, 2)))
+    save_textured(tmp_path / "a.fbx", mesh, np.full((4, 4, 4), 200, np.uint8))
+    assert (tmp_path / "a.fbx").read_bytes().startswith(b"Kaydara FBX Binary")
+    assert meshmatch.load_shape(tmp_path / "a.fbx").F == 2
+
+
+@needs_blender
+def test_scripts_and_drivers_of_a_blend_file_do_not_run(tmp_path: Path) -> None:
+    for name, text in (("hostile.py", HOSTILE), ("trusting.py", TRUSTING)):
+        (tmp_path / name).write_text(text)
+    touched = tmp_path / "touched"
+    run_inside(tmp_path / "hostile.py", tmp_path / "a.blend", touched)
+    assert meshmatch.load_shape(tmp_path / "a.blend").F == 4
+    assert not list(tmp_path.glob("touched*"))
+    run_inside(tmp_path / "trusting.py", tmp_path / "a.blend")  # who trusts the file does run them
+    assert (tmp_path / "touched-text").exists()
+
+
+@needs_blender
+@pytest.mark.parametrize("suffix", blender.WRITTEN)
+def test_a_file_that_is_cut_short_is_one_line(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"tube{suffix}"
+    meshmatch.save_shape(path, tube())
+    path.write_bytes(path.read_bytes()[:800])
+    with pytest.raises(InputError, match="cannot be read"):
+        meshmatch.load_shape(path)
