@@ -54,7 +54,8 @@ class MovedMesh(Brief):
 
     def save(self, path: str | Path) -> None:
         """Write the mesh; an .obj from an .obj keeps all of its text but the positions and the directions of normals, and
-        its materials and images are copied beside it.
+        its materials and images are copied beside it. A .glb from a .glb, .gltf or .vrm keeps everything but positions and
+        what turns with them.
 
         Parameters
         ----------

@@ -17,8 +17,8 @@ def transfer_garment(
     target: Target,
     output: Path = output_option(
         "FILE",
-        "GARMENT on TGT. An .obj from an .obj keeps everything but the positions, and its materials and images are "
-        "copied beside it; .glb, .ply and others keep less, and say what is lost.",
+        "GARMENT on TGT. An .obj from an .obj, or a .glb from a .glb, keeps everything but the positions; materials "
+        "and images of an .obj are copied beside it. Other formats keep less, and say what is lost.",
     ),
     maps: MapOptions,
     run: RunOptions,

@@ -23,8 +23,8 @@ def wrap(
     scan: Path = Argument(..., metavar="SCAN", help="The shape whose surface it is laid on."),
     output: Path = output_option(
         "FILE",
-        "BASE on SCAN. An .obj from an .obj keeps everything but the positions, and its materials and images are "
-        "copied beside it; .glb, .ply and others keep less, and say what is lost.",
+        "BASE on SCAN. An .obj from an .obj, or a .glb from a .glb, keeps everything but the positions; materials "
+        "and images of an .obj are copied beside it. Other formats keep less, and say what is lost.",
     ),
     how: PairOptions,
     run: RunOptions,

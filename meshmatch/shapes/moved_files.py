@@ -1,4 +1,6 @@
-"""Meshes whose vertices have moved, in files: an obj keeps its text but for the positions, and takes its materials along."""
+"""Meshes whose vertices have moved, in files: a glb stays what it was but for the positions, and an obj keeps its text and
+takes its materials along.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import make_folder, replace_all_on_success
 from meshmatch.shapes.appearance import Appearance, png_bytes
 from meshmatch.shapes.files import check_suffix, save_shape
-from meshmatch.shapes.formats import Textured, gltf_out, obj_look, obj_text
+from meshmatch.shapes.formats import Textured, gltf, gltf_out, obj_look, obj_text
+from meshmatch.shapes.formats.gltf_moved import moved
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import find_appearance
@@ -80,6 +83,12 @@ class MovedFile:
             text = obj_text.with_positions(original.name, read_bytes(original), shape.verts_or_nan, turns)
             places[0].write_bytes(text)
             return
+        as_it_came = None
+        if original is not None and suffix == ".glb" and original.suffix.lower() in gltf.SUFFIXES:
+            as_it_came = _scene(self.output, original, shape, turns)
+        if as_it_came is not None:
+            places[0].write_bytes(as_it_came)
+            return
         look = None
         with suppress(InputError):  # an image that is not there is no reason to lose the mesh
             look = None if original is None or shape.is_cloud else find_appearance(original, shape)
@@ -103,6 +112,23 @@ def save_moved(path: str | Path, original: Path | None, shape: Shape, turns: Flo
         plan.write(places, shape, turns)
 
 
+def _scene(output: Path, original: Path, shape: Shape, turns: Float[Floats, "V 3 3"]) -> bytes | None:
+    """The original's scene with its vertices moved; None where it draws copies of a mesh, which cannot move apart. That
+    joints do not move is told.
+    """
+
+    def made(document: gltf.Document) -> tuple[bytes, bool] | None:
+        if gltf.INSTANCES in document.json.get("extensionsUsed", []):
+            return None
+        return moved(document, shape.verts_or_nan, turns), bool(document.json.get("skins"))
+
+    found = gltf.understood(original, read_bytes(original), "scene makes", made)
+    if found is not None and found[1]:
+        still = f"the joints of {original.name} stay where they are in {output.name}"
+        warn(f"{still}: `meshmatch transfer-rig {original.name} {output.name}` moves them")
+    return None if found is None else found[0]
+
+
 def _one_image(shape: Shape, look: Appearance) -> tuple[Textured, bytes] | None:
     """The mesh with its texture, a PNG, if that is all that its look says."""
     if len(look.materials) != 1 or look.colors is not None or look.materials[0].image is None:
@@ -123,6 +149,6 @@ def _lost(original: Path | None, look: Appearance | None, textured: bool) -> str
         lost += ["the texture coordinates", "the materials"]
     if suffix == ".obj":
         lost += ["the polygons", "the groups"]
-    elif suffix in (".glb", ".gltf"):
+    elif suffix in gltf.SUFFIXES:
         lost += ["other maps than the base color", "skins", "morph targets", "the nodes"]
     return " and ".join([", ".join(lost[:-1]), lost[-1]]) if len(lost) > 1 else "".join(lost)
