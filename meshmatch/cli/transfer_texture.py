@@ -40,7 +40,7 @@ def transfer_texture(
     target: Target,
     output: Path = output_option(
         "FILE",
-        "TGT with its texture: .glb, or .obj (with an .mtl and a .png of the same name). As .ply or .off, "
+        "TGT with its texture: .glb, or .obj (with an .mtl and images of the same name). As .ply or .off, "
         "and for a point cloud, it gets vertex colors instead.",
     ),
     texture: TextureOptions,
@@ -49,11 +49,11 @@ def transfer_texture(
     run: RunOptions,
     picture: Picture = None,
 ) -> None:
-    """Transfer the texture of one shape to another.
+    """Transfer the material of one shape to another: color, normals, roughness, metal, occlusion and emission.
 
-    Each texel takes the color of the corresponding point of SRC, from its materials and images or from its vertex
-    colors. The VALUE of --blank is a color such as #808080, or 0 for transparent. A glb or an obj keeps everything else
-    of a TGT in the same format: nodes, skins, clips, groups, polygons. Another TGT is turned upright in a glb.
+    Each texel takes those of the corresponding point of SRC, from its materials and images or from its vertex colors. The
+    VALUE of --blank is a color such as #808080, or 0 for transparent. A glb or an obj keeps everything else of a TGT in
+    the same format: nodes, skins, clips, groups, polygons. Another TGT is turned upright in a glb.
     """
     from meshmatch.shapes import textured_files
     from meshmatch.shapes.dressed_files import tell_lost
@@ -72,9 +72,10 @@ def transfer_texture(
     if painted and uv == "keep":
         hint = "leave out --uv keep" if b.is_cloud else "end the output in .glb or .obj for a texture"
         raise OptionError(f"{b.name} gets vertex colors, which need no texture coordinates", hint)
-    files = [output] if painted else textured_files.files_of(output)
+    look = textured_files.load_appearance(source, a, image)
+    layers = () if look.finish is None else look.finish.images
+    files = [output] if painted else textured_files.files_of(output, layers)
     with transfer.outputs(image, files=files) as temporary:
-        look = textured_files.load_appearance(source, a, image)
         if painted:
             done = meshmatch.transfer_colors(a, b, transfer, colors=look, rule=rule)
             save_colors(temporary[0], b, done.data, target)

@@ -11,7 +11,7 @@ import os
 import struct
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from io import BytesIO
@@ -40,11 +40,12 @@ _DAMAGE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error,
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """The base color of some faces: an image times a factor.
+    """The base color of some faces: an image times a factor. Or what else an image says of a surface (`Finish`).
 
-    `image` (H, W, 4) has sRGB colors and plain alpha; its top row begins at v = 0. `factor` is linear red, green, blue,
-    and alpha. `wrap` says what u and v outside 0..1 mean, `nearest` that the file wants texels as squares, not blended.
-    Alpha is ignored ("opaque"), compared with `cutoff` ("mask"), or a share ("blend").
+    `image` (H, W, 4) has sRGB colors, or numbers if it is `linear`, and plain alpha; its top row begins at v = 0. `factor`
+    is linear red, green, blue, and alpha; `strength` is how much the image of a layer counts. `wrap` says what u and v
+    outside 0..1 mean, `nearest` that the file wants texels as squares, not blended. Alpha is ignored ("opaque"), compared
+    with `cutoff` ("mask"), or a share ("blend").
     """
 
     name: str = ""
@@ -54,6 +55,41 @@ class Material:
     nearest: bool = False
     alpha: Alpha = "opaque"
     cutoff: float = 0.5
+    linear: bool = False
+    strength: float = 1.0
+
+
+Layer = Literal["normal", "surface", "occlusion", "glow"]
+
+
+@dataclass(frozen=True, eq=False)
+class Finish:
+    """What a file says of its surface besides its color.
+
+    Each layer is laid on like the colors, by materials and coordinates of its own: "normal", directions in the frame of the
+    surface; "surface", with roughness in green and metal in blue; "occlusion" in red; "glow", light that it sends out, in
+    units of `light`. A layer that is missing says nothing.
+    """
+
+    layers: Mapping[Layer, Appearance]
+    light: float = 1.0
+    double_sided: bool = True
+    unlit: bool = False
+
+    @property
+    def occluded(self) -> bool:
+        """Whether an image says where light is kept out."""
+        return "occlusion" in self.layers and self.layers["occlusion"].textured
+
+    @property
+    def images(self) -> tuple[Layer, ...]:
+        """The layers that need an image when they are baked; occlusion goes with the surface."""
+        needed: dict[Layer, bool] = {
+            "normal": "normal" in self.layers and self.layers["normal"].textured,
+            "surface": "surface" in self.layers and (self.occluded or not self.layers["surface"].plain),
+            "glow": "glow" in self.layers and not self.layers["glow"].plain,
+        }
+        return tuple(layer for layer, some in needed.items() if some)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +134,12 @@ class BakedMaterial:
     glow: Pixels | None = None
     light: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
+    @property
+    def layers(self) -> tuple[Layer, ...]:
+        """Those that there is an image of."""
+        shown: dict[Layer, Pixels | None] = {"normal": self.normal, "surface": self.surface, "glow": self.glow}
+        return tuple(layer for layer, image in shown.items() if image is not None)
+
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
@@ -105,7 +147,7 @@ class Appearance:
 
     There is at least one material; each face has one. `uv` are the texture coordinates of each corner: u to the right,
     v *down*, as in glTF, with the transforms that the file asks for; zeros where a material has no image. `colors` are
-    linear color and alpha of each vertex, to be multiplied.
+    linear color and alpha of each vertex, to be multiplied. `finish` is the rest of the materials, where it was asked for.
 
     `InputError` for a coordinate that is not finite or absurdly large on a face with an image.
     """
@@ -114,6 +156,7 @@ class Appearance:
     material: Int[Ints, " F"]
     uv: Float[Floats, "F 3 2"]
     colors: Float[Floats, "V 4"] | None = None
+    finish: Finish | None = None
 
     def __post_init__(self) -> None:
         pictured = np.array([m.image is not None for m in self.materials])[self.material]
@@ -132,7 +175,9 @@ class Appearance:
     def plain(self) -> bool:
         """True if there is nothing to see: no image, no vertex colors, one color all over."""
         factors = {self.materials[k].factor for k in np.unique(self.material).tolist()}
-        return not self.textured and self.colors is None and len(factors) <= 1
+        layers = () if self.finish is None else self.finish.layers.values()
+        bare = not self.textured and self.colors is None and len(factors) <= 1
+        return bare and not any(layer.textured for layer in layers)
 
 
 def visible(look: Appearance, name: str) -> Appearance:

@@ -18,7 +18,7 @@ from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_dressed import colored, dressed
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.textured_files import check_textured, files_of
+from meshmatch.shapes.textured_files import check_textured, files_of, image_file
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Dressed:
         `OptionError` if the suffix is neither .glb nor .obj, `OutputError` if a file cannot be written.
         """
         check_textured(path)
-        with replace_all_on_success(files_of(path)) as places:
+        with replace_all_on_success(files_of(path, self.material.layers)) as places:
             self.write(path, places)
 
     def write(self, path: Path, places: Sequence[Path]) -> None:
@@ -69,7 +69,8 @@ class Dressed:
         )
 
     def _write_obj(self, path: Path, places: Sequence[Path]) -> None:
-        files, name = files_of(path), "_".join((self.material.name or path.stem).split()) or "texture"
+        made, name = self.material, "_".join((self.material.name or path.stem).split()) or "texture"
+        files = files_of(path, made.layers)
         if self.file is not None and self.file.suffix.lower() == ".obj":
             text, names = self._kept_text(self.file, files[1].name, name)
             places[0].write_bytes(text)
@@ -78,8 +79,22 @@ class Dressed:
             mesh = Textured(self.shape.verts, self.shape.faces[real], self.uv[real])
             obj.write_textured(places[0], mesh, files[1].name, name)
             names = [name]
-        obj.write_materials(places[1], names, self.material, {"color": files[2].name})
-        places[2].write_bytes(png_bytes(self.material.color))
+        images = {"color": made.color}
+        if made.normal is not None:
+            images["normal"] = made.normal
+        if made.surface is not None:
+            for k, word in ((1, "roughness"), (2, "metal")):
+                images[word] = np.dstack([*[made.surface[..., k]] * 3, made.surface[..., 3]])
+        if made.glow is not None:
+            images["emission"] = made.glow
+        where = dict(zip(files, places, strict=True))
+        named = {word: image_file(path, word) if word != "color" else files[2] for word in images}
+        obj.write_materials(places[1], names, made, {word: file.name for word, file in named.items()})
+        for word, image in images.items():
+            where[named[word]].write_bytes(png_bytes(image))
+        if made.occluded or made.unlit:
+            lost = " and ".join(["an occlusion map"] * made.occluded + ["materials without light"] * made.unlit)
+            warn(f"{path.name} does not have {lost}: an mtl holds none")
 
     def _kept_text(self, file: Path, library: str, name: str) -> tuple[bytes, list[str]]:
         data = read_bytes(file)

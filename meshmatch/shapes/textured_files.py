@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +12,14 @@ from meshmatch import blender
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes import appearance
-from meshmatch.shapes.appearance import Appearance, ImageReader
-from meshmatch.shapes.formats import gltf, gltf_attributes, obj_look, ply_look
+from meshmatch.shapes.appearance import Appearance, ImageReader, Layer
+from meshmatch.shapes.formats import gltf, gltf_attributes, gltf_finish, obj_look, ply_look
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
 TEXTURED_SUFFIXES = (".glb", ".obj")
+_FINISHES = dict.fromkeys(gltf.SUFFIXES, gltf_finish.read_finish) | {".obj": obj_look.read_finish}
+_SHOWN: dict[Layer, tuple[str, ...]] = {"normal": ("normal",), "surface": ("roughness", "metal"), "glow": ("emission",)}
 _READERS = {  # of the look, and of texture coordinates alone
     **dict.fromkeys(gltf.SUFFIXES, (gltf_attributes.read_look, gltf_attributes.read_coordinates)),
     ".obj": (obj_look.read_look, obj_look.read_coordinates),
@@ -26,7 +30,7 @@ _READERS = {  # of the look, and of texture coordinates alone
 def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = None) -> Appearance:
     """What a file says about the look of its surface.
 
-    glb and gltf: materials with base color image and factor, samplers, texture transforms, vertex colors.
+    glb and gltf: materials with their images and factors, samplers, texture transforms, vertex colors.
     obj: its mtl with Kd, map_Kd, d and map_d, beside it. ply: the images that its comments name, beside it, or else vertex
     colors. Everything else: vertex colors.
 
@@ -34,7 +38,7 @@ def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
     names, or that it fails to name. `InputError`: an image or material file is missing, damaged, too large, or outside
     the file's folder; there are no texture coordinates for `image`; or the file has no look at all.
     """
-    found = find_appearance(path, shape, image)
+    found = find_appearance(path, shape, image, finished=True)
     if found is None:
         nothing = f"{Path(path).name} has no texture and no vertex colors: there is nothing to transfer"
         hint = "name a picture for its texture coordinates with --image, or export it with its materials"
@@ -42,8 +46,10 @@ def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
     return found
 
 
-def find_appearance(path: str | Path, shape: Shape, image: str | Path | None = None) -> Appearance | None:
-    """As `load_appearance`, but None where the file has no look at all."""
+def find_appearance(
+    path: str | Path, shape: Shape, image: str | Path | None = None, finished: bool = False
+) -> Appearance | None:
+    """As `load_appearance`, but None where the file has no look at all, and with a finish only if that is asked for."""
     path = Path(path)
     suffix, reader = path.suffix.lower(), ImageReader()
     picture = None if image is None else reader.decode(read_bytes(Path(image)), Path(image).name)
@@ -56,6 +62,8 @@ def find_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
         found = appearance.vertex_colors_alone(shape)
     if len(found.material) != shape.F or (found.colors is not None and len(found.colors) != shape.V):
         raise InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
+    if finished and suffix in _FINISHES:
+        found = replace(found, finish=_FINISHES[suffix](path, read_bytes(path), shape, reader))
     return None if found.plain else appearance.visible(found, path.name)
 
 
@@ -72,9 +80,17 @@ def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] |
     return found if shape.F else None
 
 
-def files_of(path: Path) -> list[Path]:
-    """What will be written for an output: an obj has two companions."""
-    return [path, *(path.with_suffix(end) for end in (".mtl", ".png") if path.suffix.lower() == ".obj")]
+def files_of(path: Path, layers: Collection[Layer] = ()) -> list[Path]:
+    """What will be written for an output: an obj has companions, more of them with images of these layers."""
+    if path.suffix.lower() != ".obj":
+        return [path]
+    shown = [word for layer in layers for word in _SHOWN.get(layer, ())]
+    return [path, path.with_suffix(".mtl"), path.with_suffix(".png"), *(image_file(path, word) for word in shown)]
+
+
+def image_file(path: Path, word: str) -> Path:
+    """The image beside an output that shows what a word says."""
+    return path.with_name(f"{path.stem}-{word}.png")
 
 
 def check_textured(path: Path, colored: tuple[str, ...] = ()) -> None:

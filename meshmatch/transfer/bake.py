@@ -7,8 +7,8 @@ its texture coordinates: they are never interpolated across the source's seams. 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import count
 from numbers import Integral
 
@@ -17,10 +17,10 @@ import numpy as np
 from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32
 from meshmatch.errors import OptionError
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.appearance import Alpha, Appearance, BakedMaterial, Pixels
-from meshmatch.shapes.colors import bytes_of
+from meshmatch.shapes.appearance import Alpha, Appearance, BakedMaterial, Finish, Layer, Pixels
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map
+from meshmatch.transfer.layers import ColorPainter, NormalPainter, Painter, Spots, SurfacePainter, painted_bytes
 from meshmatch.transfer.surface_walk import PointWalker, SurfaceWalker
 from meshmatch.transfer.texel_colors import MaterialSampler, TexelLocator, images_of
 from meshmatch.transfer.texels import beside_another, faces_on, fill, grown
@@ -120,7 +120,7 @@ def transfer_texture(
     """Bake the look of a source's file (`load_appearance`) for a target mesh, along a map from target to source, into
     an atlas (`atlas_of`) for the options' size and padding; `progress` is called with the share that is done.
     """
-    walker, sampler = _arranged(source, look)
+    walker, look = _arranged(source, look)
     uv = atlas.uv
     if target.invalid is not None:  # faces with a corner that has no position
         valid = target.valid_faces
@@ -128,15 +128,21 @@ def transfer_texture(
     locator = TexelLocator(walker, target, back, uv * options.size)
     inside = faces_on(uv * options.size, options.size)[0]
     on = grown(inside, _OVERHANG if options.padding else 0)
-    image, low = _painted(sampler, locator, on.reshape(-1), options, progress)
-    alpha = _fill_and_blank(image, on.reshape(-1) >= 0, low, options, sampler.alpha)
-    if options.padding == 0:
-        image[inside < 0] = 0
-    elif alpha == "opaque":
-        image[..., 3] = 255
+    color = ColorPainter(look, walker)
+    painters: dict[Layer, Painter] = {} if look.finish is None else _painters(look.finish, walker, locator, uv)
+    (image, *others), low = _painted([color, *painters.values()], locator, on.reshape(-1), options, progress)
+    alpha = _fill_and_blank(image, on.reshape(-1) >= 0, low, options, color.sampler.alpha)
+    for other, painter in zip(others, painters.values(), strict=True):
+        _fill(other, (on.reshape(-1) >= 0) & ~(low & options.fill), options, painter.linear)
+    for each in (image, *others):
+        if options.padding == 0:
+            each[inside < 0] = 0
+        elif alpha == "opaque" or each is not image:
+            each[..., 3] = 255
     progress(1.0)
     torn = float(target.face_areas[locator.discontinuous].sum()) / max(target.area, 1e-300)
-    material = BakedMaterial(image, alpha, sampler.cutoff, _name_of(look))
+    plain = BakedMaterial(image, alpha, color.sampler.cutoff, _name_of(look))
+    material = _finished(plain, look, dict(zip(painters, others, strict=True)))
     return Baked(material, float((inside >= 0).mean()), _share_of_surface(target, inside.reshape(-1), low), torn)
 
 
@@ -146,29 +152,72 @@ def _name_of(look: Appearance) -> str:
     return names.pop() if len(names) == 1 else ""
 
 
+def _painters(finish: Finish, walker: SurfaceWalker, locator: TexelLocator, uv: Floats) -> dict[Layer, Painter]:
+    """What paints the layers of a finish that need an image."""
+    found: dict[Layer, Painter] = {}
+    for layer in finish.images:
+        if layer == "normal":
+            found[layer] = NormalPainter(finish.layers[layer], walker, locator, uv)
+        else:
+            found[layer] = (
+                SurfacePainter(finish, walker) if layer == "surface" else ColorPainter(finish.layers[layer], walker)
+            )
+    return found
+
+
+def _finished(plain: BakedMaterial, look: Appearance, images: dict[Layer, Pixels]) -> BakedMaterial:
+    """A baked material with the finish of a look: images, and numbers where those of all faces are the same."""
+    finish = look.finish
+    if finish is None:
+        return plain
+    made = replace(plain, double_sided=finish.double_sided, unlit=finish.unlit, normal=images.get("normal"))
+    if "surface" in images:
+        made = replace(made, surface=images["surface"], occluded=finish.occluded, roughness=1.0, metal=1.0)
+    elif "surface" in finish.layers:
+        _, roughness, metal, _ = _factor(finish.layers["surface"])
+        made = replace(made, roughness=roughness, metal=metal)
+    if "glow" in images:
+        return replace(made, glow=images["glow"], light=(finish.light,) * 3)
+    if "glow" in finish.layers:
+        red, green, blue = (finish.light * share for share in _factor(finish.layers["glow"])[:3])
+        return replace(made, light=(red, green, blue))
+    return made
+
+
+def _factor(layer: Appearance) -> tuple[float, float, float, float]:
+    """That of all faces."""
+    return layer.materials[int(layer.material[0]) if len(layer.material) else 0].factor
+
+
 def colors_of_vertices(source: Shape, look: Appearance, target: Shape, back: VertexMap) -> Floats:
     """(V_tgt, 4) linear colors and alpha of a target's vertices or points, as wide as the gaps between them."""
-    walker, sampler = _arranged(source, look)
+    walker, look = _arranged(source, look)
+    sampler = MaterialSampler(look, walker)
     points, start = images_of(walker, back)
     place, weights, _ = walker.closest(points.T.astype(np.float32, order="C"), start.astype(np.int32))
     reach = np.sqrt(target.vertex_areas / max(target.area, 1e-300)).astype(np.float32)
     return sampler.colors(place, weights, sampler.footprint(place, reach)).T.astype(np.float64)
 
 
-def _arranged(source: Shape, look: Appearance) -> tuple[SurfaceWalker, MaterialSampler]:
+def _arranged(source: Shape, look: Appearance) -> tuple[SurfaceWalker, Appearance]:
     """A source and its look, ready to be looked up; each point of a cloud is a face."""
-    walker = PointWalker(source) if source.is_cloud else SurfaceWalker(source)
     if source.is_cloud:
-        look = Appearance(look.materials, np.zeros(source.V, np.int64), np.zeros((source.V, 3, 2)), look.colors)
-    return walker, MaterialSampler(look, walker)
+        plain = Appearance(look.materials, np.zeros(source.V, np.int64), np.zeros((source.V, 3, 2)), look.colors)
+        return PointWalker(source), plain
+    return SurfaceWalker(source), look
 
 
 def _painted(
-    sampler: MaterialSampler, locator: TexelLocator, on: Ints32, options: BakeOptions, progress: Callable[[float], None]
-) -> tuple[Pixels, Bools]:
-    """The image, painted where a triangle lies on a texel (N,), and the texels (N,) of low confidence."""
+    painters: Sequence[Painter],
+    locator: TexelLocator,
+    on: Ints32,
+    options: BakeOptions,
+    progress: Callable[[float], None],
+) -> tuple[list[Pixels], Bools]:
+    """The images, painted where a triangle lies on a texel (N,), and the texels (N,) of low confidence."""
     size = options.size
-    pixels = np.zeros((size * size, 4), np.uint8)
+    images = [np.zeros((size * size, 4), np.uint8) for _ in painters]
+    samplers = [sampler for painter in painters for sampler in painter.samplers]
     chart, hint = np.full(size * size, -1, np.int32), np.full(size * size, -1, np.int32)
     coarse, low = np.zeros(size * size, bool), np.zeros(size * size, bool)
 
@@ -177,9 +226,12 @@ def _painted(
         row, column = np.divmod(at, size)
         weights, place, held = locator.locate(face, (column + 0.5).astype(np.float32), (row + 0.5).astype(np.float32))
         low[at] = locator.confidence(face, weights) < options.min_confidence
-        footprint = sampler.footprint(place, locator.reach.take(face))
-        _store(pixels, at, sampler.colors(place, held, footprint))
-        chart[at], hint[at], coarse[at] = sampler.chart[place], place, footprint > _COARSE
+        spots = Spots(face, weights, place, held, locator.reach.take(face))
+        for image, painter in zip(images, painters, strict=True):
+            image[at] = painted_bytes(painter, painter.seen(spots))
+        chart[at], hint[at] = samplers[0].chart[place], place
+        footprint = np.max([sampler.footprint(place, spots.reach) for sampler in samplers], axis=0)
+        coarse[at] = footprint > _COARSE
 
     grid = (np.arange(options.samples, dtype=np.float32) + np.float32(0.5)) / options.samples
     steps = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
@@ -187,18 +239,15 @@ def _painted(
     def again(at: Ints) -> None:
         row, column = (part.astype(np.float32) for part in np.divmod(at, size))
         face, start = on[at], hint[at]
-        total, plain = np.zeros((4, len(at)), np.float32), np.zeros((3, len(at)), np.float32)
+        means = [_Mean(len(at)) for _ in painters]
         for right, down in steps:
-            _, place, held = locator.locate(face, column + right, row + down, start)
+            weights, place, held = locator.locate(face, column + right, row + down, start)
             narrow = locator.reach.take(face) / np.float32(options.samples)
-            seen = sampler.colors(place, held, sampler.footprint(place, narrow))
-            plain += seen[:3]
-            seen[:3] *= seen[3]  # transparent samples do not count for the color
-            total += seen
-        share = total[3]
-        total[:3] = np.where(share > 0, total[:3] / np.where(share > 0, share, 1), plain / len(steps))
-        total[3] /= len(steps)
-        _store(pixels, at, total)
+            spots = Spots(face, weights, place, held, narrow)
+            for mean, painter in zip(means, painters, strict=True):
+                mean.add(painter.seen(spots))
+        for image, mean, painter in zip(images, means, painters, strict=True):
+            image[at] = painted_bytes(painter, mean.result())
 
     def run(work: Callable[[Ints], None], chosen: Ints, done: float, share: float) -> None:
         parts, finished = [chosen[k : k + _CHUNK] for k in range(0, len(chosen), _CHUNK)], count(1)
@@ -213,12 +262,26 @@ def _painted(
     if options.samples > 1:  # at seams, and where a texel covers much of the source's
         several = coarse | beside_another(chart.reshape(size, size)).reshape(-1)
         run(again, np.flatnonzero(several), 0.5, 0.45)
-    return pixels.reshape(size, size, 4), low
+    return [image.reshape(size, size, 4) for image in images], low
 
 
-def _store(pixels: Pixels, at: Ints, colors: Floats32) -> None:
-    pixels[at, :3] = bytes_of(colors[:3]).T
-    pixels[at, 3] = np.round(np.clip(colors[3], 0, 1) * 255)
+class _Mean:
+    """The mean of amounts and alpha (4, N); transparent ones do not count for the color."""
+
+    def __init__(self, N: int) -> None:
+        self.total, self.plain, self.count = np.zeros((4, N), np.float32), np.zeros((3, N), np.float32), 0
+
+    def add(self, seen: Floats32) -> None:
+        self.plain += seen[:3]
+        seen[:3] *= seen[3]
+        self.total += seen
+        self.count += 1
+
+    def result(self) -> Floats32:
+        share = self.total[3]
+        self.total[:3] = np.where(share > 0, self.total[:3] / np.where(share > 0, share, 1), self.plain / self.count)
+        self.total[3] /= self.count
+        return self.total
 
 
 def _fill_and_blank(image: Pixels, painted: Bools, low: Bools, options: BakeOptions, alpha: Alpha) -> Alpha:
@@ -228,8 +291,7 @@ def _fill_and_blank(image: Pixels, painted: Bools, low: Bools, options: BakeOpti
     weight = known.astype(np.float32)
     if alpha != "opaque":
         weight *= np.maximum(pixels[:, 3], 1) / np.float32(255)
-    if options.padding or options.fill:
-        fill(image, weight.reshape(image.shape[:2]))
+    _fill(image, weight, options)
     if options.blank is not None:
         red, green, blue, share = np.round(255 * np.array(options.blank)).astype(np.uint8).tolist()
         pixels[low, 3] = share
@@ -238,6 +300,12 @@ def _fill_and_blank(image: Pixels, painted: Bools, low: Bools, options: BakeOpti
         if share < 255 and low.any() and alpha == "opaque":
             return "blend" if share else "mask"
     return alpha
+
+
+def _fill(image: Pixels, weight: Bools | Floats32, options: BakeOptions, linear: bool = False) -> None:
+    """Fill in the texels of an image whose weight (N,) is 0, where the options ask for that."""
+    if options.padding or options.fill:
+        fill(image, weight.astype(np.float32).reshape(image.shape[:2]), linear)
 
 
 def _share_of_surface(target: Shape, inside: Ints32, low: Bools) -> float:

@@ -10,7 +10,7 @@ from scipy.ndimage import maximum_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32
+from meshmatch.arrays import Bools, Float, Floats, Floats32, Ints, Ints32
 from meshmatch.geometry.triangles import cross_product, interpolate, squared_lengths
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Alpha, Appearance, Material
@@ -187,7 +187,7 @@ class TexelLocator:
         self.walker = walker
         self._confidence = back.confidence.astype(np.float32)
         self._image, start = images_of(walker, back)
-        self._faces, self._verts = target.faces, target.verts
+        self.faces, self.verts = target.faces, target.verts
         self._corners = list(np.ascontiguousarray(target.faces.T))
         held = self._image[target.faces]
         first, second = held[:, 1] - held[:, 0], held[:, 2] - held[:, 0]
@@ -205,9 +205,16 @@ class TexelLocator:
             self._jacobian = _jacobians(target, held, ~self.discontinuous)
             bend = (scale * own_length.max(axis=1) / np.maximum(self._size, 1e-12)).astype(np.float32)
             self.reach[self.discontinuous] *= bend[self.discontinuous]
+        self._steps = first, second
         self._start = list(start[target.faces].T.astype(np.int32, order="C"))
         table = np.concatenate([corners[:, 0], flat, held[:, 0], first, second], axis=1)
         self._table = list(table.T.astype(np.float32, order="C"))
+
+    def laid(self, directions: Float[Floats, "F N M 3"]) -> Float[Floats, "F N M 3"]:
+        """Directions along each triangle of the target, as the map lays them on the source."""
+        shares = (np.einsum("fnmi,fi->fnm", directions, dual) for dual in duals(self.verts[self.faces]))
+        one, two = (share[..., None] * step[:, None, None] for share, step in zip(shares, self._steps, strict=True))
+        return np.asarray(one + two)
 
     def locate(
         self, face: Ints32, x: Floats32, y: Floats32, start: Ints32 | None = None
@@ -256,9 +263,9 @@ class TexelLocator:
 
     def _continued(self, face: Ints32, weights: Floats32, corner: Ints) -> Floats32:
         """Points (3, N) of discontinuous triangles: the surface around the nearest corner, continued."""
-        vertex = self._faces[face, corner]
-        corners = self._verts[self._faces[face]]
-        away = np.einsum("kn,nkd->nd", weights, corners) - self._verts[vertex]
+        vertex = self.faces[face, corner]
+        corners = self.verts[self.faces[face]]
+        away = np.einsum("kn,nkd->nd", weights, corners) - self.verts[vertex]
         points = self._image[vertex] + np.einsum("nij,nj->ni", self._jacobian[vertex], away)
         return np.asarray(points.T, np.float32)
 

@@ -102,13 +102,14 @@ def beside_another(values: Ints32) -> Bools:
     return out
 
 
-def fill(pixels: Pixels, weight: Floats32) -> list[Pixels]:
+def fill(pixels: Pixels, weight: Floats32, linear: bool = False) -> list[Pixels]:
     """All levels of (H, W, 4) pixels, these first, each half as large as the one before, down to one texel. Those whose
     weight (H, W) is 0 are filled, in place; if nothing at all is known, everything counts.
+    `linear` pixels are numbers, which are averaged as they are.
     """
     levels, weights = [pixels], [weight if (weight > 0).any() else np.ones_like(weight)]
     while max(levels[-1].shape[:2]) > 1:
-        smaller, lighter = _next_level(levels[-1], weights[-1])
+        smaller, lighter = _next_level(levels[-1], weights[-1], linear)
         levels.append(smaller)
         weights.append(lighter)
     for k in range(len(levels) - 2, -1, -1):
@@ -122,18 +123,18 @@ def fill(pixels: Pixels, weight: Floats32) -> list[Pixels]:
     return levels
 
 
-def _next_level(pixels: Pixels, weight: Floats32) -> tuple[Pixels, Floats32]:
+def _next_level(pixels: Pixels, weight: Floats32, linear: bool) -> tuple[Pixels, Floats32]:
     height, width = pixels.shape[:2]
     out = np.zeros(((height + 1) // 2, (width + 1) // 2, 4), np.uint8)
     total = np.zeros(out.shape[:2], np.float32)
     for low in range(0, height, 2 * _ROWS):
         part = pixels[low : low + 2 * _ROWS]
         light = np.empty(part.shape, np.float32)
-        light[..., :3] = LINEAR_OF_BYTE.take(part[..., :3])
+        light[..., :3] = part[..., :3] if linear else LINEAR_OF_BYTE.take(part[..., :3])
         light[..., 3] = part[..., 3]
         mean, known = _halved(light, weight[low : low + 2 * _ROWS])
         rows = slice(low // 2, low // 2 + len(mean))
-        out[rows, :, :3] = bytes_of(mean[..., :3])
+        out[rows, :, :3] = np.round(mean[..., :3]) if linear else bytes_of(mean[..., :3])
         out[rows, :, 3] = np.round(mean[..., 3])
         total[rows] = known
     return out, total
@@ -166,7 +167,8 @@ class Pyramid:
             pixels[..., 3] = 255
         else:
             weight *= alpha / np.float32(255)
-        levels = fill(pixels, weight)
+        levels = fill(pixels, weight, material.linear)
+        self.table = _SHARE if material.linear else LINEAR_OF_BYTE
         if material.alpha != "opaque":  # colors are made up, not the holes between them
             pixels[..., 3] = alpha
             means, share = alpha.astype(np.float32)[..., None], np.ones(alpha.shape, np.float32)
@@ -211,7 +213,7 @@ class Pyramid:
         corners = [self.texels.take(row + column) for row in rows for column in columns]
         out = np.empty((4, len(u)), np.float32)
         for k in range(4):
-            a, b, c, d = (_light(texel, k) for texel in corners)
+            a, b, c, d = (_amounts(texel, k, _SHARE if k == 3 else self.table) for texel in corners)
             out[k] = _mixed(_mixed(a, b, across), _mixed(c, d, across), down)
         return out
 
@@ -223,7 +225,7 @@ def pyramids_of(
 
     ``known`` texels (H, W) of a material are asked for with the coordinates (F, 3, 2) of all faces that share it.
     """
-    keys = [(id(m.image), m.wrap, m.nearest, m.alpha == "opaque") for m in look.materials]
+    keys = [(id(m.image), m.wrap, m.nearest, m.alpha == "opaque", m.linear) for m in look.materials]
     used = [k for k in np.unique(look.material).tolist() if look.materials[k].image is not None]
     made: dict[tuple[object, ...], Pyramid] = {}
     group = {key: k for k, key in enumerate(dict.fromkeys(keys))}
@@ -238,11 +240,10 @@ def pyramids_of(
     return {number: made[keys[number]] for number in used}
 
 
-def _light(texels: NDArray[np.uint32], channel: int) -> Floats32:
-    """Light of red, green or blue, or alpha as it is, of texels whose bytes come in this order."""
+def _amounts(texels: NDArray[np.uint32], channel: int, table: Floats32) -> Floats32:
+    """What a table has for the bytes of a channel of texels: red, green, blue and alpha, in this order."""
     shift = 8 * channel if sys.byteorder == "little" else 24 - 8 * channel
-    byte = (texels >> np.uint32(shift)).astype(np.uint8)
-    return (_SHARE if channel == 3 else LINEAR_OF_BYTE).take(byte)
+    return table.take((texels >> np.uint32(shift)).astype(np.uint8))
 
 
 def _mixed(a: Floats32, b: Floats32, share: Floats32) -> Floats32:

@@ -1,8 +1,9 @@
 """What a glTF scene says of its vertices besides their places: how they look, and which joint moves which.
 
 Specification: Khronos glTF 2.0, sections 3.7.3, 3.8 and 3.9; KHR_texture_transform,
-KHR_materials_pbrSpecularGlossiness (its diffuse part) and EXT_texture_webp. Metal, roughness, normals and light are
-ignored. Vertices and faces are those of `meshmatch.shapes.formats.gltf.read`, in the same order.
+KHR_materials_pbrSpecularGlossiness (its diffuse part) and EXT_texture_webp. Metal, roughness, normals and light are read
+by `meshmatch.shapes.formats.gltf_finish`. Vertices and faces are those of `meshmatch.shapes.formats.gltf.read`, in the
+same order.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _NEAREST = 9728
 
 def read_look(path: Path, data: bytes, _: Shape, reader: ImageReader, picture: Pixels | None) -> Appearance:
     """Materials and texture coordinates; `picture` replaces all images."""
-    return understood(path, data, "materials make", lambda document: _Look(document, reader, picture).scene())
+    return understood(path, data, "materials make", lambda document: Look(document, reader, picture).scene())
 
 
 def read_coordinates(path: Path, data: bytes, _: Shape) -> Float[Floats, "F 3 2"] | None:
@@ -60,13 +61,16 @@ def _coordinates(document: Document) -> Floats | None:
     return np.concatenate(parts)
 
 
-class _Look:
+class Look:
+    """Reads the colors of a scene."""
+
     def __init__(self, document: Document, reader: ImageReader, picture: Pixels | None) -> None:
         self.document, self.json, self.reader, self.picture = document, document.json, reader, picture
         self.images: dict[int, Pixels] = {}
         self.materials: dict[tuple[int, bool], Material] = {}
 
     def scene(self) -> Appearance:
+        """What lies on its faces, in the order of `gltf.read`."""
         uvs: list[Floats] = [np.empty((0, 3, 2))]
         kinds: list[Ints] = [np.empty(0, np.int64)]
         colors: list[Floats | None] = []
@@ -79,7 +83,7 @@ class _Look:
             uv = self._coordinates(primitive) if len(faces) else None
             key = primitive.get("material", -1), uv is not None
             if key not in self.materials:
-                self.materials[key] = self._read(*key)
+                self.materials[key] = self.read(*key)
             kinds.append(np.full(len(faces), numbers.setdefault(key, len(numbers))))
             uvs.append(np.zeros((len(faces), 3, 2)) if uv is None else uv[faces])
         painted = joined_colors(colors, counts)
@@ -88,7 +92,7 @@ class _Look:
             raise no_coordinates(self.document.name)
         return found
 
-    def _base(self, number: int) -> tuple[dict[str, Any], dict[str, Any] | None, tuple[float, ...]]:
+    def base(self, number: int) -> tuple[dict[str, Any], dict[str, Any] | None, tuple[float, ...]]:
         """A material, its base color texture and its factor."""
         material = self.json["materials"][number] if number >= 0 else {}
         gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
@@ -97,9 +101,9 @@ class _Look:
         pbr = material.get("pbrMetallicRoughness", {})
         return material, pbr.get("baseColorTexture"), tuple(pbr.get("baseColorFactor", (1.0,) * 4))
 
-    def _read(self, number: int, laid: bool) -> Material:
+    def read(self, number: int, laid: bool) -> Material:
         """A material of the file, with its image if there are coordinates."""
-        entry, texture, factor = self._base(number)
+        entry, texture, factor = self.base(number)
         red, green, blue, alpha = (float(np.clip(value, 0.0, 1.0)) for value in factor)
         meaning, cutoff = _ALPHAS[entry.get("alphaMode", "OPAQUE")], float(entry.get("alphaCutoff", 0.5))
         name, factor = str(entry.get("name", "")), (red, green, blue, alpha)
@@ -131,7 +135,7 @@ class _Look:
 
     def _coordinates(self, primitive: dict[str, Any]) -> Floats | None:
         """(V, 2) coordinates of a primitive's vertices, or None where it has none, or nothing to lay on."""
-        _, texture, _ = self._base(primitive.get("material", -1))
+        _, texture, _ = self.base(primitive.get("material", -1))
         if texture is None and self.picture is None:
             return None
         texture = texture or {}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import numpy as np
 from meshmatch.arrays import Bools, Float, Floats, Ints
 from meshmatch.errors import InputError, warn
 from meshmatch.shapes import appearance
-from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap
+from meshmatch.shapes.appearance import Alpha, Appearance, Finish, ImageReader, Layer, Material, Pixels, Wrap
 from meshmatch.shapes.colors import to_linear
 from meshmatch.shapes.companions import beside, folded
 from meshmatch.shapes.formats import DECIMAL_COMMA, columns, damaged, lines_of, numbers, words_per_line
@@ -24,6 +25,7 @@ from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
+_FINISH = ("pr", "pm", "ke", "map_pr", "map_pm", "map_ke", "norm", "map_bump", "bump")
 _LARGEST_MTL = 10_000_000  # bytes
 _MOST_LIBRARIES = 100  # names in one line
 _COMMENT = re.compile(r"\s#.*")  # or the end of a name, such as Material #25
@@ -55,6 +57,8 @@ class _Entry:
     transparency: float = 0.0
     image: _Map | None = None
     alpha: _Map | None = None
+    numbers: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    maps: dict[str, _Map] = field(default_factory=dict)
     folder: Path = field(default_factory=Path)
 
     @property
@@ -65,28 +69,14 @@ class _Entry:
 
 def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, picture: Pixels | None) -> Appearance:
     """Materials and texture coordinates, face by face in the order of `obj.read`; `picture` replaces all images."""
-    data = joined_lines(data)
-    named, libraries = (_words(*found) for found in lines_of(data, b"usemtl", b"mtllib"))
-    corners, laid, lines = _coordinates(path.name, data, shape)
-    names = list(dict.fromkeys(name for name, _ in named))
-    place = {name: k for k, name in enumerate(names)}
-    used = np.searchsorted([line for _, line in named], lines, side="right") - 1
-    used = np.array([*(place[name] for name, _ in named), -1])[used]  # -1: none named yet
-    names.append("")
-    entries = {} if picture is not None else _libraries(path, [name for name, _ in libraries], shape)
-    wanted = {names[k] for k in np.unique(used).tolist()}
-    meant = _materials_meant(path.name, wanted, entries.keys()) if entries else {name: name for name in wanted}
-    # Only what faces use is read; a material counts twice where some of its faces have no coordinates.
-    _, which, kind = np.unique(2 * used + laid, return_index=True, return_inverse=True)
-    kind = kind.reshape(-1).astype(np.int64)
+    worn = _worn(path, joined_lines(data), shape, picture is None)
+    corners, laid, kind = worn.corners, worn.laid, worn.kind
     materials: list[Material] = []
-    scale, offset = np.ones((len(which), 2)), np.zeros((len(which), 2))
-    for number, face in enumerate(which.tolist()):
-        name = meant[names[used[face]]]
-        entry = entries.get(name, _Entry())
-        image = picture if picture is not None else _image(path, name, entry, reader, bool(laid[face]))
-        materials.append(_material(name, entry, image if laid[face] else None))
-        if laid[face] and entry.image is not None:
+    scale, offset = np.ones((len(worn.entries), 2)), np.zeros((len(worn.entries), 2))
+    for number, (name, entry, covered) in enumerate(worn.entries):
+        image = picture if picture is not None else _image(path, name, entry, reader, covered)
+        materials.append(_material(name, entry, image if covered else None))
+        if covered and entry.image is not None:
             scale[number], offset[number] = entry.image.scale, entry.image.offset
     corners[laid] = corners[laid] * scale[kind[laid], None] + offset[kind[laid], None]
     corners[laid, :, 1] = 1.0 - corners[laid, :, 1]
@@ -97,6 +87,86 @@ def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, pictur
     if picture is not None and not laid.any():
         raise appearance.no_coordinates(path.name)
     return Appearance(tuple(materials), kind, corners)
+
+
+def read_finish(path: Path, data: bytes, shape: Shape, reader: ImageReader) -> Finish | None:
+    """What the materials say besides their color, as exporters of physically based materials write it: ``Pr``, ``Pm``,
+    ``Ke``, their maps, and a normal map (``norm`` or ``map_Bump``). An image that cannot be read is told, and left out.
+    """
+    worn = _worn(path, joined_lines(data), shape, True)
+    if not any(entry.numbers or entry.maps for _, entry, _ in worn.entries):
+        return None
+    corners = worn.corners
+    corners[worn.laid, :, 1] = 1.0 - corners[worn.laid, :, 1]
+    made: dict[Layer, list[Material]] = {"normal": [], "surface": [], "glow": []}
+    for name, entry, covered in worn.entries:
+        images: dict[str, Pixels] = {}
+        for word, placed in entry.maps.items() if covered else ():
+            try:
+                images[word] = _decoded(path, name, entry, placed, reader)
+            except InputError as error:
+                warn(f"{error.message}; it is left out")
+        normal = images.get("norm", images.get("map_bump", images.get("bump")))
+        if normal is not None and (normal[..., 0] == normal[..., 2]).all():
+            warn(f"the bump map of {name} in {path.name} holds heights, which are not transferred")
+            normal = None
+        flat = (0.5, 0.5, 1.0, 1.0) if normal is None else (1.0,) * 4
+        made["normal"].append(Material(name, normal, flat, linear=True))
+        made["surface"].append(_surface(name, entry, images.get("map_pr"), images.get("map_pm")))
+        glow = images.get("map_ke")
+        red, green, blue = entry.numbers.get("ke", (0.0,) * 3)
+        if glow is not None and not (red or green or blue):  # as some programs write it beside the image
+            red = green = blue = 1.0
+        made["glow"].append(Material(name, glow, (red, green, blue, 1.0)))
+    layers: dict[Layer, Appearance] = {
+        layer: Appearance(tuple(materials), worn.kind, corners) for layer, materials in made.items()
+    }
+    return Finish(layers)
+
+
+def _surface(name: str, entry: _Entry, rough: Pixels | None, metal: Pixels | None) -> Material:
+    """Roughness in green and metal in blue, of images or of numbers; matt paint without either."""
+    factors = [1.0, *entry.numbers.get("pr", (1.0,))[:1], *entry.numbers.get("pm", (0.0,))[:1], 1.0]
+    if rough is None and metal is None:
+        return Material(name, None, (factors[0], factors[1], factors[2], 1.0), linear=True)
+    if rough is not None and metal is not None and rough.shape != metal.shape:
+        warn(f"the maps of roughness and metal of {name} differ in size: the second is left out")
+        metal = None
+    image = np.full_like(rough if rough is not None else metal, 255)
+    for channel, given in ((1, rough), (2, metal)):
+        if given is not None:
+            image[..., channel], factors[channel] = given[..., 0], 1.0
+    return Material(name, image, (factors[0], factors[1], factors[2], 1.0), linear=True)
+
+
+@dataclass
+class _Worn:
+    """Of each face its coordinates (v up), whether it has any, and its number in a list of materials: name, entry, and
+    whether its faces have coordinates.
+    """
+
+    corners: Floats
+    laid: Bools
+    kind: Ints
+    entries: list[tuple[str, _Entry, bool]]
+
+
+def _worn(path: Path, data: bytes, shape: Shape, libraries_too: bool) -> _Worn:
+    named, libraries = (_words(*found) for found in lines_of(data, b"usemtl", b"mtllib"))
+    corners, laid, lines = _coordinates(path.name, data, shape)
+    names = list(dict.fromkeys(name for name, _ in named))
+    place = {name: k for k, name in enumerate(names)}
+    used = np.searchsorted([line for _, line in named], lines, side="right") - 1
+    used = np.array([*(place[name] for name, _ in named), -1])[used]  # -1: none named yet
+    names.append("")
+    entries = _libraries(path, [name for name, _ in libraries], shape) if libraries_too else {}
+    wanted = {names[k] for k in np.unique(used).tolist()}
+    meant = _materials_meant(path.name, wanted, entries.keys()) if entries else {name: name for name in wanted}
+    # Only what faces use is read; a material counts twice where some of its faces have no coordinates.
+    _, which, kind = np.unique(2 * used + laid, return_index=True, return_inverse=True)
+    found = [(meant[names[used[face]]], bool(laid[face])) for face in which.tolist()]
+    listed = [(name, entries.get(name, _Entry()), covered) for name, covered in found]
+    return _Worn(corners, laid, kind.reshape(-1).astype(np.int64), listed)
 
 
 def read_coordinates(path: Path, data: bytes, shape: Shape) -> Float[Floats, "F 3 2"] | None:
@@ -229,7 +299,7 @@ def _parse(file: Path) -> dict[str, _Entry]:
     for line in data.decode("utf-8", "surrogateescape").split("\n"):
         word, rest = (*line.split(None, 1), "", "")[:2]
         word, rest = word.lower(), rest.strip()
-        if word not in ("newmtl", "map_kd", "map_d"):
+        if word not in ("newmtl", "map_kd", "map_d", *_FINISH):
             rest = _uncommented(f" {rest}")
         if not rest and word != "newmtl":
             continue  # a word alone says nothing
@@ -247,10 +317,23 @@ def _parse(file: Path) -> dict[str, _Entry]:
                 entry.image = _map(rest)
             elif word == "map_d":
                 entry.alpha = _map(rest)
+            elif word in _FINISH:
+                _read_finish(entry, word, rest)
         except (ValueError, LookupError) as error:
             odd = damaged(file.name, f"cannot make sense of the line '{line.strip()[:60]}'")
             raise InputError(odd.message, DECIMAL_COMMA if "," in rest else odd.hint) from error
     return entries
+
+
+def _read_finish(entry: _Entry, word: str, rest: str) -> None:
+    """Note what a line says besides the color; what makes no sense there never mattered, and is left out."""
+    with suppress(ValueError, LookupError):
+        if word in ("pr", "pm", "ke"):
+            values = tuple(float(np.clip(_number(each), 0.0, 1.0)) for each in rest.split()[:3])
+            if len(values) == (3 if word == "ke" else 1) and np.isfinite(values).all():
+                entry.numbers[word] = values
+        else:
+            entry.maps[word] = _map(rest)
 
 
 def _number(word: str) -> float:
@@ -289,27 +372,25 @@ def _material(name: str, entry: _Entry, image: Pixels | None) -> Material:
 
 def _image(path: Path, name: str, entry: _Entry, reader: ImageReader, laid: bool) -> Pixels | None:
     """The image of a material; if it is `laid` on, with the alpha of map_d: of that its own, else how bright it is."""
-
-    folders = (entry.folder, path.parent)
-
-    def decode(wanted: _Map) -> Pixels:
-        named = [
-            (folder, name) for name in dict.fromkeys((wanted.file, _uncommented(wanted.file))) for folder in folders
-        ]
-        file = next((found for each in named if (found := beside(*each)) is not None), None)
-        if file is None:
-            what = f"{path.name} needs the image {wanted.file[:200]} of its material {name}, which is not there"
-            raise InputError(what, f"copy it to {entry.folder}, or name another with --image")
-        return reader.decode(read_bytes(file), file.name)
-
     if entry.image is None:
         return None
-    image = decode(entry.image)
+    image = _decoded(path, name, entry, entry.image, reader)
     if not laid or entry.alpha is None or entry.alpha.file == entry.image.file:
         return image
-    other = decode(entry.alpha)
+    other = _decoded(path, name, entry, entry.alpha, reader)
     if other.shape != image.shape:
         what = f"{path.name}: the alpha image {entry.alpha.file} differs in size from the color image"
         raise InputError(what, "save both at the same size, or the alpha as a channel of the color png")
     channel = other[..., 0] if (other[..., 3] == 255).all() else other[..., 3]
     return np.concatenate([image[..., :3], channel[..., None]], axis=-1)
+
+
+def _decoded(path: Path, name: str, entry: _Entry, wanted: _Map, reader: ImageReader) -> Pixels:
+    """An image that a material names."""
+    names = dict.fromkeys((wanted.file, _uncommented(wanted.file)))
+    places = [(folder, each) for each in names for folder in (entry.folder, path.parent)]
+    file = next((found for each in places if (found := beside(*each)) is not None), None)
+    if file is None:
+        what = f"{path.name} needs the image {wanted.file[:200]} of its material {name}, which is not there"
+        raise InputError(what, f"copy it to {entry.folder}, or name another with --image")
+    return reader.decode(read_bytes(file), file.name)
