@@ -18,7 +18,9 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.maps.build import build_map
 from meshmatch.maps.evaluate import Evaluation, evaluate_map
 from meshmatch.maps.files import load_map
+from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.places import Places
+from meshmatch.maps.unfold import unfolded
 from meshmatch.maps.vertex_map import VertexMap, check_map
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.moved_files import save_moved
@@ -26,7 +28,6 @@ from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.low_confidence import LowConfidence
-from meshmatch.transfer.mapped_mesh import invert_map
 
 if TYPE_CHECKING:
     from meshmatch.implicit.fit import ImplicitFit
@@ -197,11 +198,13 @@ def map_of_fits(
         assert first.owner and first.source and second.source
         return first.owner.match(first, second, first.source, second.source)
 
-    def places(fit: Fit | ImplicitFit, own: Fit | ImplicitFit) -> Places:
+    def placed(fit: Fit | ImplicitFit, own: Fit | ImplicitFit) -> tuple[Places, Shape]:
         assert isinstance(fit, Fit) and isinstance(own, Fit)
-        return Places.of(shape_of(fit), fit, own, threads)
+        part = shape_of(fit)
+        return Places.of(part, fit, own, threads), part.original
 
-    return build_map(places(first, before[0]), places(second, before[1]), threads)
+    (here, source), (there, target) = placed(first, before[0]), placed(second, before[1])
+    return unfolded(build_map(here, there, threads), source, target, threads)
 
 
 def shape_of(fit: Fit) -> Repaired:

@@ -183,7 +183,7 @@ def evaluate(
 ) -> None:
     """Measure how good a map is.
 
-    Reports coverage and, between meshes, distortion. With --truth or --points also geodesic errors on TARGET:
+    Reports coverage and, between meshes, distortion and folds. With --truth or --points also geodesic errors on TARGET:
     in percent of the square root of its area, and in centimetres with TARGET scaled to 1.9 square metres,
     the skin area of a person.
     """
@@ -231,4 +231,10 @@ def _rows(result: "Evaluation", threshold: float) -> list[tuple[str, str, str]]:
     ]
     if result.distortion is not None:
         rows.append(("distortion", f"{result.distortion:.4f}", "sqrt(area), between random pairs of points"))
+    if (folds := result.folds) is not None:
+        rows += [
+            ("flipped", f"{100 * folds.flipped:.2f} %", "of the source's area is turned over"),
+            ("crushed", f"{100 * folds.crushed:.2f} %", "is laid on less than a quarter of its area"),
+            ("stretch", f"{folds.stretch:.2f}", "half of the area is stretched or shrunk by more than this factor"),
+        ]
     return rows

@@ -30,6 +30,7 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.build import build_map
 from meshmatch.maps.files import check_suffix
 from meshmatch.maps.places import Places
+from meshmatch.maps.unfold import unfolded
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.progress import ProgressCallback
@@ -247,7 +248,8 @@ class Collection:
                 hint = "fit it with `meshmatch fit`; its vertices and faces must be those of the fitted file"
                 raise InputError(f"{self.store.location} holds no fit of {shape.name or 'this shape'}", hint)
         a, b = (names[shape.hash] for shape in shapes)
-        return MapPair(*shapes, self.map(a, b).for_shapes(*shapes), opposite=self.map(b, a).for_shapes(*shapes[::-1]))
+        there, back = self.map(a, b).for_shapes(*shapes), self.map(b, a).for_shapes(*shapes[::-1])
+        return MapPair(*shapes, unfolded(there, *shapes), opposite=unfolded(back, *shapes[::-1]))
 
     def _hash_of(self, name: str) -> str:
         return str(self._words(name).get("shape_hash", ""))

@@ -18,9 +18,9 @@ from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.modes import inner_products, principal, rounding, weighted_sums
 from meshmatch.collections.superimpose import Shapes, Superimposed
 from meshmatch.errors import InputError, OptionError
+from meshmatch.maps.mapped_mesh import MappedMesh
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.mapped_mesh import MappedMesh
 
 COUNTS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
 """Numbers of modes that are measured, as far as there are so many, and the largest that can be."""

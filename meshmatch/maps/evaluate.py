@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from meshmatch.arrays import Brief, Float, Floats, Floats32, Pickled, frozen, off_torch
 from meshmatch.errors import InputError
+from meshmatch.maps.folds import Folds
 from meshmatch.maps.geodesics import GEODESIC, GeodesicDistances
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
@@ -126,10 +127,11 @@ def distortion(
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All measures of one map; `errors` only where the truth is known, `distortion` only between meshes."""
+    """All measures of one map; `errors` only where the truth is known, `distortion` and `folds` only between meshes."""
 
     coverage: Coverage
     distortion: float | None = None
+    folds: Folds | None = None
     errors: Errors | None = None
     geodesic: str = GEODESIC
 
@@ -139,6 +141,7 @@ class Evaluation:
             "coverage_vertices": self.coverage.vertices,
             "coverage_area": self.coverage.area,
             "distortion": self.distortion,
+            **({} if self.folds is None else asdict(self.folds)),
         }
         if self.errors is not None:
             record |= {
@@ -163,18 +166,19 @@ def evaluate_map(
     *,
     rng: np.random.Generator | None = None,
 ) -> Evaluation:
-    """Coverage, distortion (if both shapes are meshes) and, where the truth is given as in `map_errors`, errors.
+    """Coverage, distortion and folds (if both shapes are meshes) and, where the truth is given as in `map_errors`, errors.
 
     With `target_points` alone, entry i belongs to vertex i of the source. `rng` chooses the points of `distortion`;
     ``default_rng(0)`` if none is given. `InputError` if the map does not belong to these shapes, or the truth to them;
     or if the truth is given and the target is a cloud.
     """
     vertex_map = vertex_map.for_shapes(source, target)
-    errors = stretched = None
+    errors = stretched = folds = None
     if target_points is not None:
         source_points = np.arange(source.V) if source_points is None else source_points
         errors = map_errors(vertex_map.index, source_points, target_points, GeodesicDistances(target))
     if not source.is_cloud and not target.is_cloud:
         both = GeodesicDistances(source), GeodesicDistances(target)
         stretched = distortion(vertex_map.index, *both, rng or np.random.default_rng(0))
-    return Evaluation(coverage(vertex_map.index, target), stretched, errors)
+        folds = Folds.of(vertex_map, source, target)
+    return Evaluation(coverage(vertex_map.index, target), stretched, folds, errors)

@@ -2,7 +2,7 @@
 
 `Surface` is for many queries that lie near it, such as the vertices of a shape around a fitted template: the nearest
 vertex in a space of positions and normals, then the closest of its triangles. It is fast and knows the resting
-template, but not exact for triangles that are large compared with the distance. `meshmatch.transfer.mapped_mesh` is
+template, but not exact for triangles that are large compared with the distance. `meshmatch.maps.mapped_mesh` is
 exact for triangles of any size; `meshmatch.transfer.surface_walk` starts from a known face and keeps to its sheet.
 
 Where two sheets of a surface touch, the closest point may lie on the wrong one. Neighbours whose images lie far apart

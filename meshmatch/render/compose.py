@@ -16,6 +16,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
+from meshmatch.maps.mapped_mesh import MappedMesh, invert_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.facing import Rotations, same_side, upright
 from meshmatch.render.figures import Panel
@@ -27,7 +28,6 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 from meshmatch.transfer.attributes import pull_values
 from meshmatch.transfer.label_files import Labels
-from meshmatch.transfer.mapped_mesh import MappedMesh, invert_map
 
 ErrorUnit = Literal["cm", "x100"]
 

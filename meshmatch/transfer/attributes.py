@@ -14,9 +14,9 @@ from scipy.sparse import csr_array
 from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import triangle_areas
+from meshmatch.maps.mapped_mesh import MappedMesh, discontinuous_faces, known_normals, mean_around
 from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, known_normals, mean_around
 
 NO_LABEL = -1
 # A face is cut into the square of so many small triangles, whose centers vote.

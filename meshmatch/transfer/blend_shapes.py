@@ -15,13 +15,13 @@ from scipy.sparse.csgraph import connected_components
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import dot, triangle_vectors, unit
+from meshmatch.maps.mapped_mesh import length_of
 from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.faces import seams
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.clean_weights import same_at
 from meshmatch.transfer.local_frames import local_frames
 from meshmatch.transfer.low_confidence import diffuse, vertex_graph
-from meshmatch.transfer.mapped_mesh import length_of
 
 # All set by hand; lengths in units of sqrt(area).
 # A move grows and shrinks with the surface, but not beyond this factor from what the whole shape does.

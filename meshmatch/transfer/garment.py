@@ -20,10 +20,10 @@ from meshmatch.fitting.solve.priors import nearest_rotations
 from meshmatch.geometry.smoothing import laplacian, solved
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import dot, edge_lengths, edges_of, interpolate, same_rows, unit
+from meshmatch.maps.mapped_mesh import MappedMesh, length_of
 from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.local_frames import local_frames
-from meshmatch.transfer.mapped_mesh import MappedMesh, length_of
 
 # All set by hand; lengths in units of sqrt(area).
 # Vertices of the body that one of the garment is bound to; those count that are not further away than the nearest by more

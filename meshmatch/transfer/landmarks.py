@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from meshmatch.arrays import Brief, Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
+from meshmatch.maps.mapped_mesh import MappedMesh, discontinuous_faces, known_normals
 from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes import tables
 from meshmatch.shapes.landmark_files import (
@@ -28,7 +29,6 @@ from meshmatch.shapes.landmark_files import (
     read_landmark_file,
 )
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, known_normals
 
 # A landmark this far from the surface, in diagonals of the shape, belongs to another shape.
 _ELSEWHERE = 0.25

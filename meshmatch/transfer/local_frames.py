@@ -9,9 +9,9 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.solve.priors import nearest_rotations
 from meshmatch.geometry.smoothing import averaged
 from meshmatch.geometry.triangles import dot, edge_lengths, interpolate, is_discontinuous, triangle_vectors, unit
+from meshmatch.maps.mapped_mesh import length_of
 from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.mapped_mesh import length_of
 
 # Set by hand, in units of sqrt(area): over this distance turns and scales are averaged.
 _SMOOTH = 0.06

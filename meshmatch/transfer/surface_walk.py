@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Floats, Floats32, Ints, Ints32
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import blend, closest_on_triangles, same_rows, squared_lengths, triangle_areas
+from meshmatch.maps.mapped_mesh import length_of
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.mapped_mesh import length_of
 
 _INSIDE = np.float32(-1e-5)
 _STEPS, _STEPS_AGAIN = 32, 12

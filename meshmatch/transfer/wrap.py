@@ -12,9 +12,9 @@ from meshmatch.geometry.smoothing import averaged
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import dot, edge_lengths, interpolate, same_rows, unit, vertex_normals
 from meshmatch.maps.deformed import surface_rotations
+from meshmatch.maps.mapped_mesh import MappedMesh, known_normals, length_of
 from meshmatch.maps.vertex_map import corners_of
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.mapped_mesh import MappedMesh, known_normals, length_of
 
 # All set by hand; lengths in units of sqrt(area).
 # Displacements are averaged over these distances, one after the other.

@@ -129,7 +129,7 @@ def test_after_a_match_shapes_are_turned_as_their_fits_say(
     stub: FakeMatching,
 ) -> None:
     from meshmatch.geometry.frames import Frame
-    from meshmatch.transfer.mapped_mesh import invert_map
+    from meshmatch.maps.mapped_mesh import invert_map
 
     turns = iter((np.eye(3), np.diag([-1.0, 1.0, -1.0])))
     forward = load_map("ab.npz", load_shape("a.ply"), load_shape("b.ply"))

@@ -7,6 +7,7 @@ import pytest
 
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
+from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render import compose
 from meshmatch.render.compose import (
@@ -28,7 +29,6 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import load_template
 from meshmatch.transfer.label_files import Labels
-from meshmatch.transfer.mapped_mesh import invert_map
 
 
 def turned(shape: Shape, degrees: float, name: str) -> Shape:

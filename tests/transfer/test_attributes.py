@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
 
+from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import largest_weights, most_votes, pull_labels, pull_values, pull_weights
-from meshmatch.transfer.mapped_mesh import invert_map
 from tests.conftest import icosphere
 from tests.transfer.known import split
 

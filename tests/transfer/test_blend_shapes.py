@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Floats, Floats32
 from meshmatch.errors import InputError, OptionError
+from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.blend_shapes import carry_moves
-from meshmatch.transfer.mapped_mesh import invert_map
 from tests.transfer.worn import RADIUS, bent, rod, same_numbers, tube
 
 

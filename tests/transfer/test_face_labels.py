@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import lattice, pull_face_labels
-from meshmatch.transfer.mapped_mesh import invert_map
 from tests.conftest import icosphere
 from tests.maps.solids import grid
 from tests.transfer.known import split

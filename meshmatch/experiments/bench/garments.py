@@ -27,12 +27,12 @@ from meshmatch.experiments.makers.other_triangles import other_triangles
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.generators.bodies import sample_free_pose
 from meshmatch.generators.rig import build_rig, skin
+from meshmatch.maps.mapped_mesh import MappedMesh
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.garment import carry_garment
-from meshmatch.transfer.mapped_mesh import MappedMesh
 
 Pose = Literal["rest", "posed"]
 _VERTICES = 19_158  # of MakeHuman's base mesh; those of its body come first

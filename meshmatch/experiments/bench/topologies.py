@@ -15,7 +15,7 @@ from typer import Option
 from meshmatch.api.wrap import wrap
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.garments import Bound, Pose, body_of, people
-from meshmatch.transfer.mapped_mesh import MappedMesh
+from meshmatch.maps.mapped_mesh import MappedMesh
 
 COLUMNS = {
     "topology": "topology", "pose": "pose", "pairs": "pairs:d", "mean cm": "mean_cm:.2f", "95 %": "high_cm:.2f",

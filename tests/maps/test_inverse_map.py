@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
+from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
-from meshmatch.transfer.mapped_mesh import invert_map
 from tests.conftest import icosphere
 from tests.maps.solids import grid
 from tests.transfer.known import split

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from meshmatch.maps.mapped_mesh import MappedMesh, discontinuous_faces
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces
 from tests.conftest import icosphere
 from tests.maps.solids import bumpy_sphere
 from tests.transfer.known import brute_force, split
@@ -29,7 +29,7 @@ def test_points_anywhere_find_their_closest_point() -> None:
 def test_more_points_than_one_portion_are_each_answered(monkeypatch: pytest.MonkeyPatch, sphere: Shape) -> None:
     points = np.random.default_rng(2).normal(size=(500, 3))
     whole = MappedMesh.of(sphere).query(points)
-    monkeypatch.setattr("meshmatch.transfer.mapped_mesh._CHUNK", 37)
+    monkeypatch.setattr("meshmatch.maps.mapped_mesh._CHUNK", 37)
     parts = MappedMesh.of(sphere).query(points)
     assert np.array_equal(whole.face, parts.face)
     assert np.array_equal(whole.barycentric, parts.barycentric)

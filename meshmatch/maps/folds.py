@@ -1,0 +1,104 @@
+"""Triangles that a map turns over, crushes or stretches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.geometry.triangles import cross_product, dot, interpolate, squared_lengths, triangle_vectors, unit
+from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.shapes.shape import Shape
+
+CRUSHED = 0.25
+"""An image of less than this share of a triangle's area, both shapes scaled to the same area, is crushed."""
+
+
+@dataclass(frozen=True)
+class Folds:
+    """Where a map is not one to one, and how much it stretches.
+
+    Attributes
+    ----------
+    flipped
+        Share (0..1) of the source's area on triangles whose images are turned over.
+    crushed
+        Share on triangles whose images have less than a quarter of their area, both shapes scaled to the same area.
+    stretch
+        Half of the source's area is stretched, or shrunk, by more than this factor in some direction; 1 for an isometry.
+    """
+
+    flipped: float
+    crushed: float
+    stretch: float
+
+    @classmethod
+    def of(cls, found: VertexMap, source: Shape, target: Shape) -> Folds:
+        """Those of a map between two meshes."""
+        points, verts = found.points(target) / _length(target), source.verts / _length(source)
+        faces, areas = source.faces[source.valid_faces], source.face_areas[source.valid_faces]
+        normals = normals_at(found, target)
+        normals *= orientation(points, normals, verts, faces)
+        ratio = area_ratios(points, normals, verts, faces)
+        known = np.isfinite(ratio) & (areas > 0)
+        if not known.any():
+            return cls(0.0, 0.0, 1.0)
+        share = areas[known] / areas[known].sum()
+        ratio, factor = ratio[known], _factors(points, normals, verts, faces[known])
+        order = np.argsort(factor)
+        middle = order[np.searchsorted(np.cumsum(share[order]), 0.5)]
+        crushed = (ratio > 0) & (ratio < CRUSHED)
+        return cls(float(share[ratio <= 0].sum()), float(share[crushed].sum()), float(factor[middle]))
+
+
+def normals_at(found: VertexMap, target: Shape) -> Float[Floats, "V_source 3"]:
+    """Unit normals of the target where the vertices of the source are matched."""
+    corners = corners_of(target.faces, found.face, found.index)
+    return unit(interpolate(target.vertex_normals, corners, found.barycentric))
+
+
+def orientation(
+    points: Float[Floats, "V 3"], normals: Float[Floats, "V 3"], verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]
+) -> float:
+    """1, or -1 where most of the surface is turned over, as by a map to a mirror image. Arguments as in `area_ratios`."""
+    images = dot(triangle_vectors(points, faces), _facing(normals, faces))
+    own = np.sqrt(squared_lengths(triangle_vectors(verts, faces)))
+    return 1.0 if own[images >= 0].sum() >= own[images < 0].sum() else -1.0
+
+
+def area_ratios(
+    points: Float[Floats, "V 3"], normals: Float[Floats, "V 3"], verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]
+) -> Float[Floats, " F"]:
+    """Area of the image of each triangle, seen along the surface that it lies on, over the triangle's own: negative where
+    it is turned over, nan where the triangle has no area. ``points`` are the images of ``verts``.
+    """
+    facing = _facing(normals, faces)
+    own = np.sqrt(squared_lengths(triangle_vectors(verts, faces)))
+    return np.asarray(dot(triangle_vectors(points, faces), facing) / np.where(own > 0, own, np.nan))
+
+
+def _factors(points: Floats, normals: Floats, verts: Floats, faces: Ints) -> Floats:
+    """(F,) by how much lengths change most, as a factor of at least 1, across the surface that the images lie on."""
+    facing = _facing(normals, faces)
+    metric = []
+    for each, flat in ((verts, None), (points, facing)):
+        first, second = (each.take(faces[:, k], 0) - each.take(faces[:, 0], 0) for k in (1, 2))
+        if flat is not None:
+            first, second = (edge - dot(edge, flat)[:, None] * flat for edge in (first, second))
+        metric.append((dot(first, first), dot(first, second), dot(second, second), cross_product(first, second)))
+    (a, b, c, own), (p, q, r, image) = metric
+    square = squared_lengths(own)
+    total = (c * p - 2 * b * q + a * r) / np.maximum(square, 1e-300)  # squared singular values, added up
+    product = np.sqrt(squared_lengths(image) / np.maximum(square, 1e-300))
+    difference = np.sqrt(np.maximum(total**2 - 4 * product**2, 0.0))
+    large = np.sqrt((total + difference) / 2)
+    return np.asarray(np.maximum(large, large / np.maximum(product, 1e-12)))
+
+
+def _facing(normals: Floats, faces: Ints) -> Floats:
+    return unit(sum(normals.take(faces[:, k], 0) for k in range(3)))  # type: ignore[arg-type]
+
+
+def _length(shape: Shape) -> float:
+    return float(np.sqrt(shape.area)) or 1.0

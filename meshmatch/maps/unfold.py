@@ -1,0 +1,197 @@
+"""Maps without folds: what a map turns over or crushes is laid out anew, as its surroundings are.
+
+Closest points fold where a fit and its shape are apart by more than the radius at which they bend. Around each triangle
+whose image is turned over or crushed, images are found whose deformation gradients are nearest to those of the triangles
+that are sound (a Poisson equation, as in Sumner and Popovic, *Deformation transfer for triangle meshes*, 2004), and put back
+on the surface of the target. Ever wider surroundings move, until nothing is folded or the map tears; what does not become
+better stays as it was.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.sparse import csr_array, eye_array
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+
+from meshmatch.arrays import Bool, Bools, Floats, Ints
+from meshmatch.geometry.triangles import dot, same_rows, squared_lengths, triangle_areas, triangle_vectors, unit
+from meshmatch.maps.folds import CRUSHED, area_ratios, normals_at, orientation
+from meshmatch.maps.mapped_mesh import MappedMesh, length_of
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.shape import Shape
+
+# All set by hand on bodies of SCAPE, FAUST and SHREC'19.
+_RINGS = (1, 2, 2, 3)  # of triangles around a fold that move, round by round; more rounds gain little
+_STRETCH, _SLACK = 3.0, 0.02  # an edge whose image is longer, in units of sqrt(area), is where the map tears
+_STIFFEST = 50.0  # a sliver's sides count no more
+_MOST = 0.2  # a map that folds more of the surface is wrong as a whole
+_LARGEST = 200_000  # vertices; triangles of larger meshes are smaller than the fits are exact
+_HOLD = 1e-3  # how much each image stays, so that every part has a solution
+
+
+def unfolded(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -> VertexMap:
+    """A map between these shapes with fewer folds: the same where it has none, and of clouds and very large meshes."""
+    if source.is_cloud or target.is_cloud or max(source.V, target.V) > _LARGEST:
+        return found
+    images = _Images(found, source, target, workers)
+    for rings in _RINGS:
+        if not images.relaid(rings):
+            break
+    return images.map
+
+
+class _Images:
+    """The source's vertices on the target, both scaled to area 1; vertices at one place are one."""
+
+    def __init__(self, found: VertexMap, source: Shape, target: Shape, workers: int) -> None:
+        self.map, self.source, self.workers = found, source, workers
+        self.same = same_rows(source.verts)
+        faces = self.same[source.faces[source.valid_faces]]
+        self.faces = faces[(faces != faces[:, [1, 2, 0]]).all(axis=1)]
+        self.verts, self.points = source.verts / length_of(source), found.points(target) / length_of(target)
+        self.normals = normals_at(found, target)
+        self.side = orientation(self.points, self.normals, self.verts, self.faces)
+        self.normals *= self.side
+        self.target = Shape(target.verts / length_of(target), target.faces, invalid=target.invalid)
+        self.areas = triangle_areas(self.verts, self.faces)
+        self.ratio = area_ratios(self.points, self.normals, self.verts, self.faces)
+        self.torn = self._torn(np.arange(len(self.faces)), self.points)
+        self.surface: MappedMesh | None = None
+
+    def _torn(self, some: Ints, points: Floats) -> Bool[Bools, " N"]:
+        """Which of some faces the map pulls apart."""
+        corners = self.faces[some]
+        found = np.zeros(len(some), bool)
+        for start, end in zip(corners.T, corners[:, [1, 2, 0]].T, strict=True):
+            own, image = (np.sqrt(squared_lengths(each[start] - each[end])) for each in (self.verts, points))
+            found |= image > _STRETCH * own + _SLACK
+        return found
+
+    def relaid(self, rings: int) -> bool:
+        """Lay out the surroundings of all folds anew, so many triangles wide; False where there is nothing to do."""
+        folded = (self.ratio < CRUSHED) & ~self.torn
+        if not 0 < self.areas[folded].sum() < _MOST * self.areas.sum():
+            return False
+        inside = self._dilated(self.faces[folded].ravel(), rings)
+        inside[self.faces[self.torn].ravel()] = False
+        rows = np.flatnonzero(inside)
+        near = np.flatnonzero(inside[self.faces].any(axis=1))
+        laid = near[~self.torn[near] & np.isfinite(self.ratio[near])]
+        if not len(rows) or not len(laid):
+            return False
+        points, normals, found = self._on_surface(rows, self._solved(rows, laid))
+        ratio = area_ratios(points, normals, self.verts, self.faces[near])
+        # each part that moved counts by itself
+        number = np.full(len(self.verts), -1)
+        number[rows] = np.arange(len(rows))
+        corners = number[self.faces[near]]
+        part = _parts(corners, len(rows))
+        of_face = np.where(corners >= 0, part[corners], -1).max(axis=1)
+        own = self.areas[near]
+        before, after = (
+            np.bincount(of_face, np.where(each < CRUSHED, own, 0.0), part.max() + 1)
+            for each in (self.ratio[near], ratio)
+        )
+        better = (after < before)[part]
+        self._take(rows[better], points, normals, (found[0][better], found[1][better], found[2][better]))
+        changed = near[(after < before)[of_face]]
+        self.ratio[changed] = area_ratios(self.points, self.normals, self.verts, self.faces[changed])
+        self.torn[changed] = self._torn(changed, self.points)
+        return True
+
+    def _dilated(self, vertices: Ints, rings: int) -> Bools:
+        """(V,) these vertices, and those so many triangles around."""
+        marked = np.zeros(len(self.verts), bool)
+        marked[vertices] = True
+        for _ in range(rings):
+            marked[self.faces[marked[self.faces].any(axis=1)].ravel()] = True
+        return marked
+
+    def _gradients(self, some: Ints) -> Floats:
+        """(N, 3, 3) how some triangles and their normals are deformed."""
+        corners = self.faces[some]
+        normal = unit(triangle_vectors(self.verts, corners))
+        facing = unit(self.normals[corners].sum(axis=1))
+        before, after = (
+            np.stack([each[corners[:, 1]] - each[corners[:, 0]], each[corners[:, 2]] - each[corners[:, 0]], up], axis=2)
+            for each, up in ((self.verts, normal), (self.points, facing))
+        )
+        return np.asarray(after @ np.linalg.inv(before))
+
+    def _wanted(self, laid: Ints) -> Floats:
+        """(N, 3, 3) the gradients that triangles should have: the mean of those around that are sound."""
+        near = np.zeros(len(self.verts), bool)
+        near[self.faces[laid].ravel()] = True
+        around = np.flatnonzero(near[self.faces].any(axis=1))
+        sound = around[~self.torn[around] & (self.ratio[around] >= CRUSHED)]
+        area = self.areas[sound]
+        vertices = np.unique(self.faces[around])
+        local = np.full(len(self.verts), -1)
+        local[vertices] = np.arange(len(vertices))
+        values = np.column_stack([self._gradients(sound).reshape(-1, 9) * area[:, None], area])
+        places = local[self.faces[sound]].ravel()
+        to_vertices = csr_array(
+            (np.ones(len(places)), (places, np.repeat(np.arange(len(sound)), 3))), shape=(len(vertices), len(sound))
+        )
+        mean = (to_vertices @ values)[local[self.faces[laid]]].sum(axis=1)
+        found = mean[:, :9] / np.maximum(mean[:, 9:], 1e-300)
+        found[mean[:, 9] <= 0] = np.eye(3).ravel()
+        return np.asarray(found.reshape(-1, 3, 3))
+
+    def _solved(self, rows: Ints, laid: Ints) -> Floats:
+        """(N, 3) images of vertices whose triangles' gradients are nearest to those wanted, the rest staying."""
+        gradients, V = self._wanted(laid), len(self.verts)
+        double = 2 * self.areas[laid]
+        right, entries = np.zeros((V, 3)), []
+        for k in range(3):
+            i, j, opposite = (self.faces[laid, (k + each) % 3] for each in (1, 2, 0))
+            a, b = self.verts[i] - self.verts[opposite], self.verts[j] - self.verts[opposite]
+            cotangent = np.clip(dot(a, b) / np.maximum(double, 1e-300), -_STIFFEST, _STIFFEST)
+            pull = cotangent[:, None] * np.einsum("nij,nj->ni", gradients, self.verts[i] - self.verts[j])
+            for axis in range(3):
+                right[:, axis] += np.bincount(i, pull[:, axis], V) - np.bincount(j, pull[:, axis], V)
+            entries += [(i, i, cotangent), (j, j, cotangent), (i, j, -cotangent), (j, i, -cotangent)]
+        first, second, value = (np.concatenate(each) for each in zip(*entries, strict=True))
+        number = np.full(V, -1)
+        number[rows] = np.arange(len(rows))
+        own = number[first] >= 0
+        first, second, value = number[first[own]], second[own], value[own]
+        free = number[second] >= 0
+        N = len(rows)
+        matrix = csr_array((value[free], (first[free], number[second[free]])), shape=(N, N)) + _HOLD * eye_array(N)
+        held = csr_array((value[~free], (first[~free], second[~free])), shape=(N, V)) @ self.points
+        return np.asarray(splu(matrix.tocsc()).solve(right[rows] - held + _HOLD * self.points[rows]))
+
+    def _on_surface(self, rows: Ints, wanted: Floats) -> tuple[Floats, Floats, tuple[Ints, Ints, Floats]]:
+        """All points and normals, these rows put on the target's surface; and where on it they are."""
+        if self.surface is None:
+            self.surface = MappedMesh.of(self.target)
+        foot = self.surface.query(wanted, self.side * self.normals[rows], self.workers)
+        points, normals = self.points.copy(), self.normals.copy()
+        points[rows] = foot.values(self.target.faces, self.target.verts)
+        normals[rows] = self.side * unit(foot.values(self.target.faces, self.target.vertex_normals))
+        return points, normals, (foot.vertex, foot.face, foot.barycentric)
+
+    def _take(self, rows: Ints, points: Floats, normals: Floats, found: tuple[Ints, Ints, Floats]) -> None:
+        """Move these vertices, and all at their places."""
+        if not len(rows):
+            return
+        at = np.full(len(self.verts), -1)
+        at[rows] = np.arange(len(rows))
+        at = at[self.same]
+        moved = np.flatnonzero(at >= 0)
+        self.points[moved], self.normals[moved] = points[self.same[moved]], normals[self.same[moved]]
+        index, face, weights = self.map.index.copy(), self.map.face.copy(), self.map.barycentric.copy()
+        index[moved], face[moved], weights[moved] = (each[at[moved]] for each in found)
+        self.map = replace(self.map, index=index, face=face, barycentric=weights)
+
+
+def _parts(corners: Ints, N: int) -> Ints:
+    """(N,) which part each of N vertices is in; those of a triangle are in one, -1 for a corner that is none of them."""
+    start, end = np.concatenate([corners[:, [k, (k + 1) % 3]] for k in range(3)]).T
+    both = (start >= 0) & (end >= 0)
+    graph = csr_array((np.ones(int(both.sum()), np.int8), (start[both], end[both])), shape=(N, N))
+    return np.asarray(connected_components(graph, directed=False)[1])

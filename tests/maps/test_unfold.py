@@ -1,0 +1,112 @@
+"""Maps without folds: what is turned over or crushed is laid out anew, and nothing else moves."""
+
+import numpy as np
+import pytest
+from trimesh.creation import icosphere
+
+from meshmatch.arrays import Ints
+from meshmatch.maps.folds import Folds
+from meshmatch.maps.mapped_mesh import MappedMesh
+from meshmatch.maps.unfold import unfolded
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.shape import Shape
+
+MOVED = np.array([100, 300, 500])
+
+
+def ball(subdivisions: int, turn: float = 0.3) -> Shape:
+    mesh = icosphere(subdivisions)
+    around = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    return Shape(mesh.vertices @ around.T * [1.0, 0.8, 1.3], mesh.faces)
+
+
+def put(source: Shape, target: Shape, places: np.ndarray) -> VertexMap:
+    foot = MappedMesh.of(target).query(places)
+    rest = {"face": foot.face, "barycentric": foot.barycentric, "confidence": np.full(source.V, 0.5, np.float32)}
+    return VertexMap.between(source, target, foot.vertex, **rest)
+
+
+def folded(source: Shape, target: Shape, moved: Ints = MOVED) -> VertexMap:
+    """The map to the closest point, but for vertices that are pulled across a neighbour."""
+    places, edges = source.verts.copy(), source.edges.vertices
+    for vertex in moved:
+        other = edges[(edges == vertex).any(axis=1)][0].sum() - vertex
+        places[vertex] += 1.8 * (source.verts[other] - source.verts[vertex])
+    return put(source, target, places)
+
+
+def test_folds_are_opened_and_the_rest_stays() -> None:
+    source, target = ball(3), ball(3, 0.0)
+    before = folded(source, target)
+    after = unfolded(before, source, target)
+    assert Folds.of(before, source, target).flipped > 0.003
+    assert Folds.of(after, source, target) == Folds(0.0, 0.0, pytest.approx(1.0, abs=0.15))
+    far = np.linalg.norm(source.verts[:, None] - source.verts[MOVED], axis=2).min(axis=1) > 0.8
+    np.testing.assert_array_equal(after.points(target)[far], before.points(target)[far])
+    right = put(source, target, source.verts).points(target)
+    away = np.linalg.norm(after.points(target) - right, axis=1)
+    assert away[MOVED].max() < 0.3 * np.linalg.norm(before.points(target) - right, axis=1)[MOVED].min()
+    np.testing.assert_array_equal(after.confidence, before.confidence)
+
+
+def test_a_map_without_folds_is_the_same() -> None:
+    source, target = ball(3), ball(2)
+    found = put(source, target, source.verts)
+    assert unfolded(found, source, target) is found
+
+
+def test_a_mirror_image_is_no_fold() -> None:
+    source, target = ball(3), ball(3, 0.0)
+    mirrored = Shape(target.verts * [-1, 1, 1], target.faces[:, ::-1])
+    before = folded(source, target)
+    found = VertexMap.between(source, mirrored, before.index, confidence=before.confidence)
+    assert 0.003 < Folds.of(found, source, mirrored).flipped < 0.1
+    assert Folds.of(unfolded(found, source, mirrored), source, mirrored).flipped == 0
+
+
+def test_vertices_at_one_place_move_together() -> None:
+    source, target = ball(3), ball(3, 0.0)
+    doubled = Shape(
+        np.concatenate([source.verts, source.verts]), source.faces + source.V * (np.arange(source.F) % 2)[:, None]
+    )
+    before = folded(source, target)
+    rest = {name: np.concatenate([getattr(before, name)] * 2) for name in ("face", "barycentric", "confidence")}
+    found = VertexMap.between(doubled, target, np.tile(before.index, 2), **rest)
+    points = unfolded(found, doubled, target).points(target)
+    np.testing.assert_array_equal(points[: source.V], points[source.V :])
+    np.testing.assert_allclose(points[: source.V], unfolded(before, source, target).points(target), atol=1e-6)
+
+
+def test_what_it_does_not_touch() -> None:
+    source, target = ball(3), ball(3, 0.0)
+    found = folded(source, target)
+    cloud = Shape(source.verts, np.zeros((0, 3), int))
+    of_cloud = VertexMap.between(cloud, target, found.index)
+    assert unfolded(of_cloud, cloud, target) is of_cloud
+    rng = np.random.default_rng(0)  # folded everywhere: wrong as a whole
+    wrong = VertexMap.between(source, target, rng.integers(0, target.V, source.V))
+    assert unfolded(wrong, source, target) is wrong
+
+
+def test_where_the_map_tears_nothing_is_laid_out() -> None:
+    source, target = ball(3), ball(3, 0.0)
+    places = np.where(source.verts[:, 2:] > 0, -source.verts, source.verts)  # one half goes to the other side
+    found = put(source, target, places)
+    points = unfolded(found, source, target).points(target)
+    assert np.linalg.norm(points - found.points(target), axis=1).max() < 0.1
+
+
+def test_folds_of_known_maps() -> None:
+    flat = Shape(np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    assert Folds.of(VertexMap.identity(flat), flat, flat) == Folds(0.0, 0.0, pytest.approx(1.0))
+    long = Shape(flat.verts * [2, 0.5, 1], flat.faces)
+    found = VertexMap.between(flat, long, np.arange(4))
+    assert Folds.of(found, flat, long) == Folds(0.0, 0.0, pytest.approx(2.0))
+    wide = Shape(flat.verts * [10, 10, 1], flat.faces)
+    assert Folds.of(VertexMap.between(flat, wide, np.arange(4)), flat, wide).stretch == pytest.approx(1.0)
+    small = Shape(np.concatenate([flat.verts, flat.verts[:3] * 0.1 + 5]), np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6]]))
+    share = flat.face_areas[0] / small.area
+    into = VertexMap.between(Shape(flat.verts[:3], flat.faces[:1]), small, np.array([4, 5, 6]))
+    assert Folds.of(into, Shape(flat.verts[:3], flat.faces[:1]), small).crushed == 1.0 and share > 0.4
+    turned = VertexMap.between(flat, flat, np.array([0, 1, 2, 1]))  # the second triangle lies on the first
+    assert Folds.of(turned, flat, flat).flipped == pytest.approx(0.5)
