@@ -104,13 +104,32 @@ def prepare():
     return not with_shapes
 
 
+def image_above(socket):
+    """The socket of the first image that something is made of; None if there is none."""
+    for link in socket.links:
+        if link.from_node.type == "TEX_IMAGE":
+            return link.from_socket
+        for other in link.from_node.inputs:
+            if (found := image_above(other)) is not None:
+                return found
+    return None
+
+
+def lay_images_bare():
+    """Lay images directly on their materials: exporters do not look behind the product with a color."""
+    for material in bpy.data.materials:
+        for node in material.node_tree.nodes if material.use_nodes else ():
+            if node.type == "BSDF_PRINCIPLED" and (image := image_above(node.inputs["Base Color"])) is not None:
+                material.node_tree.links.new(image, node.inputs["Base Color"])
+
+
 def write(path, apply):
     suffix = os.path.splitext(path)[1].lower()
     if suffix == ".glb":
         call(
             operator("export_scene.gltf"), filepath=path, export_format="GLB", export_yup=True, export_apply=apply,
             export_animations=True, export_skins=True, export_morph=True, export_all_influences=True,
-            export_tangents=False, export_extras=False, use_renderable=True, export_optimize_animation_size=False,
+            export_all_vertex_colors=False, export_tangents=False, export_extras=False, use_renderable=True, export_optimize_animation_size=False,
         )  # fmt: skip
     elif suffix == ".fbx":
         call(
@@ -140,6 +159,8 @@ def main(source, output):
     if not shown():
         raise SystemExit("there is no mesh in it")
     leave_out_strangers(os.path.dirname(source))
+    if not output.lower().endswith(".glb"):
+        lay_images_bare()
     write(output, prepare())
     if not os.path.isfile(output):
         raise SystemExit("Blender wrote nothing")
