@@ -129,7 +129,8 @@ def write(path, apply):
         call(
             operator("export_scene.gltf"), filepath=path, export_format="GLB", export_yup=True, export_apply=apply,
             export_animations=True, export_skins=True, export_morph=True, export_all_influences=True,
-            export_all_vertex_colors=False, export_tangents=False, export_extras=False, use_renderable=True, export_optimize_animation_size=False,
+            export_all_vertex_colors=False, export_tangents=False, export_extras=False, use_renderable=True,
+            export_optimize_animation_size=False,
         )  # fmt: skip
     elif suffix == ".fbx":
         call(

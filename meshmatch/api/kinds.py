@@ -33,7 +33,6 @@ _NEXT, _TOGETHER = ("quadruped",), 2  # asked after people, before the others; h
 _MOST_READ = 40  # files of a folder whose kind is found out
 _NAME_IT = "name the model (--model NAME, in Python model=NAME) if that is wrong"
 _LEAVE_OUT = "exclude what does not belong to it with --without (`meshmatch info` lists parts)"
-_NONE = f"if it is one of these, name the model (--model NAME, in Python model=NAME); {_LEAVE_OUT}"
 
 
 @dataclass(frozen=True)
@@ -173,7 +172,7 @@ def choose_model(
             found[number] = Classification(card.category, card, alone.fit)
         refuse_far_parts(clean[number])
     shapes = [each.shape for each in clean]
-    _refuse_unknown(models, found, shapes, configs)
+    _refuse_unknown(models, readings, found, shapes, configs)
     names: dict[str, str] = {} if settled is None else {settled.card.category: "the shapes before"}
     for shape, kind in zip(shapes, [each.kind for each in found], strict=True):
         if kind is not None and kind not in names and names:
@@ -215,7 +214,7 @@ def classify_shapes(
     `InputError` for a complete mesh that is not of the kind that reads it best.
     """
     found = _classified(models, readings, shapes, configs, progress)
-    _refuse_unknown(models, found, shapes, configs)
+    _refuse_unknown(models, readings, found, shapes, configs)
     return found
 
 
@@ -240,14 +239,25 @@ def _classified(
 
 
 def _refuse_unknown(
-    models: Sequence[Installed], found: Sequence[Classification], shapes: Sequence[Shape], configs: Sequence[FitConfig]
+    models: Sequence[Installed],
+    readings: Float[Floats, "M S"],
+    found: Sequence[Classification],
+    shapes: Sequence[Shape],
+    configs: Sequence[FitConfig],
 ) -> None:
-    for shape, config, each in zip(shapes, configs, found, strict=True):
+    for shape, config, each, nearest in zip(shapes, configs, found, readings.min(0), strict=True):
         if each.kind is None and not shape.is_cloud and not may_show_part(shape, config):
             names = ", ".join(sorted({model.card.category for model in models}))
             problem = f"{shape.name} does not look like anything that the installed models know: {names}"
             error = UnknownKindsError if all(other.kind is None for other in found) else InputError
-            raise error(problem, _NONE)
+            raise error(problem, _nearest(each) if np.isfinite(nearest) else _LEAVE_OUT)
+
+
+def _nearest(found: Classification) -> str:
+    """What to do about a shape of no known kind: the kind that comes nearest, and how to insist on it."""
+    name, trust = found.card.name, "" if found.fit is None else f", trust {found.fit.trust:.2f}"
+    named = f"if it is one, name the model: --model {name} (in Python model={name!r})"
+    return f"nearest: {found.card.category}{trust}; {named}; {_LEAVE_OUT}"
 
 
 def other_kind(model: TrainedModel, shape: Shape, config: FitConfig) -> str | None:

@@ -45,6 +45,8 @@ def without_noise(shape: Shape, parts: int = 1) -> tuple[Shape, int]:
     neighbours, smooth, passes = laplacian_calculation(mesh), shape, 0
     while passes < _MOST and coherence(smooth) < _SMOOTH:
         filter_taubin(mesh, **_PASS, laplacian_operator=neighbours)
-        smooth = Shape(np.array(mesh.vertices), shape.faces, shape.name, shape.colors, weights=shape.weights)
+        smooth = Shape(
+            np.array(mesh.vertices), shape.faces, shape.name, shape.colors, weights=shape.weights, upright=shape.upright
+        )
         passes += 1
     return smooth, passes

@@ -163,7 +163,7 @@ def _read(path: str | Path) -> tuple[Shape, Raw]:
         raw = _FORMATS[suffix][0](path, data)
     name = plain_text(path.name)
     shape = Shape.with_invalid(raw.verts, raw.faces, name, _visible(name, raw.colors))
-    return (shape if raw.skinned is None else replace(shape, skinned=raw.skinned)), raw
+    return (replace(shape, skinned=raw.skinned, upright=True) if suffix in gltf.SUFFIXES else shape), raw
 
 
 def _visible(name: str, colors: Floats | None) -> Floats | None:

@@ -155,7 +155,7 @@ def _result(
     new[chosen] = np.arange(len(chosen))
     colors = None if shape.colors is None else shape.colors[chosen]
     weights = None if shape.weights is None else shape.weights[chosen]
-    repaired = Shape(shape.verts[chosen], new[faces], shape.name, colors, weights=weights)
+    repaired = Shape(shape.verts[chosen], new[faces], shape.name, colors, weights=weights, upright=shape.upright)
     stands = twin if valid.all() else twin[_valid_neighbour(shape, valid)]
     answer = new[stands]
     lost = np.flatnonzero(answer < 0)

@@ -44,6 +44,8 @@ class Shape(Pickled):
         (V,) how far a fit trusts each vertex, from 0 (not at all) to 1; fully where not given.
     skinned
         (V,) True for a vertex that joints of its file move: no part with one is ever dropped as dirt.
+    upright
+        Whether the format of its file says that y is up and z the front, as glTF does. A fit tries that first.
 
     Raises
     ------
@@ -64,6 +66,7 @@ class Shape(Pickled):
     invalid: Bool[Bools, " V"] | None = None
     weights: Float[Floats, " V"] | None = None
     skinned: Bool[Bools, " V"] | None = None
+    upright: bool = False
 
     def __post_init__(self) -> None:
         label = self.name or "the shape"

@@ -124,7 +124,7 @@ def test_one_known_shape_of_two_is_still_told() -> None:
     unknown, known = kinds.Classification(None, card), kinds.Classification("human", card)  # type: ignore[arg-type]
     for found, error in (([unknown, unknown], kinds.UnknownKindsError), ([unknown, known], InputError)):
         with pytest.raises(InputError) as caught:
-            kinds._refuse_unknown(models, found, [mesh, mesh], [config, config])
+            kinds._refuse_unknown(models, np.full((1, 2), np.inf), found, [mesh, mesh], [config, config])
         assert type(caught.value) is error
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.search import candidates, refinement
+from meshmatch.fitting.search import candidates, frames, refinement
 from meshmatch.fitting.search.candidates import candidates_of_whole
 from meshmatch.fitting.search.discontinuities import discontinuous_share, neighbours
 from meshmatch.fitting.search.predictor import Candidate, Predictor
@@ -45,8 +45,8 @@ def test_a_shape_that_the_network_misses_is_tried_with_its_core_further_down(
 ) -> None:
     model = egg_model()
     task = FitTask.of(model, FitConfig(), Shape(model.template.shape.verts, model.template.shape.faces))
-    frames = [RigidPose(np.eye(3)[[1, 2, 0]], np.full(3, 0.01 * k)) for k in range(6)]
-    monkeypatch.setattr(candidates, "frames_to_try", lambda *_: frames)
+    tried_frames = [RigidPose(np.eye(3)[[1, 2, 0]], np.full(3, 0.01 * k)) for k in range(6)]
+    monkeypatch.setattr(candidates, "frames_to_try", lambda *_: tried_frames)
     asked: list[list[RigidPose]] = []
 
     def fit_all(self: Predictor, starts: list[tuple[OrientedPoints, RigidPose]], *_: int, **__: int) -> list[Candidate]:
@@ -55,11 +55,49 @@ def test_a_shape_that_the_network_misses_is_tried_with_its_core_further_down(
 
     monkeypatch.setattr(Predictor, "fit_all", fit_all)
     candidates_of_whole(task)
-    assert sum(map(len, asked[:-1])) == tried * len(frames)
+    assert sum(map(len, asked[:-1])) == tried * len(tried_frames)
     assert len(asked[-1]) == careful
     if tried > 1:
-        down = asked[1][0].center - frames[0].center
-        assert np.allclose(down / np.linalg.norm(down), -frames[0].rotation[:, 1])
+        down = asked[1][0].center - tried_frames[0].center
+        assert np.allclose(down / np.linalg.norm(down), -tried_frames[0].rotation[:, 1])
+
+
+@pytest.mark.parametrize(("upright", "careful"), [(False, 3), (True, 4)])
+def test_how_a_file_stands_is_tried_however_badly_it_begins(
+    monkeypatch: pytest.MonkeyPatch, upright: bool, careful: int
+) -> None:
+    """The aligner has five other orientations, which look better at first."""
+    model = egg_model()
+    task = FitTask.of(model, FitConfig(), replace(model.template.shape, upright=upright))
+    odd = np.eye(3)[[1, 2, 0]]
+    monkeypatch.setattr(frames, "propose", lambda *_: [RigidPose(odd, np.zeros(3))])
+    monkeypatch.setattr(frames, "with_flips", lambda poses: poses * 5)
+    asked: list[list[RigidPose]] = []
+
+    def fit_all(self: Predictor, starts: list[tuple[OrientedPoints, RigidPose]], *_: int, **__: int) -> list[Candidate]:
+        asked.append([pose for _, pose in starts])
+        still = np.zeros((task.system.K, 3))
+        return [Candidate(pose, still, 0.04 if pose.rotation is odd else 0.045) for _, pose in starts]
+
+    monkeypatch.setattr(Predictor, "fit_all", fit_all)
+    _, found = candidates_of_whole(task)
+    assert [len(poses) for poses in asked] == [5 + upright, careful]
+    assert [each.pose.rotation is odd for each in found] == [True] * 3 + [False] * upright
+    assert candidates.of_file(task, found) == found[3:]  # it will be refined, too
+
+
+def test_another_orientation_than_the_files_costs_a_little(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = egg_model()
+    turned = RigidPose(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.zeros(3))  # up along z, front along -y
+    costs = {}
+    for upright in (False, True):
+        task = FitTask.of(model, FitConfig(), replace(model.template.shape, upright=upright))
+        comparison = WholeComparison(task, [])
+        monkeypatch.setattr(refinement.CandidateScorer, "score", lambda *_: 0.03)
+        monkeypatch.setattr(comparison, "doubt", lambda _: 0.0)
+        here = still(task.system)
+        costs[upright] = [comparison.score(replace(here, pose=pose), True) for pose in (STILL, turned)]
+    assert costs == {False: [0.03, 0.03], True: [0.03, pytest.approx(0.031)]}
 
 
 class Scored:

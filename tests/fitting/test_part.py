@@ -131,7 +131,7 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
     patient = replace(candidates.SETTINGS, lost=np.inf)
 
     def frames(
-        model: TrainedModel, samples: OrientedPoints, config: FitConfig, wide: bool
+        model: TrainedModel, samples: OrientedPoints, config: FitConfig, wide: bool, upright: bool
     ) -> tuple[list[RigidPose], list[RigidPose]]:
         asked.add((config.copies, config.hypotheses, wide))
         return [near if wide == wide_is_better else far], []

@@ -54,7 +54,7 @@ def category_residual(model: TrainedModel, shape: Shape, samples: OrientedPoints
     rng = np.random.default_rng(config.seed)
     placed = samples.in_frame(scan_frame(model, without_outliers(shape)))
     thin, predictor = placed.first(_THIN), Predictor.of(model, rng, config.device, mirrored=False)
-    starts = [(thin, pose) for pose in frames_to_try(model, thin, config)]
+    starts = [(thin, pose) for pose in frames_to_try(model, thin, config, shape.upright)]
     best = best_first(predictor.fit_all(starts, rounds=1, draws=1))[0]
     return predictor.fit(placed, best.pose, draws=1).residual
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats
-from meshmatch.fitting.search.frames import frames_of_part, frames_to_try
+from meshmatch.fitting.search.frames import frames_of_part, frames_to_try, stands_upright
 from meshmatch.fitting.search.predictor import (
     Candidate,
     Predictor,
@@ -106,7 +106,7 @@ def candidates_of_whole(task: FitTask) -> tuple[FitTask, list[Candidate]]:
     orientation(0.0)
     # A cloud's residual says little before its core frame is found; a second round finds it.
     care = 2 if task.shape.is_cloud else 1
-    starts = [(task.coarse, pose) for pose in frames_to_try(task.model, task.samples, task.config)]
+    starts = [(task.coarse, pose) for pose in frames_to_try(task.model, task.samples, task.config, task.shape.upright)]
     candidates = best_first(task.predictor.fit_all(starts, rounds=care, draws=care))
     careful = task.config.careful
     part = task.config.partial == "yes"  # which is no strange body
@@ -121,9 +121,20 @@ def candidates_of_whole(task: FitTask) -> tuple[FitTask, list[Candidate]]:
     orientation(0.7)
     if task.shape.is_cloud:
         task, candidates = _rescaled(task, candidates)
-    best = task.predictor.fit_all([(task.samples, each.pose) for each in candidates[:careful]])
+    chosen = candidates[:careful]
+    chosen += [each for each in of_file(task, candidates) if each not in chosen]
+    best = task.predictor.fit_all([(task.samples, each.pose) for each in chosen])
     orientation(1.0)
     return task, best_first(best)
+
+
+def of_file(task: FitTask, candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Of a shape whose file says how it stands, the best candidate that stands so, where the best of all (the first) does
+    not: it is to be tried too.
+    """
+    if not task.shape.upright or stands_upright(candidates[0].pose):
+        return []
+    return [each for each in candidates if stands_upright(each.pose)][:1]
 
 
 def _rescaled(task: FitTask, candidates: list[Candidate]) -> tuple[FitTask, list[Candidate]]:
@@ -228,7 +239,7 @@ def _careful(task: FitTask, wide: bool, progress: Progress) -> list[Candidate]:
     order = sorted(SETTINGS.shares, key=lambda share: wide and share not in SETTINGS.wide_shares)
     for number, share in enumerate(order):
         samples = scaled_to_area(task.samples, share)
-        frames, others = frames_of_part(task.model, samples, task.config, wide)
+        frames, others = frames_of_part(task.model, samples, task.config, wide, task.shape.upright)
         tried = list(range(len(others)))
         if wide and number >= len(SETTINGS.wide_shares):
             tried = sorted(best, key=lambda frame: best[frame])[: len(others) // 4]

@@ -28,6 +28,8 @@ _VOTERS = 2048  # samples that the aligner sees
 # How far along its own up axis a body's core may lie from the middle of a part of it (units of sqrt(area)).
 _ALONG = (-0.3, -0.15, 0.0, 0.15)
 _OBEYS = 0.5  # cosine of the angle between an axis of a frame and the user's
+USUAL = 0.85
+"""Cosine above which an orientation is a usual one, or that of the file."""
 _AGREE = 30  # degrees: votes that are closer agree. Set by hand.
 # Turns of the core frame that a vote may be wrong by: about face, upside down, on its head, a quarter either way.
 _FLIPS = Rotation.from_rotvec(
@@ -42,14 +44,20 @@ def scan_frame(model: TrainedModel, shape: Shape, mirrored: bool = False) -> Fra
     return replace(frame, rotation=frame.rotation * [[-1], [1], [1]]) if mirrored else frame
 
 
-def frames_to_try(model: TrainedModel, samples: OrientedPoints, config: FitConfig) -> list[RigidPose]:
-    """Core frames to try: the category's, the aligner's (or a grid without one), or those that obey the user's axes."""
+def frames_to_try(
+    model: TrainedModel, samples: OrientedPoints, config: FitConfig, upright: bool = False
+) -> list[RigidPose]:
+    """Core frames to try: the category's, the aligner's (or a grid without one), or those that obey the user's axes; and
+    that in which a shape is ``upright``, if its file says so.
+    """
     frames = aligned_frames(model, samples)
     if frames is None and not model.inference.config.align_basis:
         frames = standing_grid(samples.points.mean(0))
     elif frames is None:
         points = samples.points[:_VOTERS]
         frames = with_flips(propose(model.on(config.device), points, config.copies, config.hypotheses, config.seed))
+        if upright and not any(stands_upright(pose) for pose in frames):
+            frames.append(RigidPose.identity())
     up, front = _axes(config)
     if up is None and front is None:
         return frames
@@ -59,6 +67,11 @@ def frames_to_try(model: TrainedModel, samples: OrientedPoints, config: FitConfi
         if (up is None or pose.rotation[:, 1] @ up > _OBEYS) and (front is None or pose.rotation[:, 2] @ front > _OBEYS)
     ]
     return obeying or forced_frames(up, front)
+
+
+def stands_upright(pose: RigidPose) -> bool:
+    """Whether a core frame stands as glTF says: up along y, and front along z."""
+    return bool(min(pose.rotation[1, 1], pose.rotation[2, 2]) > USUAL)
 
 
 def aligned_frames(model: TrainedModel, samples: OrientedPoints) -> list[RigidPose] | None:
@@ -77,14 +90,14 @@ def _template_samples(model: TrainedModel) -> OrientedPoints:
 
 
 def frames_of_part(
-    model: TrainedModel, samples: OrientedPoints, config: FitConfig, wide: bool
+    model: TrainedModel, samples: OrientedPoints, config: FitConfig, wide: bool, upright: bool = False
 ) -> tuple[list[RigidPose], list[RigidPose]]:
     """Core frames to try for a part, whose middle is not that of the whole, and which a vote seldom knows.
 
     Those of `frames_to_try`; and, the same for any samples, all turns about the user's axes, or, if the search is to be
     ``wide``, about the axes of the file, each with several places of the core along the body.
     """
-    frames = frames_to_try(model, samples, config)
+    frames = frames_to_try(model, samples, config, upright)
     if model.card.frame["orientation"] in ALIGNS:
         return frames, []
     up, front = _axes(config)

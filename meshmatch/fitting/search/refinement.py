@@ -19,8 +19,9 @@ import numpy as np
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import needs
 from meshmatch.fitting import fit_config
-from meshmatch.fitting.search.candidates import STAGE, candidates_of_part, candidates_of_whole, completed
+from meshmatch.fitting.search.candidates import STAGE, candidates_of_part, candidates_of_whole, completed, of_file
 from meshmatch.fitting.search.discontinuities import Pairs, discontinuous_share, neighbours
+from meshmatch.fitting.search.frames import USUAL, stands_upright
 from meshmatch.fitting.search.predictor import (
     USUAL_SPREAD,
     Candidate,
@@ -55,8 +56,7 @@ class RefinementSettings:
     pool : among how many of the best those that are unlike each other are looked for
     screening_margin : an interpretation whose score is more than this times the best one's after a few steps is left: on 78
         bodies of SCAPE, FAUST and SHREC'19 the best after a few steps was the best at the end
-    unusual_axes_cost : margin by which an orientation that is rare in files must win
-    usual_cosine : cosine above which an orientation is a usual one
+    unusual_axes_cost : margin by which an orientation must win that is rare in files, or not that which the file states
     spread_cost : residual for each unit that the network's predictions for tilted copies lie from an interpretation, up to
         the usual spread, beyond which they tell no more: on robots of seeds 0 and 1 they tell front from back in 15 of 15
         ties
@@ -73,7 +73,6 @@ class RefinementSettings:
     pool: int = 24
     screening_margin: float = 1.05
     unusual_axes_cost: float = 0.001
-    usual_cosine: float = 0.85
     spread_cost: float = 0.3
     part_finalists: int = 4
     screening_samples: int = 4096
@@ -138,16 +137,17 @@ def _search_code(task: FitTask, candidates: list[Candidate]) -> Candidate:
 
 def _fit_nodes(task: FitTask, candidates: list[Candidate]) -> Candidate:
     """The best of the candidates and of variants of the best one, refined by least squares on the nodes."""
-    config, coarse, pose = task.config, task.coarse, candidates[0].pose
-    local = task.samples.to_local(pose)
-    pool = task.predictor.variants(local, coarse.to_local(pose), pose, config.variants, config.tilt)
+    config, coarse = task.config, task.coarse
+    pool: list[Candidate] = []
+    for pose in (each.pose for each in (candidates[0], *of_file(task, candidates))):
+        local = task.samples.to_local(pose)
+        pool += task.predictor.variants(local, coarse.to_local(pose), pose, config.variants, config.tilt)
     for each in candidates:
         residual = two_way_residual(task.system, coarse.to_local(each.pose), each.vectors)
         pool.append(replace(each, residual=residual))
     found = best_first(pool)
-    return choose(
-        found, config.finalists, WholeComparison(task.on_visible_samples, found), task.progress.stage("refinement")
-    )
+    comparison = WholeComparison(task.on_visible_samples, found)
+    return choose([*of_file(task, found), *found], config.finalists, comparison, task.progress.stage("refinement"))
 
 
 def _fit_nodes_to_part(task: FitTask, candidates: list[Candidate]) -> Candidate:
@@ -238,7 +238,8 @@ class WholeComparison:
         cost = replace(candidate, residual=residual).cost
         if not in_full:
             return cost
-        return cost + (0.0 if has_common_axes(candidate.pose) else SETTINGS.unusual_axes_cost) + self.doubt(candidate)
+        usual = stands_upright if self.task.shape.upright else has_common_axes
+        return cost + (0.0 if usual(candidate.pose) else SETTINGS.unusual_axes_cost) + self.doubt(candidate)
 
     def doubt(self, candidate: Candidate) -> float:
         """What is added to the residual of an interpretation that the network reads less surely."""
@@ -310,7 +311,7 @@ def has_common_axes(pose: RigidPose) -> bool:
     along -y.
     """
     up, front = pose.rotation[:, 1], pose.rotation[:, 2]
-    return bool(min(up[1], front[2]) > SETTINGS.usual_cosine or min(up[2], -front[1]) > SETTINGS.usual_cosine)
+    return bool(min(up[1], front[2]) > USUAL or min(up[2], -front[1]) > USUAL)
 
 
 def differ(here: Float[Floats, "V 3"], there: Float[Floats, "V 3"], far: float = SETTINGS.different_distance) -> bool:
