@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import edge_lengths, edges_of, unit
@@ -53,12 +54,12 @@ def _move(
     before, frames = document.placed(number, part, place), frames_of(document, number, part)
     origin = document.moved(number, part, np.tile([0.0, 0.0, 0.0, 1.0], (len(verts), 1)), place)
     back = np.linalg.pinv(frames)
-    kept = ~np.isfinite(verts).all(axis=1)
+    kept = np.asarray(~np.isfinite(verts).all(axis=1))
     now = np.where(kept[:, None], before, verts)
-    turned = np.einsum("vij,vjk,vkl->vil", back, np.where(kept[:, None, None], np.eye(3), turns), frames)
+    turned = back @ np.where(kept[:, None, None], np.eye(3), turns) @ frames
     facing = np.linalg.pinv(turned).swapaxes(1, 2)  # normals turn so that they stay across tangents
 
-    def rows(accessor: int, by: Floats) -> Floats:
+    def rows(accessor: int, by: NDArray[Any]) -> Floats:
         values = document.accessor(accessor)
         return np.hstack([np.einsum("vij,vj->vi", by, values[:, :3]), values[:, 3:]])
 
@@ -74,8 +75,7 @@ def _move(
     for target in own.get("targets", []):
         for key, by in (("POSITION", growth[:, None, None] * turned), ("NORMAL", facing), ("TANGENT", turned)):
             if key in target:
-                values = rows(target[key], by).astype("<f4")
-                target[key] = editor.add_sparse(values, bounds=key == "POSITION")
+                target[key] = editor.add_sparse(rows(target[key], by).astype(np.float32), bounds=key == "POSITION")
 
 
 def _growth(before: Float[Floats, "N 3"], now: Float[Floats, "N 3"], faces: Int[Ints, "F 3"]) -> Float[Floats, " N"]:
@@ -83,4 +83,4 @@ def _growth(before: Float[Floats, "N 3"], now: Float[Floats, "N 3"], faces: Int[
     edges = edges_of(faces).vertices
     sums = [np.bincount(edges.T.ravel(), np.tile(edge_lengths(each, edges), 2), len(now)) for each in (before, now)]
     usual = float(sums[1].sum() / sums[0].sum()) if sums[0].sum() > 0 else 1.0
-    return np.where(sums[0] > 0, sums[1] / np.where(sums[0] > 0, sums[0], 1.0), usual)
+    return np.asarray(np.where(sums[0] > 0, sums[1] / np.where(sums[0] > 0, sums[0], 1.0), usual), np.float64)
