@@ -282,4 +282,5 @@ def view(
     transfer.console.say(*page.notes)
     transfer.console.say(f"wrote {output} ({page.size / 1e6:.1f} MB): open it in a browser")
     record = {"drawn_vertices": list(page.drawn), "bytes": page.size}
-    transfer.print_record(record, page.maps, float(page.maps.forward.confidence.mean()))
+    if run.json:
+        print_json(transfer.record(record, page.maps, float(page.maps.forward.confidence.mean())))

@@ -7,7 +7,9 @@ from typer import Option
 
 import meshmatch
 from meshmatch.cli.options import RuleOptions, RunOptions, grouped, optional, output_option
+from meshmatch.cli.targets import to_targets
 from meshmatch.cli.transfer_options import MapOptions, MapOptionsWithPairs, Picture, Source, Target, Transfer
+from meshmatch.cli.words import Json
 from meshmatch.errors import InputError, OptionError
 
 _FAR = 0.02  # of the size of a shape: a landmark this far from its surface is worth a warning
@@ -15,6 +17,7 @@ On = Literal["vertices", "faces"]
 
 
 @grouped
+@to_targets(".ply", ".glb", ".obj", ".off")
 def transfer_color(
     *,
     source: Source,
@@ -35,7 +38,7 @@ def transfer_color(
         help="The numbers of --values are directions, such as normals: turn them with the surface.",
     ),
     picture: Picture = None,
-) -> None:
+) -> Json:
     """Transfer vertex colors, or other numbers per vertex.
 
     They are interpolated within the faces of SRC. The VALUE of --blank is a number, one number for each column
@@ -79,10 +82,11 @@ def transfer_color(
             tables = [table if table.ndim == 1 else table[:, 0] for table in (here, result.data)]
             shown = compose_values((a, b), tables, title)
         transfer.draw(result.maps, shown)
-    transfer.print_record({"picture": picture, "columns": columns} | low, result.maps, float(result.confidence.mean()))
+    return transfer.record({"picture": picture, "columns": columns} | low, result.maps, float(result.confidence.mean()))
 
 
 @grouped
+@to_targets(".npy")
 def transfer_labels(
     *,
     source: Source,
@@ -99,7 +103,7 @@ def transfer_labels(
     ),
     to: On | None = Option(None, help="Whether to label vertices or faces of TGT. Default: as in FILE."),
     picture: Picture = None,
-) -> None:
+) -> Json:
     """Transfer labels of vertices or faces.
 
     Labels are chosen by vote and never averaged. The VALUE of --blank is a label, such as -1 or unknown; TGT also
@@ -131,10 +135,11 @@ def transfer_labels(
         faces = given.on == "faces", found.on == "faces"
         transfer.draw(result.maps, compose_labels((a, b), (given.codes, theirs), names, faces))
     record = {"picture": picture, "from": given.on, "to": found.on, "labels": used} | low
-    transfer.print_record(record, result.maps, float(result.maps.backward.confidence.mean()))
+    return transfer.record(record, result.maps, float(result.maps.backward.confidence.mean()))
 
 
 @grouped
+@to_targets(".npz")
 def transfer_weights(
     *,
     source: Source,
@@ -149,7 +154,7 @@ def transfer_weights(
     fill: bool = Option(False, "--fill", help="Replace weights of low confidence by those of their neighbours."),
     min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Minimum confidence for weights to be trusted."),
     picture: Picture = None,
-) -> None:
+) -> Json:
     """Transfer skin weights.
 
     They are interpolated within the faces of SRC; each vertex keeps its heaviest joints, and their weights sum to 1.
@@ -183,10 +188,11 @@ def transfer_weights(
         heaviest = most_votes(given.matrix), most_votes(matrix)
         transfer.draw(result.maps, compose_labels((a, b), heaviest, given.names))
     counts = {"picture": picture, "joints": len(given.names), "used_joints": used, "without_weights": bare}
-    transfer.print_record(counts | low, result.maps, float(result.confidence.mean()))
+    return transfer.record(counts | low, result.maps, float(result.confidence.mean()))
 
 
 @grouped
+@to_targets(".csv")
 def transfer_landmarks(
     *,
     source: Source,
@@ -203,7 +209,7 @@ def transfer_landmarks(
     run: RunOptions,
     min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Landmarks below this confidence are listed."),
     picture: Picture = None,
-) -> None:
+) -> Json:
     """Transfer landmarks to exact points on the surface of another shape.
 
     For each landmark, .csv and .json files have its vertex, position, face with barycentric weights, and confidence;
@@ -241,4 +247,4 @@ def transfer_landmarks(
 
         transfer.draw(result.maps, compose_points((a, b), (given.points, found.points)))
     counts = {"landmarks": len(found.names), "min_confidence": min_confidence, "low_confidence": len(low)}
-    transfer.print_record({"picture": picture} | counts, result.maps, float(result.maps.forward.confidence.mean()))
+    return transfer.record({"picture": picture} | counts, result.maps, float(result.maps.forward.confidence.mean()))

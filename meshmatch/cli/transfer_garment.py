@@ -6,10 +6,13 @@ from typer import Argument
 
 import meshmatch
 from meshmatch.cli.options import RunOptions, grouped, output_option
+from meshmatch.cli.targets import to_targets
 from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, Transfer
+from meshmatch.cli.words import Json
 
 
 @grouped
+@to_targets("")
 def transfer_garment(
     *,
     garment: Path = Argument(..., metavar="GARMENT", help="Mesh that sits on SRC: clothes, hair, a hat, shoes."),
@@ -23,7 +26,7 @@ def transfer_garment(
     maps: MapOptions,
     run: RunOptions,
     picture: Picture = None,
-) -> None:
+) -> Json:
     """Transfer clothes, hair or other things that sit on one shape to another.
 
     GARMENT must lie on SRC, in its place and unit. Its vertices follow SRC to TGT, with their distance from the skin
@@ -56,4 +59,4 @@ def transfer_garment(
         transfer.draw(result.maps, compose_worn((a, b), (worn, result.shape)))
     record = {"picture": picture, "files": [str(file) for file in plan.files], "vertices": worn.V}
     record |= {"pushed_out": len(result.pushed), "below_skin": len(result.sunk)}
-    transfer.print_record(record, result.maps, float(result.maps.forward.confidence.mean()))
+    return transfer.record(record, result.maps, float(result.maps.forward.confidence.mean()))

@@ -13,7 +13,7 @@ from typer import Argument, Option
 import meshmatch
 from meshmatch.cli import words
 from meshmatch.cli.options import PAIRS_HELP, PairOptions, RunOptions, check_outputs
-from meshmatch.cli.words import Console, Json, print_json
+from meshmatch.cli.words import Console, Json
 from meshmatch.models.registry import check_model
 from meshmatch.outputs import replace_all_on_success
 
@@ -139,10 +139,8 @@ class Transfer:
         shown.rotated(turns).named(self.names).render(self.picture)
         self.console.say(f"drew {self.picture}: both shapes with what was transferred")
 
-    def print_record(self, own: Json, maps: MapPair, confidence: float) -> None:
-        """With --json, what was done, and by which map."""
-        if not self.run.json:
-            return
+    def record(self, own: Json, maps: MapPair, confidence: float) -> Json:
+        """For --json: what was done, and by which map."""
         record: Json = {"output": self.output} | own | words.map_record(maps.forward, self.names)
         record["map"] = self.options.map
         record["confidence_mean"] = confidence
@@ -151,4 +149,4 @@ class Transfer:
                 "notes": list(maps.match.notes),
                 "seconds": round(maps.match.seconds, 3),
             }
-        print_json(record)
+        return record

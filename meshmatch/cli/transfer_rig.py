@@ -7,12 +7,15 @@ from typer import Option
 
 import meshmatch
 from meshmatch.cli.options import RunOptions, grouped, output_option
+from meshmatch.cli.targets import to_targets
 from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, Transfer
+from meshmatch.cli.words import Json
 
 _NAMED = 8  # joints that a note lists
 
 
 @grouped
+@to_targets(".glb")
 def transfer_rig(
     *,
     source: Source,
@@ -26,7 +29,7 @@ def transfer_rig(
         "rest", help="How TGT stands in the file. rest: as it came; source: as SRC stands."
     ),
     picture: Picture = None,
-) -> None:
+) -> Json:
     """Transfer a rig: skeleton, skin weights and animation clips.
 
     SRC is a rigged .glb, .gltf or .vrm, or a file that Blender reads. Of a TGT in these formats everything is kept but a
@@ -63,4 +66,4 @@ def transfer_rig(
         transfer.draw(result.maps, compose_labels((a, b), heaviest, result.weights.names))
     record = {"picture": picture, "pose": pose, "joints": joints, "clips": clips, "unused_joints": list(result.unused)}
     record |= {"replaced_joints": result.replaced}
-    transfer.print_record(record, result.maps, float(result.maps.forward.confidence.mean()))
+    return transfer.record(record, result.maps, float(result.maps.forward.confidence.mean()))

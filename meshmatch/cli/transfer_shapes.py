@@ -6,12 +6,15 @@ from typer import Option
 
 import meshmatch
 from meshmatch.cli.options import RunOptions, grouped, output_option
+from meshmatch.cli.targets import to_targets
 from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, Transfer
+from meshmatch.cli.words import Json
 
 _NAMED = 8  # shapes that a warning lists
 
 
 @grouped
+@to_targets(".glb")
 def transfer_shapes(
     *,
     source: Source,
@@ -30,7 +33,7 @@ def transfer_shapes(
     maps: MapOptions,
     run: RunOptions,
     picture: Picture = None,
-) -> None:
+) -> Json:
     """Transfer blendshapes (morph targets), such as the expressions of a face.
 
     SRC is a .glb, .gltf or .vrm with morph targets, or any mesh with --shapes. Displacements turn and grow with the
@@ -62,4 +65,4 @@ def transfer_shapes(
         bodies = result.maps.source, result.target
         transfer.draw(result.maps, compose_values(bodies, moved, "largest displacement of a shape"))
     record = {"picture": picture, "shapes": list(names), "still": list(result.still), "clips": clips}
-    transfer.print_record(record, result.maps, float(result.maps.backward.confidence.mean()))
+    return transfer.record(record, result.maps, float(result.maps.backward.confidence.mean()))

@@ -8,6 +8,7 @@ from typer import Option
 
 import meshmatch
 from meshmatch.cli.options import RuleOptions, RunOptions, grouped, optional, output_option
+from meshmatch.cli.targets import to_targets
 from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, Transfer
 from meshmatch.cli.words import Console, Json
 from meshmatch.errors import OptionError
@@ -34,6 +35,7 @@ class TextureOptions:
 
 
 @grouped
+@to_targets(".glb", ".obj")
 def transfer_texture(
     *,
     source: Source,
@@ -48,7 +50,7 @@ def transfer_texture(
     rules: RuleOptions,
     run: RunOptions,
     picture: Picture = None,
-) -> None:
+) -> Json:
     """Transfer the material of one shape to another: color, normals, roughness, metal, occlusion and emission.
 
     Each texel takes those of the corresponding point of SRC, from its materials and images or from its vertex colors. The
@@ -98,7 +100,7 @@ def transfer_texture(
         result = meshmatch.load_shape(output)
         transfer.draw(pair, compose_shapes([(a, look), (result, textured_files.find_appearance(output, result))]))
     record = {"picture": picture, "files": [str(file) for file in files]} | record
-    transfer.print_record(record, pair, float(pair.backward.confidence.mean()))
+    return transfer.record(record, pair, float(pair.backward.confidence.mean()))
 
 
 def _tell_baked(

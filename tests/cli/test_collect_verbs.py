@@ -106,6 +106,12 @@ def test_transfers_and_measures_follow_fits(fits: Path, run: Run, tmp_path: Path
     followed = Collection(fits).map("dancer", "climber").apply(np.load(values))
     assert np.allclose(np.load(tmp_path / "there.npy"), followed)
     assert run("evaluate", fits, climber, dancer, "--json").status == 0
+    many = run(words[0], climber, fits, *words[3:5], "-o", tmp_path / "all", "--format", "npy", "--json")
+    assert many.status == 0, many.err
+    assert [(each["name"], each["map"]) for each in json.loads(many.out)["targets"]] == [
+        ("climber", str(fits)), ("dancer", str(fits))
+    ]  # fmt: skip
+    assert np.allclose(np.load(tmp_path / "all" / "dancer.npy"), followed)
     stranger = run(*words[:2], SAMPLES / "child.ply", *words[3:], "--map", fits)
     assert stranger.status == 1 and "holds no fit of child" in stranger.err
     assert run(*words, "--map", tmp_path).status == 1

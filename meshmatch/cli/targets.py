@@ -1,0 +1,254 @@
+"""One transfer to several targets: files, a folder of shapes, or a folder of fits; what is finished is kept."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import inspect
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, is_dataclass, replace
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+from typer import Argument, Option
+
+import meshmatch
+from meshmatch.cli.transfer_options import MapOptions
+from meshmatch.cli.words import Console, Json, print_json
+from meshmatch.errors import InputError, MeshmatchError, OptionError, OutputError
+
+Verb = Callable[..., Json]
+TABLE = "transfers.csv"
+_COLUMNS = ("name", "file", "output", "verdict", "confidence", "seconds", "error", "made")
+_ROW = "{:<28} {:<8} {:>10} {:>8}"
+_FAILED, _FITS = "failed", "fits.csv"
+_NAMED = 5  # targets that the last line lists
+_Targets = Annotated[
+    list[Path],
+    Argument(
+        metavar="TGT",
+        help="Shape to transfer to. Or several: files, patterns in quotes, a folder of shapes, or a folder of fits, whose "
+        "maps are used; the output is a folder then.",
+    ),
+]
+
+
+def to_targets(suffix: str, *own: str) -> Callable[[Verb], Callable[..., None]]:
+    """Let a verb of one target, which returns its record for --json, take several.
+
+    What it writes for each ends in ``suffix``, or as the target does where that is one of ``own``; if ``suffix`` is empty,
+    as the garment does.
+    """
+
+    def wrapped(verb: Verb) -> Callable[..., None]:
+        @wraps(verb)
+        def called(*, target: list[Path], ending: str | None, **rest: Any) -> None:
+            if _several(target):
+                _transfer_all(verb, target, lambda file: _ending(file, ending, suffix, own, rest), rest)
+                return
+            if ending is not None:
+                raise OptionError("--format is for several targets", "end the name of the output in it")
+            record = verb(target=target[0], **rest)
+            if rest["run"].json:
+                print_json(record)
+
+        usual = f"{suffix}{', or as TGT' if own else ''}" if suffix else "as GARMENT"
+        words = f"With several targets, what the name of each output ends in. Default: {usual}."
+        format_ = Option(None, "--format", metavar="SUFFIX", help=words)
+        parameters = dict(inspect.signature(verb).parameters)
+        parameters["target"] = parameters["target"].replace(annotation=_Targets)
+        parameters["ending"] = inspect.Parameter("ending", inspect.Parameter.KEYWORD_ONLY, default=format_)
+        called.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
+        hints = get_type_hints(verb, include_extras=True)
+        called.__annotations__ = hints | {"target": _Targets, "ending": str | None, "return": None}
+        return called
+
+    return wrapped
+
+
+@dataclass(frozen=True)
+class _Row:
+    """What became of one target: a row of ``transfers.csv``. What it was made of and how is a digest."""
+
+    name: str
+    file: str
+    output: str
+    verdict: str
+    confidence: str = ""
+    seconds: str = ""
+    error: str = ""
+    made: str = ""
+
+
+def _several(target: Sequence[Path]) -> bool:
+    one = target[0]
+    return len(target) > 1 or one.is_dir() or (not one.exists() and any(mark in str(one) for mark in "*?["))
+
+
+def _ending(file: Path, given: str | None, suffix: str, own: Sequence[str], rest: Mapping[str, Any]) -> str:
+    if given is not None:
+        return f".{given.removeprefix('.')}"
+    if not suffix:
+        garment = rest["garment"].suffix.lower()
+        return ".glb" if garment in (".gltf", ".vrm") else str(garment)
+    if rest.get("values") is not None:  # a shape does not hold them
+        return suffix
+    return file.suffix.lower() if file.suffix.lower() in own else suffix
+
+
+def _transfer_all(verb: Verb, target: Sequence[Path], ending: Callable[[Path], str], rest: dict[str, Any]) -> None:
+    """Transfer to each target, say a row for each, and fail in the end if one failed."""
+    from meshmatch.collections.stores import Store
+
+    run, output, picture = rest["run"], rest["output"], rest["picture"]
+    _check_folders(output, picture)
+    rest["maps"].check()
+    files, maps = _files(target, output, rest["maps"], [rest["source"], rest.get("garment")])
+    console = Console(run.quiet)
+    rest |= {"maps": maps, "run": _changed(run, json=False, quiet=True)}
+    how = _how(verb, rest)
+    with Store.of(output).alone():
+        rows = _read(output / TABLE)
+        _write(output / TABLE, rows.values())
+        console.say(_ROW.format("target", "verdict", "confidence", "seconds"))
+        records = []
+        for name, file in files.items():
+            written = output / f"{name}{ending(file)}"
+            made, before = _digest(how, file), rows.get(name)
+            kept = before is not None and before.made == made and before.output == str(written) and written.exists()
+            if before is None or not kept:
+                drawn = None if picture is None else picture / f"{name}.png"
+                row, record = _transfer(verb, name, rest | {"target": file, "output": written, "picture": drawn}, made)
+                with (output / TABLE).open("a", encoding="utf-8", newline="") as table:
+                    csv.writer(table, lineterminator="\n").writerow(asdict(row).values())
+            else:
+                row, record = before, {"output": before.output, "verdict": before.verdict, "kept": True}
+            rows[name] = row
+            records.append({"name": name, "file": str(file)} | record)
+            console.say(_ROW.format(name, row.verdict, row.confidence, "kept" if kept else row.seconds).rstrip())
+            if row.error:
+                console.warn(f"{name}: {row.error}")
+        _write(output / TABLE, rows.values())
+    _tell(console, output, [rows[name] for name in files], records, run.json)
+
+
+def _transfer(verb: Verb, name: str, rest: dict[str, Any], made: str) -> tuple[_Row, Json]:
+    """What became of one target; that a transfer fails stops no other."""
+    from meshmatch.outputs import make_folder
+
+    file, output, began = str(rest["target"]), str(rest["output"]), time.monotonic()
+    try:
+        for path in (rest["output"], rest["picture"]):
+            if path is not None:
+                make_folder(path.parent)
+        record = verb(**rest)
+    except MeshmatchError as error:
+        words = error.message + (f" ({error.hint})" if error.hint else "")
+        return _Row(name, file, output, _FAILED, error=words), {"verdict": _FAILED, "error": words}
+    confidence, seconds = f"{record['confidence_mean']:.2f}", f"{time.monotonic() - began:.1f}"
+    return _Row(name, file, output, record["verdict"], confidence, seconds, made=made), record
+
+
+def _tell(console: Console, output: Path, rows: Sequence[_Row], records: list[Json], json: bool) -> None:
+    counts = Counter(row.verdict for row in rows)
+    told = ", ".join(f"{counts[verdict]} {verdict}" for verdict in sorted(counts))
+    done = len(rows) - counts[_FAILED]
+    console.say(f"{done} of {len(rows)} targets are in {output}: {told}; see {output / TABLE}")
+    if json:
+        print_json({"output": output, "table": output / TABLE, "verdicts": counts, "targets": records})
+    if counts[_FAILED]:
+        failed = [row.name for row in rows if row.verdict == _FAILED]
+        names = ", ".join(failed[:_NAMED]) + (", ..." if len(failed) > _NAMED else "")
+        hint = f"{output / TABLE} says why; the same command goes on with what is missing"
+        raise InputError(f"{len(failed)} of {len(rows)} targets failed: {names}", hint)
+
+
+def _check_folders(output: Path, picture: Path | None) -> None:
+    """Refuse files where folders are needed (`OptionError`)."""
+    from meshmatch.shapes.files import SUFFIXES
+
+    for path, what in ((output, "the output"), (picture, "the picture")):
+        if path is not None and path.suffix.lower() in (*SUFFIXES, ".npz", ".csv", ".txt", ".json", ".png"):
+            raise OptionError(f"of several targets {what} is a folder, not {path.name}", "give a name without a suffix")
+
+
+def _files(
+    target: Sequence[Path], output: Path, maps: MapOptions, others: Iterable[Path | None]
+) -> tuple[dict[str, Path], MapOptions]:
+    """The targets by name, without other inputs; and where their maps come from."""
+    from meshmatch.collections.sources import find_sources
+    from meshmatch.collections.stores import Store
+
+    fits = target[0] / _FITS
+    if len(target) == 1 and fits.is_file():
+        with fits.open(encoding="utf-8", newline="") as file:
+            rows = [row for row in csv.DictReader(file) if row.get("verdict") != _FAILED]
+        found = {str(row.get("name")): Path(str(row.get("file"))) for row in rows}
+        maps = maps if maps.map is not None else _changed(maps, map=target[0])
+    else:
+        sources = find_sources([str(each) for each in target], Store.of(output))
+        found = {source.name: Path(source.path) for source in sources}
+    taken = {os.path.realpath(path) for path in others if path is not None}
+    found = {name: file for name, file in found.items() if os.path.realpath(file) not in taken}
+    if not found:
+        raise InputError(f"there is no target in {target[0]}", "name files or folders of shapes")
+    return found, maps
+
+
+def _changed(options: Any, **changes: Any) -> Any:
+    """A group of options with others; which were given stays known."""
+    new = replace(options, **changes)
+    object.__setattr__(new, "given", options.given)
+    return new
+
+
+def _how(verb: Verb, rest: Mapping[str, Any]) -> str:
+    """All that decides about the results but the target: choices, and the files that are read."""
+    parts = [meshmatch.__version__, verb.__name__]
+    for name, value in sorted(rest.items()):
+        if name in ("run", "output", "picture"):
+            continue
+        values = asdict(value) if is_dataclass(value) and not isinstance(value, type) else {name: value}
+        for key, each in sorted(values.items()):
+            parts.append(f"{key}={each!r}")
+            listed = each if isinstance(each, list | tuple) else [each]
+            parts += [_state(path) for path in listed if isinstance(path, Path)]
+    return "\n".join([*parts, f"strict={rest['run'].strict}"])
+
+
+def _state(path: Path) -> str:
+    """What tells whether a file, or one in a folder, has changed."""
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    found = [(file, file.stat()) for file in files if file.is_file()]
+    return " ".join(f"{file} {state.st_size} {state.st_mtime_ns}" for file, state in found)
+
+
+def _digest(how: str, file: Path) -> str:
+    return hashlib.blake2b(f"{how}\n{_state(file)}".encode(errors="surrogatepass"), digest_size=16).hexdigest()
+
+
+def _read(path: Path) -> dict[str, _Row]:
+    """The rows of a table that a run before wrote; `OutputError` if it is something else."""
+    if not path.exists():
+        return {}
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            lines = csv.reader(file)
+            if tuple(next(lines, ())) != _COLUMNS:
+                raise ValueError
+            rows = [_Row(*line) for line in lines if len(line) == len(_COLUMNS)]
+    except (OSError, ValueError, csv.Error) as error:
+        raise OutputError(f"{path} is no table of transfers", "choose another folder") from error
+    return {row.name: row for row in rows}
+
+
+def _write(path: Path, rows: Iterable[_Row]) -> None:
+    from meshmatch.outputs import replace_on_success
+    from meshmatch.shapes.tables import write_rows
+
+    with replace_on_success(path) as temporary:
+        write_rows(temporary, _COLUMNS, ([str(each) for each in asdict(row).values()] for row in rows))

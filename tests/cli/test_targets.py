@@ -1,0 +1,171 @@
+"""One transfer to many targets, through the program's only door."""
+
+import csv
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from meshmatch.api import matching
+from meshmatch.api.results import MatchResult
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.shape import Shape
+from tests.cli.conftest import FakeMatching, Run, well
+
+LABELS = ("transfer-labels", "a.ply", "in", "--labels", "labels.txt", "-o", "out")
+VERBS = {
+    "transfer-color": ("b.ply", "sub/c.glb"),
+    "transfer-labels": ("b.npy", "sub/c.npy"),
+    "transfer-weights": ("b.npz", "sub/c.npz"),
+    "transfer-landmarks": ("b.csv", "sub/c.csv"),
+    "transfer-shapes": ("b.glb", "sub/c.glb"),
+    "transfer-garment": ("b.obj", "sub/c.obj"),
+}
+"""What each verb writes of in/b.ply and in/sub/c.glb."""
+MORE = {
+    "transfer-labels": ("--labels", "labels.txt"),
+    "transfer-weights": ("--weights", "weights.json"),
+    "transfer-landmarks": ("--landmarks", "points.txt"),
+    "transfer-shapes": ("--shapes", "moved.ply"),
+}
+
+
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sphere: Shape, torus: Shape) -> Path:
+    """A source and a folder of two targets, and what verbs want beside them."""
+    monkeypatch.chdir(tmp_path)
+    Path("in/sub").mkdir(parents=True)
+    save_shape("worn.obj", Shape(1.1 * sphere.verts, sphere.faces, "worn"))
+    save_shape("moved.ply", Shape(sphere.verts + 0.1, sphere.faces))
+    save_shape("a.ply", Shape(sphere.verts, sphere.faces, "a", np.full((sphere.V, 4), 0.5)))
+    save_shape("in/b.ply", torus)
+    save_shape("in/sub/c.glb", torus)
+    Path("labels.txt").write_text("1\n" * sphere.V)
+    Path("weights.json").write_text(json.dumps({"weights": [[1.0]] * sphere.V}))
+    Path("points.txt").write_text("0\n5\n")
+    return tmp_path
+
+
+def table(folder: str = "out") -> dict[str, dict[str, str]]:
+    with Path(folder, "transfers.csv").open(encoding="utf-8", newline="") as file:
+        return {row["name"]: row for row in csv.DictReader(file)}
+
+
+def counted(stub: FakeMatching, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The names of targets, as they are matched from now on."""
+    seen: list[str] = []
+
+    def match(a: Shape, b: Shape, **options: Any) -> MatchResult:
+        seen.append(b.name)
+        return stub.match(a, b, **options)
+
+    monkeypatch.setattr(matching, "match", match)
+    return seen
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_takes_a_folder(run: Run, files: Path, stub: FakeMatching, verb: str) -> None:
+    garment = ("worn.obj",) if verb == "transfer-garment" else ()
+    answer = well(run(verb, *garment, "a.ply", "in", "-o", "out", *MORE.get(verb, ()), "--json"))
+    assert {str(path.relative_to("out")) for path in Path("out").rglob("*.*")} >= {*VERBS[verb], "transfers.csv"}
+    record = json.loads(answer.out)
+    assert (record["output"], record["table"], record["verdicts"]) == ("out", "out/transfers.csv", {"good": 2})
+    assert [each["name"] for each in record["targets"]] == ["b", "sub/c"]
+    assert [each["source"] for each in record["targets"]] == ["a.ply", "a.ply"]
+    lines = answer.err.splitlines()
+    assert lines[0].split() == ["target", "verdict", "confidence", "seconds"]
+    assert [line.split()[:3] for line in lines if line.startswith(("b ", "sub/c "))] == [
+        ["b", "good", "1.00"], ["sub/c", "good", "1.00"]
+    ]  # fmt: skip
+    assert "2 of 2 targets are in out: 2 good; see out/transfers.csv" in lines
+
+
+def test_what_is_finished_is_kept(run: Run, files: Path, stub: FakeMatching, monkeypatch: pytest.MonkeyPatch) -> None:
+    well(run(*LABELS))
+    seen = counted(stub, monkeypatch)
+    before = {path: path.read_bytes() for path in Path("out").rglob("*.npy")}
+    answer = well(run(*LABELS, "--json", "--threads", "1"))
+    assert (seen, "kept" in answer.err) == ([], True)
+    assert [each["kept"] for each in json.loads(answer.out)["targets"]] == [True, True]
+    Path("out/b.npy").unlink()
+    well(run(*LABELS))
+    assert seen == ["b.ply"]
+    later = load_shape("in/sub/c.glb").verts + 1.0
+    save_shape("in/sub/c.glb", Shape(later, load_shape("in/sub/c.glb").faces))
+    save_shape("in/d.ply", load_shape("in/b.ply"))
+    well(run(*LABELS))
+    assert seen == ["b.ply", "d.ply", "c.glb"]
+    well(run(*LABELS, "--to", "faces"))  # another choice
+    assert seen[3:] == ["b.ply", "d.ply", "c.glb"]
+    os.utime("labels.txt", (1, 1))  # another file, as far as one can tell
+    well(run(*LABELS, "--to", "faces"))
+    assert seen[6:] == ["b.ply", "d.ply", "c.glb"]
+    assert set(before) <= set(Path("out").rglob("*.npy"))
+
+
+def test_one_that_fails_stops_no_other(run: Run, files: Path, stub: FakeMatching) -> None:
+    Path("in/a-bad.ply").write_text("nothing")
+    answer = run(*LABELS, "--json")
+    assert answer.status == 1
+    assert "warning: a-bad: a-bad.ply is not a ply file" in answer.err
+    assert answer.err.splitlines()[-2] == "error: 1 of 3 targets failed: a-bad"
+    assert json.loads(answer.out)["verdicts"] == {"failed": 1, "good": 2}
+    assert Path("out/b.npy").exists() and not Path("out/a-bad.npy").exists()
+    assert table()["a-bad"]["verdict"] == "failed" and "not a ply file" in table()["a-bad"]["error"]
+    save_shape("in/a-bad.ply", load_shape("in/b.ply"))
+    answer = well(run(*LABELS))
+    assert answer.err.count("kept") == 2
+    assert table()["a-bad"]["verdict"] == "good"
+
+
+def test_a_poor_map_fails_where_that_is_asked(run: Run, files: Path, stub: FakeMatching) -> None:
+    stub.verdict = "poor"
+    assert well(run(*LABELS)).err.count("poor") >= 2
+    answer = run(*LABELS, "--strict")
+    assert answer.status == 1 and "2 of 2 targets failed: b, sub/c" in answer.err
+
+
+def test_lists_patterns_and_pictures(run: Run, files: Path, stub: FakeMatching) -> None:
+    words = LABELS[:2], ("in/b.ply", "in/sub/c.glb"), LABELS[3:]
+    well(run(*words[0], *words[1], *words[2], "--picture", "pictures", "--format", ".txt"))
+    assert sorted(path.name for path in Path("pictures").iterdir()) == ["b.png", "c.png"]
+    assert sorted(path.name for path in Path("out").glob("*.txt")) == ["b.txt", "c.txt"]
+    well(run(*words[0], "in/*.ply", *words[2][:-1], "some"))
+    assert list(table("some")) == ["b"]
+    well(run(*words[0], "in/b.ply", "a.ply", *words[2][:-1], "others"))
+    assert list(table("others")) == ["b"]  # not to itself
+
+
+WRONG = [
+    ((*LABELS[:-1], "out.npy"), "of several targets the output is a folder, not out.npy"),
+    ((*LABELS, "--picture", "p.png"), "of several targets the picture is a folder, not p.png"),
+    ((*LABELS[:-1], "taken"), "taken/transfers.csv is no table of transfers"),
+    ((*LABELS[:2], "empty", *LABELS[3:]), "there are no shapes in empty"),
+    ((*LABELS[:2], "in/b.ply", *LABELS[3:-1], "out.npy", "--format", "txt"), "--format is for several targets"),
+    ((*LABELS, "--up", "y", "--front", "-y"), "lie along one axis"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), WRONG)
+def test_what_cannot_be_is_told(
+    run: Run, files: Path, stub: FakeMatching, words: tuple[str, ...], message: str
+) -> None:
+    Path("empty").mkdir()
+    Path("taken").mkdir()
+    Path("taken/transfers.csv").write_text("mine\n")
+    answer = run(*words)
+    assert answer.status == 1 and message in answer.err, answer.err
+    assert Path("taken/transfers.csv").read_text() == "mine\n"
+    assert not Path("out").exists()
+
+
+def test_a_damaged_row_is_done_again(run: Run, files: Path, stub: FakeMatching) -> None:
+    well(run(*LABELS))
+    text = Path("out/transfers.csv").read_text().splitlines()
+    Path("out/transfers.csv").write_text("\n".join([*text[:2], text[2][:20]]))
+    answer = well(run(*LABELS))
+    assert answer.err.count("kept") == 1
+    assert len(table()) == 2
