@@ -14,7 +14,7 @@ import numpy as np
 from meshmatch.api.results import MapPair
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.atlas import Atlas
-from meshmatch.collections.fit_all import Fitted, fit_all
+from meshmatch.collections.fit_all import TABLE, Fitted, fit_all, fit_other_kinds
 from meshmatch.collections.fit_files import load_words
 from meshmatch.collections.map_all import Pair, map_all
 from meshmatch.collections.registered import Registered, held
@@ -99,7 +99,8 @@ class Collection:
         shapes
             Files, folders, patterns such as ``scans/*.ply``, or URLs of folders.
         model
-            Name, folder, "auto" or "none".
+            Name, folder, "auto" or "none". With "auto" the first shape decides; shapes of other kinds that the installed
+            models know are fitted by theirs, in a folder of the kind's name within this one.
         config
             How all shapes are fitted.
         only
@@ -130,6 +131,8 @@ class Collection:
         with self.store.alone(), hired(self.workers) as crew:
             setting = settled(wish, sources)
             made = fit_all(setting, sources, crew, agree, self.progress, tell)
+            if model == AUTO:
+                made = fit_other_kinds(made, wish, sources, crew, agree, self.progress, tell)
         forget()
         return made
 
@@ -222,7 +225,8 @@ class Collection:
     def maps_between(self, source: ShapeLike, target: ShapeLike) -> MapPair:
         """The maps between two shapes themselves, in both directions, for transfers and `evaluate`.
 
-        They are found among the fits by their vertices and faces.
+        They are found among the fits by their vertices and faces; also among those of another kind, which are in a folder
+        of their own.
 
         Parameters
         ----------
@@ -243,6 +247,10 @@ class Collection:
         """
         shapes = as_shape(source, "source"), as_shape(target, "target")
         names = {self._hash_of(name): name for name in self.names}
+        for other in self._others():
+            theirs = {other._hash_of(name): name for name in other.names}
+            if all(shape.hash in theirs for shape in shapes):
+                return other.maps_between(*shapes)
         for shape in shapes:
             if shape.hash not in names:
                 hint = "fit it with `meshmatch fit`; its vertices and faces must be those of the fitted file"
@@ -250,6 +258,11 @@ class Collection:
         a, b = (names[shape.hash] for shape in shapes)
         there, back = self.map(a, b).for_shapes(*shapes), self.map(b, a).for_shapes(*shapes[::-1])
         return MapPair(*shapes, unfolded(there, *shapes), opposite=unfolded(back, *shapes[::-1]))
+
+    def _others(self) -> list[Collection]:
+        """The collections of shapes of other kinds within this one."""
+        found = [name.split("/") for name in self.store.names() if name.endswith(f"/{TABLE}")]
+        return [Collection(f"{self.store.location}/{parts[0]}") for parts in found if len(parts) == 2]
 
     def _hash_of(self, name: str) -> str:
         return str(self._words(name).get("shape_hash", ""))

@@ -6,11 +6,12 @@ import csv
 import io
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from meshmatch.arrays import Floats
 from meshmatch.collections.setting import AGREEING, ALONE, FAILED, FIRST, Record, Setting, Source, digest_of
-from meshmatch.collections.settle import on_the_mean, save_text
+from meshmatch.collections.settle import on_the_mean, save_text, settled
 from meshmatch.collections.sources import natural
 from meshmatch.collections.stores import Store
 from meshmatch.collections.tasks import (
@@ -38,7 +39,7 @@ from meshmatch.progress import ProgressCallback
 TABLE = "fits.csv"
 COLUMNS = (
     *("name", "file", "verdict", "trust", "reasons", "residual", "inverted", "volume"),
-    *("up", "front", "vertices", "seconds", "notes"),
+    *("up", "front", "vertices", "seconds", "notes", "kind"),
 )
 _GROUP = 4  # fits that one task of the agreement takes a step with: fixed, for sums must not depend on the workers
 
@@ -90,6 +91,36 @@ def fit_all(
     setting.store.remove(AGREEING)
     _write_table(setting.store, records)
     return Fitted(tuple(records), len(agreeing) if groups else 0, setting.model)
+
+
+def fit_other_kinds(
+    made: Fitted,
+    wish: Setting,
+    sources: Sequence[Source],
+    crew: Workers,
+    agree: bool = True,
+    progress: ProgressCallback | None = None,
+    tell: Callable[[Record], None] | None = None,
+) -> Fitted:
+    """Fit shapes that are of another kind than the model by the model of their own, in a folder of that name within the
+    folder of all; the records say so then. ``wish`` is as it was before the first shapes decided on a model.
+    """
+    others: dict[str, list[int]] = defaultdict(list)
+    for number, record in enumerate(made.records):
+        if record.kind:
+            others[record.kind].append(number)
+    records = list(made.records)
+    for kind, numbers in others.items():
+        store, own = Store.of(f"{wish.store.location}/{kind}"), [sources[number] for number in numbers]
+        with store.alone(), suppress(InputError):  # of kinds that change their mind: the first fits stay
+            setting = settled(replace(wish, store=store), own)
+            found = fit_all(setting, own, crew, agree, progress, tell)
+            for number, record in zip(numbers, found.records, strict=True):
+                where = f"{kind}: its fit is in {store.location}"
+                records[number] = replace(record, kind=kind, notes=f"{where}; {record.notes}".removesuffix("; "))
+    if others:
+        _write_table(wish.store, records)
+    return replace(made, records=tuple(records))
 
 
 @dataclass(frozen=True)

@@ -87,6 +87,7 @@ class Record:
     seconds: float = 0.0
     digest: str = ""
     notes: str = ""  # which parts were left out, if any
+    kind: str = ""  # that it is of, if that is another one than the model's
 
     @property
     def fitted(self) -> bool:

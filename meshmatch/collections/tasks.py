@@ -57,9 +57,9 @@ def fit_alone(task: FitTask) -> Record:
         last = None if task.last is None else setting.read(task.folder, task.last.name).fit
         fit = setting.fit(source.load(setting.only, setting.without), last)
         assert fit.repaired is not None
-        reasons, samples = "; ".join(fit.reasons), None
+        reasons, other, samples = "; ".join(fit.reasons), "", None
         if fit.verdict == "poor" and setting.model != NO_MODEL:
-            other = other_kind(setting.trained, fit.repaired.shape, setting.config)
+            other = other_kind(setting.trained, fit.repaired.shape, setting.config) or ""
             reasons = f"it is of another kind: {other}; {reasons}" if other else reasons
         if setting.agrees:
             how = AgreeConfig.for_collection(setting.trained)
@@ -78,6 +78,7 @@ def fit_alone(task: FitTask) -> Record:
             seconds=round(time.monotonic() - began, 3),
             digest=digest,
             notes=fit.repaired.notes[0] if fit.left_out else "; ".join(fit.notes) if fit.model == NO_MODEL else "",
+            kind=other,
         )
         words = {"record": asdict(record), "roughness": fit.repaired.shape.roughness}
         with setting.store.writing(file) as path:

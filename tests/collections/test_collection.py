@@ -435,3 +435,21 @@ def test_a_shape_of_another_kind_is_called_so(tmp_path: Path) -> None:
     shutil.copy(SAMPLES / "dancer.ply", tmp_path)
     (record,) = meshmatch.Collection(tmp_path / "fits", workers=1).fit(tmp_path, model="quadruped").records
     assert (record.verdict, record.reasons.split("; ")[0]) == ("poor", "it is of another kind: human")
+
+
+def test_each_shape_of_a_mixed_folder_gets_the_model_of_its_kind(tmp_path: Path) -> None:
+    (tmp_path / "shapes").mkdir()
+    for name in ("dancer", "calf", "fox"):
+        shutil.copy(SAMPLES / f"{name}.ply", tmp_path / "shapes" / f"{'a-' if name == 'dancer' else ''}{name}.ply")
+    collection = meshmatch.Collection(tmp_path / "fits", workers=1)
+    made = collection.fit(tmp_path / "shapes")
+    assert (made.model, [record.verdict for record in made.records]) == ("human", ["good"] * 3)
+    assert [record.kind for record in made.records] == ["", "quadruped", "quadruped"]
+    assert made.records[1].notes.startswith(f"quadruped: its fit is in {tmp_path / 'fits' / 'quadruped'}")
+    animals = meshmatch.Collection(tmp_path / "fits" / "quadruped")
+    assert (animals.model, animals.names) == ("quadruped", ["calf", "fox"])
+    files = [tmp_path / "shapes" / f"{name}.ply" for name in ("calf", "fox")]
+    assert collection.maps_between(*files).forward.verdict == "good"
+    before = {path: path.read_bytes() for path in (tmp_path / "fits").rglob("*.safetensors")}
+    assert [record.verdict for record in collection.fit(tmp_path / "shapes").records] == ["good"] * 3
+    assert before == {path: path.read_bytes() for path in (tmp_path / "fits").rglob("*.safetensors")}
