@@ -56,7 +56,8 @@ def fit(
 ) -> None:
     """Fit every shape of a collection once, for maps between any two of them and for atlases.
 
-    Each shape is reported when it is finished; one that cannot be fitted does not stop the others. Run the command
+    Each shape is reported when it is finished; one that cannot be fitted does not stop the others. Without --model, shapes
+    of another kind than the first are fitted by the model of theirs, in FITS/KIND. Run the command
     again to continue after an interruption or to add shapes. With --model none the template is built from the shapes
     themselves, which must be complete, in any pose and orientation; mirror images are found. FITS/fits.csv lists the
     result of every shape.
