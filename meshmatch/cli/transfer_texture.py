@@ -1,6 +1,6 @@
 """``meshmatch transfer-texture``."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -77,6 +77,7 @@ def transfer_texture(
     look = textured_files.load_appearance(source, a, image)
     layers = () if look.finish is None else look.finish.images
     files = [output] if painted else textured_files.files_of(output, layers)
+    turn = None
     with transfer.outputs(image, files=files) as temporary:
         if painted:
             done = meshmatch.transfer_colors(a, b, transfer, colors=look, rule=rule)
@@ -91,6 +92,7 @@ def transfer_texture(
             made.dressed.write(output, temporary)
             record, pair = _tell_baked(transfer.console, made, rule, size), made.maps
             if made.dressed.turned and output.suffix.lower() == ".glb":
+                turn = made.dressed.turn
                 transfer.console.say(f"note: a node turns {b.name} upright, along y")
     what = "with vertex colors" if painted else f"with a texture of {size} x {size}"
     transfer.console.say(f"wrote {' '.join(str(file) for file in files)}: {transfer.names[1]} {what}")
@@ -98,6 +100,8 @@ def transfer_texture(
         from meshmatch.render.compose import compose_shapes
 
         result = meshmatch.load_shape(output)
+        if turn is not None:  # the picture shows it as the target's file has it
+            result = replace(result, verts=result.verts @ turn)
         transfer.draw(pair, compose_shapes([(a, look), (result, textured_files.find_appearance(output, result))]))
     record = {"picture": picture, "files": [str(file) for file in files]} | record
     return transfer.record(record, pair, float(pair.backward.confidence.mean()))

@@ -122,6 +122,26 @@ def test_a_texture_on_both(run: Run, pair: Path, drawn: Drawn) -> None:  # noqa:
     assert not drawn.panels[1].appearance.textured
 
 
+def test_what_is_turned_upright_in_its_file_is_drawn_as_the_target_stands(
+    run: Run,
+    pair: Path,  # noqa: F811
+    drawn: Drawn,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    quarter = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    monkeypatch.setattr("meshmatch.api.texture.turn_upright", lambda *_: quarter)
+    write_square_obj(pair / "square.obj")
+    square = load_shape("square.obj")
+    (pair / "square.mtl").write_text("newmtl paint\nmap_Kd skin.png\n")
+    (pair / "skin.png").write_bytes(encoded(quarters(8)))
+    save_shape("plain.ply", square)
+    np.save("same.npy", np.arange(4))
+    words = ("transfer-texture", "square.obj", "plain.ply", "--map", "same.npy", "--size", "64")
+    well(run(*words, "-o", "out.glb", "--picture", "p.png"))
+    assert np.abs(load_shape("out.glb").bounds - square.bounds).max() > 0.1
+    assert drawn.panels[1].shape.bounds == pytest.approx(square.bounds, abs=1e-6)
+
+
 def test_after_a_match_shapes_are_turned_as_their_fits_say(
     run: Run,
     pair: Path,  # noqa: F811
