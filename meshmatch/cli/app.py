@@ -7,6 +7,7 @@ from typer.core import TyperGroup
 
 from meshmatch import __version__
 from meshmatch.cli.atlas import atlas
+from meshmatch.cli.blender_addon import blender_addon
 from meshmatch.cli.collect import fit, map
 from meshmatch.cli.info import info
 from meshmatch.cli.interpolate import interpolate
@@ -70,7 +71,7 @@ for verb in (
     *(transfer_texture, transfer_color, transfer_labels, transfer_weights),
     *(transfer_rig, transfer_shapes, transfer_landmarks, transfer_garment),
     *(fit, map, atlas),
-    *(interpolate, picture, view, info, prepare, train),
+    *(interpolate, picture, view, info, prepare, train, blender_addon),
 ):
     app.command()(verb)
 app.add_typer(models, name="models")

@@ -92,7 +92,9 @@ def test_later_shapes_are_of_the_kind_before(models: list[TrainedModel]) -> None
 def test_a_complete_shape_of_no_kind_is_refused() -> None:
     with pytest.raises(InputError, match=r"chair 7 7 6 does not look like .*: human, quadruped") as caught:
         choose(ball("man 3 4 6"), ball("chair 7 7 6"))
-    assert caught.value.hint.startswith("nearest: quadruped, trust 0.00; if it is one, name the model: --model quadruped")
+    assert caught.value.hint.startswith(
+        "nearest: quadruped, trust 0.00; if it is one, name the model: --model quadruped"
+    )
     with pytest.raises(InputError) as caught:  # too strange for a fit
         choose(ball("man 3 4 6"), ball("robot 8 9 9"))
     assert caught.value.hint.startswith("nearest: human; if it is one, name the model: --model human")
