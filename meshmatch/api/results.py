@@ -22,6 +22,7 @@ from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.places import Places
 from meshmatch.maps.unfold import unfolded
 from meshmatch.maps.vertex_map import VertexMap, check_map
+from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.moved_files import save_moved
 from meshmatch.shapes.repair import Repaired
@@ -285,6 +286,7 @@ def evaluate(
     truth: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
     *,
     seed: int = 0,
+    progress: ProgressCallback | None = None,
 ) -> Evaluation:
     """Measure a map: its coverage, its distortion, and its errors where the truth is known.
 
@@ -304,6 +306,8 @@ def evaluate(
         ((N,), (N,)).
     seed
         Of the random pairs of points between which distortion is measured.
+    progress
+        As in `match`.
 
     Returns
     -------
@@ -328,4 +332,4 @@ def evaluate(
     check_map(vertex_map)
     known = truth if isinstance(truth, tuple) and len(truth) == 2 else (None, truth)
     with thread_limit(1):
-        return evaluate_map(vertex_map, source, target, *known, rng=np.random.default_rng(seed))
+        return evaluate_map(vertex_map, source, target, *known, rng=np.random.default_rng(seed), progress=progress)

@@ -198,7 +198,9 @@ def evaluate(
     else:
         found = meshmatch.load_map(map_file, *shapes)
     known = options.load_truth(truth, points, shapes[0])
-    result = meshmatch.evaluate(found, *shapes, known, seed=seed)
+    console = Console()
+    with console.progress() as report:
+        result = meshmatch.evaluate(found, *shapes, known, seed=seed, progress=report)
     if known is not None and result.errors is not None:
         if curve is not None:
             from meshmatch.render.charts import draw_curves
@@ -209,7 +211,7 @@ def evaluate(
             from meshmatch.render.compose import compose_errors
 
             compose_errors(*shapes, found, known, result.errors, unit).render(picture)
-    Console().say(*(f"note: {reason}" for reason in found.reasons))
+    console.say(*(f"note: {reason}" for reason in found.reasons))
     if json:
         print_json(dict(result.as_dict(threshold)))
     else:

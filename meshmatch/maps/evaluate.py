@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from meshmatch.errors import InputError
 from meshmatch.maps.folds import Folds
 from meshmatch.maps.geodesics import GEODESIC, GeodesicDistances
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.shape import Shape
 
 SKIN_M2 = 1.9
@@ -79,7 +80,11 @@ class Coverage:
 
 
 def map_errors(
-    index: ArrayLike, source_points: ArrayLike, target_points: ArrayLike, geodesics: GeodesicDistances
+    index: ArrayLike,
+    source_points: ArrayLike,
+    target_points: ArrayLike,
+    geodesics: GeodesicDistances,
+    progress: Callable[[float], None] | None = None,
 ) -> Errors:
     """Errors at known points: is ``index[source_points[n]]`` the vertex ``target_points[n]``?
 
@@ -96,7 +101,7 @@ def map_errors(
     for ids, size, side in ((a, len(index), "source"), (b, geodesics.V, "target")):
         if ids.min() < 0 or ids.max() >= size:
             raise InputError(f"the truth names points that are not among the {size} vertices of the {side}")
-    return Errors(geodesics.between(index[a], b).astype(np.float32))
+    return Errors(geodesics.between(index[a], b, progress).astype(np.float32))
 
 
 def coverage(index: ArrayLike, target: Shape) -> Coverage:
@@ -165,6 +170,7 @@ def evaluate_map(
     target_points: ArrayLike | None = None,
     *,
     rng: np.random.Generator | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Evaluation:
     """Coverage, distortion and folds (if both shapes are meshes) and, where the truth is given as in `map_errors`, errors.
 
@@ -173,12 +179,14 @@ def evaluate_map(
     or if the truth is given and the target is a cloud.
     """
     vertex_map = vertex_map.for_shapes(source, target)
-    errors = stretched = folds = None
+    over = errors = stretched = folds = None
+    report = Progress(progress, target.name).stage("measuring errors")
     if target_points is not None:
         source_points = np.arange(source.V) if source_points is None else source_points
-        errors = map_errors(vertex_map.index, source_points, target_points, GeodesicDistances(target))
+        over = GeodesicDistances(target)
+        errors = map_errors(vertex_map.index, source_points, target_points, over, report)
     if not source.is_cloud and not target.is_cloud:
-        both = GeodesicDistances(source), GeodesicDistances(target)
+        both = GeodesicDistances(source), over or GeodesicDistances(target)
         stretched = distortion(vertex_map.index, *both, rng or np.random.default_rng(0))
         folds = Folds.of(vertex_map, source, target)
     return Evaluation(coverage(vertex_map.index, target), stretched, folds, errors)

@@ -8,7 +8,7 @@ lies on the surface and its length is exact. Adding these diagonals to the graph
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -21,6 +21,9 @@ from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.shape import Shape
 
 CHUNK_BYTES = 64_000_000
+# Pairs that are near each other are searched for within so many edges first, then within twice as much, up to a share of the
+# shape's size; a path is taken to be at most so much longer than the straight line; of fewer pairs all is searched.
+_EDGES, _NEARBY, _DETOUR, _FEW = 6.0, 0.1, 1.2, 200
 GEODESIC = "Dijkstra on edges and unfolded diagonals"
 
 Arcs = tuple[Ints, Ints, Floats]
@@ -110,6 +113,8 @@ class GeodesicDistances:
             raise InputError(f"{shape.name or 'the shape'} has no surface area")
         # An invalid vertex has a stand-in for a position: a path over it would cut through the body.
         self.graph = surface_graph(shape.verts, shape.faces[shape.valid_faces])
+        self._verts = shape.verts
+        self._step = _EDGES * float(np.median(self.graph.data)) if self.graph.nnz else 0.0
 
     @property
     def V(self) -> int:
@@ -127,13 +132,22 @@ class GeodesicDistances:
         for first in range(0, len(sources), step):
             yield first, self.rows(sources[first : first + step])
 
-    def between(self, a: Int[Ints, " N"], b: Int[Ints, " N"]) -> Float[Floats, " N"]:
-        """Distances between vertices ``a[n]`` and ``b[n]``, one Dijkstra for each different one in
-        the side that has fewer of them."""
+    def between(
+        self, a: Int[Ints, " N"], b: Int[Ints, " N"], progress: Callable[[float], None] | None = None
+    ) -> Float[Floats, " N"]:
+        """Distances between vertices ``a[n]`` and ``b[n]``; ``progress`` is called with the share of pairs that are done.
+
+        Where the two are near each other, the graph is searched around them alone; of the others one Dijkstra is made for
+        each different one in the side that has fewer of them.
+        """
         a, b = np.asarray(a, dtype=np.int64), np.asarray(b, dtype=np.int64)
+        report = progress or (lambda share: None)
         # Where the two agree the distance is 0: an identity costs nothing.
         result = np.zeros(len(a))
         differ = np.flatnonzero(a != b)
+        for done in self._near(a, b, differ, result):
+            report(1.0 - len(done) / max(len(a), 1))
+            differ = done
         starts, column = np.unique(a[differ], return_inverse=True)
         other = b[differ]
         ends, end_column = np.unique(other, return_inverse=True)
@@ -142,4 +156,42 @@ class GeodesicDistances:
         for first, rows in self.chunks(starts):
             mine = np.flatnonzero((column >= first) & (column < first + len(rows)))
             result[differ[mine]] = rows[column[mine] - first, other[mine]]
+            report(1.0 - len(differ) / max(len(a), 1) * (1.0 - (first + len(rows)) / len(starts)))
         return result
+
+    def _near(self, a: Ints, b: Ints, left: Ints, result: Floats) -> Iterator[Ints]:
+        """Fill in distances of pairs that are near each other, nearest first; gives the pairs that are left, every time.
+
+        No edge of the graph is longer than its ends are apart, so a path of some length stays within that distance of its
+        start: a box around is all that has to be searched.
+        """
+        apart = np.linalg.norm(self._verts[a[left]] - self._verts[b[left]], axis=1)
+        low, high = self._verts.min(axis=0), self._verts.max(axis=0)
+        reach, most = self._step, _NEARBY * float((high - low).max())
+        tree = cKDTree(self._verts) if len(left) > _FEW else None
+        while tree is not None and reach < most and len(left) > _FEW:
+            now = np.flatnonzero(apart * _DETOUR <= reach)
+            cells = np.floor((self._verts[a[left[now]]] - low) / reach).astype(np.int64)
+            order = np.lexsort(cells.T)
+            changes = (np.diff(cells[order], axis=0) != 0).any(axis=1)
+            found = np.zeros(len(left), bool)
+            for group in np.split(now[order], np.flatnonzero(changes) + 1) if len(now) else ():
+                pairs = left[group]
+                center = low + (np.floor((self._verts[a[pairs[0]]] - low) / reach) + 0.5) * reach
+                nodes = np.sort(tree.query_ball_point(center, 1.5 * reach, p=np.inf))
+                part = self.graph[nodes][:, nodes]
+                starts, row = np.unique(a[pairs], return_inverse=True)
+                ends = np.searchsorted(nodes, b[pairs]).clip(max=len(nodes) - 1)
+                here = nodes[ends] == b[pairs]
+                size = max(1, CHUNK_BYTES // (8 * len(nodes)))
+                for first in range(0, len(starts), size):
+                    some = np.searchsorted(nodes, starts[first : first + size])
+                    rows = dijkstra(part, directed=True, indices=some, limit=reach).reshape(len(some), -1)
+                    mine = np.flatnonzero(here & (row >= first) & (row < first + len(some)))
+                    values = rows[row[mine] - first, ends[mine]]
+                    known = np.isfinite(values)
+                    result[pairs[mine[known]]] = values[known] / self.unit
+                    found[group[mine[known]]] = True
+            left, apart = left[~found], apart[~found]
+            reach *= 2.0
+            yield left

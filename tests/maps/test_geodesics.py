@@ -78,6 +78,32 @@ def test_chunks_and_pairs_agree_with_rows() -> None:
     assert geodesics.between(np.arange(9), np.arange(9)).tolist() == [0.0] * 9
 
 
+def test_pairs_near_each_other_are_as_far_as_in_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two sheets that nearly touch, and a bridge to a third: some pairs are near in space and far along the surface."""
+    first = grid(30, 30)
+    above = first.verts + np.array([0.2, 0.1, 0.05])
+    verts = np.concatenate([first.verts, above, first.verts + np.array([40.0, 0, 0])])
+    faces = np.concatenate([first.faces + k * first.V for k in range(3)])
+    shape = Shape(verts, faces, "sheets")
+    geodesics = GeodesicDistances(shape)
+    rng = np.random.default_rng(0)
+    a = rng.integers(0, shape.V, 2000)
+    near = np.clip(a + rng.integers(-3, 4, 2000) + 31 * rng.integers(-3, 4, 2000), 0, shape.V - 1)
+    b = np.where(rng.random(2000) < 0.2, (a + first.V) % shape.V, near)
+    true = geodesics.rows(a)[np.arange(2000), b]
+    asked: list[int] = []
+    monkeypatch.setattr(
+        geodesics, "chunks", lambda starts: asked.append(len(starts)) or GeodesicDistances.chunks(geodesics, starts)
+    )
+    monkeypatch.setattr("meshmatch.maps.geodesics._NEARBY", 0.5)
+    shares: list[float] = []
+    assert geodesics.between(a, b, shares.append) == pytest.approx(true, abs=1e-12)
+    assert asked[0] < 700  # most pairs did not need all of the surface
+    assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) > 2
+    monkeypatch.setattr("meshmatch.maps.geodesics.CHUNK_BYTES", 4000)
+    assert geodesics.between(a, b) == pytest.approx(true, abs=1e-12)
+
+
 def test_a_seam_costs_nothing() -> None:
     sheet = grid(2, 2, name="cut")
     # The same sheet as two halves that share no vertex, as an OBJ with texture seams has them.
