@@ -53,7 +53,8 @@ def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> Ma
     target
         The shape that receives them.
     match
-        A match or a map from source to target, or its path; or a `Matcher` that makes it, by default a new one.
+        A match or a map from source to target, or its path; or a `Matcher` that makes it. By default a new one, unless
+        both meshes have the same faces: then each vertex goes to the one of its number.
 
     Returns
     -------
@@ -72,6 +73,8 @@ def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> Ma
     >>> moved = meshmatch.transfer_values(maps.source, maps.target, heights, maps)
     """
     source, target = as_shape(source, "source"), as_shape(target, "target")
+    if match is None and have_same_faces(source, target):
+        return vertex_to_vertex(source, target)
     label = Path(match).name if isinstance(match, str | Path) else "the map"
     found = load_map(match) if isinstance(match, str | Path) else match
     if callable(found):
@@ -90,6 +93,20 @@ def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> Ma
         return MapPair(source, target, found.map.for_shapes(source, target), found, found.threads)
     found.forward.for_shapes(source, target)
     return found
+
+
+def have_same_faces(source: Shape, target: Shape) -> bool:
+    """Whether two meshes are one in two poses: as many vertices, and the same triangles in the same order."""
+    return source.V == target.V and source.F > 0 and np.array_equal(source.faces, target.faces)
+
+
+def vertex_to_vertex(source: Shape, target: Shape) -> MapPair:
+    """The exact maps between two poses of one mesh."""
+    there, back = (
+        VertexMap.between(a, b, np.arange(a.V), confidence=np.ones(a.V, np.float32), verdict="good")
+        for a, b in ((source, target), (target, source))
+    )
+    return MapPair(source, target, there, opposite=back)
 
 
 def transfer_values(

@@ -14,7 +14,7 @@ import meshmatch
 from meshmatch.cli import words
 from meshmatch.cli.options import PAIRS_HELP, PairOptions, RunOptions, check_outputs
 from meshmatch.cli.words import Console, Json
-from meshmatch.models.registry import check_model
+from meshmatch.models.registry import AUTO, check_model
 from meshmatch.outputs import replace_all_on_success
 
 if TYPE_CHECKING:
@@ -91,7 +91,8 @@ class Transfer:
             yield temporary
 
     def __call__(self, source: meshmatch.Shape, target: meshmatch.Shape) -> MapPair:
-        """The maps, from the file or by matching; judged if --strict was given."""
+        """The maps, from the file, by the same faces or by matching; judged if --strict was given."""
+        from meshmatch.api.transfer import have_same_faces, vertex_to_vertex
 
         def matched(a: meshmatch.Shape, b: meshmatch.Shape) -> meshmatch.MatchResult:
             if self.options.only or self.options.without:  # a fit's weights, no attribute to carry
@@ -100,12 +101,16 @@ class Transfer:
 
         if self.options.map is not None and self.options.map.is_dir():
             maps = meshmatch.Collection(self.options.map).maps_between(source, target)
+        elif self.options.map is None and self.options.model == AUTO and have_same_faces(source, target):
+            maps = vertex_to_vertex(source, target)
         else:
             maps = meshmatch.find_maps(source, target, self.options.map or matched)
         found = maps.forward
         words.refuse_poor(self.run.strict, found.verdict, found.reasons, "the map")
         a, b = self.names
-        if maps.match is None:
+        if maps.match is None and self.options.map is None:
+            self.console.say(f"{a} and {b} have the same faces: each vertex goes to the one of its number")
+        elif maps.match is None:
             self.console.say(f"used the map {self.options.map} from {a} to {b}")
         else:
             words.tell_match(self.console, maps.match, (a, b))

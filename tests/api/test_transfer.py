@@ -10,6 +10,7 @@ import meshmatch
 from meshmatch import ConfidenceRule
 from meshmatch.api import matching
 from meshmatch.api.results import MapPair
+from meshmatch.api.transfer import have_same_faces
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
@@ -37,6 +38,18 @@ def test_a_map_at_hand_is_turned_round() -> None:
     assert np.allclose(maps.backward.points(coarse), back.points(coarse), atol=1e-12)
     assert meshmatch.find_maps(coarse, fine, maps) is maps
     assert meshmatch.find_maps(coarse, fine, lambda source, target: MapPair(source, target, forward)).match is None
+
+
+def test_two_poses_of_a_mesh_need_no_match(pair: tuple[Shape, Shape, VertexMap]) -> None:
+    sphere, other, true = pair
+    maps = meshmatch.find_maps(sphere, other)
+    for found in (maps.forward, maps.backward):
+        np.testing.assert_array_equal(found.index, true.index)
+        assert (found.verdict, found.confidence.min()) == ("good", 1.0)
+    values = np.arange(float(sphere.V))
+    np.testing.assert_array_equal(meshmatch.transfer_values(sphere, other, values).data, values)
+    assert not have_same_faces(sphere, Shape(other.verts, np.roll(other.faces, 1, axis=1)))
+    assert not have_same_faces(Shape(sphere.verts, sphere.faces[:0]), Shape(other.verts, other.faces[:0]))
 
 
 def test_shapes_and_map_may_be_files(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ Maps are made by construction; the last test alone matches.
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,13 @@ def test_colors_of_a_finer_copy(run: Run, pair: Path, out: str) -> None:
     assert np.abs(found[:, :3] - (b.verts / 2 + 0.5)).max() < 0.05
     assert f"wrote {out}: colors for the {b.V} vertices of b.ply" in answer.err
     assert "used the map ab.npz from a.ply to b.ply" in answer.err
+
+
+def test_two_poses_of_a_mesh_are_told(run: Run, pair: Path) -> None:
+    save_shape("posed.ply", replace(load_shape("a.ply"), verts=2.0 * load_shape("a.ply").verts + 1.0))
+    answer = well(run("transfer-color", "a.ply", "posed.ply", "--values", "values.npy", "-o", "v.npy"))
+    assert "a.ply and posed.ply have the same faces: each vertex goes to the one of its number" in answer.err
+    np.testing.assert_array_equal(np.load("v.npy"), np.load("values.npy"))
 
 
 def test_values_of_a_finer_copy(run: Run, pair: Path) -> None:
