@@ -1,6 +1,6 @@
 """``meshmatch transfer-texture``."""
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -111,7 +111,10 @@ def _tell_baked(
     console: Console, made: "meshmatch.TexturedResult", rule: "meshmatch.ConfidenceRule", size: int
 ) -> Json:
     """What came out, in words and for --json."""
-    baked, atlas = made.baked, made.atlas
+    from meshmatch.maps.folds import Folds
+
+    baked, atlas, maps = made.baked, made.atlas, made.maps
+    folds = None if maps.source.is_cloud else Folds.of(maps.backward, maps.target, maps.source)
     if atlas.note:
         console.say(f"note: {atlas.note}")
     if baked.low:
@@ -119,6 +122,11 @@ def _tell_baked(
         console.say(f"{100 * baked.low:.1f} % of the surface has less confidence than {rule.minimum:g}: {became}")
     if baked.torn > _WORTH_SAYING:
         console.say(f"note: the map is discontinuous on {100 * baked.torn:.1f} % of the surface; colors are cut there")
+    if folds is not None:
+        console.say(
+            f"the map turns over {100 * folds.flipped:.2f} % of the surface and crushes {100 * folds.crushed:.2f} %; "
+            f"half of it is stretched or shrunk by more than {folds.stretch:.2f}"
+        )
     whose = "its own texture coordinates" if atlas.own else "new texture coordinates"
     console.say(f"{whose}: {100 * baked.used:.0f} % of the texture lies on the surface ({made.seconds:.1f} s)")
     uv = {"size": size, "uv": "own" if atlas.own else "new", "uv_note": atlas.note, "used": baked.used}
@@ -129,4 +137,5 @@ def _tell_baked(
         | {"alpha": baked.material.alpha}
         | low
         | {"torn_share": baked.torn, "baking_seconds": round(made.seconds, 3)}
+        | ({} if folds is None else asdict(folds))
     )

@@ -101,6 +101,7 @@ def test_a_finer_copy_shows_the_same(run: Run, pair: Path, out: str) -> None:
     assert np.median(off) < 20 and (off < 60).mean() > 0.9  # the middles of two triangles, not one place
     assert "used the map ab.npz" in answer.err
     assert "new texture coordinates: " in answer.err
+    assert "the map turns over 0.00 % of the surface" in answer.err
     assert f"wrote {out}" in answer.err
     assert answer.out == ""
 
@@ -115,6 +116,7 @@ def test_json_says_all_of_it(run: Run, pair: Path) -> None:
     assert record["low_confidence_share"] == record["filled_share"] == record["blank_share"] == 0
     assert (record["source"], record["target"], record["map"]) == ("a.glb", "b.ply", "ab.npz")
     assert record["baking_seconds"] > 0
+    assert record["flipped"] == 0 and record["crushed"] < 0.01 and 1 <= record["stretch"] < 1.2
 
 
 @pytest.mark.parametrize(("uv", "used"), [("auto", "own"), ("keep", "own"), ("new", "new")])
