@@ -8,7 +8,9 @@ jaxtyping is not loaded for them either, unless it was before, as tests do.
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import Field, fields
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -92,6 +94,13 @@ class Brief:
         if isinstance(value, tuple | list | dict) and len(value) > 3:
             return f"{field.name}: {len(value)} items"
         return f"{field.name}={value!r}"
+
+
+def table_html(title: str, rows: Mapping[str, str]) -> str:
+    """A heading and a table for a notebook, of the rows that say something."""
+    left = '<td style="text-align:left">'
+    lines = [f"<tr>{left}{escape(name)}</td>{left}{escape(value)}</td></tr>" for name, value in rows.items() if value]
+    return f"<b>{escape(title)}</b><table>{''.join(lines)}</table>"
 
 
 def off_torch(values: Any) -> Any:

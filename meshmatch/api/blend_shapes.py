@@ -74,6 +74,11 @@ class BlendShapesResult(Brief):
     stands_along_y: bool = False
     original: Path | None = None
 
+    def _repr_html_(self) -> str:
+        from meshmatch.api.notebook import carried_html
+
+        return carried_html("Blendshapes", self.maps.forward, None, {"shapes": ", ".join(self.shapes.names)})
+
     def save(self, path: str | Path) -> None:
         """Write the target with its shapes.
 

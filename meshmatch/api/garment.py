@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from meshmatch.api.results import MapPair, MovedMesh
@@ -45,6 +46,14 @@ class GarmentResult(MovedMesh):
     sunk: Int[Ints, " M"]
     maps: MapPair
     seconds: float
+
+    def _repr_html_(self) -> str:
+        from meshmatch.api.notebook import carried_html
+        from meshmatch.render.compose import compose_worn
+
+        sunk = f"{len(self.pushed)} pushed out, {len(self.sunk)} below the skin"
+        draw = partial(compose_worn, [self.maps.target], [self.shape])
+        return carried_html("Garment", self.maps.forward, draw, {"vertices of the garment": sunk})
 
 
 def transfer_garment(garment: ShapeLike, source: ShapeLike, target: ShapeLike, match: MapLike = None) -> GarmentResult:

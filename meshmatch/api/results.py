@@ -113,6 +113,14 @@ class MatchResult:
     def __repr__(self) -> str:
         return f"MatchResult({self.map!r}, {self.seconds:.1f} s, {len(self.notes)} notes)"
 
+    def _repr_html_(self) -> str:
+        from meshmatch.api.notebook import map_html
+
+        repaired = [getattr(fit, "repaired", None) for fit in (self.source_fit, self.target_fit)]
+        shapes = (repaired[0].original, repaired[1].original) if repaired[0] and repaired[1] else None
+        more = {"time": f"{self.seconds:.1f} s", "notes": "; ".join(self.notes)}
+        return map_html("Match", self.map, shapes, self.rotations, more)
+
     @property
     def rotations(self) -> tuple[Floats | None, Floats | None]:
         """(3, 3) of source and target: from their files into the orientation of the template, for pictures; an implicit
@@ -171,6 +179,11 @@ class MapPair(Brief):
     match: MatchResult | None = None
     threads: int = 1
     opposite: VertexMap | None = None
+
+    def _repr_html_(self) -> str:
+        from meshmatch.api.notebook import map_html
+
+        return map_html("Maps", self.forward, (self.source, self.target), self.rotations)
 
     @property
     def rotations(self) -> tuple[Floats | None, Floats | None]:
@@ -277,6 +290,12 @@ class Transferred(Brief, Generic[T]):
     confidence: Float[Floats, " N"]
     low: LowConfidence
     maps: MapPair
+
+    def _repr_html_(self) -> str:
+        from meshmatch.api.notebook import map_html
+
+        maps, low = self.maps, {"low confidence": f"{self.low.low:,} of {self.low.total:,} values"}
+        return map_html("Transferred", maps.forward, (maps.source, maps.target), maps.rotations, low)
 
 
 def evaluate(

@@ -22,7 +22,7 @@ from meshmatch.shapes.formats.gltf_rig import Rig, read_rig
 from meshmatch.shapes.formats.gltf_rigged import hanging_groups, rigged
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.threads import thread_limit
-from meshmatch.transfer.attributes import joint_table, pull_weights
+from meshmatch.transfer.attributes import joint_table, most_votes, pull_weights
 from meshmatch.transfer.carry_rig import UP, carry, upright
 from meshmatch.transfer.clean_weights import clean_weights, rigid
 from meshmatch.transfer.retarget_clips import standing_clips
@@ -68,6 +68,18 @@ class RiggedResult(Brief):
     replaced: int
     maps: MapPair
     glb: bytes
+
+    def _repr_html_(self) -> str:
+        from meshmatch.api.notebook import carried_html
+        from meshmatch.render.compose import compose_labels
+
+        heaviest, target = most_votes(self.weights.matrix), self.maps.target
+        draw = partial(compose_labels, [target], [heaviest], self.weights.names)
+        more = {
+            "joints": f"{len(self.rig.joints)}, {len(self.unused)} of them without a vertex on the target",
+            "clips": ", ".join(clip.name for clip in self.rig.clips),
+        }
+        return carried_html("Rig", self.maps.forward, draw, more)
 
     def save(self, path: str | Path) -> None:
         """Write the glb.

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
@@ -18,14 +19,17 @@ from meshmatch.outputs import as_path
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.appearance import Appearance, vertex_colors_alone
 from meshmatch.shapes.dressed_files import Dressed
-from meshmatch.shapes.files import ShapeLike, as_shape
+from meshmatch.shapes.files import ShapeLike, as_shape, load_shape
 from meshmatch.shapes.formats import gltf, obj_text
 from meshmatch.shapes.input_files import read_bytes
-from meshmatch.shapes.textured_files import load_appearance, load_coordinates
+from meshmatch.shapes.textured_files import find_appearance, load_appearance, load_coordinates
 from meshmatch.threads import thread_limit
 from meshmatch.transfer import bake
 from meshmatch.transfer.bake import Baked, BakeOptions
 from meshmatch.transfer.unwrap import Atlas, Keep, atlas_of
+
+if TYPE_CHECKING:
+    from meshmatch.render.compose import Composition
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -58,6 +62,22 @@ class TexturedResult(Brief):
     atlas: Atlas
     maps: MapPair
     seconds: float
+
+    def _repr_html_(self) -> str:
+        from meshmatch.api.notebook import carried_html
+
+        used = f"{'its own' if self.atlas.own else 'new'}; {100 * self.baked.used:.0f} % of the image is used"
+        return carried_html("Texture", self.maps.forward, self._drawn, {"texture coordinates": used})
+
+    def _drawn(self) -> Composition:
+        """The target as its file will look."""
+        from meshmatch.render.compose import compose_shapes
+
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "shown.glb")
+            self.save(path)
+            shape = load_shape(path)
+            return compose_shapes([(shape, find_appearance(path, shape))])
 
     def save(self, path: str | Path) -> None:
         """Write a .glb, or an .obj with an .mtl and a .png of the same name.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,6 +62,14 @@ class WrapResult(MovedMesh):
     free: Bool[Bools, " V"]
     match: MatchResult
     seconds: float
+
+    def _repr_html_(self) -> str:
+        from meshmatch.api.notebook import carried_html
+        from meshmatch.render.compose import compose_shapes
+
+        apart = f"{float(self.distance.mean()):.3g} on average, {float(self.distance.max()):.3g} at most"
+        draw = partial(compose_shapes, [(self.shape, None)], plain=True)
+        return carried_html("Wrap", self.match.map, draw, {"distance to the surface": apart})
 
 
 def wrap(

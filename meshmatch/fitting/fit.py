@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats, Int, Ints, Pickled
+from meshmatch.arrays import Float, Floats, Int, Ints, Pickled, table_html
 from meshmatch.errors import OptionError
 from meshmatch.fitting.judge.reasons import Reason, Verdict
 from meshmatch.fitting.solve.regularity import Regularity
@@ -113,6 +113,17 @@ class Fit(Pickled):
         part = ", part" if self.partial else ""
         way = f"up {self.up}, front {self.front}"
         return f"Fit({name}model {self.model!r}, {self.verdict}, trust {self.trust:.2f}, {way}{part})"
+
+    def _repr_html_(self) -> str:
+        name = self.repaired.original.name if self.repaired else "a shape"
+        rows = {
+            "model": self.model + (", fitted to a part" if self.partial else ""),
+            "verdict": "; ".join([self.verdict, *self.reasons]),
+            "trust": f"{self.trust:.2f}",
+            "axes": f"up {self.up}, front {self.front}",
+            "notes": "; ".join(self.notes),
+        }
+        return table_html(f"Fit: {name}", rows)
 
     @cached_property
     def vertex_distance(self) -> Floats:
