@@ -23,7 +23,7 @@ from meshmatch.threads import parallel_map
 from meshmatch.transfer.layers import ColorPainter, NormalPainter, Painter, Spots, SurfacePainter, painted_bytes
 from meshmatch.transfer.surface_walk import PointWalker, SurfaceWalker
 from meshmatch.transfer.texel_colors import MaterialSampler, TexelLocator, images_of
-from meshmatch.transfer.texels import beside_another, faces_on, fill, grown
+from meshmatch.transfer.texels import beside_another, faces_on, fill, grow
 from meshmatch.transfer.unwrap import Atlas
 
 _LARGEST = 8192  # texels along a side
@@ -32,6 +32,7 @@ _OVERHANG = 2
 # A texel that covers more than this many of the source's is sampled several times.
 _COARSE = 1.25
 _CHUNK = 1 << 16
+_BAND = 1 << 22  # texels that are painted together
 
 
 @dataclass(frozen=True)
@@ -126,8 +127,9 @@ def transfer_texture(
         valid = target.valid_faces
         target, uv = Shape(target.verts, target.faces[valid], target.name), uv[valid]
     locator = TexelLocator(walker, target, back, uv * options.size)
-    inside = faces_on(uv * options.size, options.size)[0]
-    on = grown(inside, _OVERHANG if options.padding else 0)
+    on = faces_on(uv * options.size, options.size)[0]
+    inside = on >= 0
+    grow(on, _OVERHANG if options.padding else 0)
     color = ColorPainter(look, walker)
     painters: dict[Layer, Painter] = {} if look.finish is None else _painters(look.finish, walker, locator, uv)
     (image, *others), low = _painted([color, *painters.values()], locator, on.reshape(-1), options, progress)
@@ -136,14 +138,14 @@ def transfer_texture(
         _fill(other, (on.reshape(-1) >= 0) & ~(low & options.fill), options, painter.linear)
     for each in (image, *others):
         if options.padding == 0:
-            each[inside < 0] = 0
+            each[~inside] = 0
         elif alpha == "opaque" or each is not image:
             each[..., 3] = 255
     progress(1.0)
     torn = float(target.face_areas[locator.discontinuous].sum()) / max(target.area, 1e-300)
     plain = BakedMaterial(image, alpha, color.sampler.cutoff, _name_of(look))
     material = _finished(plain, look, dict(zip(painters, others, strict=True)))
-    return Baked(material, float((inside >= 0).mean()), _share_of_surface(target, inside.reshape(-1), low), torn)
+    return Baked(material, float(inside.mean()), _share_of_surface(target, on[inside], low[inside.reshape(-1)]), torn)
 
 
 def _name_of(look: Appearance) -> str:
@@ -217,28 +219,61 @@ def _painted(
     """The images, painted where a triangle lies on a texel (N,), and the texels (N,) of low confidence."""
     size = options.size
     images = [np.zeros((size * size, 4), np.uint8) for _ in painters]
-    samplers = [sampler for painter in painters for sampler in painter.samplers]
-    chart, hint = np.full(size * size, -1, np.int32), np.full(size * size, -1, np.int32)
-    coarse, low = np.zeros(size * size, bool), np.zeros(size * size, bool)
+    low = np.zeros(size * size, bool)
+    rows = max(_BAND // size, 1)
+    for top in range(0, size, rows):
+        lines = slice(top, min(top + rows, size))
+        report = _within(progress, lines.start / size, lines.stop / size)
+        _paint_rows(painters, locator, on, options, lines, images, low, report)
+    return [image.reshape(size, size, 4) for image in images], low
 
-    def first(at: Ints) -> None:
+
+def _within(progress: Callable[[float], None], begin: float, end: float) -> Callable[[float], None]:
+    """The progress of a part of the work, as that of the whole."""
+    return lambda share: progress(begin + (end - begin) * share)
+
+
+def _paint_rows(
+    painters: Sequence[Painter],
+    locator: TexelLocator,
+    on: Ints32,
+    options: BakeOptions,
+    rows: slice,
+    images: Sequence[Pixels],
+    low: Bools,
+    progress: Callable[[float], None],
+) -> None:
+    """Paint some rows of the images, which takes memory for these alone."""
+    size = options.size
+    samplers = [sampler for painter in painters for sampler in painter.samplers]
+    above, below = max(rows.start - 1, 0), min(rows.stop + 1, size)  # rows beside, to know where seams are
+    offset, many = above * size, (below - above) * size
+    chart, hint, coarse = np.full(many, -1, np.int32), np.full(many, -1, np.int32), np.zeros(many, bool)
+    texels = offset + np.flatnonzero(on[offset : below * size] >= 0)
+    inner = (texels >= rows.start * size) & (texels < rows.stop * size)
+
+    def placed(at: Ints) -> tuple[Ints32, Floats32, Ints32, Floats32]:
         face = on[at]
         row, column = np.divmod(at, size)
         weights, place, held = locator.locate(face, (column + 0.5).astype(np.float32), (row + 0.5).astype(np.float32))
+        chart[at - offset], hint[at - offset] = samplers[0].chart[place], place
+        return face, weights, place, held
+
+    def first(at: Ints) -> None:
+        face, weights, place, held = placed(at)
         low[at] = locator.confidence(face, weights) < options.min_confidence
         spots = Spots(face, weights, place, held, locator.reach.take(face))
         for image, painter in zip(images, painters, strict=True):
             image[at] = painted_bytes(painter, painter.seen(spots))
-        chart[at], hint[at] = samplers[0].chart[place], place
         footprint = np.max([sampler.footprint(place, spots.reach) for sampler in samplers], axis=0)
-        coarse[at] = footprint > _COARSE
+        coarse[at - offset] = footprint > _COARSE
 
     grid = (np.arange(options.samples, dtype=np.float32) + np.float32(0.5)) / options.samples
     steps = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
 
     def again(at: Ints) -> None:
         row, column = (part.astype(np.float32) for part in np.divmod(at, size))
-        face, start = on[at], hint[at]
+        face, start = on[at], hint[at - offset]
         means = [_Mean(len(at)) for _ in painters]
         for right, down in steps:
             weights, place, held = locator.locate(face, column + right, row + down, start)
@@ -249,7 +284,7 @@ def _painted(
         for image, mean, painter in zip(images, means, painters, strict=True):
             image[at] = painted_bytes(painter, mean.result())
 
-    def run(work: Callable[[Ints], None], chosen: Ints, done: float, share: float) -> None:
+    def run(work: Callable[[Ints], object], chosen: Ints, done: float, share: float) -> None:
         parts, finished = [chosen[k : k + _CHUNK] for k in range(0, len(chosen), _CHUNK)], count(1)
 
         def report(part: Ints) -> None:
@@ -258,11 +293,12 @@ def _painted(
 
         parallel_map(report, parts, threads=options.workers)
 
-    run(first, np.flatnonzero(on >= 0), 0.0, 0.5)
+    run(first, texels[inner], 0.0, 0.5)
     if options.samples > 1:  # at seams, and where a texel covers much of the source's
-        several = coarse | beside_another(chart.reshape(size, size)).reshape(-1)
-        run(again, np.flatnonzero(several), 0.5, 0.45)
-    return [image.reshape(size, size, 4) for image in images], low
+        run(placed, texels[~inner], 0.5, 0.0)
+        several = coarse | beside_another(chart.reshape(-1, size)).reshape(-1)
+        chosen = offset + np.flatnonzero(several)
+        run(again, chosen[(chosen >= rows.start * size) & (chosen < rows.stop * size)], 0.5, 0.45)
 
 
 class _Mean:
@@ -305,14 +341,13 @@ def _fill_and_blank(image: Pixels, painted: Bools, low: Bools, options: BakeOpti
 def _fill(image: Pixels, weight: Bools | Floats32, options: BakeOptions, linear: bool = False) -> None:
     """Fill in the texels of an image whose weight (N,) is 0, where the options ask for that."""
     if options.padding or options.fill:
-        fill(image, weight.astype(np.float32).reshape(image.shape[:2]), linear)
+        fill(image, weight.astype(np.float32, copy=False).reshape(image.shape[:2]), linear)
 
 
 def _share_of_surface(target: Shape, inside: Ints32, low: Bools) -> float:
-    """How much of the target's area has the texels (N,) that are `low`, by the triangle on each."""
-    held = inside >= 0
-    count = np.bincount(inside[held], minlength=target.F)
-    part = np.bincount(inside[held & low], minlength=target.F)
+    """How much of the target's area has the texels that are `low` (N,), by the triangle (N,) on each."""
+    count = np.bincount(inside, minlength=target.F)
+    part = np.bincount(inside[low], minlength=target.F)
     some = count > 0
     area = target.face_areas[some]
     return float((area * part[some] / count[some]).sum() / max(area.sum(), 1e-300))

@@ -18,11 +18,14 @@ from meshmatch.shapes.appearance import Appearance, Material, Pixels, Wrap
 from meshmatch.shapes.colors import LINEAR_OF_BYTE, bytes_of
 
 _AT_ONCE = 1 << 21  # texels
-_ROWS = 256  # of an image at a time
+_ROWS = 64  # of an image at a time
 MOST_ROWS = 40_000_000
 """Of all triangles together; coordinates that need more are no atlas."""
 # Neighbours of a texel, so far down and to the right: the straight ones first.
 _AROUND = ((1, 0), (0, 1), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+# The texels that become one of the next level.
+_FOURS = tuple((slice(row, None, 2), slice(column, None, 2)) for column in (0, 1) for row in (0, 1))
+_BYTES: Floats32 = np.arange(256, dtype=np.float32)
 _SHARE: Floats32 = (np.arange(256) / 255.0).astype(np.float32)
 
 
@@ -80,16 +83,20 @@ def faces_on(corners: Floats, size: int) -> tuple[Ints32, int]:
     return found.reshape(size, size), total - int((found >= 0).sum())
 
 
-def grown(found: Ints32, steps: int) -> Ints32:
-    """The same with each texel that is free, but has a neighbour that is not, taking over from it; `steps` times."""
+def grow(found: Ints32, steps: int) -> None:
+    """Let each texel (H, W) that is free (-1), but has a neighbour that is not, take over from it; `steps` times."""
     height, width = found.shape
     for _ in range(steps):
-        framed = np.pad(found, 1, constant_values=-1)
-        found = found.copy()
+        known = found >= 0
+        near = np.pad(known, 1)
+        near = near[:-2] | near[1:-1] | near[2:]
+        row, column = np.nonzero((near[:, :-2] | near[:, 1:-1] | near[:, 2:]) & ~known)
+        taken = np.full(len(row), -1, np.int32)
         for down, right in _AROUND:
-            beside = framed[1 + down : 1 + down + height, 1 + right : 1 + right + width]
-            np.copyto(found, beside, where=found < 0)
-    return found
+            r, c = row + down, column + right
+            there = (r >= 0) & (r < height) & (c >= 0) & (c < width) & (taken < 0)
+            taken[there] = found[r[there], c[there]]
+        found[row, column] = taken
 
 
 def beside_another(values: Ints32) -> Bools:
@@ -127,16 +134,20 @@ def _next_level(pixels: Pixels, weight: Floats32, linear: bool) -> tuple[Pixels,
     height, width = pixels.shape[:2]
     out = np.zeros(((height + 1) // 2, (width + 1) // 2, 4), np.uint8)
     total = np.zeros(out.shape[:2], np.float32)
+    table = _BYTES if linear else LINEAR_OF_BYTE
     for low in range(0, height, 2 * _ROWS):
-        part = pixels[low : low + 2 * _ROWS]
-        light = np.empty(part.shape, np.float32)
-        light[..., :3] = part[..., :3] if linear else LINEAR_OF_BYTE.take(part[..., :3])
-        light[..., 3] = part[..., 3]
-        mean, known = _halved(light, weight[low : low + 2 * _ROWS])
-        rows = slice(low // 2, low // 2 + len(mean))
-        out[rows, :, :3] = np.round(mean[..., :3]) if linear else bytes_of(mean[..., :3])
-        out[rows, :, 3] = np.round(mean[..., 3])
-        total[rows] = known
+        part, own = pixels[low : low + 2 * _ROWS], weight[low : low + 2 * _ROWS]
+        odd = tuple((0, n % 2) for n in own.shape)
+        if odd != ((0, 0), (0, 0)):
+            part, own = np.pad(part, (*odd, (0, 0))), np.pad(own, odd)
+        known = _sum_of_fours([own[at] for at in _FOURS])
+        rows, safe = slice(low // 2, low // 2 + len(known)), np.maximum(known, 1e-20)
+        for k in range(4):
+            amounts = _BYTES if k == 3 else table
+            sums = _sum_of_fours([amounts.take(part[(*at, k)]) * own[at] for at in _FOURS])
+            mean = (sums / safe).astype(np.float32)
+            out[rows, :, k] = np.round(mean) if amounts is _BYTES else bytes_of(mean)
+        total[rows] = np.minimum(known, np.float32(1.0))
     return out, total
 
 
@@ -145,12 +156,13 @@ def _halved(values: Floats32, weight: Floats32) -> tuple[Floats32, Floats32]:
     odd = tuple((0, n % 2) for n in weight.shape)
     if odd != ((0, 0), (0, 0)):
         values, weight = np.pad(values, (*odd, (0, 0))), np.pad(weight, odd)
-    sums, known = _sum_of_fours(values * weight[..., None]), _sum_of_fours(weight)
+    products = values * weight[..., None]
+    sums, known = (_sum_of_fours([each[at] for at in _FOURS]) for each in (products, weight))
     return (sums / np.maximum(known, 1e-20)[..., None]).astype(np.float32), np.minimum(known, np.float32(1.0))
 
 
-def _sum_of_fours(values: Floats32) -> Floats32:
-    return (values[0::2, 0::2] + values[1::2, 0::2]) + (values[0::2, 1::2] + values[1::2, 1::2])
+def _sum_of_fours(four: list[Floats32]) -> Floats32:
+    return (four[0] + four[1]) + (four[2] + four[3])
 
 
 class Pyramid:

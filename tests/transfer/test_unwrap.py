@@ -7,7 +7,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.triangles import face_parts
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer import new_charts, unwrap
-from meshmatch.transfer.texels import faces_on, grown
+from meshmatch.transfer.texels import faces_on, grow
 from meshmatch.transfer.unwrap import atlas_of, unwrapped
 from tests.conftest import icosphere
 from tests.shapes.painted import CORNERS, FACES, UV
@@ -39,7 +39,9 @@ def test_new_coordinates_are_an_atlas(request: pytest.FixtureRequest, name: str,
     # from both sides, half of the padding may be walked without meeting
     for chart in np.unique(number):
         own, others = image == chart, (image >= 0) & (image != chart)
-        reach = grown(np.where(own, 0, -1).astype(np.int32), padding - 1) >= 0
+        found = np.where(own, 0, -1).astype(np.int32)
+        grow(found, padding - 1)
+        reach = found >= 0
         assert not (reach & others).any()
 
 
