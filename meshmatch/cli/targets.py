@@ -107,7 +107,7 @@ def _transfer_all(verb: Verb, target: Sequence[Path], ending: Callable[[Path], s
     run, output, picture = rest["run"], rest["output"], rest["picture"]
     _check_folders(output, picture)
     rest["maps"].check()
-    files, maps = _files(target, output, rest["maps"], [rest["source"], rest.get("garment")])
+    files, maps = _files(target, output, rest["maps"], (rest["source"], rest.get("garment")))
     console = Console(run.quiet)
     rest |= {"maps": maps, "run": _changed(run, json=False, quiet=True)}
     how = _how(verb, rest)
@@ -177,9 +177,9 @@ def _check_folders(output: Path, picture: Path | None) -> None:
 
 
 def _files(
-    target: Sequence[Path], output: Path, maps: MapOptions, others: Iterable[Path | None]
+    target: Sequence[Path], output: Path, maps: MapOptions, others: tuple[Path, Path | None]
 ) -> tuple[dict[str, Path], MapOptions]:
-    """The targets by name, without other inputs; and where their maps come from."""
+    """The targets by name, without other inputs, of which the source is the first; and where their maps come from."""
     from meshmatch.collections.sources import find_sources
     from meshmatch.collections.stores import Store
 
@@ -188,7 +188,8 @@ def _files(
         with fits.open(encoding="utf-8", newline="") as file:
             rows = [row for row in csv.DictReader(file) if row.get("verdict") != _FAILED]
         found = {str(row.get("name")): Path(str(row.get("file"))) for row in rows}
-        maps = maps if maps.map is not None else _changed(maps, map=target[0])
+        if maps.map is None and meshmatch.Collection(target[0]).holds(others[0]):
+            maps = _changed(maps, map=target[0])
     else:
         sources = find_sources([str(each) for each in target], Store.of(output))
         found = {source.name: Path(source.path) for source in sources}

@@ -259,6 +259,22 @@ class Collection:
         there, back = self.map(a, b).for_shapes(*shapes), self.map(b, a).for_shapes(*shapes[::-1])
         return MapPair(*shapes, unfolded(there, *shapes), opposite=unfolded(back, *shapes[::-1]))
 
+    def holds(self, shape: ShapeLike) -> bool:
+        """Whether a shape is among the fits, or among those of another kind, by its vertices and faces.
+
+        Parameters
+        ----------
+        shape
+            As in `match`.
+
+        Returns
+        -------
+        bool
+            True if `maps_between` can find it.
+        """
+        digest = as_shape(shape).hash
+        return any(digest == each._hash_of(name) for each in (self, *self._others()) for name in each.names)
+
     def _others(self) -> list[Collection]:
         """The collections of shapes of other kinds within this one."""
         found = [name.split("/") for name in self.store.names() if name.endswith(f"/{TABLE}")]

@@ -103,7 +103,7 @@ def test_transfers_and_measures_follow_fits(fits: Path, run: Run, tmp_path: Path
     words = "transfer-color", climber, dancer, "--values", values, "-o", tmp_path / "there.npy"
     answer = run(*words, "--map", fits, "--json")
     assert answer.status == 0, answer.err
-    followed = Collection(fits).map("dancer", "climber").apply(np.load(values))
+    followed = Collection(fits).maps_between(climber, dancer).backward.apply(np.load(values))
     assert np.allclose(np.load(tmp_path / "there.npy"), followed)
     assert run("evaluate", fits, climber, dancer, "--json").status == 0
     many = run(words[0], climber, fits, *words[3:5], "-o", tmp_path / "all", "--format", "npy", "--json")
@@ -112,6 +112,10 @@ def test_transfers_and_measures_follow_fits(fits: Path, run: Run, tmp_path: Path
         ("climber", str(fits)), ("dancer", str(fits))
     ]  # fmt: skip
     assert np.allclose(np.load(tmp_path / "all" / "dancer.npy"), followed)
+    np.save(values, np.zeros(load_shape(SAMPLES / "child.ply").V))
+    other = run(words[0], SAMPLES / "child.ply", fits, *words[3:5], "-o", tmp_path / "others", "--model", "nowhere")
+    assert other.status == 1 and "no model called nowhere" in other.err  # it would be matched
+    np.save(values, load_shape(climber).verts[:, 2])
     stranger = run(*words[:2], SAMPLES / "child.ply", *words[3:], "--map", fits)
     assert stranger.status == 1 and "holds no fit of child" in stranger.err
     assert run(*words, "--map", tmp_path).status == 1

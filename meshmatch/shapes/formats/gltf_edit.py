@@ -122,7 +122,7 @@ class Editor:
         rows = np.flatnonzero(values.any(axis=1))
         numbers = rows.astype("<u2" if len(values) <= 2**16 else "<u4")
         if numbers.nbytes + values[rows].nbytes + 64 > values.nbytes:  # there are two views to describe
-            return self.add_array(values, bounds=bounds)
+            return self.add_array(values, bounds=bounds, target=VERTICES)
         entry: dict[str, Any] = {"componentType": 5126, "count": len(values), "type": _TYPES[values.shape[1]]}
         if len(rows):
             indices = {
