@@ -20,6 +20,7 @@ import meshmatch
 from meshmatch.cli.transfer_options import MapOptions
 from meshmatch.cli.words import Console, Json, print_json
 from meshmatch.errors import InputError, MeshmatchError, OptionError, OutputError
+from meshmatch.models.registry import check_model
 
 Verb = Callable[..., Json]
 TABLE = "transfers.csv"
@@ -108,6 +109,8 @@ def _transfer_all(verb: Verb, target: Sequence[Path], ending: Callable[[Path], s
     _check_folders(output, picture)
     rest["maps"].check()
     files, maps = _files(target, output, rest["maps"], (rest["source"], rest.get("garment")))
+    if maps.map is None:
+        check_model(maps.model)
     console = Console(run.quiet)
     rest |= {"maps": maps, "run": _changed(run, json=False, quiet=True)}
     how = _how(verb, rest)
