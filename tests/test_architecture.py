@@ -32,6 +32,7 @@ FITTING = ("fit_config", "solve", "search", "judge", "fit")
 
 # Which rooms know which third-party library.
 OWNERS = {
+    "DracoPy": {"shapes"},
     "PIL": {"shapes", "maps", "transfer", "render", "experiments"},
     "anny": {"generators"},
     "distributed": {"collections"},
@@ -42,6 +43,7 @@ OWNERS = {
     "jaxtyping": {"arrays"},
     "matplotlib": {"render"},
     "meshmonk": {"experiments"},
+    "meshoptimizer": {"shapes"},
     "platformdirs": {"outputs", "experiments"},
     "pyFM": {"experiments"},
     "pydantic": {"models"},
@@ -84,6 +86,7 @@ DISTRIBUTIONS = {
 }
 EXTRAS = (
     "meshlab",
+    "compressed",
     "train",
     "implicit",
     "cluster",

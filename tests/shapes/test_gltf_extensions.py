@@ -97,8 +97,6 @@ def test_hidden_meshes_are_left_out_and_said(tmp_path: Path) -> None:
         ("KHR_lights_punctual", True),
         ("KHR_animation_pointer", True),
         ("VRMC_vrm", True),
-        ("KHR_draco_mesh_compression", False),
-        ("EXT_meshopt_compression", False),
         ("CESIUM_RTC", False),
         ("KHR_gaussian_splatting", False),
         ("MADE_up_materials", False),

@@ -371,7 +371,6 @@ CIRCLE = {"nodes": [{"children": [1]}, {"children": [0]}], "scenes": [{"nodes": 
 @pytest.mark.parametrize(
     ("document", "words"),
     [
-        (ONE | {"extensionsRequired": ["KHR_draco_mesh_compression"]}, "compressed"),
         (ONE | CIRCLE, "has two parents"),
         (ONE | INDEXED, "refers to vertex 7"),
         ({"nodes": [{}]}, "no triangles and no points"),

@@ -25,11 +25,10 @@ from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import to_srgb
 from meshmatch.shapes.companions import beside
 from meshmatch.shapes.formats import NO_FACES, WRONG_SUFFIX, Raw, check_places, damaged, joined_colors
+from meshmatch.shapes.formats.gltf_compressed import COMPONENTS, DRACO, MESHOPT, WIDTHS, decompress
 from meshmatch.shapes.input_files import check_text, json_of, read_bytes
 
-COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+COMPRESSED = (DRACO, *MESHOPT)
 INSTANCES, _VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
 # What a file may require: extensions that are read, and others that change neither what is drawn nor where.
 _KNOWN = ("KHR_mesh_quantization", INSTANCES, _VISIBILITY)
@@ -83,10 +82,9 @@ class Document:
             raise InputError(f"{self.name} is not a glTF file", WRONG_SUFFIX)
         if str(self.json["asset"].get("version", "")).split(".")[0] != "2":
             raise InputError(f"{self.name} is not glTF version 2", "export it as glTF 2.0")
-        for extension in self.json.get("extensionsRequired", []):
-            if extension in COMPRESSED:
-                raise self._compressed(extension)
-            if extension not in _KNOWN and not _HARMLESS.fullmatch(extension):
+        required = self.json.get("extensionsRequired", [])
+        for extension in required:
+            if extension not in (*_KNOWN, *COMPRESSED) and not _HARMLESS.fullmatch(extension):
                 unknown = f"{self.name} requires the glTF extension {extension[:80]}, which meshmatch does not read"
                 raise InputError(unknown, "export it as plain glTF 2.0")
         self.nodes = self.json.get("nodes", [])
@@ -95,6 +93,8 @@ class Document:
         self.hidden: set[int] = set()
         self._bones: dict[int, Floats] = {}  # a thousand meshes may hang from one skin of a thousand joints
         self._bound: int | None = None
+        if compressed := {each for each in required if each in COMPRESSED}:
+            self.buffers |= decompress(self.name, self.size, self.json, self.buffer, compressed)
 
     def _compressed(self, extension: str) -> InputError:
         return InputError(f"{self.name} is compressed ({extension})", "export it without mesh compression")
@@ -314,7 +314,7 @@ class Document:
     def accessor(self, number: int, whole: bool = False) -> Float[Floats, "count width"]:
         """(count, width) values; whole numbers that stand for 0..1 or -1..1 are divided unless `whole`."""
         accessor = self.json["accessors"][number]
-        count, width = int(accessor["count"]), _WIDTHS[accessor["type"]]
+        count, width = int(accessor["count"]), WIDTHS[accessor["type"]]
         kind = np.dtype(COMPONENTS[accessor["componentType"]])
         if "bufferView" in accessor:
             values = self._view(accessor, count, width, kind)

@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, OutputError
-from meshmatch.shapes.formats.gltf import COMPONENTS, INSTANCES, Document, embedded
+from meshmatch.shapes.formats.gltf import INSTANCES, Document, embedded
+from meshmatch.shapes.formats.gltf_compressed import COMPONENTS
 from meshmatch.shapes.formats.gltf_prune import prune, unused
 
 _COMPONENTS = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
@@ -36,13 +37,14 @@ class Editor:
         self._chunks: list[bytes] = []
         self._size = 0
         self._uses = Counter(node["mesh"] for node in document.nodes if "mesh" in node)
-        files: dict[str, int] = {}  # a thousand buffers, or images, may name one file
+        files: dict[str | int, int] = {}  # a thousand buffers, or images, may name one file
         starts = []
         for k, buffer in enumerate(self.json.get("buffers", [])):
             uri = buffer.get("uri", "")
-            if uri not in files or embedded(uri):
-                files[uri] = self._append(document.buffer(k))
-            starts.append(files[uri])
+            own = k if not uri or embedded(uri) else uri
+            if own not in files:
+                files[own] = self._append(document.buffer(k))
+            starts.append(files[own])
         for view in self.json.get("bufferViews", []):
             start = starts[view["buffer"]]
             view["buffer"] = 0

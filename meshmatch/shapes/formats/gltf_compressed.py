@@ -1,0 +1,187 @@
+"""Compressed meshes of glTF files: KHR_draco_mesh_compression, EXT_meshopt_compression and KHR_meshopt_compression.
+
+They are decoded by DracoPy and meshoptimizer, in a process of its own that may take only so much time and memory.
+
+Afterwards the description is that of a file without compression: the decoded data is one more buffer.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.errors import InputError
+from meshmatch.shapes.formats import damaged
+from meshmatch.shapes.input_files import check_memory
+
+DRACO = "KHR_draco_mesh_compression"
+MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_STREAM = ("mode", "filter", "count", "byteStride")
+_SECONDS, _MEMORY = 300, 8 << 30
+_PROGRAM = f"import sys; sys.path[:] = sys.argv[1:]; from {__name__} import main; main()"
+
+
+def decompress(
+    name: str, size: int, description: dict[str, Any], buffer: Callable[[int], bytes], extensions: set[str]
+) -> dict[int, bytes]:
+    """Decode what a file of so many bytes has compressed by some extensions, and let its description forget that it was; the
+    buffers that are new, or stand for nothing now.
+
+    `InputError`: the library that decodes it is not installed, or the data is damaged or promises too much.
+    """
+    for extension in sorted(extensions):
+        library = "DracoPy" if extension == DRACO else "meshoptimizer"
+        if importlib.util.find_spec(library) is None:
+            hint = "pip install 'meshmatch[compressed]', or export it without mesh compression"
+            raise InputError(f"{name} is compressed ({extension}), which needs {library}", hint)
+    views = description.setdefault("bufferViews", [])
+    packed = [view for view in views if _meshopt(view)]
+    meshes = description.get("meshes", [])
+    primitives = [each for mesh in meshes for each in mesh["primitives"] if DRACO in each.get("extensions", {})]
+
+    def part(entry: dict[str, Any]) -> bytes:
+        start = entry.get("byteOffset", 0)
+        return buffer(entry["buffer"])[start : start + entry["byteLength"]]
+
+    streams = [_meshopt(view) for view in packed]
+    dracos = [primitive["extensions"][DRACO] for primitive in primitives]
+    jobs: list[dict[str, Any]] = [{key: each.get(key, "NONE") for key in _STREAM} for each in streams]
+    jobs += [{"ids": each["attributes"]} for each in dracos]
+    data = [*map(part, streams), *(part(views[each["bufferView"]]) for each in dracos)]
+    promised = sum(int(each["count"]) * int(each["byteStride"]) for each in streams)
+    promised += sum(_size(accessor) for each in primitives for _, accessor in _accessors(description, each))
+    check_memory(name, size, 4 * promised)
+    found = _decoded(name, jobs, data) if jobs else {}
+    buffers = description.setdefault("buffers", [])
+    made = _Buffer(len(buffers))
+    for k, view in enumerate(packed):
+        view.update(made.kept(found[f"{k}"].tobytes()))
+        view.pop("extensions")
+    for k, primitive in enumerate(primitives, len(packed)):
+        for what, accessor in _accessors(description, primitive):
+            values = found[f"{k} {what}"]
+            if values.size != accessor["count"] * WIDTHS[accessor["type"]]:
+                raise damaged(name, f"it promises {accessor['count']} values of {what}, and holds others")
+            accessor.pop("byteOffset", None)
+            accessor["bufferView"] = len(views)
+            views.append(made.kept(values.astype(COMPONENTS[accessor["componentType"]]).tobytes()))
+        primitive["extensions"].pop(DRACO)
+    for key in ("extensionsRequired", "extensionsUsed"):
+        description[key] = [each for each in description.get(key, []) if each not in extensions]
+        if not description[key]:
+            del description[key]
+    empty = {k: b"" for k, each in enumerate(buffers) if _stands_in(each)}
+    if not made.size:
+        return empty
+    buffers.append({"byteLength": made.size})
+    return empty | {made.number: b"".join(made.chunks)}
+
+
+class _Buffer:
+    """A buffer that grows."""
+
+    def __init__(self, number: int) -> None:
+        self.number, self.size = number, 0
+        self.chunks: list[bytes] = []
+
+    def kept(self, values: bytes) -> dict[str, int]:
+        """Where the values are from now on."""
+        place = {"buffer": self.number, "byteOffset": self.size, "byteLength": len(values)}
+        self.chunks.append(values + b"\0" * (-len(values) % 4))
+        self.size += len(self.chunks[-1])
+        return place
+
+
+def _stands_in(buffer: dict[str, Any]) -> bool:
+    """Whether a buffer without data stood for what was compressed; it does no more."""
+    found = [buffer.get("extensions", {}).pop(each, {}) for each in MESHOPT]
+    return "uri" not in buffer and any(each.get("fallback") for each in found)
+
+
+def _meshopt(view: dict[str, Any]) -> Any:
+    return next((view["extensions"][each] for each in MESHOPT if each in view.get("extensions", {})), None)
+
+
+def _accessors(description: dict[str, Any], primitive: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """What a primitive of Draco holds, by name."""
+    numbers = {name: primitive["attributes"][name] for name in primitive["extensions"][DRACO]["attributes"]}
+    if "indices" in primitive:
+        numbers["indices"] = primitive["indices"]
+    for name, number in numbers.items():
+        yield name, description["accessors"][number]
+
+
+def _size(accessor: dict[str, Any]) -> int:
+    return int(accessor["count"]) * WIDTHS[accessor["type"]] * np.dtype(COMPONENTS[accessor["componentType"]]).itemsize
+
+
+def _decoded(name: str, jobs: list[dict[str, Any]], data: list[bytes]) -> dict[str, NDArray[Any]]:
+    """What the other process answers: for each job an array of bytes, or one array for each attribute."""
+    question = io.BytesIO()
+    arrays = {f"data {k}": np.frombuffer(each, np.uint8) for k, each in enumerate(data)}
+    np.savez(question, jobs=json.dumps(jobs), **arrays)  # type: ignore[arg-type]
+    command = [sys.executable, "-I", "-c", _PROGRAM, *sys.path]
+    try:
+        done = subprocess.run(command, input=question.getvalue(), capture_output=True, timeout=_SECONDS, check=False)
+    except subprocess.TimeoutExpired:
+        raise damaged(name, f"its compressed data cannot be decoded within {_SECONDS // 60} minutes") from None
+    if done.returncode:
+        words = done.stderr.decode(errors="replace").strip().splitlines() or [f"status {done.returncode}"]
+        raise damaged(name, f"its compressed data cannot be decoded: {words[-1]}")
+    with np.load(io.BytesIO(done.stdout), allow_pickle=False) as answer:
+        return {key: answer[key] for key in answer}
+
+
+def main() -> None:
+    """Answer the question on stdin."""
+    with suppress(ImportError, OSError, ValueError):  # a system that has no such limits
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
+    found: dict[str, NDArray[Any]] = {}
+    with np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False) as question:
+        for k, job in enumerate(json.loads(str(question["jobs"]))):
+            data = question[f"data {k}"].tobytes()
+            if "ids" in job:
+                found |= {f"{k} {name}": values for name, values in _draco(data, job["ids"]).items()}
+            else:
+                found[f"{k}"] = _of_meshopt(data, **job)
+    np.savez(sys.stdout.buffer, **found)  # type: ignore[arg-type]
+
+
+def _draco(data: bytes, ids: dict[str, int]) -> dict[str, NDArray[Any]]:
+    import DracoPy
+
+    mesh = DracoPy.decode(data)
+    found = {name: np.asarray(mesh.get_attribute_by_unique_id(number)["data"]) for name, number in ids.items()}
+    faces = getattr(mesh, "faces", None)
+    return found if faces is None else found | {"indices": np.asarray(faces).ravel()}
+
+
+def _of_meshopt(data: bytes, mode: str, filter: str, count: int, byteStride: int) -> NDArray[np.uint8]:
+    import meshoptimizer
+
+    if mode == "ATTRIBUTES":
+        values = meshoptimizer.decode_vertex_buffer(count, byteStride, data, dtype=np.dtype(f"V{byteStride}"))
+    else:
+        read = {"TRIANGLES": meshoptimizer.decode_index_buffer, "INDICES": meshoptimizer.decode_index_sequence}[mode]
+        values = read(count, byteStride, data)
+    filters = {
+        "NONE": lambda values, *_: values,
+        "OCTAHEDRAL": meshoptimizer.decode_filter_oct,
+        "QUATERNION": meshoptimizer.decode_filter_quat,
+        "EXPONENTIAL": meshoptimizer.decode_filter_exp,
+    }
+    values = filters[filter](values, count, byteStride)
+    return np.frombuffer(values.tobytes(), np.uint8)[: count * byteStride]
