@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import meshmatch
 from meshmatch import blender
@@ -14,7 +15,7 @@ from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.formats import gltf_out
 from meshmatch.shapes.formats.gltf_rig import read_rig
 from meshmatch.shapes.input_files import read_bytes
-from meshmatch.shapes.textured_files import load_appearance
+from meshmatch.shapes.textured_files import find_appearance, load_appearance
 from meshmatch.transfer.weight_files import load_weights
 from tests.blender_at_hand import needs_blender, run_inside, stand_in
 from tests.transfer.rigs import tube, write_tube
@@ -178,9 +179,9 @@ def test_blender_keeps_an_image(suffix: str, tmp_path: Path) -> None:
     blender.from_glb(sample, path, path)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        look = load_appearance(path, meshmatch.load_shape(path))
+        look = find_appearance(path, meshmatch.load_shape(path))
     old = load_appearance(sample, meshmatch.load_shape(sample))
-    assert look.materials[0].image is not None and old.materials[0].image is not None
+    assert look is not None and look.materials[0].image is not None and old.materials[0].image is not None
     assert look.materials[0].image.shape == old.materials[0].image.shape
     beside = {"dancer-dancer-textured.png"} if suffix == ".dae" else set()
     assert {each.name for each in tmp_path.iterdir()} == {path.name} | beside
@@ -207,6 +208,61 @@ def test_scripts_and_drivers_of_a_blend_file_do_not_run(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("touched*"))
     run_inside(tmp_path / "trusting.py", tmp_path / "a.blend")  # who trusts the file does run them
     assert (tmp_path / "touched-text").exists()
+
+
+STAGE = """#usda 1.0
+(
+    defaultPrim = "a"
+    upAxis = "Z"
+    metersPerUnit = 0.01
+)
+def Mesh "a" {
+    int[] faceVertexCounts = [3, 3]
+    int[] faceVertexIndices = [0, 1, 2, 0, 2, 3]
+    point3f[] points = [(0, 0, 0), (100, 0, 0), (100, 0, 200), (0, 0, 200)]
+    texCoord2f[] primvars:st = [(0, 0), (1, 0), (1, 1), (0, 0), (1, 1), (0, 1)] (
+        interpolation = "faceVarying"
+    )
+    rel material:binding = </m>
+}
+def Material "m" {
+    token outputs:surface.connect = </m/s.outputs:surface>
+    def Shader "s" {
+        uniform token info:id = "UsdPreviewSurface"
+        color3f inputs:diffuseColor.connect = </m/t.outputs:rgb>
+        token outputs:surface
+    }
+    def Shader "t" {
+        uniform token info:id = "UsdUVTexture"
+        asset inputs:file = @IMAGE@
+        float2 inputs:st.connect = </m/r.outputs:result>
+        float3 outputs:rgb
+    }
+    def Shader "r" {
+        uniform token info:id = "UsdPrimvarReader_float2"
+        string inputs:varname = "st"
+        float2 outputs:result
+    }
+}
+"""
+
+
+@needs_blender
+@pytest.mark.parametrize("inside", [True, False])
+def test_axes_and_unit_are_the_headers_and_images_those_of_the_folder(tmp_path: Path, inside: bool) -> None:
+    (tmp_path / "asset").mkdir()
+    path, image = tmp_path / "asset" / "a.usda", tmp_path / ("asset/skin.png" if inside else "skin.png")
+    Image.new("RGB", (8, 8), (200, 30, 30)).save(image)
+    path.write_text(STAGE.replace("IMAGE", str(image)))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        shape = meshmatch.load_shape(path)
+    np.testing.assert_allclose(shape.verts.max(0) - shape.verts.min(0), [1, 2, 0], atol=1e-6)  # meters, y up
+    look = find_appearance(path, shape)
+    assert (look is not None and look.materials[0].image is not None) is inside
+    assert [str(each.message) for each in told] == (
+        [] if inside else ["a.usda: left out what it names and what is not in its folder: skin.png"]
+    )
 
 
 @needs_blender
