@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import make_folder, replace_all_on_success
-from meshmatch.shapes.appearance import Appearance, png_bytes
+from meshmatch.shapes.appearance import Appearance, BakedMaterial
+from meshmatch.shapes.dressed_files import Dressed
 from meshmatch.shapes.files import check_suffix, save_shape
-from meshmatch.shapes.formats import Textured, gltf, gltf_out, obj_look, obj_text
+from meshmatch.shapes.formats import gltf, obj_look, obj_text
 from meshmatch.shapes.formats.gltf_moved import moved
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
@@ -92,13 +92,12 @@ class MovedFile:
         look = None
         with suppress(InputError):  # an image that is not there is no reason to lose the mesh
             look = None if original is None or shape.is_cloud else find_appearance(original, shape)
-        textured = _one_image(shape, look) if suffix == ".glb" and look is not None else None
-        if textured is not None:
-            mesh, image = textured
-            gltf_out.write_textured(places[0], self.output.stem, mesh, image)
+        worn = _one_image(shape, look) if suffix == ".glb" and look is not None else None
+        if worn is not None:
+            worn.write(self.output, places[:1])
         else:
             save_shape(places[0], shape)
-        if lost := _lost(original, look, textured is not None):
+        if lost := _lost(original, look, worn is not None):
             warn(f"{self.output.name} does not have {lost} of {getattr(original, 'name', '')}")
 
 
@@ -129,14 +128,12 @@ def _scene(output: Path, original: Path, shape: Shape, turns: Float[Floats, "V 3
     return None if found is None else found[0]
 
 
-def _one_image(shape: Shape, look: Appearance) -> tuple[Textured, bytes] | None:
-    """The mesh with its texture, a PNG, if that is all that its look says."""
-    if len(look.materials) != 1 or look.colors is not None or look.materials[0].image is None:
+def _one_image(shape: Shape, look: Appearance) -> Dressed | None:
+    """The mesh with its texture, if that is all that its look says."""
+    made = look.materials[0]
+    if len(look.materials) != 1 or look.colors is not None or made.image is None:
         return None
-    material = look.materials[0]
-    wrap: Literal["clamp", "repeat"] = "clamp" if material.wrap == ("clamp", "clamp") else "repeat"
-    mesh = Textured(shape.verts, shape.faces, look.uv, material.alpha, material.cutoff, wrap)
-    return mesh, png_bytes(look.materials[0].image)
+    return Dressed(shape, None, look.uv, False, BakedMaterial(made.image, made.alpha, made.cutoff, made.name))
 
 
 def _lost(original: Path | None, look: Appearance | None, textured: bool) -> str:

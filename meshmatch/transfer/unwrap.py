@@ -16,6 +16,8 @@ from meshmatch.transfer.texels import MOST_ROWS, faces_on, rows_of
 Keep = Literal["auto", "keep", "new"]
 # Share of the used texels that two triangles may share: rounding at the edges of charts.
 _OVERLAP = 0.002
+# Share up to which they are used all the same: layouts made by hand overlap here and there.
+_FEW = 0.02
 # Coordinates must use this share of the image, and may leave this share of the surface without room.
 _MIN_USED, _MAX_STARVED = 0.05, 0.02
 # A triangle is starved if it has this share of the room that its area deserves.
@@ -31,7 +33,7 @@ class Atlas:
 
     uv: Float[Floats, "F 3 2"]  # within 0..1, u to the right, v down; zeros for a face without area
     own: bool  # True if they are those of the file
-    note: str = ""  # why the file's own are not used; empty if they are, or if there are none
+    note: str = ""  # why the file's own are not used, or what is odd about them
 
 
 def atlas_of(
@@ -51,9 +53,9 @@ def atlas_of(
         raise InputError(f"{name} has no triangle with an area", "is it a mesh?")
     words, note = f"{name} has no texture coordinates to keep", ""
     if own is not None and keep != "new":
-        within, problem = _checked(own, shape, size)
+        within, problem, doubt = _checked(own, shape, size)
         if not problem:
-            return Atlas(within, True)
+            return Atlas(within, True, f"{name}: its own texture coordinates {doubt}" if doubt else "")
         words = f"{name}: its own texture coordinates cannot be used: {problem}"
         note = f"{words}; new ones were made"
     if keep == "keep":
@@ -61,31 +63,36 @@ def atlas_of(
     return Atlas(unwrapped(shape, size, padding, polygons), False, note)
 
 
-def _checked(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str]:
-    """Coordinates brought into 0..1 by whole numbers, a triangle at a time; why they are no atlas, empty if they are."""
+def _checked(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str, str]:
+    """Coordinates brought into 0..1 by whole numbers, a triangle at a time; why they are no atlas, empty if they are; and
+    what is odd all the same.
+    """
     real = shape.face_areas > 0
     if not np.isfinite(uv[real]).all():
-        return uv, "some are not numbers"
+        return uv, "some are not numbers", ""
     if np.abs(uv[real]).max() > 1e6:
-        return uv, "some are absurdly large"
+        return uv, "some are absurdly large", ""
     out = np.where(real[:, None, None], uv, 0.0)
     out = out - np.floor(out.min(axis=1, keepdims=True) + 1e-5)
     beyond = int((out.max(axis=(1, 2)) > 1.0 + 1e-5).sum())
     if beyond:
-        return out, f"{beyond} faces reach out of range, over the edge of the image"
+        return out, f"{beyond} faces reach out of range, over the edge of the image", ""
     uv = np.clip(out, 0.0, 1.0)
     room = flat_areas(uv)
     if room.sum() < _MIN_USED:
-        return uv, f"they use only {100 * room.sum():.1f} % of the image"
-    if room.sum() > 1.0 + _OVERLAP or rows_of(uv * size).sum() > MOST_ROWS:
-        return uv, f"they overlap ({room.sum():.1f} times the image)"
+        return uv, f"they use only {100 * room.sum():.1f} % of the image", ""
+    if room.sum() > 1.0 + _FEW or rows_of(uv * size).sum() > MOST_ROWS:
+        return uv, f"they overlap ({room.sum():.1f} times the image)", ""
     deserved = shape.face_areas / shape.face_areas.sum()
     starved = float(deserved[room < _STARVED * deserved].sum())
     if starved > _MAX_STARVED:
-        return uv, f"{100 * starved:.0f} % of the surface has no room in the image"
+        return uv, f"{100 * starved:.0f} % of the surface has no room in the image", ""
     found, twice = faces_on(uv * size, size)
     share = twice / max(int((found >= 0).sum()), 1)
-    return uv, f"they overlap on {100 * share:.1f} % of their texels" if share > _OVERLAP else ""
+    words = f"overlap on {100 * share:.1f} % of their texels"
+    if share > _FEW:
+        return uv, f"they {words}", ""
+    return uv, "", f"{words}, which show one of two places" if share > _OVERLAP else ""
 
 
 def unwrapped(shape: Shape, size: int, padding: int, polygons: Ints | None = None) -> Floats:

@@ -83,6 +83,16 @@ def test_another_tile_of_the_image_is_the_same_place() -> None:
     np.testing.assert_allclose(atlas.uv, OWN, atol=1e-12)
 
 
+def test_a_few_texels_that_are_shared_are_told() -> None:
+    """The second triangle lies a little over the first."""
+    uv = 0.1 + 0.8 * OWN
+    uv[1] += (0.004, 0.004)
+    atlas = atlas_of(SQUARE, uv, 512, 2)
+    assert atlas.own and "of their texels, which show one of two places" in atlas.note
+    uv[1] += (0.02, 0.02)
+    assert not atlas_of(SQUARE, uv, 512, 2).own
+
+
 @pytest.mark.parametrize(
     ("uv", "word"),
     [

@@ -57,8 +57,7 @@ class Raw:
 class Textured:
     """A mesh that wears one image, ready to be written, in the unit of the file.
 
-    `uv` belongs to each corner: u to the right, v down; `wrap` says what lies outside 0..1, `cutoff` is the threshold of
-    "mask".
+    `uv` belongs to each corner: u to the right, v down; `cutoff` is the threshold of "mask".
     """
 
     verts: Float[Floats, "V 3"]
@@ -66,7 +65,6 @@ class Textured:
     uv: Float[Floats, "F 3 2"]
     alpha: Literal["opaque", "mask", "blend"] = "opaque"
     cutoff: float = 0.5
-    wrap: Literal["clamp", "repeat"] = "clamp"
 
 
 def tell_lost_faces(name: str, listed: int, faces: Int[Ints, "F 3"]) -> None:

@@ -48,7 +48,8 @@ def dressed(
         What turns the scene upright.
     """
     editor = Editor(document)
-    wardrobe = _Wardrobe(editor, document, material, own)
+    stored = _stored(document) if own else uv  # the file may have them in another tile of the image
+    wardrobe = _Wardrobe(editor, document, material, stored)
     seen = 0
     for number, parts in drawn(document).items():
         mesh = editor.own_mesh(number)  # each has its own place in the image
@@ -91,6 +92,13 @@ def colored(document: Document, colors: Float[Floats, "V 4"], turn: Float[Floats
         editor.turn(turn)
     editor.prune(document)
     return editor.to_bytes()
+
+
+def _stored(document: Document) -> Floats:
+    """All first texture coordinates of a scene."""
+    parts = [part["attributes"] for parts in drawn(document).values() for part in parts.values()]
+    found = [document.accessor(part["TEXCOORD_0"]) for part in parts if "TEXCOORD_0" in part]
+    return np.concatenate([np.empty((0, 2)), *found])
 
 
 Laid: TypeAlias = tuple[Ints, Floats, Ints]
@@ -139,7 +147,7 @@ def _add_tangents(
 class _Wardrobe:
     """The materials of a scene, which wear a baked one; each as often as it is needed."""
 
-    def __init__(self, editor: Editor, document: Document, material: BakedMaterial, own: bool) -> None:
+    def __init__(self, editor: Editor, document: Document, material: BakedMaterial, uv: Floats) -> None:
         self.editor, self.baked = editor, material
         self.before = copy.deepcopy(editor.json.get("materials", []))
         parts = [part for parts in drawn(document).values() for part in parts.values()]
@@ -147,9 +155,8 @@ class _Wardrobe:
         others = (part for mesh in document.json["meshes"] for part in mesh["primitives"] if id(part) not in seen)
         self.worn_elsewhere = {number for part in others for number in _materials_of(part)}
         self.made: dict[tuple[int | None, int | None], int] = {}
-        wrap = _CLAMP
-        if own and any(_leaves(document.accessor(part["attributes"]["TEXCOORD_0"])) for part in parts):
-            wrap = _REPEAT
+        leaves = len(uv) > 0 and (uv.min() < -_SLACK or uv.max() > 1.0 + _SLACK)
+        wrap = _REPEAT if leaves else _CLAMP
         sampler = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPS, "wrapS": wrap, "wrapT": wrap}
         self.sampler = editor.add("samplers", sampler)
         self.color = self._texture(material.color, "")
@@ -236,11 +243,6 @@ class _Wardrobe:
         listed = self.editor.json.get("extensionsUsed", [])
         if added := [key for key in (_GLOW, _UNLIT) if key in used and key not in listed]:
             self.editor.json["extensionsUsed"] = [*listed, *added]
-
-
-def _leaves(uv: Floats) -> bool:
-    """Whether coordinates leave the image."""
-    return bool(len(uv) and (uv.min() < -_SLACK or uv.max() > 1.0 + _SLACK))
 
 
 def _materials_of(primitive: dict[str, Any]) -> Iterator[int]:

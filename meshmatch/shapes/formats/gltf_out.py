@@ -1,4 +1,5 @@
-"""Writing glTF 2.0, binary (glb): one node, one mesh, one primitive, and within the file its texture or its morph targets.
+"""Writing glTF 2.0, binary (glb): one node, one mesh, one primitive, and its morph targets; a texture is laid on by
+`meshmatch.shapes.formats.gltf_dressed`.
 
 Positions are 32-bit floats, with about seven digits. Those of a shape that lies far from the origin, as a scan in
 coordinates of a country does, are written from a center near it; the center is the node's translation, in all its digits.
@@ -19,8 +20,7 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import dot, same_rows, vertex_normals
 from meshmatch.shapes.colors import light
-from meshmatch.shapes.formats import Textured, as_float32
-from meshmatch.shapes.formats.seams import split_at_seams
+from meshmatch.shapes.formats import as_float32
 from meshmatch.shapes.shape import Shape
 
 # Coincident vertices whose normals are further than this cosine (32 degrees) from their mean are an edge of the shape,
@@ -30,8 +30,6 @@ _FAR = 8.0  # three of the 24 bits of a float
 _POINTS, _TRIANGLES = 0, 4
 _FLOAT, _UNSIGNED = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
-_LINEAR, _LINEAR_MIPS = 9729, 9987
-_WRAPS = {"repeat": 10497, "clamp": 33071}
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
 
@@ -47,7 +45,7 @@ def glb_of(shape: Shape) -> bytes:
         attributes["NORMAL"] = smooth_normals(shape.verts, shape.faces)
     if shape.colors is not None:
         attributes["COLOR_0"] = light(shape.colors)
-    return _glb(shape.name, attributes, shape.faces, {}, b"")
+    return _glb(shape.name, attributes, shape.faces)
 
 
 def write_morphs(path: Path, shape: Shape, targets: Mapping[str, Float[Floats, "V 3"]]) -> None:
@@ -58,26 +56,7 @@ def write_morphs(path: Path, shape: Shape, targets: Mapping[str, Float[Floats, "
         for name, verts in targets.items()
     }
     attributes = {"POSITION": shape.verts, "NORMAL": normals}
-    path.write_bytes(_glb(shape.name, attributes, shape.faces, {}, b"", moves))
-
-
-def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
-    """A mesh that wears one image (a PNG): the first vertices are those of the shape, copies for seams follow.
-
-    The material is plain paint (metallic 0, roughness 1), seen from both sides; the sampler asks for mip levels.
-    """
-    vertex, uv, faces = split_at_seams(len(mesh.verts), mesh.faces, mesh.uv)
-    normals = smooth_normals(mesh.verts, mesh.faces)
-    paint = {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
-    material: dict[str, Any] = {"name": name, "doubleSided": True, "pbrMetallicRoughness": paint}
-    if mesh.alpha != "opaque":
-        material["alphaMode"] = mesh.alpha.upper()
-    if mesh.alpha == "mask":
-        material["alphaCutoff"] = mesh.cutoff
-    sampler = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPS, **dict.fromkeys(("wrapS", "wrapT"), _WRAPS[mesh.wrap])}
-    look = {"materials": [material], "textures": [{"sampler": 0, "source": 0}], "samplers": [sampler]}
-    attributes = {"POSITION": mesh.verts[vertex], "NORMAL": normals[vertex], "TEXCOORD_0": uv}
-    path.write_bytes(_glb(name, attributes, faces, look, png))
+    path.write_bytes(_glb(shape.name, attributes, shape.faces, moves))
 
 
 def center_of(verts: Float[Floats, "V 3"]) -> Float[Floats, " 3"]:
@@ -96,14 +75,9 @@ def center_of(verts: Float[Floats, "V 3"]) -> Float[Floats, " 3"]:
 
 
 def _glb(
-    name: str,
-    attributes: dict[str, Floats],
-    faces: Ints,
-    look: dict[str, Any],
-    png: bytes,
-    moves: Mapping[str, dict[str, Floats]] | None = None,
+    name: str, attributes: dict[str, Floats], faces: Ints, moves: Mapping[str, dict[str, Floats]] | None = None
 ) -> bytes:
-    """Arrays and an image one after the other, each at a multiple of four bytes, behind what describes them."""
+    """Arrays one after the other, each at a multiple of four bytes, behind what describes them."""
     center = center_of(attributes["POSITION"])
     attributes = attributes | {"POSITION": attributes["POSITION"] - center}
     arrays: list[NDArray[Any]] = [as_float32(values, ".glb") for values in attributes.values()]
@@ -120,7 +94,7 @@ def _glb(
         places.append(len(arrays))
         primitive["targets"].append({key: len(arrays) + k for k, key in enumerate(move)})
         arrays += [as_float32(values, ".glb") for values in move.values()]
-    chunks = [*(values.tobytes() for values in arrays), *([png] if png else [])]
+    chunks = [values.tobytes() for values in arrays]
     padded = [chunk + b"\0" * (-len(chunk) % 4) for chunk in chunks]
     starts = np.cumsum([0, *map(len, padded)]).tolist()
     views: list[dict[str, Any]] = [
@@ -137,11 +111,8 @@ def _glb(
         accessors[k] |= {"min": arrays[k].min(0).tolist(), "max": arrays[k].max(0).tolist()}
     document = {"asset": {"version": "2.0", "generator": "meshmatch"}, "scene": 0, "scenes": [{"nodes": [0]}]}
     node = {"mesh": 0, "name": name} | ({"translation": center.tolist()} if center.any() else {})
-    document |= {"nodes": [node], "meshes": [mesh]} | look
+    document |= {"nodes": [node], "meshes": [mesh]}
     document |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}]}
-    if png:
-        primitive["material"] = 0
-        document["images"] = [{"bufferView": len(arrays), "mimeType": "image/png", "name": name}]
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     head = b"glTF" + np.array([2, 28 + len(text) + starts[-1], len(text)], "<u4").tobytes() + b"JSON"
