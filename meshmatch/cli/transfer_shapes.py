@@ -21,8 +21,8 @@ def transfer_shapes(
     target: Target,
     output: Path = output_option(
         "FILE",
-        "TGT with the blendshapes: .glb. Or .npz for their names and displacements; or a folder (a name without a suffix), "
-        "which gets an .obj for each shape.",
+        "TGT with the blendshapes: .glb or, with Blender installed, .fbx, .usdz or .blend. Or .npz for their "
+        "names and displacements; or a folder (a name without a suffix), which gets an .obj for each shape.",
     ),
     shapes: list[Path] | None = Option(
         None,
@@ -36,9 +36,9 @@ def transfer_shapes(
 ) -> Json:
     """Transfer blendshapes (morph targets), such as the expressions of a face.
 
-    SRC is a .glb, .gltf or .vrm with morph targets, or any mesh with --shapes. Displacements turn and grow with the
-    surface; eyes, teeth and other separate parts move with what surrounds them; closed lips and lids stay closed. Of a TGT
-    in these formats everything is kept; clips that animate the shapes come along.
+    SRC is a .glb, .gltf or .vrm with morph targets, a file that Blender reads, or any mesh with --shapes. Displacements
+    turn and grow with the surface; eyes, teeth and other separate parts move with what surrounds them; closed lips and
+    lids stay closed. Of a TGT in these formats everything is kept; clips that animate the shapes come along.
     """
     import numpy as np
 

@@ -125,7 +125,7 @@ def test_shapes_that_move_nothing_are_named(run: Run, pair: Path) -> None:
 
 
 WRONG = [
-    (("-o", "out.fbx"), "'.fbx' is not a format for blendshapes"),
+    (("-o", "out.stl"), "'.stl' is not a format for blendshapes"),
     (("-o", "out.glb", "--shapes", "same.ply"), "the files of blendshapes are all like the source"),
     (("-o", "out.glb", "--shapes", "small.ply"), "small.ply has 3 vertices, but a.glb has 658"),
     (("-o", "out.glb", "--shapes", "empty"), "there are no shapes in empty"),
