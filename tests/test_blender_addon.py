@@ -19,7 +19,8 @@ from tests.transfer.rigs import tube
 # Two tubes; each verb in turn, one that fails, one that is stopped, and one that has no program.
 SCRIPT = """
 import json, os, sys, time
-from types import SimpleNamespace
+from itertools import repeat
+from types import MethodType, SimpleNamespace
 import bpy
 extension, program, tube = sys.argv[sys.argv.index("--") + 1 :]
 bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -67,6 +68,34 @@ while not job.process.progress()[1]:
 told["progress"] = job.process.progress()
 job.cancel()
 told["stopped"] = [job.process.running.returncode != 0, os.path.exists(job.folder)]
+
+# As a window runs it: no operator can be made without one, so that its methods get something like it.
+timers = []
+manager = SimpleNamespace(
+    event_timer_add=lambda *_, **__: timers.append(1), event_timer_remove=lambda _: timers.pop(),
+    modal_handler_add=lambda _: None,
+)
+context = SimpleNamespace(
+    scene=bpy.context.scene, preferences=bpy.context.preferences, window_manager=manager, window=None, screen=None
+)
+
+def in_a_window(events):
+    said = []
+    operator = SimpleNamespace(verb="wrap", report=lambda kind, words: said.append(words))
+    for name in ("begin", "show", "end"):
+        setattr(operator, name, MethodType(getattr(addon.MeshmatchRun, name), operator))
+    states = [sorted(addon.MeshmatchRun.invoke(operator, context, None))[0]]
+    while states[-1] in ("RUNNING_MODAL", "PASS_THROUGH"):
+        time.sleep(0.1)
+        working = chosen.working
+        states.append(sorted(addon.MeshmatchRun.modal(operator, context, SimpleNamespace(type=next(events))))[0])
+    return [states[0], working, states[-1], said, chosen.working, len(timers), os.path.exists(operator.job.folder)]
+
+told["esc"] = in_a_window(iter(["TIMER", "MOUSEMOVE", "ESC"]))
+os.environ["MESHMATCH_TEST"] = "fail"
+told["modal fails"] = in_a_window(repeat("TIMER"))
+os.environ["MESHMATCH_TEST"] = ""
+told["modal"] = in_a_window(repeat("TIMER"))
 preferences.command = "/no/such/meshmatch"
 told["no program"] = run("wrap")
 
@@ -170,6 +199,11 @@ def test_the_extension_works_in_blender(extension: Path, tmp_path: Path, monkeyp
     assert told["progress"] == ["a.glb: refinement, 60 % (67 s)", 0.6]
     assert told["stopped"] == [True, False]
     assert "There is no program /no/such/meshmatch" in told["no program"]
+    assert told["esc"] == ["RUNNING_MODAL", True, "CANCELLED", ["meshmatch was stopped"], False, 0, False]
+    failed = ["error: the fit is poor hint: try --only"]
+    assert told["modal fails"] == ["RUNNING_MODAL", True, "CANCELLED", failed, False, 0, False]
+    done = ["wrote result.glb: source.glb target.glb"]
+    assert told["modal"] == ["RUNNING_MODAL", True, "FINISHED", done, False, 0, False]
     assert told["registered"] is False
     buttons = [what[2] for what in told["panel"] if what[:2] == ["operator", "meshmatch.run"]]
     assert buttons == ["Texture", "Rig", "Weights", "Shape keys", "Garment", "Wrap", "Match"]
