@@ -23,7 +23,7 @@ from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import as_path, plain_text, replace_on_success
 from meshmatch.shapes import tables
 from meshmatch.shapes.colors import INVISIBLE
-from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, obj, off, plain, ply, stl
+from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, obj, off, plain, ply, stl, vtk, vtk_xml
 from meshmatch.shapes.input_files import existing, read_bytes
 from meshmatch.shapes.other_libraries import HINT, arrays_of, as_faces
 from meshmatch.shapes.parts import Parts
@@ -39,6 +39,9 @@ _FORMATS: dict[str, tuple[Callable[[Path, bytes], Raw], Callable[[Path, Shape], 
     ".xyz": (plain.read_xyz, plain.write_xyz),
     ".pcd": (ply.read_pcd, None),
     ".npy": (plain.read_points, plain.write_points),
+    ".vtk": (vtk.read, vtk.write_vtk),
+    ".vtp": (vtk_xml.read, vtk.write_vtp),
+    ".vtu": (vtk_xml.read, None),
 }
 _WRITERS = {suffix: write for suffix, (_, write) in _FORMATS.items() if write is not None}
 SUFFIXES = tuple(_FORMATS)

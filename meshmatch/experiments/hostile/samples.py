@@ -70,7 +70,7 @@ def make_samples(folder: Path) -> list[Sample]:  # noqa: C901
         others = sorted(set(os.listdir(place)) - {name})
         found.append(Sample(family, place, (name, *others)))
 
-    for suffix in (".ply", ".obj", ".off", ".stl", ".glb"):
+    for suffix in (".ply", ".obj", ".off", ".stl", ".glb", ".vtk", ".vtp"):
         add("shapes", f"a{suffix}", lambda path: save_shape(path, shape))
     for suffix in (".xyz", ".npy", ".ply"):
         add("shapes", f"a{suffix}", lambda path: save_shape(path, cloud))

@@ -1,0 +1,216 @@
+"""VTK's older files (.vtk) of surfaces, text and binary; and surfaces with data of their vertices as .vtk and .vtp."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.arrays import Floats, Ints
+from meshmatch.errors import InputError
+from meshmatch.shapes.formats import WRONG_SUFFIX, Raw, check_places, damaged, indices, numbers
+from meshmatch.shapes.formats.vtk_cells import Cells, raw_of
+from meshmatch.shapes.shape import Shape
+
+Arrays = Mapping[str, NDArray[Any]]
+"""Data of vertices by name: a row, or a number, for each."""
+
+_TYPES = {
+    b"char": "i1", b"unsigned_char": "u1", b"short": "i2", b"unsigned_short": "u2", b"int": "i4", b"unsigned_int": "u4",
+    b"long": "i8", b"unsigned_long": "u8", b"float": "f4", b"double": "f8", b"vtkidtype": "i4", b"vtktypeint32": "i4",
+    b"vtktypeint64": "i8",
+}  # fmt: skip
+_CELLS = {b"POLYGONS": 7, b"TRIANGLE_STRIPS": 6, b"VERTICES": 2, b"LINES": 4, b"CELLS": None}
+_KEYWORD = re.compile(rb"\n[ \t]*[A-Z_]{5,}")
+_COLORS = re.compile(rb"\n[ \t]*COLOR_SCALARS[ \t]+\S+[ \t]+([34])[ \t]*\r?\n")
+
+
+def read(path: Path, data: bytes) -> Raw:
+    """The points and faces of a PolyData or an unstructured grid, and the colors of its points."""
+    return _File(path.name, data).raw()
+
+
+class _File:
+    def __init__(self, name: str, data: bytes) -> None:
+        self.name, self.data, self.at = name, data, 0
+        first, _, kind = (self._line() for _ in range(3))
+        if not first.lower().startswith(b"# vtk datafile") or kind.upper() not in (b"ASCII", b"BINARY"):
+            raise InputError(f"{name} is not a vtk file: it does not begin as one", WRONG_SUFFIX)
+        self.binary = kind.upper() == b"BINARY"
+
+    def raw(self) -> Raw:
+        verts, cells, kinds = np.zeros((0, 3)), [], None
+        while line := self._next():
+            word, *rest = line.split()
+            word = word.upper()
+            if word == b"DATASET":
+                if not rest or rest[0].upper() not in (b"POLYDATA", b"UNSTRUCTURED_GRID"):
+                    what = b" ".join(rest)[:40].decode(errors="replace")
+                    raise InputError(f"{self.name} holds {what}, not a surface", "save a surface: PolyData")
+            elif word == b"POINTS":
+                count = self._count(rest, 0)
+                check_places(self.name, len(self.data), count, text=not self.binary)
+                verts = self._array(3 * count, rest[1:]).reshape(-1, 3).astype(np.float64)
+            elif word in _CELLS:
+                check_places(self.name, len(self.data), len(verts), self._count(rest, 0), text=not self.binary)
+                corners, sizes = self._cells(self._count(rest, 0), self._count(rest, 1))
+                cells.append(Cells(corners, sizes, np.full(len(sizes), _CELLS[word] or 7)))
+            elif word == b"CELL_TYPES":
+                kinds = indices(self.name, self._array(self._count(rest, 0), [b"int"]))
+            elif word == b"METADATA":
+                blank = re.compile(rb"\n[ \t]*\r?\n").search(self.data, self.at)
+                self.at = blank.end() if blank else len(self.data)
+            elif word in (b"POINT_DATA", b"CELL_DATA"):
+                break
+            elif word == b"FIELD":
+                found = re.compile(rb"\n[ \t]*POINTS[ \t]").search(self.data, self.at)
+                self.at = found.start() if found else len(self.data)
+            else:
+                raise damaged(self.name, f"it has {line[:40].decode(errors='replace')!r} where a section should begin")
+        if kinds is not None:
+            if len(cells) != 1 or len(cells[0].sizes) != len(kinds):
+                raise damaged(self.name, "it does not say of what kind its cells are")
+            cells = [Cells(cells[0].corners, cells[0].sizes, kinds)]
+        return raw_of(self.name, len(self.data), verts, cells, self._colors(len(verts)))
+
+    def _cells(self, count: int, size: int) -> tuple[Ints, Ints]:
+        before = self.at
+        line = self._next().split()
+        if line[:1] == [b"OFFSETS"]:  # since version 5
+            ends = indices(self.name, self._array(count, line[1:]))
+            line = self._next().split()
+            if line[:1] != [b"CONNECTIVITY"]:
+                raise damaged(self.name, "its cells have no points")
+            return indices(self.name, self._array(size, line[1:])), np.diff(ends)
+        self.at = before
+        flat = indices(self.name, self._array(size, [b"int"]))
+        starts = np.zeros(count, np.int64)
+        at = 0
+        for k in range(count):
+            if not 0 <= at < size or flat[at] < 0:
+                raise damaged(self.name, "a cell has fewer points than it says")
+            starts[k] = at
+            at += 1 + int(flat[at])
+        if at > size:
+            raise damaged(self.name, "a cell has fewer points than it says")
+        kept = np.ones(at, bool)
+        kept[starts] = False
+        return flat[:at][kept], flat[starts]
+
+    def _colors(self, count: int) -> Floats | None:
+        cells = self.data.find(b"\nCELL_DATA", self.at)
+        found = _COLORS.search(self.data, max(self.at - 1, 0), cells if cells >= 0 else len(self.data))
+        if found is None:
+            return None
+        width, self.at = int(found[1]), found.end()
+        values = self._array(count * width, [b"unsigned_char"]).reshape(-1, width)
+        colors = np.ones((count, 4))
+        colors[:, :width] = np.clip(values / (255.0 if self.binary else 1.0), 0, 1)
+        return colors
+
+    def _array(self, count: int, kind: list[bytes]) -> NDArray[Any]:
+        """So many numbers from here on."""
+        if not self.binary:
+            found = _KEYWORD.search(self.data, self.at - 1)
+            end = found.start() if found else len(self.data)
+            values = numbers(self.name, self.data[self.at : end])
+            self.at = end
+            if len(values) < count:
+                raise damaged(self.name, f"it has {len(values)} numbers where {count} should be")
+            return values[:count]
+        kind_ = _TYPES.get(kind[0].lower()) if kind else None
+        if kind_ is None:
+            raise damaged(self.name, f"numbers of the unknown type {b' '.join(kind)[:40].decode(errors='replace')}")
+        size = count * np.dtype(kind_).itemsize
+        if self.at + size > len(self.data):
+            raise damaged(self.name, f"it ends before the {count} numbers that it promises")
+        self.at += size
+        return np.frombuffer(self.data, f">{kind_}", count, self.at - size)
+
+    def _count(self, words: list[bytes], which: int) -> int:
+        if len(words) <= which or not (words[which].isdigit() and len(words[which]) < 12):
+            raise damaged(self.name, "a section does not say how large it is")
+        return int(words[which])
+
+    def _line(self) -> bytes:
+        end = self.data.find(b"\n", self.at)
+        end = len(self.data) if end < 0 else end
+        line, self.at = self.data[self.at : end].strip(), end + 1
+        return line
+
+    def _next(self) -> bytes:
+        """The next line that is not blank; empty at the end."""
+        while self.at < len(self.data):
+            if line := self._line():
+                return line
+        return b""
+
+
+def write_vtk(path: Path, shape: Shape, arrays: Arrays | None = None) -> None:
+    """A binary PolyData of version 4.2, which everything reads."""
+    cells = np.arange(shape.V)[:, None] if shape.is_cloud else shape.faces
+    rows = np.concatenate([np.full((len(cells), 1), cells.shape[1]), cells], axis=1).astype(">i4")
+    word = "VERTICES" if shape.is_cloud else "POLYGONS"
+    parts = [
+        f"# vtk DataFile Version 4.2\nmeshmatch\nBINARY\nDATASET POLYDATA\nPOINTS {shape.V} double\n".encode(),
+        shape.verts_or_nan.astype(">f8").tobytes(),
+        f"\n{word} {len(rows)} {rows.size}\n".encode(),
+        rows.tobytes(),
+        f"\nPOINT_DATA {shape.V}\n".encode(),
+    ]
+    if shape.colors is not None:
+        parts += [b"COLOR_SCALARS Colors 4\n", _bytes(shape.colors).tobytes(), b"\n"]
+    if arrays:
+        parts.append(f"FIELD FieldData {len(arrays)}\n".encode())
+        for name, values in _plain(arrays):
+            kind = {"f4": "float", "f8": "double", "i4": "int", "i8": "vtktypeint64", "u1": "unsigned_char"}
+            words = f"{'_'.join(name.split())} {values.shape[1]} {len(values)} {kind[values.dtype.str[1:]]}\n"
+            parts += [words.encode(), values.astype(values.dtype.newbyteorder(">")).tobytes(), b"\n"]
+    path.write_bytes(b"".join(parts))
+
+
+def write_vtp(path: Path, shape: Shape, arrays: Arrays | None = None) -> None:
+    """PolyData in XML, its numbers in base64."""
+    cells = np.arange(shape.V)[:, None] if shape.is_cloud else shape.faces
+    ends = np.arange(1, len(cells) + 1) * cells.shape[1]
+    group, counts = ("Verts", (len(cells), 0)) if shape.is_cloud else ("Polys", (0, len(cells)))
+    data = [] if shape.colors is None else [_element("Colors", _bytes(shape.colors))]
+    data += [_element(name, values) for name, values in _plain(arrays or {})]
+    lines = [
+        '<?xml version="1.0"?>',
+        '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
+        f'<PolyData><Piece NumberOfPoints="{shape.V}" NumberOfVerts="{counts[0]}" NumberOfLines="0" NumberOfStrips="0" '
+        f'NumberOfPolys="{counts[1]}">',
+        *("<PointData>", *data, "</PointData>"),
+        *("<Points>", _element("Points", shape.verts_or_nan), "</Points>"),
+        *(f"<{group}>", _element("connectivity", cells.ravel()), _element("offsets", ends), f"</{group}>"),
+        "</Piece></PolyData></VTKFile>",
+    ]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _element(name: str, values: NDArray[Any]) -> str:
+    kind = {"f4": "Float32", "f8": "Float64", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}[values.dtype.str[1:]]
+    width = f' NumberOfComponents="{values.shape[1]}"' if values.ndim > 1 else ""
+    data = np.ascontiguousarray(values, values.dtype.newbyteorder("<")).tobytes()
+    text = base64.b64encode(len(data).to_bytes(8, "little") + data).decode()
+    return f'<DataArray type="{kind}" Name={quoteattr(name)}{width} format="binary">{text}</DataArray>'
+
+
+def _plain(arrays: Arrays) -> Iterable[tuple[str, NDArray[Any]]]:
+    """(V, D) arrays of types that VTK has."""
+    for name, values in arrays.items():
+        kind = values.dtype.str[1:]
+        if kind not in ("f4", "f8", "i4", "i8", "u1"):
+            values = values.astype("i4" if values.dtype.kind in "iub" and values.dtype.itemsize < 4 else "f8")
+        yield name, values.reshape(len(values), -1)
+
+
+def _bytes(colors: Floats) -> NDArray[np.uint8]:
+    return np.round(255 * colors).astype(np.uint8)

@@ -1,0 +1,218 @@
+"""VTK's XML files of surfaces (.vtp, .vtu), as ParaView, 3D Slicer and PyVista write them.
+
+Numbers may be text, base64, or raw bytes behind everything else, each of them in blocks that zlib or lzma compressed. No
+more is unpacked than what the points and faces that the file announces can need.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import lzma
+import re
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.arrays import Floats, Ints
+from meshmatch.errors import InputError
+from meshmatch.shapes.formats import (
+    FEW_PLACES,
+    WRONG_SUFFIX,
+    Raw,
+    check_places,
+    damaged,
+    joined_colors,
+    numbers,
+    painted,
+)
+from meshmatch.shapes.formats.vtk_cells import Cells, raw_of
+
+_TYPES = {
+    **{f"Float{8 * n}": f"f{n}" for n in (4, 8)},
+    **{f"{word}{8 * n}": f"{letter}{n}" for word, letter in (("Int", "i"), ("UInt", "u")) for n in (1, 2, 4, 8)},
+}
+_UNPACK: dict[str, Callable[[], Any]] = {
+    "vtkZLibDataCompressor": zlib.decompressobj,
+    "vtkLZMADataCompressor": lzma.LZMADecompressor,
+}
+_APPENDED = re.compile(rb"<AppendedData\b([^>]*)>\s*_")
+
+
+def read(path: Path, data: bytes) -> Raw:
+    """The points of all pieces and their faces; colors where a piece has three or four bytes a point."""
+    return _File(path.name, data).raw()
+
+
+class _File:
+    def __init__(self, name: str, data: bytes) -> None:
+        self.name, self.size, self.appended, self.encoding = name, len(data), b"", b""
+        found = _APPENDED.search(data)
+        if found:
+            self.appended, self.encoding = data[found.end() :], found[1]
+            data = data[: found.start()] + b"</VTKFile>"
+        if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+            raise InputError(f"{name} has a document type, which no VTK file has", WRONG_SUFFIX)
+        try:
+            self.root = ElementTree.fromstring(data)
+        except (ElementTree.ParseError, ValueError, LookupError) as error:
+            raise damaged(name, f"it is not XML ({error})") from None
+        if self.root.tag != "VTKFile" or self.root.get("type") not in ("PolyData", "UnstructuredGrid"):
+            kind = str(self.root.get("type") or self.root.tag)[:40]
+            hint = "save a surface: PolyData (.vtp) or UnstructuredGrid (.vtu)"
+            raise InputError(f"{name} holds {kind}, not a surface", hint)
+        self.order = ">" if self.root.get("byte_order") == "BigEndian" else "<"
+        self.header = np.dtype(self.order + ("u8" if self.root.get("header_type") == "UInt64" else "u4"))
+        self.compressor = str(self.root.get("compressor") or "")
+
+    def raw(self) -> Raw:
+        pieces = self.root.findall("./*/Piece")
+        counts = [_count(self.name, piece, "NumberOfPoints") for piece in pieces]
+        faces = sum(
+            _count(self.name, piece, f"NumberOf{what}") for piece in pieces for what in ("Polys", "Strips", "Cells")
+        )
+        check_places(self.name, self.size, sum(counts), faces)
+        self.left = 64 * (FEW_PLACES + self.size // 12)  # bytes that may be unpacked
+        verts, colors, cells = [np.zeros((0, 3))], [], []
+        for piece, count in zip(pieces, counts, strict=True):
+            points = self._named(piece, "Points", None)
+            if points is None or points.size != 3 * count:
+                raise damaged(self.name, f"a piece has other than the {count} points that it promises")
+            first = sum(len(each) for each in verts)
+            verts.append(points.reshape(-1, 3).astype(np.float64))
+            colors.append(self._colors(piece, count))
+            cells += [each.moved(first) for each in self._cells(piece)]
+        painted_ = joined_colors(colors, counts) if pieces else None
+        return raw_of(self.name, self.size, np.concatenate(verts), cells, painted_)
+
+    def _cells(self, piece: ElementTree.Element) -> list[Cells]:
+        found = []
+        for group, kind in (("Polys", 7), ("Strips", 6), ("Cells", None)):
+            corners = self._named(piece, group, "connectivity")
+            ends = self._named(piece, group, "offsets")
+            if corners is None or ends is None or not len(ends):
+                continue
+            kinds = self._named(piece, group, "types") if kind is None else np.full(len(ends), kind)
+            if kinds is None or len(kinds) != len(ends):
+                raise damaged(self.name, "it does not say of what kind its cells are")
+            sizes = np.diff(np.concatenate([[0], ends.astype(np.int64)]))
+            found.append(Cells(corners.astype(np.int64), sizes, kinds.astype(np.int64)))
+        return found
+
+    def _colors(self, piece: ElementTree.Element, count: int) -> Floats | None:
+        for element in piece.findall("./PointData/DataArray"):
+            channels = element.get("NumberOfComponents")
+            if element.get("type") == "UInt8" and channels in ("3", "4"):
+                found = self._array(element)
+                if found.size == count * int(channels):
+                    return painted(found.reshape(count, -1) / 255.0)
+        return None
+
+    def _named(self, piece: ElementTree.Element, group: str, name: str | None) -> NDArray[Any] | None:
+        for element in piece.findall(f"./{group}/DataArray"):
+            if name is None or element.get("Name") == name:
+                return self._array(element)
+        return None
+
+    def _array(self, element: ElementTree.Element) -> NDArray[Any]:
+        kind = _TYPES.get(str(element.get("type")))
+        if kind is None:
+            raise damaged(self.name, f"numbers of the unknown type {str(element.get('type'))[:40]}")
+        form, text = element.get("format", "ascii"), (element.text or "").strip().encode()
+        if form == "ascii":
+            return numbers(self.name, text)
+        try:
+            if form == "appended":
+                at = int(str(element.get("offset")))
+                if not 0 <= at < len(self.appended):
+                    raise ValueError("an offset beyond the end")
+                data = self._raw(at) if b"raw" in self.encoding else self._base64(self.appended[at:])
+            else:
+                data = self._base64(text)
+            return np.frombuffer(data, np.dtype(self.order + kind))
+        except (ValueError, IndexError, OverflowError, binascii.Error, zlib.error, lzma.LZMAError, EOFError) as error:
+            raise damaged(self.name, f"numbers cannot be read ({error})") from None
+
+    def _raw(self, at: int) -> bytes:
+        """The data behind a header of bytes."""
+        width = self.header.itemsize
+        first = self._head(self.appended[at : at + width], 1)
+        if not self.compressor:
+            return self._checked(self.appended[at + width : at + width + int(first[0])], int(first[0]))
+        head = self._head(self.appended[at : at + self._head_size(int(first[0]))], 3 + int(first[0]))
+        at += len(head) * width
+        return self._unpacked(head, self.appended[at : at + int(head[3:].sum())])
+
+    def _base64(self, text: bytes) -> bytes:
+        """The data behind a header of base64, which may be a text of its own."""
+        width = self.header.itemsize
+        first = base64.b64decode(text[: _letters(width)])
+        count = int(self._head(first[:width], 1)[0])
+        if not self.compressor:
+            if len(first) == width:  # padded: the header stands by itself
+                begin, skip = _letters(width), 0
+            else:
+                begin, skip = 0, width
+            letters = text[begin : begin + _letters(skip + self._limited(count))]
+            return self._checked(base64.b64decode(letters)[skip:][:count], count)
+        size = self._head_size(count)
+        head = self._head(base64.b64decode(text[: _letters(size)])[:size], 3 + count)
+        begin = _letters(size)
+        return self._unpacked(head, base64.b64decode(text[begin : begin + _letters(int(head[3:].sum()))]))
+
+    def _head_size(self, blocks: int) -> int:
+        if blocks > self.size:
+            raise ValueError("more blocks than bytes")
+        return (3 + blocks) * self.header.itemsize
+
+    def _head(self, data: bytes, count: int) -> Ints:
+        found = np.frombuffer(data, self.header, count).astype(np.int64)
+        if (found < 0).any():
+            raise ValueError("a length below 0")
+        return found
+
+    def _limited(self, count: int) -> int:
+        """A number of bytes, taken from those that may still be unpacked."""
+        self.left -= count
+        if self.left < 0:
+            raise ValueError("more than points and faces can need")
+        return count
+
+    def _checked(self, data: bytes, count: int) -> bytes:
+        if len(data) < count:
+            raise ValueError("they end too early")
+        return data
+
+    def _unpacked(self, head: Ints, data: bytes) -> bytes:
+        blocks, size, last = (int(each) for each in head[:3])
+        sizes = np.full(blocks, size)
+        if blocks and last:
+            sizes[-1] = last
+        self._limited(int(sizes.sum()))
+        if self.compressor not in _UNPACK:
+            raise InputError(
+                f"{self.name} is compressed by {self.compressor[:40]}", "save it with zlib, or uncompressed"
+            )
+        out, at = [], 0
+        for packed, length in zip(head[3:].tolist(), sizes.tolist(), strict=True):
+            block = _UNPACK[self.compressor]().decompress(data[at : at + packed], length)
+            out.append(self._checked(block, length))
+            at += packed
+        return b"".join(out)
+
+
+def _letters(count: int) -> int:
+    """How many letters of base64 so many bytes take."""
+    return 4 * -(-count // 3)
+
+
+def _count(name: str, piece: ElementTree.Element, key: str) -> int:
+    found = str(piece.get(key, "0")).strip()
+    if not (found.isascii() and found.isdigit() and len(found) < 12):
+        raise damaged(name, f"{key} is no number")
+    return int(found)
