@@ -100,7 +100,7 @@ def prepare():
     with_shapes = [each for each in shown() if each.data.shape_keys]
     modified = [each.name for each in with_shapes if any(one.type != "ARMATURE" for one in each.modifiers)]
     if modified:
-        note(f"modifiers are not applied, because {', '.join(modified[:4])} has shape keys")
+        note(f"modifiers are left out of meshes with shape keys: {', '.join(modified[:4])}")
     return not with_shapes
 
 
