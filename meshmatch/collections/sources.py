@@ -11,11 +11,52 @@ from pathlib import Path, PurePosixPath
 from meshmatch import blender
 from meshmatch.collections.setting import Source
 from meshmatch.collections.stores import Store, is_url
-from meshmatch.errors import InputError
-from meshmatch.outputs import as_path
+from meshmatch.errors import InputError, warn
+from meshmatch.outputs import as_path, plain_text
 from meshmatch.shapes.files import SUFFIXES
 
 _BESIDE = {".npy", *blender.SUFFIXES}  # arrays, and works of an artist, that somebody may keep beside shapes
+_COMPANIONS = set(
+    [
+        ".mtl",
+        ".png",
+        ".jpg",
+        ".jpeg",
+        ".webp",
+        ".bmp",
+        ".tga",
+        ".tif",
+        ".tiff",
+        ".gif",
+        ".bin",
+        ".csv",
+        ".tsv",
+        ".xls",
+        ".xlsx",
+        ".txt",
+        ".json",
+        ".npz",
+        ".mat",
+        ".xml",
+        ".yaml",
+        ".yml",
+        ".md",
+        ".rst",
+        ".html",
+        ".pdf",
+        ".svg",
+        ".log",
+        ".py",
+        ".r",
+        ".sh",
+        ".fcsv",
+        ".tps",
+        ".pp",
+        ".safetensors",
+        ".zip",
+    ]
+)  # what lies beside shapes and is none
+_NAMED = 5  # of the files that are not read
 _PATTERN = "*?["
 
 
@@ -64,7 +105,13 @@ def _sources(given: str | Path, output: Store) -> Iterable[Source]:
 
 
 def _of_folder(folder: Store, output: Store) -> list[Source]:
-    files = [PurePosixPath(name) for name in folder.names() if PurePosixPath(name).suffix.lower() in SUFFIXES]
-    files = [file for file in files if not f"{folder.location}/{file}".startswith(f"{output.location}/")]
+    """The shapes of a folder. Files of unknown formats are told."""
+    found = [PurePosixPath(name) for name in folder.names()]
+    found = [file for file in found if not f"{folder.location}/{file}".startswith(f"{output.location}/")]
+    files = [file for file in found if file.suffix.lower() in SUFFIXES]
+    other = [str(file) for file in found if file.suffix.lower() not in (*SUFFIXES, *_COMPANIONS) and file.suffix]
+    if other:
+        names = ", ".join(other[:_NAMED]) + (f" and {len(other) - _NAMED} more" if len(other) > _NAMED else "")
+        warn(f"of {folder.location} are not read, for their format is not known: {plain_text(names)}")
     files = [file for file in files if file.suffix.lower() not in _BESIDE] or files
     return [Source(str(file.with_suffix("")), folder, str(file)) for file in files]

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import meshmatch
+from meshmatch.collections.sources import find_sources
+from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchWarning
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats import vtk
@@ -228,9 +230,9 @@ def test_other_compressors_are_named(tmp_path: Path) -> None:
 def test_a_folder_of_them_is_fitted_whole(tmp_path: Path) -> None:
     for name in ("a.vtk", "b.vtp", "c.ply"):
         save_shape(tmp_path / name, icosphere(1))
-    from meshmatch.collections.sources import find_sources
-    from meshmatch.collections.stores import Store
-
-    found = find_sources(tmp_path, Store.of(tmp_path / "out"))
+    for name in ("c.mtl", "notes.txt", "README", "scan.wrl", "volume.nrrd"):
+        (tmp_path / name).write_text("something")
+    with pytest.warns(MeshmatchWarning, match=r"are not read, .* not known: scan\.wrl, volume\.nrrd$"):
+        found = find_sources(tmp_path, Store.of(tmp_path / "out"))
     assert [source.file for source in found] == ["a.vtk", "b.vtp", "c.ply"]
     assert meshmatch.load_shape(tmp_path / "b.vtp").F == icosphere(1).F
