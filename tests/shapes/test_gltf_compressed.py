@@ -10,7 +10,7 @@ import pytest
 
 from meshmatch.errors import InputError
 from meshmatch.shapes.files import load_shape
-from meshmatch.shapes.formats import gltf
+from meshmatch.shapes.formats import gltf, gltf_compressed
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.textured_files import load_coordinates
@@ -45,7 +45,7 @@ def draco_file(path: Path, cut: int = 0) -> Path:
     packed = {"bufferView": 0, "attributes": {"POSITION": ids[0], "TEXCOORD_0": ids[3]}}
     primitive = {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "extensions": {DRACO: packed}}
     accessors = [
-        {"componentType": 5126, "count": V + (1 if cut < 0 else 0), "type": "VEC3"},
+        {"componentType": 5126, "count": V + (1 if cut < 0 else 0), "type": "VEC3", "min": [9] * 3, "max": [9] * 3},
         {"componentType": 5126, "count": V, "type": "VEC2"},
         {"componentType": 5123, "count": 3 * F, "type": "SCALAR"},
     ]
@@ -112,6 +112,23 @@ def test_what_is_written_of_it_needs_no_library(tmp_path: Path, make: Any, monke
     np.testing.assert_array_equal(plain.verts, shape.verts)
     np.testing.assert_array_equal(plain.faces, shape.faces)
     assert b"compression" not in glb
+    if make is draco_file:  # of the numbers as they are now
+        box = gltf.Document(tmp_path / "b.glb", glb).json["accessors"][0]
+        np.testing.assert_array_equal([box["min"], box["max"]], [plain.verts.min(0), plain.verts.max(0)])
+
+
+def test_weights_sum_to_one_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounded to few bits they do not."""
+    rounded = {"0 WEIGHTS_0": np.float32([[0.5, 0.25, 0, 0]]), "0 WEIGHTS_1": np.float32([[0.5, 0, 0, 0]])}
+    monkeypatch.setattr(gltf_compressed, "_decoded", lambda *_: rounded)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: True)
+    ids = {"WEIGHTS_0": 0, "WEIGHTS_1": 1}
+    primitive = {"attributes": dict(ids), "extensions": {DRACO: {"bufferView": 0, "attributes": ids}}}
+    accessors = [{"componentType": 5126, "count": 1, "type": "VEC4"} for _ in ids]
+    document: dict[str, Any] = {"meshes": [{"primitives": [primitive]}], "accessors": accessors}
+    document |= {"bufferViews": [{"buffer": 0, "byteLength": 4}], "buffers": [{"byteLength": 4}]}
+    made = gltf_compressed.decompress("a.glb", 100, document, lambda _: b"1234", {DRACO})
+    np.testing.assert_allclose(np.frombuffer(made[1], "<f4"), np.array([2, 1, 0, 0, 2, 0, 0, 0]) / 5)
 
 
 @pytest.mark.parametrize("make", [draco_file, meshopt_file])

@@ -69,13 +69,20 @@ def decompress(
         view.update(made.kept(found[f"{k}"].tobytes()))
         view.pop("extensions")
     for k, primitive in enumerate(primitives, len(packed)):
+        weights = [each for key, each in found.items() if key.startswith(f"{k} WEIGHTS_")]
+        totals = np.sum([each.sum(axis=-1, keepdims=True) for each in weights], axis=0)
         for what, accessor in _accessors(description, primitive):
             values = found[f"{k} {what}"]
+            if what.startswith("WEIGHTS_") and values.dtype.kind == "f":
+                values = values / np.where(totals > 0, totals, 1.0)
             if values.size != accessor["count"] * WIDTHS[accessor["type"]]:
                 raise damaged(name, f"it promises {accessor['count']} values of {what}, and holds others")
+            table = values.astype(COMPONENTS[accessor["componentType"]]).reshape(accessor["count"], -1)
             accessor.pop("byteOffset", None)
             accessor["bufferView"] = len(views)
-            views.append(made.kept(values.astype(COMPONENTS[accessor["componentType"]]).tobytes()))
+            if "min" in accessor and len(table):  # coarser numbers reach elsewhere
+                accessor |= {"min": table.min(0).tolist(), "max": table.max(0).tolist()}
+            views.append(made.kept(table.tobytes()))
         primitive["extensions"].pop(DRACO)
     for key in ("extensionsRequired", "extensionsUsed"):
         description[key] = [each for each in description.get(key, []) if each not in extensions]
