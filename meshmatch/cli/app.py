@@ -9,6 +9,7 @@ from meshmatch import __version__
 from meshmatch.cli.atlas import atlas
 from meshmatch.cli.blender_addon import blender_addon
 from meshmatch.cli.collect import fit, map
+from meshmatch.cli.export import export
 from meshmatch.cli.info import info
 from meshmatch.cli.interpolate import interpolate
 from meshmatch.cli.match import evaluate, match, register
@@ -70,7 +71,7 @@ for verb in (
     *(match, register, wrap, evaluate),
     *(transfer_texture, transfer_color, transfer_labels, transfer_weights),
     *(transfer_rig, transfer_shapes, transfer_landmarks, transfer_garment),
-    *(fit, map, atlas),
+    *(fit, map, export, atlas),
     *(interpolate, picture, view, info, prepare, train, blender_addon),
 ):
     app.command()(verb)

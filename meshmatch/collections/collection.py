@@ -14,6 +14,7 @@ import numpy as np
 from meshmatch.api.results import MapPair
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.atlas import Atlas
+from meshmatch.collections.export import Exported, Place, check_export, export
 from meshmatch.collections.fit_all import TABLE, Fitted, fit_all, fit_other_kinds
 from meshmatch.collections.fit_files import load_words
 from meshmatch.collections.map_all import Pair, map_all
@@ -337,6 +338,43 @@ class Collection:
         maps = Store.of(output)
         with maps.alone(), hired(self.workers) as crew:
             return map_all(self.store, maps, wanted, suffix, crew, self.progress)
+
+    def export(
+        self, output: str | Path, *, suffix: str = ".ply", place: Place = "files", poor: bool = False
+    ) -> Exported:
+        """Write the template on every shape, as meshes or as a table; vertex i is the same point on all of them.
+
+        Parameters
+        ----------
+        output
+            A new folder.
+        suffix
+            Of a mesh for each shape, named as it is; or .csv or .npz, one table of all coordinates: a row for each shape,
+            x, y and z of each vertex in turn; or arrays ``points`` (S, V, 3), ``faces`` (F, 3) and ``names`` (S,).
+        place
+            Where they lie: where the files have the shapes ("files"), or all with the axes of the template, about its
+            center ("template"). Both are in the unit of the files; a mirror image is turned over in the second.
+        poor
+            Whether poor fits are written.
+
+        Returns
+        -------
+        Exported
+            What was written.
+
+        Raises
+        ------
+        MeshmatchError
+            The format or place is unknown, no fit is left, or the folder is not empty or cannot be written.
+        """
+        suffix = check_export(suffix, place)
+        verdicts = {name: str(self._words(name)["verdict"]) for name in self.names}
+        left_out = tuple(name for name, verdict in verdicts.items() if verdict == "poor" and not poor)
+        names = [name for name in verdicts if name not in left_out]
+        if not names:
+            raise InputError(f"all {len(verdicts)} fits of {self.store.location} are poor", "write them with --poor")
+        files = export(output, names, self.fit_of, suffix, place, self.progress)
+        return Exported(tuple(files), len(names), self.template.shape.V, left_out)
 
     def atlas(self, *, modes: int = 100, scale: Scale = "keep", robust: bool = False, poor: bool = False) -> Atlas:
         """The mean and the modes of the fitted shapes.

@@ -11,6 +11,7 @@ import pytest
 
 from meshmatch.collections.collection import Collection
 from meshmatch.maps.files import load_map
+from meshmatch.maps.mapped_mesh import MappedMesh
 from meshmatch.shapes.files import load_shape
 from tests.cli.conftest import Run
 
@@ -69,6 +70,52 @@ def test_maps_of_names(fits: Path, run: Run, tmp_path: Path) -> None:
     answer = run("map", fits, "-o", tmp_path / "some", "--pairs", pairs, "--format", ".csv", "-q", "--jobs", "1")
     assert (answer.status, answer.err) == (0, "")
     assert len(list((tmp_path / "some").rglob("*.csv"))) == 2
+
+
+@pytest.mark.parametrize("suffix", ["vtp", ".obj"])
+def test_registered_meshes_are_exported(fits: Path, run: Run, tmp_path: Path, suffix: str) -> None:
+    answer = run("export", fits, "-o", tmp_path / "out", "--format", suffix, "--json")
+    ending = f".{suffix.removeprefix('.')}"
+    assert json.loads(answer.out)["files"] == [f"climber{ending}", f"dancer{ending}"]
+    assert f"wrote {tmp_path / 'out'}: 2 shapes, 4995 vertices each" in " ".join(answer.err.split())
+    climber, dancer = (load_shape(tmp_path / "out" / f"{name}{ending}") for name in ("climber", "dancer"))
+    np.testing.assert_array_equal(climber.faces, dancer.faces)
+    for name, shape in (("climber", climber), ("dancer", dancer)):
+        file = load_shape(SAMPLES / f"{name}.ply")
+        np.testing.assert_allclose(shape.bounds, file.bounds, atol=0.05 * file.diagonal)
+        assert np.quantile(MappedMesh.of(file).query(shape.verts).distance, 0.9) < 0.005 * file.diagonal
+
+
+def test_coordinates_are_exported_as_tables(fits: Path, run: Run, tmp_path: Path) -> None:
+    collection = Collection(fits)
+    for suffix in (".csv", ".npz"):
+        words = ["export", fits, "-o", tmp_path / suffix, "--format", suffix, "--place", "template", "-q"]
+        assert run(*words).status == 0
+    with np.load(tmp_path / ".npz" / "coords.npz", allow_pickle=False) as found:
+        points, faces, names = found["points"], found["faces"], found["names"].tolist()
+    assert names == ["climber", "dancer"] and points.shape == (2, len(collection.template.shape.verts), 3)
+    np.testing.assert_array_equal(faces, collection.template.shape.faces)
+    for name, own in zip(names, points, strict=True):
+        fit = collection.fit_of(name)
+        np.testing.assert_array_equal(own, fit.points * fit.frame.scale)
+    head, *rows = (tmp_path / ".csv" / "coords.csv").read_text().splitlines()
+    assert head.startswith("name,x0,y0,z0,x1,") and [row.split(",")[0] for row in rows] == names
+    table = np.array([row.split(",")[1:] for row in rows], float).reshape(points.shape)
+    np.testing.assert_array_equal(table, points)
+
+
+def test_what_cannot_be_exported(fits: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+    assert "wrl" in run("export", fits, "-o", out, "--format", "wrl").err
+    assert run("export", tmp_path, "-o", out).status == 1 and not out.exists()
+    out.mkdir()
+    (out / "mine.txt").write_text("kept")
+    answer = run("export", fits, "-o", out)
+    assert answer.status == 1 and (out / "mine.txt").read_text() == "kept" and len(list(out.iterdir())) == 1
+    words = Collection._words
+    monkeypatch.setattr(Collection, "_words", lambda self, name: words(self, name) | {"verdict": "poor"})
+    assert "are poor" in run("export", fits, "-o", tmp_path / "none").err
+    assert run("export", fits, "-o", tmp_path / "all", "--poor").status == 0
 
 
 def test_what_cannot_be_mapped(fits: Path, run: Run, tmp_path: Path) -> None:
