@@ -18,11 +18,12 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes import tables
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.dressed_files import save_colored
+from meshmatch.shapes.formats import ply, vtk
 from meshmatch.shapes.input_files import read_npy
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import read_table
 
-VALUE_SUFFIXES = (".npy", ".csv", ".ply")
+VALUE_SUFFIXES = (".npy", ".csv", ".ply", ".vtp", ".vtk")
 _COLOR_SUFFIXES = (".ply", ".glb", ".obj", ".off", ".npy", ".csv")
 check_values_suffix = partial(tables.check_suffix, suffixes=VALUE_SUFFIXES, what="values")
 check_color_suffix = partial(tables.check_suffix, suffixes=_COLOR_SUFFIXES, what="vertex colors")
@@ -95,16 +96,25 @@ def save_values(path: Path, values: Values, shape: Shape) -> None:
         tables.write_npy(path, numbers)
     elif suffix == ".csv":
         tables.write_rows(path, ["vertex", *names], ([k, *row] for k, row in enumerate(table.tolist())))
+    elif suffix in (".vtp", ".vtk"):
+        write = vtk.write_vtp if suffix == ".vtp" else vtk.write_vtk
+        own = _different([name or "value" for name in names], set())
+        write(path, shape, dict(zip(own, table.T, strict=True)))
     else:
-        from meshmatch.shapes.formats import ply
+        words = ["".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in name) for name in names]
+        own = _different([word or "value" for word in words], _RESERVED)
+        with np.errstate(over="ignore"):  # VTK, and so ParaView, does not read data of a ply that are double
+            ply.write(path, shape, vertex=dict(zip(own, table.T.astype(np.float32), strict=True)))
 
-        taken: list[str] = []  # as a header can hold them: no spaces, none twice, none that a ply uses already
-        for name in names:
-            word = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in name) or "value"
-            while word in taken or word in _RESERVED:
-                word += "_"
-            taken.append(word)
-        ply.write(path, shape, vertex=dict(zip(taken, table.T, strict=True)))
+
+def _different(names: list[str], taken: set[str]) -> list[str]:
+    """Names of which none is there twice, and none is among those taken."""
+    found: list[str] = []
+    for name in names:
+        while name in found or name in taken:
+            name += "_"
+        found.append(name)
+    return found
 
 
 def parse_blank(text: str, columns: int) -> Float[Floats, " D"]:

@@ -104,7 +104,7 @@ def test_names_of_columns_stay(run: Run, pair: Path) -> None:
     assert found.names == ("heat",)
     assert np.abs(found.numbers.ravel() - load_shape("b.ply").verts[:, 2]).max() < 1e-6
     well(run(*call("color --values heat.csv", out="v.ply")))
-    assert b"property double heat" in Path("v.ply").read_bytes()
+    assert b"property float heat" in Path("v.ply").read_bytes()
 
 
 def test_directions_turn_with_the_surface(run: Run, pair: Path) -> None:

@@ -1,5 +1,6 @@
 """Numbers of vertices, and vertex colors: written and read, and what files get wrong."""
 
+import base64
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -45,8 +46,25 @@ def test_a_ply_has_a_property_for_each_number(tmp_path: Path) -> None:
     save_values(tmp_path / "v.ply", Values(NUMBERS, ("heat", "x", "loss in %")), SHAPE)
     data = trimesh.load(tmp_path / "v.ply", process=False).metadata["_ply_raw"]["vertex"]["data"]
     for k, name in enumerate(("heat", "x_", "loss_in__")):
-        assert np.array_equal(np.ravel(data[name]), NUMBERS[:, k])
+        assert data[name].dtype == np.float32  # what VTK reads of a ply
+        assert np.array_equal(np.ravel(data[name]), NUMBERS[:, k].astype(np.float32))
     assert np.array_equal(load_shape(tmp_path / "v.ply").verts, SHAPE.verts)
+
+
+@pytest.mark.parametrize("suffix", [".vtp", ".vtk"])
+def test_vtk_has_an_array_for_each_number(tmp_path: Path, suffix: str) -> None:
+    save_values(tmp_path / f"v{suffix}", Values(NUMBERS, ("heat", "heat", "loss in %")), SHAPE)
+    data = (tmp_path / f"v{suffix}").read_bytes()
+    if suffix == ".vtk":
+        for k, name in enumerate((b"heat", b"heat_", b"loss_in_%")):
+            begin = data.index(name + b" 1 42 double\n") + len(name) + 13
+            assert np.array_equal(np.frombuffer(data, ">f8", 42, begin), NUMBERS[:, k])
+    else:
+        for k, name in enumerate((b"heat", b"heat_", b"loss in %")):
+            text = data[data.index(b'Name="' + name + b'"') :]
+            held = base64.b64decode(text[text.index(b">") + 1 : text.index(b"<")])
+            assert np.array_equal(np.frombuffer(held, "<f8", 42, 8), NUMBERS[:, k])
+    assert np.array_equal(load_shape(tmp_path / f"v{suffix}").verts, SHAPE.verts)
 
 
 def rows(count: int, row: str = "1,2\n") -> Callable[[Path], object]:

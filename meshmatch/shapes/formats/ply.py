@@ -179,7 +179,7 @@ def write(
 ) -> None:
     """Binary little-endian; positions as float where that loses nothing, else double; `comments` go into the header.
 
-    `vertex` and `face` are further properties, arrays (V,) or (F,) by name: uint8, int32, or else double. Names are
+    `vertex` and `face` are further properties, arrays (V,) or (F,) by name: uint8, int32, float32, or else double. Names are
     words of ASCII letters, digits and "_".
     """
     with np.errstate(over="ignore"):  # what is too large for a float is not equal to it
@@ -202,7 +202,7 @@ def write(
 
 def _rows(table: dict[str, NDArray[Any]], count: int, fields: list[Any], header: list[str]) -> bytes:
     """The rows of a table; its columns that have no field yet get one, and a line in the header."""
-    kinds = {"uint8": ("u1", "uchar"), "int32": ("<i4", "int")}
+    kinds = {"uint8": ("u1", "uchar"), "int32": ("<i4", "int"), "float32": ("<f4", "float")}
     for label in list(table)[len(fields) :]:
         kind, word = kinds.get(table[label].dtype.name, ("<f8", "double"))
         fields.append((label, kind))
