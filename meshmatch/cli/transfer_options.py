@@ -90,6 +90,11 @@ class Transfer:
                 check_model(self.options.model)  # a mistyped name is told before the long work
             yield temporary
 
+    @property
+    def _asks_for_a_match(self) -> bool:
+        """Whether an option was given that only a match can follow."""
+        return self.options.model != AUTO or any(name in self.options.given for name in self.options.for_matching)
+
     def __call__(self, source: meshmatch.Shape, target: meshmatch.Shape) -> MapPair:
         """The maps, from the file, by the same faces or by matching; judged if --strict was given."""
         from meshmatch.api.transfer import have_same_faces, vertex_to_vertex
@@ -101,7 +106,7 @@ class Transfer:
 
         if self.options.map is not None and self.options.map.is_dir():
             maps = meshmatch.Collection(self.options.map).maps_between(source, target)
-        elif self.options.map is None and self.options.model == AUTO and have_same_faces(source, target):
+        elif self.options.map is None and not self._asks_for_a_match and have_same_faces(source, target):
             maps = vertex_to_vertex(source, target)
         else:
             maps = meshmatch.find_maps(source, target, self.options.map or matched)

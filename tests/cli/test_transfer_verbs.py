@@ -82,6 +82,8 @@ def test_two_poses_of_a_mesh_are_told(run: Run, pair: Path) -> None:
     answer = well(run("transfer-color", "a.ply", "posed.ply", "--values", "values.npy", "-o", "v.npy"))
     assert "a.ply and posed.ply have the same faces: each vertex goes to the one of its number" in answer.err
     np.testing.assert_array_equal(np.load("v.npy"), np.load("values.npy"))
+    words = ("transfer-color", "a.ply", "posed.ply", "--values", "values.npy", "-o", "v.npy")
+    assert "have the same faces" not in run(*words, "--landmarks", "nowhere.txt").err
 
 
 def test_values_of_a_finer_copy(run: Run, pair: Path) -> None:

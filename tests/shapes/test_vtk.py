@@ -131,6 +131,24 @@ def test_the_older_files(tmp_path: Path, dataset: str, binary: bool, new: bool) 
     assert load_shape(tmp_path / "b.vtk").colors is None
 
 
+@pytest.mark.parametrize("first", [False, True])
+def test_colors_of_cells_are_not_those_of_points(tmp_path: Path, first: bool) -> None:
+    data = old(colors=True)
+    begin = data.index(b"\nPOINT_DATA")
+    cells = b"\nCELL_DATA 2\nCOLOR_SCALARS c 4\n1 0 0 1 1 0 0 1\n"
+    (tmp_path / "a.vtk").write_bytes(data[:begin] + cells + data[begin:] if first else data + cells)
+    is_known(tmp_path / "a.vtk")
+    (tmp_path / "b.vtk").write_bytes(data[:begin] + cells)
+    assert load_shape(tmp_path / "b.vtk").colors is None
+
+
+def test_fields_between_sections_lose_no_faces(tmp_path: Path) -> None:
+    field = b"FIELD FieldData 1\nAB 1 2 double\n1 2\n"
+    for section in (b"POINTS 5", b"POLYGONS 2"):
+        (tmp_path / "a.vtk").write_bytes(old().replace(section, field + section))
+        is_known(tmp_path / "a.vtk")
+
+
 def test_strips_pixels_and_what_is_no_face(tmp_path: Path) -> None:
     head = b"# vtk DataFile Version 3.0\nx\nASCII\n"
     points = b"POINTS 5 float\n0 0 0 1 0 0 0 1 0 1 1 0 0 2 0\n"
@@ -200,6 +218,11 @@ BOMB = zlib.compress(bytes(300_000_000))
         ("a.vtk", old().replace(b"4 0 1 2 3", b"4 0 1 2 9"), "refers to vertex 9"),
         ("a.vtk", old().replace(b"POINTS 5", b"POINTS 99999999999"), "vertices and faces"),
         ("a.vtk", old().replace(b"POLYGONS", b"POLYGONES"), "where a section should begin"),
+        ("a.vtk", old().replace(b"3 0 1 4", b"3 0 1 1.5"), "not whole"),
+        ("a.vtk", old(new=True).replace(b"\n0 4 7", b"\n1 4 7"), "does not begin at the first"),
+        ("a.vtp", "<!DOCTYPE x [<!ENTITY a 'b'>]><VTKFile type='PolyData'/>".encode("utf-16"), "another encoding"),
+        ("a.vtp", b"<?xml version='1.0' encoding='utf-7'?><VTKFile type='PolyData'/>", "another encoding"),
+        ("a.vtp", b"<AppendedData " * 200_000, "it is not XML"),
     ],
 )
 def test_damage_is_told(tmp_path: Path, name: str, content: bytes, words: str) -> None:
@@ -217,6 +240,38 @@ def test_nothing_is_unpacked_beyond_what_the_file_can_mean(tmp_path: Path) -> No
     (tmp_path / "a.vtp").write_bytes(data[:begin] + text + data[data.index(b"</DataArray>", begin) :])
     with pytest.raises(InputError, match="more than points and faces can need"):
         load_shape(tmp_path / "a.vtp")
+
+
+def test_nothing_is_read_again_and_again(tmp_path: Path) -> None:
+    """Pieces that share one array cost no more than a file of their size may."""
+    piece = (
+        '<Piece NumberOfPoints="0" NumberOfPolys="1"><Points><DataArray type="Float32" format="ascii"/></Points><Polys>'
+        '<DataArray type="UInt8" Name="connectivity" format="appended" offset="0"/>'
+        '<DataArray type="UInt8" Name="offsets" format="appended" offset="0"/></Polys></Piece>'
+    )
+    head = '<VTKFile type="PolyData" byte_order="LittleEndian"><PolyData>' + 200 * piece + "</PolyData>"
+    held = np.array([4_000_000], "<u4").tobytes() + bytes(4_000_000)
+    tail = b'<AppendedData encoding="raw">_' + held + b"</AppendedData></VTKFile>"
+    (tmp_path / "a.vtp").write_bytes(head.encode() + tail)
+    with pytest.raises(InputError, match="other than the 1 cells"):
+        load_shape(tmp_path / "a.vtp")
+    many = head.replace('NumberOfPolys="1"', 'NumberOfPolys="4000000"').encode() + tail
+    (tmp_path / "b.vtp").write_bytes(many)
+    with pytest.raises(InputError, match="vertices and faces"):
+        load_shape(tmp_path / "b.vtp")
+
+
+def test_a_piece_does_not_take_the_vertices_of_another(tmp_path: Path) -> None:
+    write_vtp(tmp_path / "a.vtp")
+    text = (tmp_path / "a.vtp").read_text()
+    begin, end = text.index("<Piece"), text.index("</Piece>") + len("</Piece>")
+    piece = text[begin:end]
+    (tmp_path / "b.vtp").write_text(text[:end] + piece + text[end:])
+    assert load_shape(tmp_path / "b.vtp").faces.tolist() == [*FACES[:2], FACES[2], *(np.array(FACES) + 5).tolist()]
+    wrong = piece.replace(">0 1 2 3 0 1 4<", ">0 1 2 3 0 1 -1<")
+    (tmp_path / "c.vtp").write_text(text[:end] + wrong + text[end:])
+    with pytest.raises(InputError, match="refers to vertex -1"):
+        load_shape(tmp_path / "c.vtp")
 
 
 def test_other_compressors_are_named(tmp_path: Path) -> None:

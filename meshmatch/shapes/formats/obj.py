@@ -7,17 +7,20 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, warn
 from meshmatch.shapes import formats
-from meshmatch.shapes.appearance import BakedMaterial
 from meshmatch.shapes.formats import Raw, columns, damaged, numbers, words_per_line
 from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.input_files import check_text
 from meshmatch.shapes.shape import Shape
+
+if TYPE_CHECKING:
+    from meshmatch.shapes.appearance import BakedMaterial
 
 _ENTRIES = (
     rb"v|vt|vn|vp|vc|f|fo|l|p|g|o|s|mg|usemtl|mtllib|newmtl|illum|"

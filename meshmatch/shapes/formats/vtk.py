@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import base64
+import html
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,11 @@ _TYPES = {
     b"vtktypeint64": "i8",
 }  # fmt: skip
 _CELLS = {b"POLYGONS": 7, b"TRIANGLE_STRIPS": 6, b"VERTICES": 2, b"LINES": 4, b"CELLS": None}
+_BACK = 80  # more than a line that begins the data of points or cells
 _KEYWORD = re.compile(rb"\n[ \t]*[A-Z_]{5,}")
+_SECTION = re.compile(
+    rb"\n[ \t]*(?:POINTS|POLYGONS|TRIANGLE_STRIPS|VERTICES|LINES|CELLS|CELL_TYPES|POINT_DATA|CELL_DATA)[ \t]+\d"
+)
 _COLORS = re.compile(rb"\n[ \t]*COLOR_SCALARS[ \t]+\S+[ \t]+([34])[ \t]*\r?\n")
 
 
@@ -69,7 +73,7 @@ class _File:
             elif word in (b"POINT_DATA", b"CELL_DATA"):
                 break
             elif word == b"FIELD":
-                found = re.compile(rb"\n[ \t]*POINTS[ \t]").search(self.data, self.at)
+                found = _SECTION.search(self.data, self.at - 1)
                 self.at = found.start() if found else len(self.data)
             else:
                 raise damaged(self.name, f"it has {line[:40].decode(errors='replace')!r} where a section should begin")
@@ -87,9 +91,11 @@ class _File:
             line = self._next().split()
             if line[:1] != [b"CONNECTIVITY"]:
                 raise damaged(self.name, "its cells have no points")
-            return indices(self.name, self._array(size, line[1:])), np.diff(ends)
+            if len(ends) and ends[0] != 0:
+                raise damaged(self.name, "its first cell does not begin at the first number")
+            return _whole(self.name, self._array(size, line[1:])), np.diff(ends)
         self.at = before
-        flat = indices(self.name, self._array(size, [b"int"]))
+        flat = _whole(self.name, self._array(size, [b"int"]))
         starts = np.zeros(count, np.int64)
         at = 0
         for k in range(count):
@@ -104,8 +110,11 @@ class _File:
         return flat[:at][kept], flat[starts]
 
     def _colors(self, count: int) -> Floats | None:
-        cells = self.data.find(b"\nCELL_DATA", self.at)
-        found = _COLORS.search(self.data, max(self.at - 1, 0), cells if cells >= 0 else len(self.data))
+        begin = self.data.find(b"\nPOINT_DATA", max(self.at - _BACK, 0))  # the line was read
+        if begin < 0:
+            return None
+        end = self.data.find(b"\nCELL_DATA", begin)
+        found = _COLORS.search(self.data, begin, end if end >= 0 else len(self.data))
         if found is None:
             return None
         width, self.at = int(found[1]), found.end()
@@ -150,6 +159,14 @@ class _File:
             if line := self._line():
                 return line
         return b""
+
+
+def _whole(name: str, values: NDArray[Any]) -> Ints:
+    """Numbers of vertices; `InputError` for fractions."""
+    found = indices(name, values)
+    if values.dtype.kind == "f" and (found != values).any():
+        raise damaged(name, "a face refers to a vertex by a number that is not whole")
+    return found
 
 
 def write_vtk(path: Path, shape: Shape, arrays: Arrays | None = None) -> None:
@@ -200,7 +217,7 @@ def _element(name: str, values: NDArray[Any]) -> str:
     width = f' NumberOfComponents="{values.shape[1]}"' if values.ndim > 1 else ""
     data = np.ascontiguousarray(values, values.dtype.newbyteorder("<")).tobytes()
     text = base64.b64encode(len(data).to_bytes(8, "little") + data).decode()
-    return f'<DataArray type="{kind}" Name={quoteattr(name)}{width} format="binary">{text}</DataArray>'
+    return f'<DataArray type="{kind}" Name="{html.escape(name)}"{width} format="binary">{text}</DataArray>'
 
 
 def _plain(arrays: Arrays) -> Iterable[tuple[str, NDArray[Any]]]:

@@ -26,9 +26,10 @@ class Cells:
     sizes: Int[Ints, " P"]
     kinds: Int[Ints, " P"]
 
-    def moved(self, first: int) -> Self:
-        """With so much added to the numbers of points."""
-        return replace(self, corners=self.corners + first)
+    def moved(self, first: int, count: int) -> Self:
+        """With so much added to the numbers of points; what is none of the piece's ``count`` stays none."""
+        known = (self.corners >= 0) & (self.corners < count)
+        return replace(self, corners=np.where(known, self.corners + first, -1))
 
 
 def raw_of(

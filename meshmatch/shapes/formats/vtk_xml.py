@@ -41,7 +41,7 @@ _UNPACK: dict[str, Callable[[], Any]] = {
     "vtkZLibDataCompressor": zlib.decompressobj,
     "vtkLZMADataCompressor": lzma.LZMADecompressor,
 }
-_APPENDED = re.compile(rb"<AppendedData\b([^>]*)>\s*_")
+_APPENDED = re.compile(rb"<AppendedData\b([^>]{0,200})>\s*_")
 
 
 def read(path: Path, data: bytes) -> Raw:
@@ -52,12 +52,15 @@ def read(path: Path, data: bytes) -> Raw:
 class _File:
     def __init__(self, name: str, data: bytes) -> None:
         self.name, self.size, self.appended, self.encoding = name, len(data), b"", b""
-        found = _APPENDED.search(data)
+        begin = data.find(b"<AppendedData")
+        found = _APPENDED.match(data, begin) if begin >= 0 else None
         if found:
             self.appended, self.encoding = data[found.end() :], found[1]
             data = data[: found.start()] + b"</VTKFile>"
-        if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-            raise InputError(f"{name} has a document type, which no VTK file has", WRONG_SUFFIX)
+        if b"\0" in data[:200] or b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # also as UTF-16
+            raise InputError(f"{name} has a document type or another encoding than a VTK file has", WRONG_SUFFIX)
+        if re.search(rb"""<\?xml[^>]{0,200}encoding=["'](?!(?i:utf-8|us-ascii|ascii|iso-8859-1)["'])""", data[:400]):
+            raise InputError(f"{name} has another encoding than a VTK file has", "save it as UTF-8")
         try:
             self.root = ElementTree.fromstring(data)
         except (ElementTree.ParseError, ValueError, LookupError) as error:
@@ -78,25 +81,28 @@ class _File:
         )
         check_places(self.name, self.size, sum(counts), faces)
         self.left = 64 * (FEW_PLACES + self.size // 12)  # bytes that may be unpacked
-        verts, colors, cells = [np.zeros((0, 3))], [], []
+        verts, colors, cells, first = [np.zeros((0, 3))], [], [], 0
         for piece, count in zip(pieces, counts, strict=True):
             points = self._named(piece, "Points", None)
             if points is None or points.size != 3 * count:
                 raise damaged(self.name, f"a piece has other than the {count} points that it promises")
-            first = sum(len(each) for each in verts)
             verts.append(points.reshape(-1, 3).astype(np.float64))
             colors.append(self._colors(piece, count))
-            cells += [each.moved(first) for each in self._cells(piece)]
+            cells += [each.moved(first, count) for each in self._cells(piece)]
+            first += count
         painted_ = joined_colors(colors, counts) if pieces else None
         return raw_of(self.name, self.size, np.concatenate(verts), cells, painted_)
 
     def _cells(self, piece: ElementTree.Element) -> list[Cells]:
         found = []
         for group, kind in (("Polys", 7), ("Strips", 6), ("Cells", None)):
+            many = _count(self.name, piece, f"NumberOf{group}")
+            if not many:
+                continue
             corners = self._named(piece, group, "connectivity")
             ends = self._named(piece, group, "offsets")
-            if corners is None or ends is None or not len(ends):
-                continue
+            if corners is None or ends is None or len(ends) != many:
+                raise damaged(self.name, f"a piece has other than the {many} cells that it promises")
             kinds = self._named(piece, group, "types") if kind is None else np.full(len(ends), kind)
             if kinds is None or len(kinds) != len(ends):
                 raise damaged(self.name, "it does not say of what kind its cells are")
@@ -143,7 +149,8 @@ class _File:
         width = self.header.itemsize
         first = self._head(self.appended[at : at + width], 1)
         if not self.compressor:
-            return self._checked(self.appended[at + width : at + width + int(first[0])], int(first[0]))
+            count = self._limited(int(first[0]))
+            return self._checked(self.appended[at + width : at + width + count], count)
         head = self._head(self.appended[at : at + self._head_size(int(first[0]))], 3 + int(first[0]))
         at += len(head) * width
         return self._unpacked(head, self.appended[at : at + int(head[3:].sum())])
