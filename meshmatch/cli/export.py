@@ -22,7 +22,8 @@ def export(
         "row for each shape, or .npz with points (S, V, 3).",
     ),
     place: Literal["files", "template"] = Option(
-        "files", help="Where they lie: where the files have the shapes, or all turned as the template stands."
+        "files",
+        help="Coordinates: as the input files have them, or all turned as the template stands, about its center.",
     ),
     poor: bool = Option(False, "--poor", help="Write poor fits too."),
     json: options.Json = False,

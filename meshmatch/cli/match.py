@@ -237,6 +237,6 @@ def _rows(result: "Evaluation", threshold: float) -> list[tuple[str, str, str]]:
         rows += [
             ("flipped", f"{100 * folds.flipped:.2f} %", "of the source's area is turned over"),
             ("crushed", f"{100 * folds.crushed:.2f} %", "is laid on less than a quarter of its area"),
-            ("stretch", f"{folds.stretch:.2f}", "half of the area is stretched or shrunk by more than this factor"),
+            ("stretch", f"{folds.stretch:.2f}", "median factor by which the surface is stretched or shrunk"),
         ]
     return rows

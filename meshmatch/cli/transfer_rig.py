@@ -53,7 +53,7 @@ def transfer_rig(
             f"{many} {have} {transfer.names[0]} {'has' if many == 1 else 'have'} no vertex on the target: {names}"
         )
     if result.replaced:
-        console.say(f"note: a skeleton of {result.replaced} joints that {transfer.names[1]} had moves it no more")
+        console.say(f"note: the skeleton that {transfer.names[1]} had ({result.replaced} joints) is replaced")
     played = f", {len(clips)} clip{'s' if len(clips) != 1 else ''}" if clips else ""
     console.say(f"wrote {output}: {transfer.names[1]} with {joints} joints{played}")
     if picture is not None:

@@ -125,7 +125,7 @@ def _tell_baked(
     if folds is not None:
         console.say(
             f"the map turns over {100 * folds.flipped:.2f} % of the surface and crushes {100 * folds.crushed:.2f} %; "
-            f"half of it is stretched or shrunk by more than {folds.stretch:.2f}"
+            f"the median stretch is {folds.stretch:.2f}-fold"
         )
     whose = "its own texture coordinates" if atlas.own else "new texture coordinates"
     console.say(f"{whose}: {100 * baked.used:.0f} % of the texture lies on the surface ({made.seconds:.1f} s)")

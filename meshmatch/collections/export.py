@@ -16,14 +16,12 @@ from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.outputs import folder_on_success, make_folder
 from meshmatch.progress import ProgressCallback
-from meshmatch.shapes import tables
-from meshmatch.shapes.files import PLAIN_SUFFIXES, save_shape
-from meshmatch.shapes.files import check_suffix as check_shape_suffix
+from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 
 Place = Literal["files", "template"]
 """Where exported meshes lie: where their files have the shapes, or all with the axes of the template, about its center."""
-TABLES = (".csv", ".npz")
+MESHES, TABLES = (".ply", ".vtp", ".vtk", ".obj", ".off", ".stl", ".glb"), (".csv", ".npz")
 
 
 @dataclass(frozen=True)
@@ -53,12 +51,9 @@ def check_export(suffix: str, place: str) -> str:
     suffix = f".{suffix.removeprefix('.').lower()}"
     if place not in get_args(Place):
         raise OptionError(f"invalid place {place!r}", f"choose one of {', '.join(get_args(Place))}")
-    if suffix not in TABLES:
-        if suffix not in PLAIN_SUFFIXES:
-            tables.check_suffix(
-                f"a{suffix}", (*TABLES, ".vtp", ".vtk", ".ply", ".obj", ".glb", ".off", ".stl"), "exports"
-            )
-        check_shape_suffix(f"a{suffix}")
+    if suffix not in (*MESHES, *TABLES):
+        hint = f"choose one of {', '.join((*MESHES, *TABLES))}"
+        raise OptionError(f"registered meshes are not exported as {suffix[:20]}", hint)
     return suffix
 
 

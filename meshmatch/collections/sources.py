@@ -15,7 +15,6 @@ from meshmatch.errors import InputError, warn
 from meshmatch.outputs import as_path, plain_text
 from meshmatch.shapes.files import SUFFIXES
 
-_BESIDE = {".npy", *blender.SUFFIXES}  # arrays, and works of an artist, that somebody may keep beside shapes
 _COMPANIONS = {
     ".mtl",
     ".png",
@@ -110,6 +109,7 @@ def _of_folder(folder: Store, output: Store) -> list[Source]:
     other = [str(file) for file in found if file.suffix.lower() not in (*SUFFIXES, *_COMPANIONS) and file.suffix]
     if other:
         names = ", ".join(other[:_NAMED]) + (f" and {len(other) - _NAMED} more" if len(other) > _NAMED else "")
-        warn(f"of {folder.location} are not read, for their format is not known: {plain_text(names)}")
-    files = [file for file in files if file.suffix.lower() not in _BESIDE] or files
+        warn(f"{folder.location}: files of unknown format are left out: {plain_text(names)}")
+    for beside in (set(blender.SUFFIXES), {".npy"}):
+        files = [file for file in files if file.suffix.lower() not in beside] or files
     return [Source(str(file.with_suffix("")), folder, str(file)) for file in files]

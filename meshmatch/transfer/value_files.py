@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.shapes import tables
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.dressed_files import save_colored
@@ -27,6 +27,7 @@ VALUE_SUFFIXES = (".npy", ".csv", ".ply", ".vtp", ".vtk")
 _COLOR_SUFFIXES = (".ply", ".glb", ".obj", ".off", ".npy", ".csv")
 check_values_suffix = partial(tables.check_suffix, suffixes=VALUE_SUFFIXES, what="values")
 check_color_suffix = partial(tables.check_suffix, suffixes=_COLOR_SUFFIXES, what="vertex colors")
+_VISIBLE = 1e-7  # share of a number that a 32-bit one may differ by
 _HINT = "one row of numbers for each vertex of the source, in the order of its file: .npy or .csv"
 # Properties that a ply has already.
 _RESERVED = {"x", "y", "z", "red", "green", "blue", "alpha", "r", "g", "b", "a"}
@@ -104,7 +105,10 @@ def save_values(path: Path, values: Values, shape: Shape) -> None:
         words = ["".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in name) for name in names]
         own = _different([word or "value" for word in words], _RESERVED)
         with np.errstate(over="ignore"):  # VTK, and so ParaView, does not read data of a ply that are double
-            ply.write(path, shape, vertex=dict(zip(own, table.T.astype(np.float32), strict=True)))
+            written = table.astype(np.float32)
+        if (np.abs(written - table) > _VISIBLE * np.abs(table)).any():
+            warn(f"{path.name} has 32-bit numbers, which change some of these; .csv, .npy and .vtp keep them")
+        ply.write(path, shape, vertex=dict(zip(own, written.T, strict=True)))
 
 
 def _different(names: list[str], taken: set[str]) -> list[str]:

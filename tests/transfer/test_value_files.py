@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError, MeshmatchWarning, OptionError
 from meshmatch.shapes.colors import seen
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
@@ -177,3 +177,8 @@ def test_no_colors_is_told_with_what_to_do(tmp_path: Path) -> None:
 def test_colors_have_their_suffixes(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=r"c\.stl: '\.stl' is not a format for vertex colors"):
         save_colors(tmp_path / "c.stl", SHAPE, np.ones((SHAPE.V, 4)))
+
+
+def test_numbers_that_a_ply_changes_are_told(tmp_path: Path) -> None:
+    with pytest.warns(MeshmatchWarning, match="32-bit numbers, which change some"):
+        save_values(tmp_path / "v.ply", Values(np.full(SHAPE.V, 20_000_001.0)), SHAPE)
