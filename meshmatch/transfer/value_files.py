@@ -27,7 +27,7 @@ VALUE_SUFFIXES = (".npy", ".csv", ".ply", ".vtp", ".vtk")
 _COLOR_SUFFIXES = (".ply", ".glb", ".obj", ".off", ".npy", ".csv")
 check_values_suffix = partial(tables.check_suffix, suffixes=VALUE_SUFFIXES, what="values")
 check_color_suffix = partial(tables.check_suffix, suffixes=_COLOR_SUFFIXES, what="vertex colors")
-_VISIBLE = 1e-7  # share of a number that a 32-bit one may differ by
+_VISIBLE = 1e-7  # share of a number, unless it is whole, that a 32-bit one may differ by
 _HINT = "one row of numbers for each vertex of the source, in the order of its file: .npy or .csv"
 # Properties that a ply has already.
 _RESERVED = {"x", "y", "z", "red", "green", "blue", "alpha", "r", "g", "b", "a"}
@@ -106,7 +106,9 @@ def save_values(path: Path, values: Values, shape: Shape) -> None:
         own = _different([word or "value" for word in words], _RESERVED)
         with np.errstate(over="ignore"):  # VTK, and so ParaView, does not read data of a ply that are double
             written = table.astype(np.float32)
-        if (np.abs(written - table) > _VISIBLE * np.abs(table)).any():
+            off = np.abs(written - table)
+        whole = (table == np.rint(table)) & (np.abs(table) < 2**53)
+        if (off > np.where(whole, 0.0, _VISIBLE * np.abs(table))).any():
             warn(f"{path.name} has 32-bit numbers, which change some of these; .csv, .npy and .vtp keep them")
         ply.write(path, shape, vertex=dict(zip(own, written.T, strict=True)))
 
