@@ -190,7 +190,7 @@ def _files(
     if len(target) == 1 and fits.is_file():
         with fits.open(encoding="utf-8", newline="") as file:
             rows = [row for row in csv.DictReader(file) if row.get("verdict") != _FAILED]
-        found = {str(row.get("name")): Path(str(row.get("file"))) for row in rows}
+        found = {_inner(str(row.get("name")), fits): Path(str(row.get("file"))) for row in rows}
         if maps.map is None and meshmatch.Collection(target[0]).holds(others[0]):
             maps = _changed(maps, map=target[0])
     else:
@@ -201,6 +201,14 @@ def _files(
     if not found:
         raise InputError(f"there is no target in {target[0]}", "name files or folders of shapes")
     return found, maps
+
+
+def _inner(name: str, table: Path) -> str:
+    """A name of a table; `InputError` if a file named so could lie outside of the folder it is meant for."""
+    path = Path(name)
+    if not path.parts or path.anchor or ".." in path.parts or "\0" in name:
+        raise InputError(f"{table}: {name!r} is no name of a shape", "correct that row, or fit the shapes again")
+    return name
 
 
 def _changed(options: Any, **changes: Any) -> Any:

@@ -13,7 +13,7 @@ from meshmatch.api import matching
 from meshmatch.api.results import MatchResult
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
-from tests.cli.conftest import FakeMatching, Run, well
+from tests.cli.conftest import FakeMatching, Run, refused, well
 
 LABELS = ("transfer-labels", "a.ply", "in", "--labels", "labels.txt", "-o", "out")
 VERBS = {
@@ -169,3 +169,13 @@ def test_a_damaged_row_is_done_again(run: Run, files: Path, stub: FakeMatching) 
     answer = well(run(*LABELS))
     assert answer.err.count("kept") == 1
     assert len(table()) == 2
+
+
+@pytest.mark.parametrize("name", ["../x", "sub/../../x", "/x", "x\0", ""])
+def test_no_name_of_a_fit_leads_out(run: Run, files: Path, stub: FakeMatching, name: str) -> None:
+    Path("fits").mkdir()
+    with Path("fits/fits.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([["name", "file", "verdict"], [name, "in/b.ply", "good"]])
+    before = {path.name for path in files.iterdir()}
+    words = "transfer-labels", "a.ply", "fits", "--labels", "labels.txt", "-o", "out"
+    refused(run(*words), "is no name of a shape", files, before)
