@@ -122,9 +122,10 @@ def _transfer_all(verb: Verb, target: Sequence[Path], ending: Callable[[Path], s
         for name, file in files.items():
             written = output / f"{name}{ending(file)}"
             made, before = _digest(how, file), rows.get(name)
+            drawn = None if picture is None else picture / f"{name}.png"
             kept = before is not None and before.made == made and before.output == str(written) and written.exists()
+            kept = kept and (drawn is None or drawn.exists())
             if before is None or not kept:
-                drawn = None if picture is None else picture / f"{name}.png"
                 row, record = _transfer(verb, name, rest | {"target": file, "output": written, "picture": drawn}, made)
                 with (output / TABLE).open("a", encoding="utf-8", newline="") as table:
                     csv.writer(table, lineterminator="\n").writerow(asdict(row).values())

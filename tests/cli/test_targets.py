@@ -106,6 +106,14 @@ def test_what_is_finished_is_kept(run: Run, files: Path, stub: FakeMatching, mon
     assert set(before) <= set(Path("out").rglob("*.npy"))
 
 
+def test_a_picture_that_is_missing_is_drawn(run: Run, files: Path, stub: FakeMatching) -> None:
+    well(run(*LABELS))
+    assert "kept" not in well(run(*LABELS, "--picture", "pictures")).err
+    Path("pictures/b.png").unlink()
+    assert well(run(*LABELS, "--picture", "pictures")).err.count("kept") == 1
+    assert Path("pictures/b.png").exists()
+
+
 def test_one_that_fails_stops_no_other(run: Run, files: Path, stub: FakeMatching) -> None:
     Path("in/a-bad.ply").write_text("nothing")
     answer = run(*LABELS, "--json")
