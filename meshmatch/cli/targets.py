@@ -58,7 +58,7 @@ def to_targets(suffix: str, *own: str) -> Callable[[Verb], Callable[..., None]]:
                 print_json(record)
 
         usual = f"{suffix}{', or as TGT' if own else ''}" if suffix else "as GARMENT"
-        words = f"With several targets, what the name of each output ends in. Default: {usual}."
+        words = f"With several targets, the suffix of each output. Default: {usual}."
         format_ = Option(None, "--format", metavar="SUFFIX", help=words)
         parameters = dict(inspect.signature(verb).parameters)
         parameters["target"] = parameters["target"].replace(annotation=_Targets)
@@ -101,6 +101,28 @@ def _ending(file: Path, given: str | None, suffix: str, own: Sequence[str], rest
     return file.suffix.lower() if file.suffix.lower() in own else suffix
 
 
+def _check_ending(verb: str, name: str, rest: Mapping[str, Any]) -> None:
+    """Refuse a name that ends in what the verb cannot write (`OptionError`), once and before any target."""
+    from meshmatch.api import blend_shapes, rig
+    from meshmatch.shapes import files, textured_files
+    from meshmatch.transfer import label_files, landmarks, value_files, weight_files
+
+    if Path(name).name != name:
+        raise OptionError(f"{name}: --format is a suffix", "such as .glb")
+    colors = value_files.check_color_suffix if rest.get("values") is None else value_files.check_values_suffix
+    checks: dict[str, Callable[[Path], object]] = {
+        "transfer_color": colors,
+        "transfer_labels": label_files.check_labels_suffix,
+        "transfer_weights": weight_files.check_weights_suffix,
+        "transfer_landmarks": landmarks.check_landmarks_suffix,
+        "transfer_rig": rig.check_rig_suffix,
+        "transfer_shapes": blend_shapes.check_suffix,
+        "transfer_texture": lambda path: textured_files.check_textured(path, (".ply", ".off")),
+        "transfer_garment": files.check_suffix,
+    }
+    checks[verb](Path(name))
+
+
 def _transfer_all(verb: Verb, target: Sequence[Path], ending: Callable[[Path], str], rest: dict[str, Any]) -> None:
     """Transfer to each target, say a row for each, and fail in the end if one failed."""
     from meshmatch.collections.stores import Store
@@ -109,6 +131,8 @@ def _transfer_all(verb: Verb, target: Sequence[Path], ending: Callable[[Path], s
     _check_folders(output, picture)
     rest["maps"].check()
     files, maps = _files(target, output, rest["maps"], (rest["source"], rest.get("garment")))
+    for each, name in {ending(file): name for name, file in reversed(files.items())}.items():
+        _check_ending(verb.__name__, f"{name.rpartition('/')[2]}{each}", rest)
     if maps.map is None:
         check_model(maps.model)
     console = Console(run.quiet)
@@ -118,7 +142,7 @@ def _transfer_all(verb: Verb, target: Sequence[Path], ending: Callable[[Path], s
         rows = _read(output / TABLE)
         _write(output / TABLE, rows.values())
         console.say(_ROW.format("target", "verdict", "confidence", "seconds"))
-        records = []
+        told, records = [], []
         for name, file in files.items():
             written = output / f"{name}{ending(file)}"
             made, before = _digest(how, file), rows.get(name)
@@ -127,17 +151,26 @@ def _transfer_all(verb: Verb, target: Sequence[Path], ending: Callable[[Path], s
             kept = kept and (drawn is None or drawn.exists())
             if before is None or not kept:
                 row, record = _transfer(verb, name, rest | {"target": file, "output": written, "picture": drawn}, made)
-                with (output / TABLE).open("a", encoding="utf-8", newline="") as table:
-                    csv.writer(table, lineterminator="\n").writerow(asdict(row).values())
+                if not _outlives(before, row):
+                    rows[name] = row
+                    with (output / TABLE).open("a", encoding="utf-8", newline="") as table:
+                        csv.writer(table, lineterminator="\n").writerow(asdict(row).values())
             else:
                 row, record = before, {"output": before.output, "verdict": before.verdict, "kept": True}
-            rows[name] = row
+            told.append(row)
             records.append({"name": name, "file": str(file)} | record)
             console.say(_ROW.format(name, row.verdict, row.confidence, "kept" if kept else row.seconds).rstrip())
             if row.error:
                 console.warn(f"{name}: {row.error}")
         _write(output / TABLE, rows.values())
-    _tell(console, output, [rows[name] for name in files], records, run.json)
+    _tell(console, output, told, records, run.json)
+
+
+def _outlives(before: _Row | None, row: _Row) -> bool:
+    """Whether what was written before, as another file, is still there, and nothing new is."""
+    if before is None or before.verdict == _FAILED or row.verdict != _FAILED:
+        return False
+    return before.output != row.output and Path(before.output).exists()
 
 
 def _transfer(verb: Verb, name: str, rest: dict[str, Any], made: str) -> tuple[_Row, Json]:
@@ -167,7 +200,7 @@ def _tell(console: Console, output: Path, rows: Sequence[_Row], records: list[Js
     if counts[_FAILED]:
         failed = [row.name for row in rows if row.verdict == _FAILED]
         names = ", ".join(failed[:_NAMED]) + (", ..." if len(failed) > _NAMED else "")
-        hint = f"{output / TABLE} says why; the same command goes on with what is missing"
+        hint = "warnings above say why; the same command goes on with what is missing"
         raise InputError(f"{len(failed)} of {len(rows)} targets failed: {names}", hint)
 
 

@@ -90,6 +90,7 @@ def test_what_is_finished_is_kept(run: Run, files: Path, stub: FakeMatching, mon
     answer = well(run(*LABELS, "--json", "--threads", "1"))
     assert (seen, "kept" in answer.err) == ([], True)
     assert [each["kept"] for each in json.loads(answer.out)["targets"]] == [True, True]
+    assert before == {path: path.read_bytes() for path in Path("out").rglob("*.npy")} != {}
     Path("out/b.npy").unlink()
     well(run(*LABELS))
     assert seen == ["b.ply"]
@@ -103,7 +104,6 @@ def test_what_is_finished_is_kept(run: Run, files: Path, stub: FakeMatching, mon
     os.utime("labels.txt", (1, 1))  # another file, as far as one can tell
     well(run(*LABELS, "--to", "faces"))
     assert seen[6:] == ["b.ply", "d.ply", "c.glb"]
-    assert set(before) <= set(Path("out").rglob("*.npy"))
 
 
 def test_a_picture_that_is_missing_is_drawn(run: Run, files: Path, stub: FakeMatching) -> None:
@@ -168,6 +168,29 @@ def test_what_cannot_be_is_told(
     assert answer.status == 1 and message in answer.err, answer.err
     assert Path("taken/transfers.csv").read_text() == "mine\n"
     assert not Path("out").exists()
+
+
+UNKNOWN = [(verb, "gbl") for verb in (*VERBS, "transfer-rig", "transfer-texture")]
+
+
+@pytest.mark.parametrize(("verb", "suffix"), [*UNKNOWN, *(("transfer-shapes", each) for each in ("", "7", "../x.glb"))])
+def test_a_format_that_cannot_be_is_told_once(
+    run: Run, files: Path, stub: FakeMatching, verb: str, suffix: str
+) -> None:
+    garment = ("worn.obj",) if verb == "transfer-garment" else ()
+    before = {path.name for path in files.iterdir()}
+    words = verb, *garment, "a.ply", "in", "-o", "out", *MORE.get(verb, ()), "--format", suffix
+    refused(run(*words), "b." if suffix != "../x.glb" else "is a suffix", files, before)
+
+
+def test_a_failure_leaves_rows_of_other_files(run: Run, files: Path, stub: FakeMatching) -> None:
+    well(run(*LABELS))
+    before = table()
+    Path("out/b.txt").mkdir()
+    answer = run(*LABELS, "--format", "txt")
+    assert answer.status == 1 and "1 of 2 targets failed: b" in answer.err
+    assert table()["b"] == before["b"] and table()["sub/c"]["output"] == "out/sub/c.txt"
+    assert "kept" in well(run(*LABELS)).err
 
 
 def test_a_damaged_row_is_done_again(run: Run, files: Path, stub: FakeMatching) -> None:
