@@ -144,6 +144,62 @@ def test_a_promise_that_is_not_kept_is_one_line(tmp_path: Path) -> None:
         load_shape(meshopt_file(tmp_path / "b.glb", 0, 80_000_000))
 
 
+def draco_document(count: int, primitives: int = 1, size: int = 4) -> dict[str, Any]:
+    """The description of points that are compressed, in primitives that share their data."""
+    packed = {"bufferView": 0, "attributes": {"POSITION": 0}}
+    alike = [{"attributes": {"POSITION": 0}, "extensions": {DRACO: dict(packed)}} for _ in range(primitives)]
+    document: dict[str, Any] = {"meshes": [{"primitives": alike}], "buffers": [{"byteLength": size}]}
+    document["accessors"] = [{"componentType": 5126, "count": count, "type": "VEC3"}]
+    return document | {"bufferViews": [{"buffer": 0, "byteLength": size}]}
+
+
+def asked(monkeypatch: pytest.MonkeyPatch, document: dict[str, Any], size: int = 4) -> list[Any]:
+    """The questions to the decoder about a file; it answers with zeros."""
+    questions = []
+
+    def answer(_: str, jobs: list[dict[str, Any]], data: list[bytes]) -> dict[str, Any]:
+        questions.append((jobs, data))
+        return {f"{k} {name}": np.zeros(n, "f4") for k, job in enumerate(jobs) for name, n in job["sizes"].items()}
+
+    monkeypatch.setattr(gltf_compressed, "_decoded", answer)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: True)
+    gltf_compressed.decompress("a.glb", size, document, lambda _: b"1" * size, {DRACO})
+    return questions
+
+
+def test_data_that_primitives_share_is_decoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    document = draco_document(3, 300)
+    [(jobs, data)] = asked(monkeypatch, document)
+    assert len(jobs) == len(data) == 1
+    assert len(document["bufferViews"]) == 2
+    assert not any(each["extensions"] for each in document["meshes"][0]["primitives"])
+
+
+def test_overlapping_data_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    size = 4_000_000
+    document = draco_document(3, 300, size)
+    document["bufferViews"] = [{"buffer": 0, "byteLength": size - k} for k in range(300)]
+    for k, each in enumerate(document["meshes"][0]["primitives"]):
+        each["extensions"][DRACO]["bufferView"] = k
+    with pytest.raises(InputError, match="promises too much"):
+        asked(monkeypatch, document, size)
+
+
+def test_more_points_than_a_file_may_have_are_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match="vertices and faces"):
+        asked(monkeypatch, draco_document(5_000_000))
+    with pytest.raises(InputError, match="negative"):
+        asked(monkeypatch, draco_document(-5))
+
+
+def test_what_is_not_promised_is_not_sent_back(tmp_path: Path) -> None:
+    DracoPy = pytest.importorskip("DracoPy")
+    data = DracoPy.encode(np.zeros((1000, 3), np.float32), preserve_order=True)
+    path = write(tmp_path / "a.glb", data, DRACO, **draco_document(3, 1, len(data)))
+    with pytest.raises(InputError, match="decoded: it promises 9 numbers of POSITION, and holds 3000"):
+        load_shape(path)
+
+
 @pytest.mark.parametrize("extension", [DRACO, MESHOPT, "KHR_meshopt_compression"])
 def test_without_the_library_the_line_names_it(tmp_path: Path, extension: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)

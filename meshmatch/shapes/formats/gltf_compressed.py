@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
-from meshmatch.shapes.formats import damaged
+from meshmatch.shapes.formats import check_places, damaged
 from meshmatch.shapes.input_files import check_memory
 
 DRACO = "KHR_draco_mesh_compression"
@@ -49,33 +49,26 @@ def decompress(
     packed = [view for view in views if _meshopt(view)]
     meshes = description.get("meshes", [])
     primitives = [each for mesh in meshes for each in mesh["primitives"] if DRACO in each.get("extensions", {})]
-
-    def part(entry: dict[str, Any]) -> bytes:
-        start = entry.get("byteOffset", 0)
-        return buffer(entry["buffer"])[start : start + entry["byteLength"]]
-
     streams = [_meshopt(view) for view in packed]
-    dracos = [primitive["extensions"][DRACO] for primitive in primitives]
-    jobs: list[dict[str, Any]] = [{key: each.get(key, "NONE") for key in _STREAM} for each in streams]
-    jobs += [{"ids": each["attributes"]} for each in dracos]
-    data = [*map(part, streams), *(part(views[each["bufferView"]]) for each in dracos)]
-    promised = sum(int(each["count"]) * int(each["byteStride"]) for each in streams)
-    promised += sum(_size(accessor) for each in primitives for _, accessor in _accessors(description, each))
-    check_memory(name, size, 4 * promised)
+    alike: dict[str, dict[str, Any]] = {}  # one of the primitives that say the same
+    for primitive in primitives:
+        alike.setdefault(json.dumps([primitive["extensions"][DRACO], _numbers(primitive)], sort_keys=True), primitive)
+    jobs, pieces = _jobs(name, size, description, streams, list(alike.values()))
+    data = [buffer(number)[start : start + length] for number, start, length in pieces]
     found = _decoded(name, jobs, data) if jobs else {}
     buffers = description.setdefault("buffers", [])
     made = _Buffer(len(buffers))
     for k, view in enumerate(packed):
         view.update(made.kept(found[f"{k}"].tobytes()))
         view.pop("extensions")
-    for k, primitive in enumerate(primitives, len(packed)):
+    for k, primitive in enumerate(alike.values(), len(packed)):
         weights = [each for key, each in found.items() if key.startswith(f"{k} WEIGHTS_")]
         totals = np.sum([each.sum(axis=-1, keepdims=True) for each in weights], axis=0)
         for what, accessor in _accessors(description, primitive):
             values = found[f"{k} {what}"]
             if what.startswith("WEIGHTS_") and values.dtype.kind == "f":
                 values = values / np.where(totals > 0, totals, 1.0)
-            if values.size != accessor["count"] * WIDTHS[accessor["type"]]:
+            if values.size != _size(accessor):
                 raise damaged(name, f"it promises {accessor['count']} values of {what}, and holds others")
             table = values.astype(COMPONENTS[accessor["componentType"]]).reshape(accessor["count"], -1)
             accessor.pop("byteOffset", None)
@@ -83,6 +76,7 @@ def decompress(
             if "min" in accessor and len(table):  # coarser numbers reach elsewhere
                 accessor |= {"min": table.min(0).tolist(), "max": table.max(0).tolist()}
             views.append(made.kept(table.tobytes()))
+    for primitive in primitives:
         primitive["extensions"].pop(DRACO)
     for key in ("extensionsRequired", "extensionsUsed"):
         description[key] = [each for each in description.get(key, []) if each not in extensions]
@@ -93,6 +87,37 @@ def decompress(
         return empty
     buffers.append({"byteLength": made.size})
     return empty | {made.number: b"".join(made.chunks)}
+
+
+def _jobs(
+    name: str, size: int, description: dict[str, Any], streams: list[Any], primitives: list[dict[str, Any]]
+) -> tuple[list[dict[str, Any]], list[tuple[int, int, int]]]:
+    """What is to be decoded, and the buffer, start and length of the data, by number; `InputError` if that is too much."""
+    pieces: dict[tuple[int, int, int], int] = {}  # of the buffers, numbered: many may need the same
+
+    def piece(entry: dict[str, Any]) -> int:
+        start, length = int(entry.get("byteOffset", 0)), int(entry["byteLength"])
+        if min(start, length) < 0:
+            raise damaged(name, "the place of its compressed data is negative")
+        return pieces.setdefault((entry["buffer"], start, length), len(pieces))
+
+    jobs = [{key: each.get(key, "NONE") for key in _STREAM} | {"data": piece(each)} for each in streams]
+    promised = [int(each["count"]) * int(each["byteStride"]) for each in streams]
+    vertices = corners = 0
+    for primitive in primitives:
+        said = primitive["extensions"][DRACO]
+        sizes = {what: _size(each) for what, each in _accessors(description, primitive)}
+        place = piece(description["bufferViews"][said["bufferView"]])
+        jobs.append({"data": place, "ids": said["attributes"], "sizes": sizes})
+        promised += [4 * each for each in sizes.values()]
+        vertices += sizes.get("POSITION", 0) // 3
+        corners += sizes.get("indices", 0)
+    if min(promised, default=0) < 0:
+        raise damaged(name, "it promises a negative count")
+    check_places(name, size, vertices, corners // 3)
+    check_memory(name, size, 4 * sum(promised))
+    check_memory(name, size, 3 * sum(length for _, _, length in pieces))
+    return jobs, list(pieces)
 
 
 class _Buffer:
@@ -120,21 +145,26 @@ def _meshopt(view: dict[str, Any]) -> Any:
     return next((view["extensions"][each] for each in MESHOPT if each in view.get("extensions", {})), None)
 
 
-def _accessors(description: dict[str, Any], primitive: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """What a primitive of Draco holds, by name."""
+def _numbers(primitive: dict[str, Any]) -> dict[str, int]:
+    """The accessors of what a primitive of Draco holds, by name."""
     numbers = {name: primitive["attributes"][name] for name in primitive["extensions"][DRACO]["attributes"]}
-    if "indices" in primitive:
-        numbers["indices"] = primitive["indices"]
-    for name, number in numbers.items():
+    return numbers | ({"indices": primitive["indices"]} if "indices" in primitive else {})
+
+
+def _accessors(description: dict[str, Any], primitive: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    for name, number in _numbers(primitive).items():
         yield name, description["accessors"][number]
 
 
 def _size(accessor: dict[str, Any]) -> int:
-    return int(accessor["count"]) * WIDTHS[accessor["type"]] * np.dtype(COMPONENTS[accessor["componentType"]]).itemsize
+    """How many numbers an accessor promises, each of four bytes at most."""
+    return int(accessor["count"]) * WIDTHS[accessor["type"]]
 
 
 def _decoded(name: str, jobs: list[dict[str, Any]], data: list[bytes]) -> dict[str, NDArray[Any]]:
-    """What the other process answers: for each job an array of bytes, or one array for each attribute."""
+    """What the other process answers: for each job an array of bytes, or one array for each attribute, of the size that is
+    promised.
+    """
     question = io.BytesIO()
     arrays = {f"data {k}": np.frombuffer(each, np.uint8) for k, each in enumerate(data)}
     np.savez(question, jobs=json.dumps(jobs), **arrays)  # type: ignore[arg-type]
@@ -159,21 +189,26 @@ def main() -> None:
     found: dict[str, NDArray[Any]] = {}
     with np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False) as question:
         for k, job in enumerate(json.loads(str(question["jobs"]))):
-            data = question[f"data {k}"].tobytes()
+            data = question[f"data {job.pop('data')}"].tobytes()
             if "ids" in job:
-                found |= {f"{k} {name}": values for name, values in _draco(data, job["ids"]).items()}
+                found |= {f"{k} {name}": values for name, values in _draco(data, **job).items()}
             else:
                 found[f"{k}"] = _of_meshopt(data, **job)
     np.savez(sys.stdout.buffer, **found)  # type: ignore[arg-type]
 
 
-def _draco(data: bytes, ids: dict[str, int]) -> dict[str, NDArray[Any]]:
+def _draco(data: bytes, ids: dict[str, int], sizes: dict[str, int]) -> dict[str, NDArray[Any]]:
     import DracoPy
 
     mesh = DracoPy.decode(data)
-    found = {name: np.asarray(mesh.get_attribute_by_unique_id(number)["data"]) for name, number in ids.items()}
-    faces = getattr(mesh, "faces", None)
-    return found if faces is None else found | {"indices": np.asarray(faces).ravel()}
+    found: dict[str, NDArray[Any]] = {}
+    for name, size in sizes.items():
+        faces = name == "indices"
+        values = getattr(mesh, "faces", ()) if faces else mesh.get_attribute_by_unique_id(ids[name])["data"]
+        found[name] = np.asarray(values).ravel() if faces else np.asarray(values)
+        if found[name].size != size:  # who asked has no room for more
+            sys.exit(f"it promises {size} numbers of {name}, and holds {found[name].size}")
+    return found
 
 
 def _of_meshopt(data: bytes, mode: str, filter: str, count: int, byteStride: int) -> NDArray[np.uint8]:
