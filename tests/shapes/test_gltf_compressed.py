@@ -200,6 +200,17 @@ def test_what_is_not_promised_is_not_sent_back(tmp_path: Path) -> None:
         load_shape(path)
 
 
+def test_an_unknown_filter_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: True)
+    inside = {"buffer": 0, "byteLength": 4, "byteStride": 4, "count": 1, "mode": "ATTRIBUTES", "filter": "COLOR"}
+    view = {"buffer": 0, "byteLength": 4, "extensions": {"KHR_meshopt_compression": inside}}
+    document = {"bufferViews": [view], "buffers": [{"byteLength": 4}]}
+    path = write(tmp_path / "a.glb", b"1234", "KHR_meshopt_compression", **document)
+    with pytest.raises(InputError, match="filter COLOR") as caught:
+        load_shape(path)
+    assert "without mesh compression" in caught.value.hint
+
+
 @pytest.mark.parametrize("extension", [DRACO, MESHOPT, "KHR_meshopt_compression"])
 def test_without_the_library_the_line_names_it(tmp_path: Path, extension: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)

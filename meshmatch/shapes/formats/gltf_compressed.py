@@ -27,6 +27,7 @@ DRACO = "KHR_draco_mesh_compression"
 MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_FILTERS = ("NONE", "OCTAHEDRAL", "QUATERNION", "EXPONENTIAL")
 _STREAM = ("mode", "filter", "count", "byteStride")
 _SECONDS, _MEMORY = 300, 8 << 30
 _PROGRAM = f"import sys; sys.path[:] = sys.argv[1:]; from {__name__} import main; main()"
@@ -93,6 +94,10 @@ def _jobs(
     name: str, size: int, description: dict[str, Any], streams: list[Any], primitives: list[dict[str, Any]]
 ) -> tuple[list[dict[str, Any]], list[tuple[int, int, int]]]:
     """What is to be decoded, and the buffer, start and length of the data, by number; `InputError` if that is too much."""
+    for each in streams:
+        if (kind := each.get("filter", "NONE")) not in _FILTERS:
+            unread = f"{name} is compressed with the filter {str(kind)[:40]}, which meshmatch does not read"
+            raise InputError(unread, "export it without mesh compression, or with EXT_meshopt_compression")
     pieces: dict[tuple[int, int, int], int] = {}  # of the buffers, numbered: many may need the same
 
     def piece(entry: dict[str, Any]) -> int:
