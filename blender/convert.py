@@ -87,7 +87,7 @@ def leave_out_strangers(folder):
                 kind.remove(each)
     if names:
         first = ", ".join(list(names)[:6]) + (", ..." if len(names) > 6 else "")
-        note(f"left out what it names and what is not in its folder: {first}")
+        note(f"left out files that are missing or outside its folder: {first}")
 
 
 def shown():

@@ -261,7 +261,7 @@ def test_axes_and_unit_are_the_headers_and_images_those_of_the_folder(tmp_path: 
     look = find_appearance(path, shape)
     assert (look is not None and look.materials[0].image is not None) is inside
     assert [str(each.message) for each in told] == (
-        [] if inside else ["a.usda: left out what it names and what is not in its folder: skin.png"]
+        [] if inside else ["a.usda: left out files that are missing or outside its folder: skin.png"]
     )
 
 
