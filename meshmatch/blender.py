@@ -15,6 +15,7 @@ import tempfile
 import threading
 from collections import OrderedDict
 from pathlib import Path
+from typing import NamedTuple
 
 from meshmatch.errors import InputError, OptionError, OutputError, warn
 
@@ -34,6 +35,13 @@ _HINT = (
 )
 _done: OrderedDict[tuple[str, int, int], bytes] = OrderedDict()
 _lock = threading.Lock()
+
+
+class _Trouble(NamedTuple):
+    """Why Blender did not convert a file, and what to do if that is not for want of a good file."""
+
+    why: str
+    hint: str = ""
 
 
 def is_converted(path: Path) -> bool:
@@ -76,8 +84,9 @@ def glb_of(path: Path) -> bytes:
                 raise InputError(f"{path.name} is larger than {_LARGEST >> 30} GiB", "export it as .glb")
             with tempfile.TemporaryDirectory(prefix="meshmatch-") as folder:
                 glb = Path(folder, "converted.glb")
-                if (why := _run(path, glb)) is not None:
-                    raise InputError(f"{path.name} cannot be read: {why}", "is it damaged? export it as .glb")
+                if (trouble := _run(path, glb)) is not None:
+                    hint = trouble.hint or "is it damaged? export it as .glb"
+                    raise InputError(f"{path.name} cannot be read: {trouble.why}", hint)
                 _done[key] = glb.read_bytes()
         _done.move_to_end(key)
         while len(_done) > _KEPT:
@@ -92,19 +101,34 @@ def check_written(path: Path) -> None:
     command(path.name)
 
 
-def from_glb(glb: Path, place: Path, path: Path) -> None:
-    """Write to ``place`` what a glb becomes as the file ``path``; images of a dae come beside it, with its name before
-    theirs. `OutputError` if Blender cannot, `OptionError` if there is none.
+def from_glb(glb: Path, place: Path, path: Path) -> dict[Path, bytes]:
+    """Write to ``place`` what a glb becomes as the file ``path``; the images of a dae, which belong beside it with its name
+    before theirs and are not there yet, are returned.
+
+    `OutputError` if Blender cannot, `OptionError` if there is none or an image would replace another file.
     """
     with tempfile.TemporaryDirectory(prefix="meshmatch-") as folder:
         output = Path(folder, path.name)
-        if (why := _run(glb, output)) is not None:
-            raise OutputError(f"cannot write {path}: {why}", "write a .glb, and open that in the other program")
-        for file in sorted(Path(folder).iterdir()):
-            shutil.copyfile(file, place if file == output else path.parent / file.name)
+        if (trouble := _run(glb, output)) is not None:
+            hint = trouble.hint or "write a .glb, and open that in the other program"
+            raise OutputError(f"cannot write {path}: {trouble.why}", hint)
+        made = [file for file in sorted(Path(folder).iterdir()) if file != output and file.is_file()]
+        new = [file for file in made if not is_converted(file) and _is_new(path.parent / file.name, file, path)]
+        shutil.copyfile(output, place)
+        return {path.parent / file.name: file.read_bytes() for file in new}
 
 
-def _run(source: Path, output: Path) -> str | None:
+def _is_new(copy: Path, file: Path, path: Path) -> bool:
+    """Whether a file that belongs to an output is not beside it yet; `OptionError` if another one has its name."""
+    if not copy.exists():
+        return True
+    if not copy.is_file() or copy.read_bytes() != file.read_bytes():
+        hint = "choose another folder for the output, or remove the file"
+        raise OptionError(f"cannot write {file.name} beside {path.name}: another {copy} is there", hint)
+    return False
+
+
+def _run(source: Path, output: Path) -> _Trouble | None:
     """Let Blender convert a file; why it did not, None if it did. What it leaves out is told."""
     script = scripts_folder() / "convert.py"
     words = [*command((source if output.suffix == ".glb" else output).name), str(script)]
@@ -115,14 +139,17 @@ def _run(source: Path, output: Path) -> str | None:
                 words, stdin=subprocess.DEVNULL, stdout=said, stderr=subprocess.STDOUT, timeout=_SECONDS, check=False
             )
         except subprocess.TimeoutExpired:
-            return f"Blender took longer than {_SECONDS // 60} minutes"
+            return _Trouble(f"Blender took longer than {_SECONDS // 60} minutes")
         except OSError as error:
-            return f"Blender cannot be started: {error.strerror}"
+            return _Trouble(f"Blender cannot be started: {error.strerror}", _HINT)
         said.seek(max(0, said.tell() - 100_000))
         lines = said.read().decode(errors="replace").splitlines()
     if done.returncode:
         worth = [line.strip() for line in lines if line.strip() and not line.startswith((" ", "note: "))]
-        return (worth or [f"Blender ended with status {done.returncode}"])[-1].split("Error: ")[-1]
+        why = (worth or [f"Blender ended with status {done.returncode}"])[-1].split("Error: ")[-1]
+        return _Trouble(why, _HINT if "No module named 'bpy'" in why else "")
+    if not output.is_file():
+        return _Trouble("Blender wrote nothing", f"is {words[0]} Blender? {_HINT}")
     notes = dict.fromkeys(line.removeprefix("note: ") for line in lines if line.startswith("note: "))
     for line in list(notes)[:8]:
         warn(f"{source.name}: {line}")

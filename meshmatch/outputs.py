@@ -68,7 +68,8 @@ def _reached(path: Path) -> Path:
 @contextmanager
 def replace_on_success(path: str | Path) -> Iterator[Path]:
     """As `_replacing`. Of a file that Blender writes (`meshmatch.blender`) the temporary path is that of a glb, which is
-    converted when the block ends well; `OptionError` if there is no Blender.
+    converted when the block ends well, with images beside it; `OptionError` if there is no Blender, or one of these would
+    replace another file.
     """
     path = Path(path)
     if not blender.is_converted(path):
@@ -80,7 +81,10 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
         glb = converted.with_suffix(".glb")
         try:
             yield glb
-            blender.from_glb(glb, converted, path)
+            images = blender.from_glb(glb, converted, path)
+            with replace_all_on_success(list(images)) as places:
+                for place, data in zip(places, images.values(), strict=True):
+                    place.write_bytes(data)
         finally:
             glb.unlink(missing_ok=True)
 

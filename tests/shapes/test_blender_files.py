@@ -1,5 +1,6 @@
 """Files that Blender reads and writes: by a stand-in that copies glb, and, where there is a Blender, by that."""
 
+import shutil
 import time
 import warnings
 from pathlib import Path
@@ -11,6 +12,7 @@ from PIL import Image
 import meshmatch
 from meshmatch import blender
 from meshmatch.errors import InputError, MeshmatchWarning, OptionError, OutputError
+from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.formats import gltf_out
 from meshmatch.shapes.formats.gltf_rig import read_rig
@@ -120,6 +122,43 @@ def test_trouble_in_blender_is_one_line(does: str, words: str, tmp_path: Path, m
     assert time.monotonic() - began < 30
 
 
+@pytest.mark.parametrize(
+    ("does", "words"),
+    [("pass", "wrote nothing"), ("raise ModuleNotFoundError(\"No module named 'bpy'\")", "No module named 'bpy'")],
+)
+def test_a_program_that_is_not_blender_is_told(
+    does: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stand_in(tmp_path, monkeypatch, does)
+    (tmp_path / "a.fbx").write_bytes(b"x")
+    with pytest.raises(InputError, match=words) as caught:
+        meshmatch.load_shape(tmp_path / "a.fbx")
+    assert blender.VARIABLE in caught.value.hint
+    with pytest.raises(OutputError, match=words) as failed:
+        meshmatch.save_shape(tmp_path / "b.fbx", tube())
+    assert blender.VARIABLE in failed.value.hint
+    assert not (tmp_path / "b.fbx").exists()
+
+
+def test_images_of_a_dae_replace_no_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    image = "os.path.join(os.path.dirname(output), 'a-skin.png')"
+    does = f"import os; shutil.copyfile(source, output); open({image}, 'w').write('new'); os.mkdir(output + '-cache')"
+    stand_in(tmp_path, monkeypatch, does)
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "a-skin.png").write_text("mine")
+    (folder / "a.dae").write_text("before")
+    with pytest.raises(OptionError, match=r"another .*a-skin\.png is there"):
+        meshmatch.save_shape(folder / "a.dae", tube())
+    assert {each.name: each.read_text() for each in folder.iterdir()} == {"a-skin.png": "mine", "a.dae": "before"}
+    (folder / "a-skin.png").unlink()
+    for _ in range(2):  # its own image may be there
+        meshmatch.save_shape(folder / "a.dae", tube())
+        assert sorted(each.name for each in folder.iterdir()) == ["a-skin.png", "a.dae"]
+        assert (folder / "a-skin.png").read_text() == "new"
+        assert (folder / "a.dae").read_bytes()[:4] == b"glTF"
+
+
 def test_what_cannot_be_written_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stand_in(tmp_path, monkeypatch, "print('Error: no room'); sys.exit(1)")
     (tmp_path / "a.fbx").write_bytes(b"before")
@@ -176,7 +215,8 @@ def test_blender_keeps_place_skeleton_and_weights(suffix: str, tmp_path: Path) -
 def test_blender_keeps_an_image(suffix: str, tmp_path: Path) -> None:
     sample = Path("templates/samples/dancer-textured.glb")
     path = tmp_path / f"dancer{suffix}"
-    blender.from_glb(sample, path, path)
+    with replace_on_success(path) as glb:
+        shutil.copyfile(sample, glb)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         look = find_appearance(path, meshmatch.load_shape(path))
