@@ -62,6 +62,7 @@ def fit(
     themselves, which must be complete, in any pose and orientation; mirror images are found. FITS/fits.csv lists the
     result of every shape.
     """
+    from meshmatch.collections.fit_all import elsewhere_words
     from meshmatch.collections.setting import FAILED
     from meshmatch.models.registry import NO_MODEL
 
@@ -81,6 +82,7 @@ def fit(
     told = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
     chosen = f" (model {made.model})" if how.model == AUTO else ""
     console.say(f"wrote {len(made.records) - counts[FAILED]} fits to {output}{chosen}: {told}")
+    console.say(*elsewhere_words(made.elsewhere))
     if made.agreed:
         console.say(f"{made.agreed} fits agreed on how the template stretches")
     if json:

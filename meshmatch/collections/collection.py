@@ -15,7 +15,7 @@ from meshmatch.api.results import MapPair
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.export import Exported, Place, check_export, export
-from meshmatch.collections.fit_all import TABLE, Fitted, fit_all, fit_other_kinds
+from meshmatch.collections.fit_all import TABLE, Fitted, elsewhere_words, fit_all, fit_other_kinds
 from meshmatch.collections.fit_files import load_words
 from meshmatch.collections.map_all import Pair, map_all
 from meshmatch.collections.registered import Registered, held
@@ -25,7 +25,7 @@ from meshmatch.collections.sources import find_sources
 from meshmatch.collections.stores import Store
 from meshmatch.collections.superimpose import Scale
 from meshmatch.collections.workers import hired
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, warn
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.build import build_map
@@ -131,20 +131,24 @@ class Collection:
         wish = Setting(self.store, str(model), config or FitConfig(), tuple(only), tuple(without), sequence)
         with self.store.alone(), hired(self.workers) as crew:
             setting = settled(wish, sources)
-            made = fit_all(setting, sources, crew, agree, self.progress, tell)
             if model == AUTO:
+                made = fit_all(setting, sources, crew, agree, self.progress, _of_this_kind(tell))
                 made = fit_other_kinds(made, wish, sources, crew, agree, self.progress, tell)
+            else:
+                made = fit_all(setting, sources, crew, agree, self.progress, tell)
         forget()
         return made
 
     @property
     def names(self) -> list[str]:
-        """Names of the fitted shapes, sorted."""
-        self._about()
-        found = [name.removesuffix(SUFFIX) for name in self.store.names(FITS) if name.endswith(SUFFIX)]
-        if not found:
-            raise InputError(f"{self.store.location} holds no finished fit", "run `meshmatch fit` to its end")
-        return found
+        """Names of the fitted shapes, sorted; not of those of another kind, whose fits are in a folder of their own."""
+        found = self._fitted
+        elsewhere = self._elsewhere(found)
+        left = [name for name in found if name not in elsewhere]
+        if not left:
+            what = f"{self.store.location} holds no fit of its own kind"
+            raise InputError(what, "; ".join(elsewhere_words(elsewhere)))
+        return left
 
     @property
     def template(self) -> Template:
@@ -247,9 +251,9 @@ class Collection:
             A shape is not among the fits.
         """
         shapes = as_shape(source, "source"), as_shape(target, "target")
-        names = {self._hash_of(name): name for name in self.names}
+        names = {self._hash_of(name): name for name in self._fitted}
         for other in self._others():
-            theirs = {other._hash_of(name): name for name in other.names}
+            theirs = {other._hash_of(name): name for name in other._fitted}
             if all(shape.hash in theirs for shape in shapes):
                 return other.maps_between(*shapes)
         for shape in shapes:
@@ -274,12 +278,41 @@ class Collection:
             True if `maps_between` can find it.
         """
         digest = as_shape(shape).hash
-        return any(digest == each._hash_of(name) for each in (self, *self._others()) for name in each.names)
+        return any(digest == each._hash_of(name) for each in (self, *self._others()) for name in each._fitted)
+
+    @property
+    def _fitted(self) -> list[str]:
+        """Names of all fits here, sorted, also of those that are of another kind."""
+        self._about()
+        found = [name.removesuffix(SUFFIX) for name in self.store.names(FITS) if name.endswith(SUFFIX)]
+        if not found:
+            raise InputError(f"{self.store.location} holds no finished fit", "run `meshmatch fit` to its end")
+        return found
 
     def _others(self) -> list[Collection]:
         """The collections of shapes of other kinds within this one."""
         found = [name.split("/") for name in self.store.names() if name.endswith(f"/{TABLE}")]
         return [Collection(f"{self.store.location}/{parts[0]}") for parts in found if len(parts) == 2]
+
+    def _elsewhere(self, names: Sequence[str]) -> dict[str, str]:
+        """Those of the names whose fits here are poor, for they are of another kind; and where their own fits are."""
+        found = {}
+        for other in self._others():
+            theirs = set(other._fitted)
+            for name in (name for name in names if name in theirs):
+                here, there = self._words(name), other._words(name)
+                same = here.get("shape_hash") == there.get("shape_hash")
+                if same and here["verdict"] == "poor" and here["model"] != there["model"]:
+                    found[name] = other.store.location
+        return found
+
+    def _names_of_one_kind(self) -> list[str]:
+        """`names`; with a warning about those that it does not have."""
+        names = self.names
+        known = set(names)
+        for text in elsewhere_words(self._elsewhere([name for name in self._fitted if name not in known])):
+            warn(text)
+        return names
 
     def _hash_of(self, name: str) -> str:
         return str(self._words(name).get("shape_hash", ""))
@@ -289,7 +322,7 @@ class Collection:
             return load_words(path)[0]
 
     def pairs(self, to: str | None = None) -> list[Pair]:
-        """All ordered pairs of names.
+        """All ordered pairs of names, with a warning about shapes of another kind, which are left out.
 
         Parameters
         ----------
@@ -301,10 +334,11 @@ class Collection:
         list of (source, target)
             Names.
         """
-        names = self.names
+        if to is not None:
+            self._check(to)
+        names = self._names_of_one_kind()
         if to is None:
             return list(permutations(names, 2))
-        self.places_of(to)  # is it there?
         return [(name, to) for name in names if name != to]
 
     def save_maps(self, output: str | Path, pairs: Sequence[Pair] | None = None, *, suffix: str = ".npz") -> int:
@@ -327,14 +361,15 @@ class Collection:
         Raises
         ------
         MeshmatchError
-            An unknown name or format, or the folder cannot be written, or another program made it.
+            An unknown name or format, or a name whose fit is of another kind, or the folder cannot be written, or another
+            program made it.
         """
         suffix = f".{suffix.removeprefix('.')}"
         check_suffix(Path(f"map{suffix}"))
         wanted = self.pairs() if pairs is None else list(pairs)
         known = set(self.names)
         for name in (name for pair in wanted for name in pair if name not in known):
-            self._read(name)  # says what is wrong
+            self._check(name)
         maps = Store.of(output)
         with maps.alone(), hired(self.workers) as crew:
             return map_all(self.store, maps, wanted, suffix, crew, self.progress)
@@ -368,7 +403,7 @@ class Collection:
             The format or place is unknown, no fit is left, or the folder is not empty or cannot be written.
         """
         suffix = check_export(suffix, place)
-        verdicts = {name: str(self._words(name)["verdict"]) for name in self.names}
+        verdicts = {name: str(self._words(name)["verdict"]) for name in self._names_of_one_kind()}
         left_out = tuple(name for name, verdict in verdicts.items() if verdict == "poor" and not poor)
         names = [name for name in verdicts if name not in left_out]
         if not names:
@@ -417,7 +452,7 @@ class Collection:
         InputError
             Fewer than three shapes are left.
         """
-        verdicts = {name: str(self._words(name)["verdict"]) for name in self.names}
+        verdicts = {name: str(self._words(name)["verdict"]) for name in self._names_of_one_kind()}
         left_out = {name: verdict for name, verdict in verdicts.items() if verdict == "poor" and not poor}
         names = tuple(name for name in verdicts if name not in left_out)
         if len(names) < 3:
@@ -439,9 +474,21 @@ class Collection:
             raise InputError(f"{self.store.location} is not a folder of fits", hint)
         return about
 
+    def _check(self, name: str) -> None:
+        """`InputError` for a name that has no fit here, or whose fit is of another kind."""
+        self.places_of(name)
+        where = self._elsewhere([name]).get(name)
+        if where is not None:
+            raise InputError(f"{name} is of another kind", f"its fit is in {where}: map there")
+
     def _read(self, name: str) -> tuple[Fit, Places]:
         if not self.store.exists(f"{FITS}/{name}{SUFFIX}"):
-            close = get_close_matches(name, self.names, n=1)
+            close = get_close_matches(name, self._fitted, n=1)
             hint = f"did you mean {close[0]}?" if close else "names are those of the fitted files, without the suffix"
             raise InputError(f"the collection has no fit of {name}", hint)
         return finished_fit(self.store, name)
+
+
+def _of_this_kind(tell: Callable[[Record], None] | None) -> Callable[[Record], None] | None:
+    """Tells of shapes that are not of another kind: those are fitted again, and told then."""
+    return None if tell is None else lambda record: None if record.kind else tell(record)

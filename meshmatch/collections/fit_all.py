@@ -6,8 +6,7 @@ import csv
 import io
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from meshmatch.arrays import Floats
 from meshmatch.collections.setting import AGREEING, ALONE, FAILED, FIRST, Record, Setting, Source, digest_of
@@ -41,16 +40,21 @@ COLUMNS = (
     *("name", "file", "verdict", "trust", "reasons", "residual", "inverted", "volume"),
     *("up", "front", "vertices", "seconds", "notes", "kind"),
 )
+_MOST_NAMED = 10  # in one line
 _GROUP = 4  # fits that one task of the agreement takes a step with: fixed, for sums must not depend on the workers
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """What became of every shape of a collection, also of those that could not be fitted; and with which model."""
+    """What became of every shape of a collection, also of those that could not be fitted; and with which model.
+
+    ``elsewhere`` are names of shapes of another kind, and the folders of their fits.
+    """
 
     records: tuple[Record, ...]
     agreed: int  # fits that took part in the agreement
     model: str
+    elsewhere: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -103,24 +107,43 @@ def fit_other_kinds(
     tell: Callable[[Record], None] | None = None,
 ) -> Fitted:
     """Fit shapes that are of another kind than the model by the model of their own, in a folder of that name within the
-    folder of all; the records say so then. ``wish`` is as it was before the first shapes decided on a model.
+    folder of all; the records say so then. ``wish`` is as it was before the first shapes decided on a model. Their first
+    fits are told only where those stay.
     """
     others: dict[str, list[int]] = defaultdict(list)
     for number, record in enumerate(made.records):
         if record.kind:
             others[record.kind].append(number)
-    records = list(made.records)
+    records, elsewhere = list(made.records), {}
     for kind, numbers in others.items():
         store, own = Store.of(f"{wish.store.location}/{kind}"), [sources[number] for number in numbers]
-        with store.alone(), suppress(InputError):  # of kinds that change their mind: the first fits stay
-            setting = settled(replace(wish, store=store), own)
-            found = fit_all(setting, own, crew, agree, progress, tell)
-            for number, record in zip(numbers, found.records, strict=True):
-                where = f"{kind}: its fit is in {store.location}"
-                records[number] = replace(record, kind=kind, notes=f"{where}; {record.notes}".removesuffix("; "))
+        try:
+            with store.alone():
+                setting = settled(replace(wish, store=store), own)
+                found = fit_all(setting, own, crew, agree, progress, tell)
+        except InputError:  # of kinds that change their mind: the first fits stay
+            if tell is not None:
+                for number in numbers:
+                    tell(records[number])
+            continue
+        for number, record in zip(numbers, found.records, strict=True):
+            where = f"{kind}: its fit is in {store.location}"
+            records[number] = replace(record, kind=kind, notes=f"{where}; {record.notes}".removesuffix("; "))
+            if record.fitted:
+                elsewhere[record.name] = store.location
     if others:
         _write_table(wish.store, records)
-    return replace(made, records=tuple(records))
+    return replace(made, records=tuple(records), elsewhere=elsewhere)
+
+
+def elsewhere_words(elsewhere: Mapping[str, str]) -> list[str]:
+    """A line for each folder of fits of another kind: which names are there."""
+    lines = []
+    for where in dict.fromkeys(elsewhere.values()):
+        names = [name for name in elsewhere if elsewhere[name] == where]
+        more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+        lines.append(f"{', '.join(names[:_MOST_NAMED])}{more}: of another kind, see {where}")
+    return lines
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from meshmatch.collections.collection import Collection
+from meshmatch.collections.fit_files import load_fit, save_fit
 from meshmatch.maps.files import load_map
 from meshmatch.maps.mapped_mesh import MappedMesh
 from meshmatch.shapes.files import load_shape
@@ -116,6 +118,37 @@ def test_what_cannot_be_exported(fits: Path, run: Run, tmp_path: Path, monkeypat
     monkeypatch.setattr(Collection, "_words", lambda self, name: words(self, name) | {"verdict": "poor"})
     assert "are poor" in run("export", fits, "-o", tmp_path / "none").err
     assert run("export", fits, "-o", tmp_path / "all", "--poor").status == 0
+
+
+def test_shapes_of_another_kind_are_left_out(fits: Path, run: Run, tmp_path: Path) -> None:
+    """They are in a folder of their own, and are found there."""
+    mixed = tmp_path / "mixed"
+    shutil.copytree(fits, mixed)
+    (mixed / "human" / "fits").mkdir(parents=True)
+    for name in ("fits.csv", "template.safetensors", "collection.json"):
+        shutil.copy(fits / name, mixed / "human")
+    template = Collection(fits).template
+    for name in ("climber", "dancer"):
+        file = mixed / "fits" / f"{name}.safetensors"
+        shutil.copy(file, mixed / "human" / "fits")
+        for animal in ("cow", "fox"):
+            shutil.copy(file, file.with_name(f"{animal}.safetensors"))
+        kept = load_fit(file, template)
+        save_fit(file, replace(kept.fit, verdict="poor", model="quadruped"), kept.places, words=kept.words)
+    said = f"warning: climber, dancer: of another kind, see {mixed / 'human'}"
+
+    answer = run("map", mixed, "-o", tmp_path / "maps", "--all", "--jobs", "1")
+    assert answer.status == 0 and answer.err.splitlines()[0] == said and answer.err.count("another kind") == 1
+    assert sorted(file.stem for file in (tmp_path / "maps").rglob("*.npz")) == ["cow", "fox"]
+    refused = run("map", mixed, "-o", tmp_path / "none", "--to", "dancer")
+    assert refused.status == 1 and "dancer is of another kind" in refused.err
+    answer = run("export", mixed, "-o", tmp_path / "out", "--poor")
+    assert answer.err.splitlines()[0] == said and len(list((tmp_path / "out").iterdir())) == 2
+    answer = run("atlas", mixed, "-o", tmp_path / "atlas")
+    assert answer.err.splitlines()[0] == said and f"{mixed} holds 2 fits\n" in answer.err
+    collection, shapes = Collection(mixed), [SAMPLES / f"{name}.ply" for name in ("climber", "dancer")]
+    assert collection.names == ["cow", "fox"] and collection.holds(shapes[0])
+    assert collection.maps_between(*shapes).forward.verdict == "good"
 
 
 def test_what_cannot_be_mapped(fits: Path, run: Run, tmp_path: Path) -> None:

@@ -442,7 +442,13 @@ def test_each_shape_of_a_mixed_folder_gets_the_model_of_its_kind(tmp_path: Path)
     for name in ("dancer", "calf", "fox"):
         shutil.copy(SAMPLES / f"{name}.ply", tmp_path / "shapes" / f"{'a-' if name == 'dancer' else ''}{name}.ply")
     collection = meshmatch.Collection(tmp_path / "fits", workers=1)
-    made = collection.fit(tmp_path / "shapes")
+    told: list[Record] = []
+    made = collection.fit(tmp_path / "shapes", tell=told.append)
+    assert sorted((record.name, record.verdict) for record in told) == [
+        ("a-dancer", "good"), ("calf", "good"), ("fox", "good")
+    ]  # fmt: skip
+    assert collection.names == ["a-dancer"]
+    assert made.elsewhere == dict.fromkeys(("calf", "fox"), str(tmp_path / "fits" / "quadruped"))
     assert (made.model, [record.verdict for record in made.records]) == ("human", ["good"] * 3)
     assert [record.kind for record in made.records] == ["", "quadruped", "quadruped"]
     assert made.records[1].notes.startswith(f"quadruped: its fit is in {tmp_path / 'fits' / 'quadruped'}")
