@@ -290,9 +290,10 @@ class Collection:
         return found
 
     def _others(self) -> list[Collection]:
-        """The collections of shapes of other kinds within this one."""
+        """The collections of shapes of other kinds within this one that hold fits."""
         found = [name.split("/") for name in self.store.names() if name.endswith(f"/{TABLE}")]
-        return [Collection(f"{self.store.location}/{parts[0]}") for parts in found if len(parts) == 2]
+        others = [Collection(f"{self.store.location}/{parts[0]}") for parts in found if len(parts) == 2]
+        return [each for each in others if each.store.names(FITS) and read_about(each.store) is not None]
 
     def _elsewhere(self, names: Sequence[str]) -> dict[str, str]:
         """Those of the names whose fits here are poor, for they are of another kind; and where their own fits are."""

@@ -135,6 +135,8 @@ def test_shapes_of_another_kind_are_left_out(fits: Path, run: Run, tmp_path: Pat
             shutil.copy(file, file.with_name(f"{animal}.safetensors"))
         kept = load_fit(file, template)
         save_fit(file, replace(kept.fit, verdict="poor", model="quadruped"), kept.places, words=kept.words)
+    (mixed / "bird").mkdir()
+    (mixed / "bird" / "fits.csv").touch()  # of shapes that could not be fitted
     said = f"warning: climber, dancer: of another kind, see {mixed / 'human'}"
 
     answer = run("map", mixed, "-o", tmp_path / "maps", "--all", "--jobs", "1")
