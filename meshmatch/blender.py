@@ -1,7 +1,7 @@
 """Files that Blender turns into glb, and glb into: fbx, blend, dae and usd.
 
 Blender is large, global, and its readers were not made for files of strangers: it runs as a process of its own, which may
-take only so much time and memory, and runs no scripts of a file (``blender/convert.py``).
+take only so much time and memory, and runs no scripts of a file (``_blender/convert.py``).
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ WRITTEN = (".fbx", ".usdz", ".dae", ".blend")
 """Files that are written by way of a glb: all but .dae hold their images."""
 VARIABLE = "MESHMATCH_BLENDER"
 """The environment variable that names Blender, or a Python that has the package bpy."""
+SCRIPTS = Path(__file__).with_name("_blender")
+"""The folder of what runs inside Blender, by its Python."""
 _LARGEST = 1 << 30  # bytes of a file that is read
 _SECONDS = 300
 _KEPT = 4  # files that are not converted again while the process lasts: a verb reads each several times
@@ -47,13 +49,6 @@ class _Trouble(NamedTuple):
 def is_converted(path: Path) -> bool:
     """Whether a file is read or written by way of a glb."""
     return path.suffix.lower() in SUFFIXES
-
-
-def scripts_folder() -> Path:
-    """The folder of what runs inside Blender: ``meshmatch/_blender`` of a wheel, ``blender/`` beside a checkout."""
-    package = Path(__file__).resolve().parent
-    installed = package / "_blender"
-    return installed if installed.is_dir() else package.parent / "blender"
 
 
 def command(name: str) -> list[str]:
@@ -130,7 +125,7 @@ def _is_new(copy: Path, file: Path, path: Path) -> bool:
 
 def _run(source: Path, output: Path) -> _Trouble | None:
     """Let Blender convert a file; why it did not, None if it did. What it leaves out is told."""
-    script = scripts_folder() / "convert.py"
+    script = SCRIPTS / "convert.py"
     words = [*command((source if output.suffix == ".glb" else output).name), str(script)]
     words += ["--", str(source.absolute()), str(output.absolute())]
     with tempfile.TemporaryFile() as said:

@@ -105,9 +105,9 @@ class Import(NamedTuple):
 
 @cache
 def trees() -> dict[str, ast.Module]:
-    """Every module of the package by its dotted name."""
+    """Every module of the package by its dotted name, without what runs inside Blender."""
     found = {}
-    for path in sorted(PACKAGE.rglob("*.py")):
+    for path in sorted(set(PACKAGE.rglob("*.py")) - set((PACKAGE / "_blender").rglob("*.py"))):
         parts = path.relative_to(ROOT).with_suffix("").parts
         name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
         found[name] = ast.parse(path.read_text(encoding="utf-8"), str(path))

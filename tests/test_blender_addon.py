@@ -231,4 +231,4 @@ os._exit(0)
 
 
 def test_the_folder_of_scripts_is_found() -> None:
-    assert (blender.scripts_folder() / "convert.py").is_file()
+    assert (blender.SCRIPTS / "convert.py").is_file()

@@ -4,7 +4,7 @@ import zipfile
 from pathlib import Path
 
 from meshmatch import __version__
-from meshmatch.blender import scripts_folder
+from meshmatch.blender import SCRIPTS
 from meshmatch.cli.options import Json, Quiet, output_option
 from meshmatch.cli.words import Console, print_json
 from meshmatch.errors import OptionError
@@ -21,7 +21,7 @@ def blender_addon(
     if output.suffix.lower() != ".zip":
         raise OptionError(f"{output.name}: an extension for Blender is a zip", "end the name in .zip")
     with replace_on_success(output) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-        for file in sorted((scripts_folder() / "addon").glob("*.*")):
+        for file in sorted((SCRIPTS / "addon").glob("*.*")):
             text = file.read_text(encoding="utf-8").replace('version = "VERSION"', f'version = "{__version__}"')
             archive.writestr(zipfile.ZipInfo(file.name), text, zipfile.ZIP_DEFLATED)  # the same bytes every day
     Console(quiet).say(f"wrote {output}: in Blender, Edit > Preferences > Get Extensions > Install from Disk")
