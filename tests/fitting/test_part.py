@@ -20,13 +20,14 @@ from meshmatch.fitting.search import candidates
 from meshmatch.fitting.search.candidates import SETTINGS
 from meshmatch.fitting.search.frames import frames_of_part, frames_to_try
 from meshmatch.fitting.search.predictor import Candidate, one_way_residual
-from meshmatch.fitting.search.task import FitTask, take_samples
+from meshmatch.fitting.search.task import FitTask, Registration, take_samples
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import unit
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.repair import repair
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
@@ -111,6 +112,33 @@ def test_one_side_of_a_body_is_found_to_be_a_part_and_matches_the_whole(dancer: 
     assert not never.partial
     alone = MATCHER.map(never, whole, agree=False).index
     assert apart.mean() < np.linalg.norm(dancer.verts[alone] - dancer.verts[used], axis=1).mean()
+
+
+@pytest.mark.parametrize("part", [False, True])
+def test_what_is_said_to_be_a_part_is_tried_as_a_whole_with_little_effort(
+    monkeypatch: pytest.MonkeyPatch, dancer: Shape, part: bool
+) -> None:
+    """In full only where it is none: a whole gets the fit that it has when nothing is said."""
+    tried: list[int] = []
+    fit_whole = fitter.fit_whole
+
+    def counted(task: FitTask) -> Registration:
+        tried.append(task.config.finalists)
+        return fit_whole(task)
+
+    def fitted(said: str) -> Fit:
+        return fitter.Fitter(as_model("human"), replace(FEW, finalists=3, seed=int(part), partial=said)).fit(
+            repair(dancer).shape
+        )
+
+    usual = fitted("no")
+    monkeypatch.setattr(fitter, "fit_whole", counted)
+    monkeypatch.setattr(fitter, "_may_be_part", lambda whole: part)
+    monkeypatch.setattr(fitter, "_as_part_if_closer", lambda whole: (whole, True))
+    found = fitted("yes")
+    assert found.partial == part
+    assert tried == ([1] if part else [1, 3])
+    assert part or np.array_equal(found.points, usual.points)
 
 
 @pytest.mark.slow
