@@ -101,11 +101,8 @@ def have_same_faces(source: Shape, target: Shape) -> bool:
 
 
 def vertex_to_vertex(source: Shape, target: Shape) -> MapPair:
-    """The exact maps between two poses of one mesh."""
-    there, back = (
-        VertexMap.between(a, b, np.arange(a.V), confidence=np.ones(a.V, np.float32), verdict="good")
-        for a, b in ((source, target), (target, source))
-    )
+    """The maps between two poses of one mesh. Nothing judges them: their verdict is "unknown"."""
+    there, back = (VertexMap.between(a, b, np.arange(a.V)) for a, b in ((source, target), (target, source)))
     return MapPair(source, target, there, opposite=back)
 
 

@@ -39,7 +39,8 @@ def expressions(people: int) -> tuple[Floats, Floats, Floats, tuple[str, ...]]:
 @pytest.mark.slow
 def test_expressions_of_another_head() -> None:
     base, faces, moves, names = expressions(6)
-    a, b = (Shape(base[k], faces, f"head {k}") for k in (0, 5))
+    # other corners first: two meshes with the same faces would not be matched
+    a, b = Shape(base[0], faces, "head 0"), Shape(base[5], np.roll(faces, 1, axis=1), "head 5")
     result = meshmatch.transfer_shapes(
         a, b, shapes=BlendShapes(names, moves[0].astype(np.float32), np.zeros(len(names)))
     )
