@@ -36,13 +36,6 @@ def shapes_of(moves: np.ndarray, *names: str, clips: tuple[WeightClip, ...] = ()
     return BlendShapes(names, np.asarray(moves, np.float32), np.zeros(len(names)), clips=clips)
 
 
-@pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    path = tmp_path / "face.gltf"
-    write_morphs(path)
-    return path
-
-
 def test_shapes_of_one_name_are_one_shape(scene: Path) -> None:
     found = read(scene)
     assert found.names == ("smile", "blink", "open")

@@ -30,13 +30,6 @@ def moved(path: Path) -> tuple[Path, Shape]:
     return out, load_shape(out)
 
 
-@pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    path = tmp_path / "face.gltf"
-    write_morphs(path)
-    return path
-
-
 def test_nodes_meshes_and_clips_stay(scene: Path) -> None:
     before = load_shape(scene)
     out, after = moved(scene)
