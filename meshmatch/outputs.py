@@ -160,15 +160,8 @@ def folder_on_success(path: str | Path, replaces: Collection[str] = ()) -> Itera
     `OutputError` if `path` is a file or holds something else, its folder is missing or cannot be written, or the disk
     refuses.
     """
-    path = _reached(Path(path))
+    path = check_new_folder(path, replaces)
     folder = path.parent
-    if path.exists() and not path.is_dir():
-        raise OutputError(f"cannot make the folder {path}: it is a file", "choose another name")
-    _only_holds(path, replaces)
-    if path.is_dir() and path.samefile(Path.cwd()):
-        raise OutputError(f"cannot make the folder {path}: it is the current folder", "give the name of a new one")
-    if not folder.is_dir():
-        raise OutputError(f"cannot make {path}: there is no folder {folder}", f"make it first: mkdir -p {folder}")
     temporary = folder / f".{path.name[:40]}.{os.urandom(4).hex()}"
     try:
         temporary.mkdir()
@@ -186,6 +179,20 @@ def folder_on_success(path: str | Path, replaces: Collection[str] = ()) -> Itera
         raise OutputError(f"cannot write {path}: {error.strerror or error}", "is the disk full?") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def check_new_folder(path: str | Path, replaces: Collection[str] = ()) -> Path:
+    """Where `folder_on_success` would make a folder; `OutputError` where it would not. Ask before long work."""
+    path = _reached(Path(path))
+    folder = path.parent
+    if path.exists() and not path.is_dir():
+        raise OutputError(f"cannot make the folder {path}: it is a file", "choose another name")
+    _only_holds(path, replaces)
+    if path.is_dir() and path.samefile(Path.cwd()):
+        raise OutputError(f"cannot make the folder {path}: it is the current folder", "give the name of a new one")
+    if not folder.is_dir():
+        raise OutputError(f"cannot make {path}: there is no folder {folder}", f"make it first: mkdir -p {folder}")
+    return path
 
 
 def _only_holds(path: Path, names: Collection[str]) -> None:

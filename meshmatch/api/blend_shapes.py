@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import count, islice
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from meshmatch.api.upright import turn_upright
 from meshmatch.arrays import Brief
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import shortest_turns
-from meshmatch.outputs import as_path, make_folder, replace_all_on_success, replace_on_success
+from meshmatch.outputs import as_path, check_new_folder, folder_on_success, replace_on_success
 from meshmatch.shapes import tables
 from meshmatch.shapes.blend_shape_files import load_blend_shapes, save_blend_shapes
 from meshmatch.shapes.blend_shapes import BlendShapes, shape_normals
@@ -86,15 +86,15 @@ class BlendShapesResult(Brief):
         ----------
         path
             A .glb: the target as it came, with morph targets and the clips that animate them. An .npz: ``names`` (K,) and
-            ``moves`` (K, V, 3). Or a folder, which gets an .obj for each shape: the target's own text with other positions,
-            if it came as .obj.
+            ``moves`` (K, V, 3). Or a new folder, which gets an .obj for each shape: the target's own text with other
+            positions, if it came as .obj.
 
         Raises
         ------
         OptionError
             The suffix is another one.
         OutputError
-            A file cannot be written, or the folder holds something else.
+            A file cannot be written, or the folder is not empty.
         """
         path = as_path(path)
         suffix = check_shapes_output(path)
@@ -105,10 +105,8 @@ class BlendShapesResult(Brief):
                 else:
                     temporary.write_bytes(self._to_glb())
             return
-        make_folder(path)
-        plans = self._plans(path)
-        with replace_all_on_success([file for plan in plans for file in plan.files]) as places:
-            self._write_meshes(plans, places)
+        with folder_on_success(path) as folder:
+            self._write_meshes(self._plans(folder))
 
     def _to_glb(self) -> bytes:
         """The target as it came, with morph targets."""
@@ -129,18 +127,23 @@ class BlendShapesResult(Brief):
             plans.append(replace(planned, original=self.original))
         return plans
 
-    def _write_meshes(self, plans: Sequence[MovedFile], places: Sequence[Path]) -> None:
-        """Write the files of `plans` where they wait to get their names."""
+    def _write_meshes(self, plans: Sequence[MovedFile]) -> None:
         normals = shape_normals(self.target, self.shapes.moves)
-        waiting = iter(places)
         for move, plan, now in zip(self.shapes.moves, plans, normals[1:], strict=True):
             shape = replace(self.target, verts=self.target.verts + move)
-            plan.write(list(islice(waiting, len(plan.files))), shape, shortest_turns(normals[0], now))
+            plan.make_folders()
+            plan.write(plan.files, shape, shortest_turns(normals[0], now))
 
 
 def check_shapes_output(path: Path) -> str:
-    """The suffix of an output, "" for a folder; `OptionError` for one that holds no blendshapes."""
-    return check_suffix(path) if path.suffix else ""
+    """The suffix of an output, "" for a folder, such as v1.0. Ask before long work.
+
+    `OptionError` for a suffix that holds no blendshapes, `OutputError` for a folder that cannot be made or is not empty.
+    """
+    if path.suffix and not path.suffix[1:].isdecimal():
+        return check_suffix(path)
+    check_new_folder(path)
+    return ""
 
 
 def _numbered(word: str) -> Iterator[str]:

@@ -22,7 +22,7 @@ def transfer_shapes(
     output: Path = output_option(
         "FILE",
         "TGT with the blendshapes: .glb or, with Blender installed, .fbx, .usdz or .blend. Or .npz for their "
-        "names and displacements; or a folder (a name without a suffix), which gets an .obj for each shape.",
+        "names and displacements; or a new folder (a name without a suffix), which gets an .obj for each shape.",
     ),
     shapes: list[Path] | None = Option(
         None,

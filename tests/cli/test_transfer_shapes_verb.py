@@ -83,12 +83,25 @@ def test_a_folder_of_meshes(run: Run, pair: Path) -> None:
     Path("b.mtl").write_text("newmtl wool\n")
     save_map("ab.npz", VertexMap.between(load_shape("a.glb"), load_shape("b.obj"), np.arange(b.V)))
     words = [word.replace("b.ply", "b.obj") for word in CALL]
-    for _ in range(2):  # again over the first
-        answer = well(run(*words, "-o", "faces"))
-        assert "wrote faces: b.obj with 3 blendshapes" in answer.err
+    answer = well(run(*words, "-o", "faces"))
+    assert "wrote faces: b.obj with 3 blendshapes" in answer.err
     assert {file.name for file in Path("faces").iterdir()} == {"swell.obj", "a_b_ c.obj", "A_B_ c-2.obj", "b.mtl"}
     assert Path("faces/swell.obj").read_text().startswith("# mine\nmtllib b.mtl\n")
     assert np.allclose(load_shape("faces/swell.obj").verts, b.verts + true_moves()[0], atol=0.02)
+
+
+def test_a_folder_that_is_not_empty_stays(run: Run, pair: Path) -> None:
+    Path("faces").mkdir()
+    well(run(*CALL, "-o", "faces"))
+    Path("faces/swell.obj").write_text("mine")
+    before = {path.name for path in pair.iterdir()}
+    refused(run(*CALL, "-o", "faces"), "the folder faces is not empty", pair, before)
+    assert Path("faces/swell.obj").read_text() == "mine"
+
+
+def test_a_folder_may_have_a_version(run: Run, pair: Path) -> None:
+    well(run(*CALL, "-o", "v1.0"))
+    assert {file.name for file in Path("v1.0").iterdir()} == {"swell.obj", "a_b_ c.obj", "A_B_ c-2.obj"}
 
 
 def test_shapes_from_meshes(run: Run, pair: Path) -> None:
