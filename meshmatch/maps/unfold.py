@@ -58,15 +58,14 @@ class _Images:
         self.target = Shape(target.verts / length_of(target), target.faces, invalid=target.invalid)
         self.areas = triangle_areas(self.verts, self.faces)
         self.ratio = area_ratios(self.points, self.normals, self.verts, self.faces)
-        self.torn = self._torn(np.arange(len(self.faces)), self.points)
+        self.torn = self._torn()
         self.surface: MappedMesh | None = None
 
-    def _torn(self, some: Ints, points: Floats) -> Bool[Bools, " N"]:
-        """Which of some faces the map pulls apart."""
-        corners = self.faces[some]
-        found = np.zeros(len(some), bool)
-        for start, end in zip(corners.T, corners[:, [1, 2, 0]].T, strict=True):
-            own, image = (np.sqrt(squared_lengths(each[start] - each[end])) for each in (self.verts, points))
+    def _torn(self) -> Bool[Bools, " F"]:
+        """Which faces the map pulls apart. Their corners never move."""
+        found = np.zeros(len(self.faces), bool)
+        for start, end in zip(self.faces.T, self.faces[:, [1, 2, 0]].T, strict=True):
+            own, image = (np.sqrt(squared_lengths(each[start] - each[end])) for each in (self.verts, self.points))
             found |= image > _STRETCH * own + _SLACK
         return found
 
@@ -99,7 +98,6 @@ class _Images:
         self._take(rows[better], points, normals, (found[0][better], found[1][better], found[2][better]))
         changed = near[(after < before)[of_face]]
         self.ratio[changed] = area_ratios(self.points, self.normals, self.verts, self.faces[changed])
-        self.torn[changed] = self._torn(changed, self.points)
         return True
 
     def _dilated(self, vertices: Ints, rings: int) -> Bools:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from meshmatch.collections.collection import Collection
+from meshmatch.collections.export import export
 from meshmatch.collections.fit_files import load_fit, save_fit
 from meshmatch.maps.files import load_map
 from meshmatch.maps.mapped_mesh import MappedMesh
@@ -86,6 +87,12 @@ def test_registered_meshes_are_exported(fits: Path, run: Run, tmp_path: Path, su
         file = load_shape(SAMPLES / f"{name}.ply")
         np.testing.assert_allclose(shape.bounds, file.bounds, atol=0.05 * file.diagonal)
         assert np.quantile(MappedMesh.of(file).query(shape.verts).distance, 0.9) < 0.005 * file.diagonal
+
+
+def test_shapes_of_folders_are_exported_into_folders(fits: Path, tmp_path: Path) -> None:
+    fit = Collection(fits).fit_of("climber")
+    files = export(tmp_path / "out", ["left/a", "b"], lambda name: fit, ".ply", "files")
+    assert files == ["left/a.ply", "b.ply"] and (tmp_path / "out" / "left" / "a.ply").is_file()
 
 
 def test_coordinates_are_exported_as_tables(fits: Path, run: Run, tmp_path: Path) -> None:

@@ -88,6 +88,31 @@ def test_what_it_does_not_touch() -> None:
     assert unfolded(wrong, source, target) is wrong
 
 
+def test_large_meshes_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    source, target = ball(3), ball(3, 0.0)
+    found = folded(source, target)
+    monkeypatch.setattr("meshmatch.maps.unfold._LARGEST", 500)
+    assert unfolded(found, source, target) is found
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_becomes_worse(seed: int) -> None:
+    """Of folds all over, which no rule opens as a whole, each part stays as it was unless it is better."""
+    source, target = ball(3), ball(3, 0.0)
+    noise = np.random.default_rng(seed).normal(scale=0.05, size=source.verts.shape)
+    found = put(source, target, source.verts + noise)
+    before, after = (Folds.of(each, source, target) for each in (found, unfolded(found, source, target)))
+    assert 0.02 < before.flipped + before.crushed < 0.2
+    assert after.flipped + after.crushed < before.flipped + before.crushed
+
+
+def test_what_does_not_become_better_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    source, target = ball(3), ball(3, 0.0)
+    found = folded(source, target)
+    monkeypatch.setattr("meshmatch.maps.unfold._Images._solved", lambda images, rows, laid: np.zeros((len(rows), 3)))
+    np.testing.assert_array_equal(unfolded(found, source, target).points(target), found.points(target))
+
+
 def test_where_the_map_tears_nothing_is_laid_out() -> None:
     source, target = ball(3), ball(3, 0.0)
     places = np.where(source.verts[:, 2:] > 0, -source.verts, source.verts)  # one half goes to the other side

@@ -255,6 +255,17 @@ def test_nothing_is_read_again_and_again(tmp_path: Path) -> None:
     (tmp_path / "a.vtp").write_bytes(head.encode() + tail)
     with pytest.raises(InputError, match="other than the 1 cells"):
         load_shape(tmp_path / "a.vtp")
+    long = '<DataArray type="UInt32" Name="offsets" format="ascii">3000000</DataArray>'
+    (tmp_path / "c.vtp").write_bytes(
+        head.replace('<DataArray type="UInt8" Name="offsets" format="appended" offset="0"/>', long).encode() + tail
+    )
+    with pytest.raises(InputError, match="vertices and faces"):
+        load_shape(tmp_path / "c.vtp")
+    paint = '<PointData><DataArray type="UInt8" NumberOfComponents="4" format="appended" offset="0"/></PointData>'
+    painted = head.replace('NumberOfPolys="1">', f'NumberOfPolys="0">{paint}').encode() + tail
+    (tmp_path / "d.vtp").write_bytes(painted)
+    with pytest.raises(InputError, match="more than points and faces can need"):
+        load_shape(tmp_path / "d.vtp")
     many = head.replace('NumberOfPolys="1"', 'NumberOfPolys="4000000"').encode() + tail
     (tmp_path / "b.vtp").write_bytes(many)
     with pytest.raises(InputError, match="vertices and faces"):

@@ -37,11 +37,12 @@ def raw_of(
 ) -> Raw:
     """What a file of this size says. `InputError` for cells that are no surface, or numbers that lead nowhere."""
     triangles = [np.zeros((0, 3), np.int64)]
-    listed = 0
+    listed = made = 0
     for each in cells:
         if (each.sizes < 0).any() or each.sizes.sum() > len(each.corners):
             raise damaged(name, "a cell has fewer points than it says")
-        check_places(name, size, len(verts), max(int(each.sizes.sum()) - 2 * len(each.sizes), 0))
+        made += max(int(each.sizes.sum()) - 2 * len(each.sizes), 0)
+        check_places(name, size, len(verts), made)
         known = np.isin(each.kinds, (*_POINTS, *_LINES, *_POLYGONS, _STRIP, _PIXEL))
         if not known.all():
             kind = int(each.kinds[~known][0])

@@ -80,6 +80,7 @@ class _File:
             _count(self.name, piece, f"NumberOf{what}") for piece in pieces for what in ("Polys", "Strips", "Cells")
         )
         check_places(self.name, self.size, sum(counts), faces)
+        self.points, self.triangles = sum(counts), 0
         self.left = 64 * (FEW_PLACES + self.size // 12)  # bytes that may be unpacked
         verts, colors, cells, first = [np.zeros((0, 3))], [], [], 0
         for piece, count in zip(pieces, counts, strict=True):
@@ -107,6 +108,9 @@ class _File:
             if kinds is None or len(kinds) != len(ends):
                 raise damaged(self.name, "it does not say of what kind its cells are")
             sizes = np.diff(np.concatenate([[0], ends.astype(np.int64)]))
+            self.triangles += max(int(sizes.sum()) - 2 * many, 0)
+            check_places(self.name, self.size, self.points, self.triangles)
+            corners = corners[: max(int(sizes.sum()), 0)]
             found.append(Cells(corners.astype(np.int64), sizes, kinds.astype(np.int64)))
         return found
 
