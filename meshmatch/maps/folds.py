@@ -39,7 +39,7 @@ class Folds:
         points, verts = found.points(target) / _length(target), source.verts / _length(source)
         faces, areas = source.faces[source.valid_faces], source.face_areas[source.valid_faces]
         normals = normals_at(found, target)
-        normals *= orientation(points, normals, verts, faces)
+        normals *= 1.0 if facing(points, normals, verts, faces) >= 0 else -1.0
         ratio = area_ratios(points, normals, verts, faces)
         known = np.isfinite(ratio) & (areas > 0)
         if not known.any():
@@ -52,19 +52,26 @@ class Folds:
         return cls(float(share[ratio <= 0].sum()), float(share[crushed].sum()), float(factor[middle]))
 
 
+def known_normals(shape: Shape) -> Float[Floats, "V 3"]:
+    """Unit vertex normals of a mesh; zeros for a cloud, where inside and outside may be confused."""
+    return np.zeros_like(shape.verts) if shape.is_cloud else shape.vertex_normals
+
+
 def normals_at(found: VertexMap, target: Shape) -> Float[Floats, "V_source 3"]:
-    """Unit normals of the target where the vertices of the source are matched."""
+    """Unit normals of the target where the vertices of the source are matched; zeros on a cloud."""
     corners = corners_of(target.faces, found.face, found.index)
-    return unit(interpolate(target.vertex_normals, corners, found.barycentric))
+    return unit(interpolate(known_normals(target), corners, found.barycentric))
 
 
-def orientation(
+def facing(
     points: Float[Floats, "V 3"], normals: Float[Floats, "V 3"], verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]
 ) -> float:
-    """1, or -1 where most of the surface is turned over, as by a map to a mirror image. Arguments as in `area_ratios`."""
+    """How much of the surface keeps its side: 1 all of it, -1 nothing, as by a map to a mirror image. Arguments as in
+    `area_ratios`.
+    """
     images = dot(triangle_vectors(points, faces), _facing(normals, faces))
     own = np.sqrt(squared_lengths(triangle_vectors(verts, faces)))
-    return 1.0 if own[images >= 0].sum() >= own[images < 0].sum() else -1.0
+    return float((own * np.where(images >= 0, 1.0, -1.0)).sum() / max(own.sum(), 1e-300))
 
 
 def area_ratios(

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.geometry.triangles import closest_on_triangles, interpolate, squared_lengths, unit
+from meshmatch.geometry.triangles import closest_on_triangles, interpolate, squared_lengths
+from meshmatch.maps.folds import known_normals, normals_at
 from meshmatch.maps.footpoints import Footpoints, reassign_islands
-from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
 # All set by hand; lengths in units of sqrt(area).
@@ -64,8 +65,7 @@ class MappedMesh:
         self.points = source_to_target.points(target)
         self.confidence = source_to_target.confidence.astype(np.float64)
         self.unit = length_of(target)
-        found = corners_of(target.faces, source_to_target.face, source_to_target.index)
-        self.normals = unit(interpolate(known_normals(target), found, source_to_target.barycentric))
+        self.normals = normals_at(source_to_target, target)
         kept = np.flatnonzero(~discontinuous_faces(source_to_target, source, target) & source.valid_faces)
         lone = source.valid
         lone[source.faces[kept].ravel()] = False
@@ -200,11 +200,6 @@ def mean_around(corners: Int[NDArray[Any], "N K"], values: Float[Floats, " N"], 
     """Mean of the values of the edges, or faces, at each vertex; 0 where there is none."""
     total = np.bincount(corners.T.ravel(), np.tile(values, corners.shape[1]), V)
     return np.asarray(total / np.maximum(np.bincount(corners.ravel(), minlength=V), 1))
-
-
-def known_normals(shape: Shape) -> Float[Floats, "V 3"]:
-    """Unit vertex normals of a mesh; zeros for a cloud, where inside and outside may be confused."""
-    return np.zeros_like(shape.verts) if shape.is_cloud else shape.vertex_normals
 
 
 def length_of(shape: Shape) -> float:

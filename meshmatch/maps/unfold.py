@@ -18,7 +18,7 @@ from scipy.sparse.linalg import splu
 
 from meshmatch.arrays import Bool, Bools, Floats, Ints
 from meshmatch.geometry.triangles import dot, same_rows, squared_lengths, triangle_areas, triangle_vectors, unit
-from meshmatch.maps.folds import CRUSHED, area_ratios, normals_at, orientation
+from meshmatch.maps.folds import CRUSHED, area_ratios, facing, normals_at
 from meshmatch.maps.mapped_mesh import MappedMesh, length_of
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
@@ -53,7 +53,7 @@ class _Images:
         self.faces = faces[(faces != faces[:, [1, 2, 0]]).all(axis=1)]
         self.verts, self.points = source.verts / length_of(source), found.points(target) / length_of(target)
         self.normals = normals_at(found, target)
-        self.side = orientation(self.points, self.normals, self.verts, self.faces)
+        self.side = 1.0 if facing(self.points, self.normals, self.verts, self.faces) >= 0 else -1.0
         self.normals *= self.side
         self.target = Shape(target.verts / length_of(target), target.faces, invalid=target.invalid)
         self.areas = triangle_areas(self.verts, self.faces)

@@ -14,7 +14,8 @@ from scipy.sparse import csr_array
 from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import triangle_areas
-from meshmatch.maps.mapped_mesh import MappedMesh, discontinuous_faces, known_normals, mean_around
+from meshmatch.maps.folds import known_normals
+from meshmatch.maps.mapped_mesh import MappedMesh, discontinuous_faces, mean_around
 from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.shape import Shape
 

@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike
 from meshmatch.arrays import Brief, Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
-from meshmatch.maps.mapped_mesh import MappedMesh, discontinuous_faces, known_normals
+from meshmatch.maps.folds import known_normals
+from meshmatch.maps.mapped_mesh import MappedMesh, discontinuous_faces
 from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes import tables
 from meshmatch.shapes.landmark_files import (

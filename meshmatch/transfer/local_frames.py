@@ -8,13 +8,15 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.solve.priors import nearest_rotations
 from meshmatch.geometry.smoothing import averaged
-from meshmatch.geometry.triangles import dot, edge_lengths, interpolate, is_discontinuous, triangle_vectors, unit
+from meshmatch.geometry.triangles import edge_lengths, is_discontinuous
+from meshmatch.maps.folds import facing, normals_at
 from meshmatch.maps.mapped_mesh import length_of
-from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
 # Set by hand, in units of sqrt(area): over this distance turns and scales are averaged.
 _SMOOTH = 0.06
+_INSIDE_OUT = -0.5  # three quarters of the surface are turned over
 
 
 def local_frames(
@@ -29,10 +31,8 @@ def local_frames(
     if source.is_cloud:
         raise InputError(f"{name} is a point cloud: its surface turns nothing", "give a mesh")
     image = forward.points(target)
-    normals = unit(
-        interpolate(target.vertex_normals, corners_of(target.faces, forward.face, forward.index), forward.barycentric)
-    )
-    if _inside_out(source, image, normals):
+    normals = normals_at(forward, target)
+    if facing(image, normals, source.verts, source.faces[source.valid_faces]) < _INSIDE_OUT:
         hint = "mirror one of the files, or match without mirror images (--mirror no)"
         raise OptionError(f"{name} matches as a mirror image: what is carried would be inside out", hint)
     edges = source.edges.vertices.astype(np.int64)
@@ -54,10 +54,3 @@ def local_frames(
     turns = nearest_rotations(around, np.broadcast_to(np.eye(3), around.shape))
     ratio = np.maximum(sums[:, 9], 0.0) / np.maximum(sums[:, 10], 1e-300)
     return turns, np.where(ratio > 0, ratio, scale)
-
-
-def _inside_out(source: Shape, image: Floats, normals: Floats) -> bool:
-    """Whether most of the source's faces look into the target where they are mapped to."""
-    moved = triangle_vectors(image, source.faces)[source.valid_faces]
-    outwards = normals[source.faces[source.valid_faces, 0]]
-    return bool(dot(moved, outwards).sum() < -0.5 * np.sqrt(dot(moved, moved)).sum())

@@ -12,7 +12,8 @@ from meshmatch.geometry.smoothing import averaged
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import dot, edge_lengths, interpolate, same_rows, unit, vertex_normals
 from meshmatch.maps.deformed import surface_rotations
-from meshmatch.maps.mapped_mesh import MappedMesh, known_normals, length_of
+from meshmatch.maps.folds import known_normals
+from meshmatch.maps.mapped_mesh import MappedMesh, length_of
 from meshmatch.maps.vertex_map import corners_of
 from meshmatch.shapes.shape import Shape
 
