@@ -6,6 +6,7 @@ Colors are mixed as light; a `Shape` has them as screens show them (sRGB), whate
 from __future__ import annotations
 
 import re
+from collections import Counter
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -114,12 +115,16 @@ def save_values(path: Path, values: Values, shape: Shape) -> None:
 
 
 def _different(names: list[str], taken: set[str]) -> list[str]:
-    """Names of which none is there twice, and none is among those taken."""
+    """Names of which none is there twice, and none is among those taken: a second a is a_, a third a_2."""
     found: list[str] = []
+    used, times = set(taken), Counter[str]()
     for name in names:
-        while name in found or name in taken:
-            name += "_"
-        found.append(name)
+        own = name
+        while own in used:
+            times[name] += 1
+            own = f"{name}_" if times[name] == 1 else f"{name}_{times[name]}"
+        used.add(own)
+        found.append(own)
     return found
 
 

@@ -12,7 +12,15 @@ from meshmatch.errors import InputError, MeshmatchWarning, OptionError
 from meshmatch.shapes.colors import seen
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.value_files import Values, light_of, load_values, parse_blank, save_colors, save_values
+from meshmatch.transfer.value_files import (
+    Values,
+    _different,
+    light_of,
+    load_values,
+    parse_blank,
+    save_colors,
+    save_values,
+)
 from tests.conftest import icosphere
 
 SHAPE = icosphere(1)
@@ -177,6 +185,11 @@ def test_no_colors_is_told_with_what_to_do(tmp_path: Path) -> None:
 def test_colors_have_their_suffixes(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=r"c\.stl: '\.stl' is not a format for vertex colors"):
         save_colors(tmp_path / "c.stl", SHAPE, np.ones((SHAPE.V, 4)))
+
+
+def test_columns_of_one_name_are_told_apart() -> None:
+    assert _different(["a", "a", "a", "a_", "x"], {"x"}) == ["a", "a_", "a_2", "a__", "x_"]
+    assert len(set(_different(["a"] * 20_000, set()))) == 20_000
 
 
 def test_numbers_that_a_ply_changes_are_told(tmp_path: Path) -> None:
