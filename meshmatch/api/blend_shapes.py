@@ -24,6 +24,7 @@ from meshmatch.shapes.blend_shape_files import load_blend_shapes, save_blend_sha
 from meshmatch.shapes.blend_shapes import BlendShapes, shape_normals
 from meshmatch.shapes.files import ShapeLike, as_scene, as_shape
 from meshmatch.shapes.formats import gltf
+from meshmatch.shapes.formats.gltf_edit import remembering
 from meshmatch.shapes.formats.gltf_morphs import with_morphs
 from meshmatch.shapes.moved_files import MovedFile
 from meshmatch.shapes.shape import Shape
@@ -113,7 +114,7 @@ class BlendShapesResult(Brief):
         path, data, in_gltf = as_scene(self.original or self.target, self.target)
         turn = np.eye(3) if in_gltf else turn_upright(self.maps, self.stands_along_y)
         adding = partial(with_morphs, shape=self.target, added=self.shapes, turn=turn)
-        return gltf.understood(path, data, "scene makes", adding)
+        return remembering(gltf.understood(path, data, "scene makes", adding), self.target)
 
     def _plans(self, folder: Path) -> list[MovedFile]:
         """The files of a folder of meshes: an .obj for each shape, and what an .obj takes along, once."""

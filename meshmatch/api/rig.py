@@ -18,8 +18,9 @@ from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.shapes import tables
 from meshmatch.shapes.files import ShapeLike, as_scene, as_shape, load_shape
 from meshmatch.shapes.formats import gltf
+from meshmatch.shapes.formats.gltf_edit import remembering
 from meshmatch.shapes.formats.gltf_rig import Rig, read_rig
-from meshmatch.shapes.formats.gltf_rigged import hanging_groups, rigged
+from meshmatch.shapes.formats.gltf_rigged import Binding, hanging_groups, rigged
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.attributes import joint_table, most_votes, pull_weights
@@ -156,10 +157,8 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
         found = rigid(clean_weights(pulled, b, INFLUENCES), hanging)
         standing, posed = carried.bind, carried.source_pose
         standing = posed if pose == "source" else replace(standing, clips=standing_clips(standing, posed))
-        bind, (joints, shares) = carried.bind.worlds(), joint_table(found)
-        glb, replaced = gltf.understood(
-            path, data, "scene makes", lambda document: rigged(document, standing, bind, joints, shares, turn)
-        )
+        binding = Binding(standing, carried.bind.worlds(), *joint_table(found), turn)
+        glb, replaced = gltf.understood(path, data, "scene makes", lambda document: rigged(document, binding))
     before, after = (np.asarray(each.sum(axis=0)).ravel() > 0 for each in (weights.matrix, found))
     unused = tuple(weights.names[joint] for joint in np.flatnonzero(before & ~after))
-    return RiggedResult(standing, SkinWeights(found, weights.names), unused, replaced, maps, glb)
+    return RiggedResult(standing, SkinWeights(found, weights.names), unused, replaced, maps, remembering(glb, b))

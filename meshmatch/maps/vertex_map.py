@@ -181,7 +181,7 @@ class VertexMap(Pickled):
         """This map, checked to be one from `source` to `target`, with names, counts and hashes filled in.
 
         Vertex counts must agree, and hashes where the map has them: a map of another pose, or of a mesh that was edited
-        since, is refused.
+        since, is refused. What a transfer made of a mesh (`Shape.made_of`) takes the maps of that mesh.
 
         Parameters
         ----------
@@ -225,6 +225,8 @@ class VertexMap(Pickled):
         """In what `shape` differs from the source or target ("side") that the map was made for; empty if in nothing."""
         vertices, digest = getattr(self, f"{side}_vertices"), getattr(self, f"{side}_hash")
         made_for, name = getattr(self, side) or "a mesh", shape.name or f"the {side}"
+        if digest in shape.made_of and (vertices == shape.V or (side == "target" and vertices < shape.V)):
+            return ""
         if vertices not in (UNKNOWN, shape.V):
             return f"{side}: {made_for} of {vertices} vertices, but {name} has {shape.V}"
         if digest not in ("", shape.hash):

@@ -16,6 +16,7 @@ from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.formats import Textured, gltf, gltf_out, obj, obj_text
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_dressed import colored, dressed
+from meshmatch.shapes.formats.gltf_edit import remembering
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import check_textured, files_of, image_file
@@ -64,9 +65,10 @@ class Dressed:
             uv, own, turn = self.uv, self.own, np.eye(3)
         else:
             uv, own, turn = self.uv[self.shape.valid_faces], False, self.turn
-        return gltf.understood(
+        made = gltf.understood(
             path, data, "scene makes", lambda document: dressed(document, uv, own, self.material, turn)
         )
+        return remembering(made, self.shape)
 
     def _write_obj(self, path: Path, places: Sequence[Path]) -> None:
         made, name = self.material, "_".join((self.material.name or path.stem).split()) or "texture"
@@ -125,7 +127,8 @@ def save_colored(path: Path, shape: Shape, file: Path | None, turn: Float[Floats
     if suffix == ".glb":
         name, data, kept = glb_base(file, shape)
         turned = np.eye(3) if kept else turn
-        path.write_bytes(gltf.understood(name, data, "scene makes", lambda doc: colored(doc, colors, turned)))
+        made = gltf.understood(name, data, "scene makes", lambda doc: colored(doc, colors, turned))
+        path.write_bytes(remembering(made, shape))
     elif suffix == ".obj" and file is not None and file.suffix.lower() == ".obj":
         path.write_bytes(obj_text.with_colors(file.name, read_bytes(file), colors))
     else:

@@ -166,7 +166,9 @@ def _read(path: str | Path) -> tuple[Shape, Raw]:
         raw = _FORMATS[suffix][0](path, data)
     name = plain_text(path.name)
     shape = Shape.with_invalid(raw.verts, raw.faces, name, _visible(name, raw.colors))
-    return (replace(shape, skinned=raw.skinned, upright=True) if suffix in gltf.SUFFIXES else shape), raw
+    if suffix in gltf.SUFFIXES:
+        shape = replace(shape, skinned=raw.skinned, upright=True, made_of=raw.made_of)
+    return shape, raw
 
 
 def _visible(name: str, colors: Floats | None) -> Floats | None:

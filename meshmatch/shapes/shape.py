@@ -46,6 +46,9 @@ class Shape(Pickled):
         (V,) True for a vertex that joints of its file move: no part with one is ever dropped as dirt.
     upright
         Whether the format of its file says that y is up and z the front, as glTF does. A fit tries that first.
+    made_of
+        Hashes of meshes whose vertices are the first ones of this one, in their order, with the same triangles: of a file
+        that a transfer made of them. Maps to one of these are maps to this shape too.
 
     Raises
     ------
@@ -67,6 +70,7 @@ class Shape(Pickled):
     weights: Float[Floats, " V"] | None = None
     skinned: Bool[Bools, " V"] | None = None
     upright: bool = False
+    made_of: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         label = self.name or "the shape"

@@ -167,6 +167,7 @@ def test_a_glb_stays_as_it_came(source: Path) -> None:
     shape = load_shape(target)
     out, _ = rigged(source, target)
     after = Document(out, out.read_bytes())
+    assert after.json["asset"].pop("extras")["meshmatch"]["made_of"] == [shape.hash]
     for kind in ("materials", "textures", "images", "asset"):
         assert after.json[kind] == before[kind]
     for kind in ("accessors", "bufferViews"):
@@ -231,12 +232,49 @@ def test_a_skeleton_of_its_own_is_replaced(source: Path, stands: float) -> None:
     found = Document(out, out.read_bytes())
     assert result.replaced == 4
     assert len(found.json["skins"]) == 1
+    assert [node["name"] for node in found.json["nodes"]] == ["tube", "source", *NODES[:-1]]  # all of the old is gone
     assert [(each["name"], len(each["channels"])) for each in found.json["animations"]][:1] == [("mesh", 1)]
     assert [each["name"] for each in found.json["animations"]][1:] == ["bend"]
     assert np.abs(load_shape(out).verts - shape.verts).max() < 1e-5
     same = found.json["meshes"][0]["primitives"][0]["attributes"]["POSITION"] == 0
     assert same == (stands == 0.0)
     assert np.linalg.norm(played(out, "bend", 0.0) - tube().verts, axis=1).mean() < 0.03
+
+
+def test_nodes_that_something_else_needs_stay(source: Path) -> None:
+    """A lamp in the hand, a node with somebody's data, and bones that an extension may name."""
+    target = source.with_name("target.glb")
+    write_tube(target)
+    nodes = Document(target, target.read_bytes()).json["nodes"]
+    nodes[4]["extensions"] = {"KHR_lights_punctual": {"light": 0}}
+    nodes[5]["extras"] = {"mine": 1}
+    more: dict[str, Any] = {"nodes": nodes, "extensionsUsed": ["KHR_lights_punctual"]}
+    write_tube(target, **more)
+    out, _ = rigged(source, target)
+    kept = Document(out, out.read_bytes()).json["nodes"]
+    assert [node["name"] for node in kept[:7]] == list(NODES)
+    nodes[4].pop("extensions")
+    write_tube(target, nodes=nodes, extensionsUsed=["VRMC_vrm"], extensions={"VRMC_vrm": {"hips": {"node": 2}}})
+    out, _ = rigged(source, target)
+    assert Document(out, out.read_bytes()).json["nodes"][2]["name"] == "hip"
+
+
+def test_what_is_made_of_a_mesh_takes_its_maps(source: Path) -> None:
+    """But not when its faces were changed since."""
+    shape, target = tube(), source.with_name("target.ply")
+    save_shape(target, shape)
+    made = same_order(source, target)
+    out, _ = rigged(source, target)
+    again = load_shape(out)
+    assert again.made_of == (load_shape(target).hash,) and again.hash not in again.made_of
+    assert made.for_shapes(None, again).target_hash == again.hash
+    editor = Editor(Document(out, out.read_bytes()))
+    part = editor.json["meshes"][0]["primitives"][0]
+    part["indices"] = editor.add_indices(shape.faces[::-1], shape.V)
+    out.write_bytes(editor.to_bytes())
+    assert load_shape(out).made_of == ()
+    with pytest.raises(InputError, match="was made for another target"):
+        made.for_shapes(None, load_shape(out))
 
 
 def test_a_cloud_is_rigged_too(source: Path) -> None:

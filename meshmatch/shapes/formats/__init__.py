@@ -51,6 +51,7 @@ class Raw:
     colors: Float[Floats, "V 4"] | None = None
     skinned: Bool[Bools, " V"] | None = None  # vertices that joints of the file move
     meshes: tuple[tuple[tuple[str, ...], int], ...] = ()  # of a scene, in order: names (of node and mesh), vertices
+    made_of: tuple[str, ...] = ()  # hashes, see `Shape.made_of`
 
 
 @dataclass(frozen=True, eq=False)

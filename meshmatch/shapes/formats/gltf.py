@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import hashlib
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -41,12 +42,19 @@ SUFFIXES = (".glb", ".gltf", ".vrm", *blender.SUFFIXES)
 """Of files in this format: a vrm is a glb with a character, and Blender turns others into a glb."""
 MOST_NODES = 100_000
 """Nodes of a scene, and primitives that it draws: each takes up to 0.1 ms."""
+ORIGINS, MOST_ORIGINS = "meshmatch", 16
+"""Where a file says what its mesh was made of: in the extras of its asset."""
 Found = TypeVar("Found")
 
 
 def read(path: Path, data: bytes) -> Raw:
     """All triangles and points of the scene, one primitive after the other, parents before children."""
     return understood(path, data, "scene makes", Document.scene)
+
+
+def digest(faces: Int[Ints, "F 3"]) -> str:
+    """16 hexadecimal digits that name these triangles."""
+    return hashlib.sha256(np.ascontiguousarray(faces, np.int64).data if len(faces) else b"").hexdigest()[:16]
 
 
 def understood(path: Path, data: bytes, what: str, reader: Callable[[Document], Found]) -> Found:
@@ -142,7 +150,25 @@ class Document:
         if painted is not None:
             painted[:, :3] = to_srgb(painted[:, :3])
         bound = np.concatenate(skinned)
-        return Raw(np.vstack(verts), np.vstack(faces), painted, bound if bound.any() else None, tuple(meshes))
+        triangles = np.vstack(faces)
+        skin, made_of = bound if bound.any() else None, self.origins(triangles)
+        return Raw(np.vstack(verts), triangles, painted, skin, tuple(meshes), made_of)
+
+    def faces(self) -> Int[Ints, "F 3"]:
+        """The triangles of `scene`, and nothing else of it."""
+        found, seen = [NO_FACES], 0
+        for _, primitive, _ in self.primitives():
+            found.append(self.triangles(primitive) + seen)
+            seen += self.count(primitive["attributes"]["POSITION"])
+        return np.vstack(found)
+
+    def origins(self, faces: Int[Ints, "F 3"]) -> tuple[str, ...]:
+        """Hashes of the meshes that this one says it was made of, vertex by vertex, unless its faces are others since."""
+        extras = self.json["asset"].get("extras")
+        said = extras.get(ORIGINS) if isinstance(extras, dict) else None
+        if not isinstance(said, dict) or said.get("faces") != digest(faces):
+            return ()
+        return tuple(str(each) for each in said["made_of"][:MOST_ORIGINS])
 
     def _names(self, number: int) -> tuple[str, ...]:
         """What a node and its mesh are called."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 # Extensions that refer to nothing but textures of materials, or what is found below; with others nothing is taken out.
@@ -17,7 +17,7 @@ Json = dict[str, Any]
 def unused(json: Json) -> dict[str, set[int]]:
     """Of each kind, the numbers that nothing refers to."""
     found = {kind: set(range(len(json.get(kind, [])))) for kind in _KINDS}
-    for kind, holder, key in _references(json):
+    for kind, holder, key in references(json):
         found[kind].discard(holder[key])
     return found
 
@@ -32,7 +32,7 @@ def prune(json: Json, before: dict[str, set[int]]) -> bool:
         if gone:
             some = True
             number = {old: new for new, old in enumerate(k for k in range(len(json[kind])) if k not in gone)}
-            for _, holder, key in [each for each in _references(json) if each[0] == kind]:
+            for _, holder, key in [each for each in references(json) if each[0] == kind]:
                 holder[key] = number.get(holder[key], holder[key])
             json[kind] = [json[kind][old] for old in number]
             if not json[kind]:
@@ -40,7 +40,37 @@ def prune(json: Json, before: dict[str, set[int]]) -> bool:
     return some
 
 
-def _references(json: Json) -> Iterator[tuple[str, Any, Any]]:
+def drop_nodes(json: Json, candidates: Iterable[int]) -> None:
+    """Take out those nodes that hold nothing, and that nothing refers to; none where an extension might."""
+    if "extensions" in json or not all(_KNOWN.fullmatch(name) for name in json.get("extensionsUsed", [])):
+        return
+    nodes, left = json["nodes"], set(candidates)
+    channels = [channel["target"] for clip in json.get("animations", []) for channel in clip["channels"]]
+    skins = json.get("skins", [])
+    needed = {target.get("node") for target in channels} | {skin.get("skeleton") for skin in skins}
+    needed |= {joint for skin in skins for joint in skin["joints"]}
+    left = {number for number in left - needed if not nodes[number].keys() & {"mesh", "camera", "extensions", "extras"}}
+    kept: set[int] = set()
+    while left != kept:
+        kept = left
+        left = {number for number in kept if set(nodes[number].get("children", [])) <= kept}
+    number = {old: new for new, old in enumerate(k for k in range(len(nodes)) if k not in left)}
+    holders = [*((node, "children") for node in nodes), *((scene, "nodes") for scene in json.get("scenes", []))]
+    for holder, key in [each for each in holders if each[1] in each[0]]:
+        holder[key] = [number[child] for child in holder[key] if child in number]
+        if not holder[key]:
+            del holder[key]
+    for target in channels:
+        if "node" in target:
+            target["node"] = number[target["node"]]
+    for skin in skins:
+        skin["joints"] = [number[joint] for joint in skin["joints"]]
+        if "skeleton" in skin:
+            skin["skeleton"] = number[skin["skeleton"]]
+    json["nodes"] = [nodes[old] for old in number]
+
+
+def references(json: Json) -> Iterator[tuple[str, Any, Any]]:
     """Kind, holder and key of all numbers of a document that stand for one of the kinds."""
     for mesh in json.get("meshes", []):
         for primitive in mesh["primitives"]:

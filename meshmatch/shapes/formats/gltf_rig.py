@@ -91,7 +91,7 @@ def _rig(document: Document) -> Rig:
     if len(joints) > MOST_JOINTS:
         raise InputError(f"{document.name} has {len(joints)} joints, of {MOST_JOINTS} at most", "export one character")
     list(document.primitives())  # walks through the scene
-    chosen = _nodes(document, joints)
+    chosen = nodes_of_skeleton(document, joints)
     if len(chosen) > _MOST_NODES * MOST_JOINTS:
         raise InputError(f"the skeleton of {document.name} has {len(chosen)} nodes, too many", "export one character")
     place = {node: k for k, node in enumerate(chosen)}
@@ -112,7 +112,7 @@ def _rig(document: Document) -> Rig:
     return rig
 
 
-def _nodes(document: Document, joints: list[int]) -> list[int]:
+def nodes_of_skeleton(document: Document, joints: list[int]) -> list[int]:
     """Joints, the nodes above them, and those below that hold nothing, parents before children."""
     if missing := [joint for joint in joints if joint not in document.world]:
         raise ValueError(f"joint {missing[0]} is not in the scene")

@@ -5,52 +5,68 @@ Specification: Khronos glTF 2.0, sections 3.7.3 and 3.11.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
+from meshmatch.arrays import Brief, Float, Floats, Floats32, Int, Ints
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor, drawn
-from meshmatch.shapes.formats.gltf_rig import Clip, Rig
+from meshmatch.shapes.formats.gltf_prune import drop_nodes
+from meshmatch.shapes.formats.gltf_rig import Clip, Rig, nodes_of_skeleton
 
 _SAME = 1e-6  # of the size of a mesh: vertices that a skin moves by less than this are not moved
 _DIRECTIONS = ("NORMAL", "TANGENT")
 
 
-def rigged(
-    document: Document,
-    rig: Rig,
-    bind: Float[Floats, "N 4 4"],
-    joints: Int[NDArray[np.int32], "V K"],
-    weights: Float[Floats32, "V K"],
-    turn: Float[Floats, "3 3"],
-) -> tuple[bytes, int]:
-    """The scene as a glb, moved by a skeleton; and how many joints of its own move it no more: these become plain nodes,
-    and their clips are left out.
+@dataclass(frozen=True, eq=False, repr=False)
+class Binding(Brief):
+    """A skeleton, and how it moves the vertices of a scene.
 
-    Vertices are stored as they are, unless a skin of their own bends them: then as they stand.
-
-    Parameters
+    Attributes
     ----------
-    document
-        The scene.
     rig
-        The skeleton as it is to stand, below its first node, with its clips.
+        The skeleton as it is to stand, with its clips.
     bind
         Where its nodes stand when every vertex is where it was, but for the turn.
     joints
-        Numbers in ``rig.joints`` of up to four joints for each vertex, in the order of the scene.
+        Numbers in ``rig.joints`` of up to four joints for each vertex.
     weights
         How much each of them moves the vertex.
     turn
         What turns the scene upright.
     """
+
+    rig: Rig
+    bind: Float[Floats, "N 4 4"]
+    joints: Int[NDArray[np.int32], "V K"]
+    weights: Float[Floats32, "V K"]
+    turn: Float[Floats, "3 3"] = field(default_factory=lambda: np.eye(3))
+
+    def of(self, rows: Int[Ints, " N"]) -> Binding:
+        """That of other vertices, which move as some of these do."""
+        return replace(self, joints=self.joints[rows], weights=self.weights[rows])
+
+    def table(self) -> tuple[NDArray[Any], Floats32]:
+        """Joints and weights, four for each vertex, as a file holds them."""
+        joints, weights = (np.pad(each, ((0, 0), (0, 4 - each.shape[1]))) for each in (self.joints, self.weights))
+        return joints.astype("<u1" if len(self.rig.joints) <= 256 else "<u2"), weights.astype(np.float32)
+
+
+def rigged(document: Document, binding: Binding) -> tuple[bytes, int]:
+    """The scene as a glb, moved by a skeleton, which hangs from its first node; and how many joints of its own move it no
+    more: these and their clips are taken out, but for nodes that something else needs.
+
+    Vertices are stored as they are, unless a skin of their own bends them: then as they stand. Those of the binding are in
+    the order of the scene.
+    """
     editor = Editor(document)
+    rig, turn = binding.rig, binding.turn
     names = _add_nodes(editor, document, rig)
-    where = _four(joints).astype("<u1" if len(rig.joints) <= 256 else "<u2")
-    shares, back = _four(weights), np.linalg.inv(bind[rig.joints])
+    where, shares = binding.table()
+    back = np.linalg.inv(binding.bind[rig.joints])
     skins: dict[bytes, int] = {}
     before: set[int] = set()
     seen = 0
@@ -83,7 +99,10 @@ def rigged(
     arrays: dict[bytes, int] = {}
     for clip in rig.clips:
         _add_clip(editor, clip, names, arrays)
-    return editor.to_bytes(), gone
+    if gone:
+        drop_nodes(editor.json, nodes_of_skeleton(document, sorted(gone)))
+        editor.prune(document)
+    return editor.to_bytes(), len(gone)
 
 
 def hanging_groups(document: Document) -> list[Ints]:
@@ -102,10 +121,6 @@ def hanging_groups(document: Document) -> list[Ints]:
             found.append(np.arange(seen, seen + V))
         seen += V
     return found
-
-
-def _four(values: NDArray[Any]) -> NDArray[Any]:
-    return np.pad(values, ((0, 0), (0, 4 - values.shape[1])))
 
 
 def _add_nodes(editor: Editor, document: Document, rig: Rig) -> list[int]:
@@ -163,8 +178,8 @@ def _straighten(editor: Editor, document: Document, number: int, part: dict[str,
             target[key] = editor.add_array(turned(target[key], False).astype("<f4"), bounds=key == "POSITION")
 
 
-def _drop_skins(editor: Editor, before: set[int]) -> int:
-    """Remove skins that move nothing any more, and what moves their joints; returns how many joints these are."""
+def _drop_skins(editor: Editor, before: set[int]) -> set[int]:
+    """Remove skins that move nothing any more, and what moves their joints; returns these joints."""
     nodes, skins = editor.json["nodes"], editor.json["skins"]
     used = {node["skin"] for node in nodes if "skin" in node}
     gone = before - used
@@ -184,7 +199,7 @@ def _drop_skins(editor: Editor, before: set[int]) -> int:
         editor.json["animations"] = [each for each in editor.json["animations"] if each["channels"]]
         if not editor.json["animations"]:
             del editor.json["animations"]
-    return len(joints)
+    return joints
 
 
 def _add_clip(editor: Editor, clip: Clip, names: list[int], arrays: dict[bytes, int]) -> None:
