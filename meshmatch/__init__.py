@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from meshmatch.api.pictures import picture as picture
     from meshmatch.api.pictures import view as view
     from meshmatch.api.results import ConfidenceRule as ConfidenceRule
+    from meshmatch.api.results import MapPair as MapPair
     from meshmatch.api.results import MatchResult as MatchResult
     from meshmatch.api.results import Transferred as Transferred
     from meshmatch.api.results import evaluate as evaluate
@@ -46,20 +47,26 @@ if TYPE_CHECKING:
     from meshmatch.errors import MeshmatchWarning as MeshmatchWarning
     from meshmatch.fitting.fit import Fit as Fit
     from meshmatch.fitting.fit_config import FitConfig as FitConfig
+    from meshmatch.fitting.judge.reasons import Reason as Reason
     from meshmatch.geometry.frames import Frame as Frame
     from meshmatch.implicit.codes import fit_implicit as fit_implicit
     from meshmatch.implicit.fit import ImplicitFit as ImplicitFit
     from meshmatch.implicit.model import ImplicitModel as ImplicitModel
     from meshmatch.implicit.model import load_implicit as load_implicit
     from meshmatch.implicit.training import train_implicit as train_implicit
+    from meshmatch.maps.evaluate import Errors as Errors
+    from meshmatch.maps.evaluate import Evaluation as Evaluation
     from meshmatch.maps.files import load_map as load_map
     from meshmatch.maps.files import save_map as save_map
     from meshmatch.maps.vertex_map import VertexMap as VertexMap
     from meshmatch.models.registry import load_model as load_model
+    from meshmatch.models.trained import TrainedModel as TrainedModel
     from meshmatch.shapes.files import load_shape as load_shape
     from meshmatch.shapes.files import save_shape as save_shape
     from meshmatch.shapes.shape import Shape as Shape
     from meshmatch.templates.prepare import prepare as prepare
+    from meshmatch.training.recipes import Recipe as Recipe
+    from meshmatch.training.recipes import recipe_for as recipe_for
     from meshmatch.training.train import train as train
     from meshmatch.transfer.bake import BakeOptions as BakeOptions
 
@@ -70,7 +77,7 @@ _NAMES = {
     "api.matcher": "Matcher",
     "api.matching": "match register",
     "api.pictures": "picture view",
-    "api.results": "ConfidenceRule MatchResult Transferred evaluate",
+    "api.results": "ConfidenceRule MapPair MatchResult Transferred evaluate",
     "api.rig": "RiggedResult transfer_rig",
     "api.texture": "TexturedResult transfer_texture",
     "api.transfer": "find_maps transfer_colors transfer_labels transfer_landmarks transfer_values transfer_weights",
@@ -81,17 +88,21 @@ _NAMES = {
     "errors": "MeshmatchError MeshmatchWarning",
     "fitting.fit": "Fit",
     "fitting.fit_config": "FitConfig",
+    "fitting.judge.reasons": "Reason",
     "geometry.frames": "Frame",
     "implicit.codes": "fit_implicit",
     "implicit.fit": "ImplicitFit",
     "implicit.model": "ImplicitModel load_implicit",
     "implicit.training": "train_implicit",
+    "maps.evaluate": "Errors Evaluation",
     "maps.files": "load_map save_map",
     "maps.vertex_map": "VertexMap",
     "models.registry": "load_model",
+    "models.trained": "TrainedModel",
     "shapes.files": "load_shape save_shape",
     "shapes.shape": "Shape",
     "templates.prepare": "prepare",
+    "training.recipes": "Recipe recipe_for",
     "training.train": "train",
     "transfer.bake": "BakeOptions",
 }

@@ -169,8 +169,25 @@ class MatchResult:
 class MapPair(Brief):
     """The maps between two shapes in both directions.
 
-    ``forward`` is from source to target. Without a ``match`` of the shapes the backward map is the inverse of it,
-    unless there is an ``opposite`` map already.
+    Attributes
+    ----------
+    source
+        The shape that values come from.
+    target
+        The shape that they go to.
+    forward
+        The map from source to target.
+    match
+        The match that the map is of, if there was one: it knows the way back.
+    threads
+        How many are allowed.
+    opposite
+        The map from target to source, if it is known already.
+
+    Examples
+    --------
+    >>> maps = meshmatch.find_maps("templates/samples/dancer.ply", "templates/samples/climber.ply")
+    >>> print(maps.forward.verdict, maps.backward.index)
     """
 
     source: Shape
@@ -192,7 +209,7 @@ class MapPair(Brief):
 
     @cached_property
     def backward(self) -> VertexMap:
-        """From target to source."""
+        """The map from target to source: the opposite one, or that of the match, or else the inverse of ``forward``."""
         if self.opposite is not None:
             return self.opposite
         if self.match is not None:

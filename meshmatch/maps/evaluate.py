@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Brief, Float, Floats, Floats32, Pickled, frozen, off_torch
+from meshmatch.arrays import Brief, Float, Floats, Floats32, Pickled, frozen, off_torch, table_html
 from meshmatch.errors import InputError
 from meshmatch.maps.folds import Folds
 from meshmatch.maps.geodesics import GEODESIC, GeodesicDistances
@@ -26,8 +26,25 @@ LOST_CM = 15.0
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Errors(Brief, Pickled):
-    """Errors of a map, one for each point whose truth is known: distance between predicted and true point along the
-    target's surface, over the square root of its area; as "cm", with the target scaled to 1.9 m2 of skin.
+    """Errors of a map, one for each point whose truth is known.
+
+    An error is the distance between predicted and true point along the target's surface, over the square root of the
+    target's area; in "cm", with the target scaled to 1.9 m2, the skin of a person.
+
+    Attributes
+    ----------
+    values
+        (N,) float32, in units of sqrt(area).
+
+    Raises
+    ------
+    InputError
+        There is no error, or one is negative or not finite.
+
+    Examples
+    --------
+    >>> errors = meshmatch.Errors(np.array([0.01, 0.02, 0.3], np.float32))
+    >>> print(errors.mean_cm, errors.share_over(15.0), errors.curve([0.05, 0.1]))
     """
 
     values: Float[Floats32, " N"]
@@ -35,35 +52,62 @@ class Errors(Brief, Pickled):
     def __post_init__(self) -> None:
         values = np.array(self.values, dtype=np.float32).reshape(-1)
         if not values.size or not np.isfinite(values).all() or values.min() < 0:
-            raise ValueError("there must be errors, all finite and 0 or more")
+            raise InputError("there must be errors, all finite and 0 or more")
         object.__setattr__(self, "values", frozen(values))
 
     @property
     def cm(self) -> Float[Floats32, " N"]:
+        """The errors in centimetres."""
         return np.asarray(self.values * np.float32(CM_PER_UNIT))
 
     @property
     def mean(self) -> float:
+        """Their mean, in units of sqrt(area)."""
         return float(self.values.mean(dtype=np.float64))
 
     @property
     def median(self) -> float:
+        """Their median, in units of sqrt(area)."""
         return float(np.median(self.values))
 
     @property
     def mean_cm(self) -> float:
+        """Their mean in centimetres."""
         return self.mean * CM_PER_UNIT
 
     @property
     def median_cm(self) -> float:
+        """Their median in centimetres."""
         return self.median * CM_PER_UNIT
 
     def share_over(self, cm: float = LOST_CM) -> float:
-        """Share (0..1) of the points whose error exceeds `cm`."""
+        """Share of the points with a large error.
+
+        Parameters
+        ----------
+        cm
+            What an error must exceed, in centimetres.
+
+        Returns
+        -------
+        float
+            From 0 to 1.
+        """
         return float((self.values > cm / CM_PER_UNIT).mean())
 
     def curve(self, thresholds: ArrayLike) -> Floats:
-        """Share (0..1) of the points with an error of at most each threshold, in units of sqrt(area)."""
+        """Share of the points with an error of at most each threshold.
+
+        Parameters
+        ----------
+        thresholds
+            In units of sqrt(area).
+
+        Returns
+        -------
+        array of float64
+            From 0 to 1, in the shape of the thresholds.
+        """
         ordered = np.sort(self.values.astype(np.float64))
         return np.asarray(np.searchsorted(ordered, np.asarray(thresholds), side="right") / len(ordered))
 
@@ -132,7 +176,28 @@ def distortion(
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All measures of one map; `errors` only where the truth is known, `distortion` and `folds` only between meshes."""
+    """All measures of one map.
+
+    Attributes
+    ----------
+    coverage
+        Shares (0..1) of the target's ``vertices`` and ``area`` that the map reaches.
+    distortion
+        Mean change of the distance between two points, in units of sqrt(area); None unless both are meshes.
+    folds
+        Shares (0..1) of the source's area that are ``flipped`` and ``crushed``, and the median ``stretch`` (a factor of 1
+        or more); None unless both are meshes.
+    errors
+        Distances from the truth; None where it is not known.
+    geodesic
+        How distances along a surface are measured.
+
+    Examples
+    --------
+    >>> climber, dancer = "templates/samples/climber.ply", "templates/samples/dancer.ply"
+    >>> found = meshmatch.evaluate(meshmatch.match(climber, dancer), climber, dancer)
+    >>> print(found.coverage.area, found.distortion, found.as_dict())
+    """
 
     coverage: Coverage
     distortion: float | None = None
@@ -140,8 +205,23 @@ class Evaluation:
     errors: Errors | None = None
     geodesic: str = GEODESIC
 
+    def _repr_html_(self) -> str:
+        rows = {name: f"{value:.4g}" for name, value in self.as_dict().items() if isinstance(value, float | int)}
+        return table_html("Evaluation", rows)
+
     def as_dict(self, threshold_cm: float = LOST_CM) -> Mapping[str, Any]:
-        """Plain numbers for a JSON line; lengths in sqrt(area) x 100 and, for people, in cm at 1.9 m2 of skin."""
+        """Plain numbers, for a line of JSON.
+
+        Parameters
+        ----------
+        threshold_cm
+            From which error on a point counts in ``share_over_threshold``.
+
+        Returns
+        -------
+        dict
+            Lengths ending in "x100" are in sqrt(area) x 100, those in "cm" are for a target of 1.9 m2.
+        """
         record: dict[str, Any] = {
             "coverage_vertices": self.coverage.vertices,
             "coverage_area": self.coverage.area,

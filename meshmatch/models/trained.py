@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Float, Floats, table_html
 from meshmatch.derived import derived, remember
 from meshmatch.errors import ModelError
 from meshmatch.fields.shape_functions import ShapeFunctions, has_nodes, shape_functions
@@ -24,13 +24,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:
-    """What fitting needs of a category.
-
-    ``inference`` answers in arrays; `network` is the same network in torch, for training and searches by gradient.
+    """A model, as `load_model` returns it.
 
     A model can be pickled, for processes of Python. One that `load_model` returned travels as its name or folder and its
     card: whoever unpickles it loads it there, once in each process (`ModelError` if it is missing there, or has other
     weights). Of any other model the arrays travel. What was derived stays behind.
+
+    Attributes
+    ----------
+    card
+        What it is, what it was trained on and how.
+    template
+        The mesh that is deformed, its control nodes, labels and core.
+    inference
+        The network as fits ask it, in arrays; `network` is the same in torch.
+    load_again
+        What a pickle of it calls; None for a model that was not loaded.
+
+    Examples
+    --------
+    >>> model = meshmatch.load_model("human")
+    >>> print(model.card.category, model.template.K)
+    >>> where = model.template.shape.verts  # (V, 3)
+    >>> moved = where + model.field(where).displaced(np.zeros((model.template.K, 3)))
     """
 
     card: ModelCard
@@ -40,7 +56,22 @@ class TrainedModel:
 
     @classmethod
     def of(cls, card: ModelCard, template: Template, network: Deformer) -> TrainedModel:
-        """A model of a network at hand, in evaluation mode."""
+        """A model of a network at hand.
+
+        Parameters
+        ----------
+        card
+            Its card.
+        template
+            Whose nodes it moves.
+        network
+            In evaluation mode.
+
+        Returns
+        -------
+        TrainedModel
+            The model.
+        """
         inference: Network = network
         if has_nodes(network.config.field):
             weights = {name: value.numpy(force=True) for name, value in network.state_dict().items()}
@@ -58,10 +89,34 @@ class TrainedModel:
         size = f"{self.template.shape.V} vertices, {self.template.K} nodes"
         return f"TrainedModel({self.card.name!r}, category {self.card.category!r}, {size})"
 
-    def field(self, points: Float[Floats, "P 3"]) -> ShapeFunctions | PointwiseField:
-        """The field on points of the template's frame, with the kernel that the network was trained with.
+    def _repr_html_(self) -> str:
+        card, template = self.card, self.template
+        rows = {
+            "category": card.category,
+            "template": f"{template.name}: {template.shape.V:,} vertices, {template.K} nodes",
+            "trained on": card.data,
+            "steps": f"{card.steps:,}",
+            "licence": card.licence,
+        }
+        return table_html(f"Model: {card.name}", rows)
 
-        `TemplateError` where a point has too few nodes in reach.
+    def field(self, points: Float[Floats, "P 3"]) -> ShapeFunctions | PointwiseField:
+        """The deformation field on fixed points, with the kernel that the network was trained with.
+
+        Parameters
+        ----------
+        points
+            (P, 3) in the template's frame.
+
+        Returns
+        -------
+        ShapeFunctions or PointwiseField
+            Says where node vectors (K, 3), such as ``Fit.vectors``, move the points, and the deformation gradient there.
+
+        Raises
+        ------
+        TemplateError
+            A point has too few nodes in reach.
         """
         config, nodes, radius = self.inference.config, self.template.nodes, self.template.radius
         if has_nodes(config.field):
@@ -74,7 +129,23 @@ class TrainedModel:
         return torch_network(self)
 
     def on(self, device: str) -> Network:
-        """What fits ask: in arrays on "cpu", in torch on its other devices (`OptionError` if that is not there)."""
+        """The network for fits: in arrays on "cpu", in torch on another device.
+
+        Parameters
+        ----------
+        device
+            Such as "cpu" or "cuda".
+
+        Returns
+        -------
+        Network
+            What a fit asks.
+
+        Raises
+        ------
+        OptionError
+            There is no such device.
+        """
         return self.inference if device == "cpu" else torch_network(self, device)
 
     @property

@@ -25,12 +25,34 @@ _CHAMFER = ChamferLoss(volume=1e-4, arap=1e-3, blend=1e-4)  # the paper's weight
 
 @dataclass(frozen=True)
 class Recipe:
-    """Network, training (with its loss), simulated scans and kernel.
+    """Everything that a training is a function of, besides its shapes.
 
-    ``deform``: registered shapes are smoothly deformed whenever they are drawn, and the card says how a fit finds the
-    orientation, as the network does not. ``storage``: how compactly the weights are written. ``template``: the bundled one
-    that generated bodies have, unless they name another. ``characters``: the share of such bodies in clothes or of other
-    proportions, and ``bodies``: how many are drawn, once (0: ever new ones), unless they say otherwise.
+    Attributes
+    ----------
+    network
+        Sizes and choices of the network.
+    train
+        Steps, rates and minutes; its ``loss`` is what is minimised.
+    scan
+        How scans are simulated.
+    kernel
+        Of the deformation field: "cubic" or "smooth".
+    deform
+        Registered shapes are smoothly deformed whenever they are drawn, and the card says how a fit finds the
+        orientation, as the network does not.
+    storage
+        How compactly the weights are written.
+    template
+        The bundled one that generated bodies have, unless they name another.
+    characters
+        The share (0..1) of generated bodies in clothes or of other proportions, unless they say otherwise.
+    bodies
+        How many generated bodies are drawn, once; 0 for ever new ones. Unless they say otherwise.
+
+    Examples
+    --------
+    >>> recipe = meshmatch.recipe_for("my-prepared").changed(minutes=60, volume=2e-3)
+    >>> print(recipe.train.steps, recipe.train.loss)
     """
 
     network: NetworkConfig
@@ -44,10 +66,23 @@ class Recipe:
     bodies: int = 0
 
     def changed(self, **settings: Any) -> Recipe:
-        """Another recipe: fields of `TrainConfig`, ``field`` of the network, ``points`` of a scan, ``volume``, ``arap`` and
-        ``blend`` of the loss; None changes nothing.
+        """Another recipe.
 
-        `OptionError` if a setting is unknown or out of range.
+        Parameters
+        ----------
+        settings
+            Fields of `TrainConfig`, ``field`` of the network, ``points`` of a scan, ``volume``, ``arap`` and ``blend`` of
+            the loss; None changes nothing.
+
+        Returns
+        -------
+        Recipe
+            With these settings.
+
+        Raises
+        ------
+        OptionError
+            A setting is unknown or out of range.
         """
         wanted = {name: value for name, value in settings.items() if value is not None}
         network = replace(self.network, field=wanted.pop("field", self.network.field))
@@ -134,12 +169,38 @@ def going_on(start: TrainedModel) -> Recipe:
 def recipe_for(
     shapes: str | Path | None = None, preset: Preset = "default", unsupervised: bool = False, kind: str | None = None
 ) -> Recipe:
-    """How a folder that `meshmatch prepare` made is learned, or generated shapes of a ``kind`` (people, unless it is
-    named) where there is none.
+    """How shapes are learned, unless something else is asked for.
 
-    With correspondence where all shapes are registered, unless ``unsupervised``; by the recipe for small data where
-    they are few and stand at equal areas. The paper's preset knows no small data.
-    `OptionError` if the preset is unknown, or ``unsupervised`` is without a folder.
+    With correspondence where all shapes are registered; by the recipe for small data where they are few and stand at equal
+    areas. The paper's preset knows no small data.
+
+    Parameters
+    ----------
+    shapes
+        A folder that `prepare` made; None for generated shapes.
+    preset
+        "default", or "paper": that of the NeurIPS 2022 paper.
+    unsupervised
+        Ignore the correspondence of registered shapes.
+    kind
+        Of generated shapes: "human" (the default), "quadruped", "hand" or "head".
+
+    Returns
+    -------
+    Recipe
+        For `train`.
+
+    Raises
+    ------
+    OptionError
+        The preset is unknown, or ``unsupervised`` is without a folder.
+    InputError
+        The folder is not prepared.
+
+    Examples
+    --------
+    >>> recipe = meshmatch.recipe_for("my-prepared").changed(minutes=60)
+    >>> meshmatch.train("my-model", shapes="my-prepared", recipe=recipe)
     """
     if preset not in ("default", "paper"):
         raise OptionError(f"unknown preset {preset!r}", "choose default or paper")

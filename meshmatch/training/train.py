@@ -108,9 +108,8 @@ def train(
 
     Examples
     --------
-    >>> from meshmatch.training.recipes import recipe_for
-    >>> recipe = recipe_for("prepared").changed(minutes=60)
-    >>> meshmatch.train("my-model", shapes="prepared", recipe=recipe)
+    >>> recipe = meshmatch.recipe_for("my-prepared").changed(minutes=60)
+    >>> meshmatch.train("my-model", shapes="my-prepared", recipe=recipe)
     """
     output, facts = Path(output), facts or CardFacts()
     facts = replace(facts, name=check_name(facts.name or output.resolve().name))

@@ -23,7 +23,7 @@ def test_a_unit_is_137_point_8_centimetres() -> None:
 
 @pytest.mark.parametrize("values", [[], [np.nan], [np.inf], [-0.1]])
 def test_errors_leave_nothing_out(values: list[float]) -> None:
-    with pytest.raises(ValueError, match="finite"):
+    with pytest.raises(InputError, match="finite"):
         Errors(np.array(values))
 
 

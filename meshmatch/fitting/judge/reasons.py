@@ -32,7 +32,23 @@ correspondence, or there was none; other fits are equally good."""
 
 
 class Reason(str):
-    """Why a verdict is not good: a sentence to print, with a ``code`` to branch on."""
+    """Why a verdict is not good: a string with a sentence to print, and a ``code`` to branch on.
+
+    The codes are "residual", "unreached", "empty", "torn", "crushed", "folded", "pieces", "uncut", "bent", "facing",
+    "unsure", "doubt", "part", "side", "unsupervised" and "ambiguous".
+
+    Parameters
+    ----------
+    code
+        One of these.
+    sentence
+        For people; may be worded differently in another version.
+
+    Examples
+    --------
+    >>> fit = meshmatch.register("templates/samples/climber.ply")
+    >>> torn = any(reason.code == "torn" for reason in fit.reasons)
+    """
 
     code: ReasonCode
 
