@@ -53,9 +53,10 @@ class Reason(str):
     code: ReasonCode
 
     def __new__(cls, code: ReasonCode, sentence: str) -> Reason:
-        reason = super().__new__(cls, sentence)
-        reason.code = code
-        return reason
+        return super().__new__(cls, sentence)
+
+    def __init__(self, code: ReasonCode, sentence: str) -> None:
+        self.code = code
 
     def __reduce__(self) -> tuple[type[Reason], tuple[str, str]]:
         return Reason, (self.code, str(self))
