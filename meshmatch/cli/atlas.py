@@ -9,7 +9,8 @@ from typer import Argument, Option
 
 from meshmatch.cli import options
 from meshmatch.cli.options import check_outputs, grouped, output_option
-from meshmatch.cli.words import Console, print_json
+from meshmatch.cli.words import Console, print_json, print_rows
+from meshmatch.collections.formula import parse
 from meshmatch.errors import OptionError
 from meshmatch.outputs import folder_on_success
 from meshmatch.threads import thread_limit
@@ -26,7 +27,12 @@ class AtlasOptions:
     """What an atlas is, and what is found out about it."""
 
     modes: int = Option(100, min=1, metavar="N", help="Maximum number of modes to keep.")
-    scale: Literal["keep", "remove"] = Option("keep", help="Keep the shapes' sizes, or scale all shapes to one size.")
+    space: Literal["form", "shape", "keep", "remove"] | None = Option(
+        None,
+        "--space",
+        "--scale",
+        help="form (or keep): shapes with their sizes, the default; shape (or remove): all scaled to one size.",
+    )
     robust: bool = Option(False, "--robust", help="Reduce the influence of outliers among the shapes.")
     poor: bool = Option(False, "--poor", help="Include shapes whose fit is poor.")
     groups: tuple[Path, Path] | None = Option(
@@ -36,7 +42,21 @@ class AtlasOptions:
         "normal",
         help="Compare displacements along the normal of the mean, or in all directions (Hotelling's T squared).",
     )
-    permutations: int = Option(10_000, min=1, metavar="N", help="Maximum number of permutations of the group labels.")
+    metadata: Path | None = Option(
+        None, metavar="TABLE", help="What is known of each shape: a row each, with its name; .csv, .tsv or .txt."
+    )
+    model: str | None = Option(
+        None,
+        metavar="FORMULA",
+        help="Explain the shapes by columns of the table: 'shape ~ log(size) + sex * age', or 'form ~ ...' with their "
+        "sizes (Procrustes analysis of variance). size is the centroid size if the table has no such column.",
+    )
+    blocks: str | None = Option(
+        None,
+        metavar="COLUMN",
+        help="Exchange only shapes with the same value here: the individual of paired or repeated measures.",
+    )
+    permutations: int = Option(10_000, min=1, metavar="N", help="Maximum number of permutations in tests.")
     samples: int = Option(0, min=0, max=10_000, metavar="N", help="Number of random shapes to write.")
     measures: bool = Option(
         True,
@@ -47,8 +67,23 @@ class AtlasOptions:
 
     def check(self) -> None:
         """Refuse a choice that nothing obeys (`OptionError`)."""
-        if self.groups is None and self.statistic != "normal":
-            raise OptionError("--statistic compares groups, and there are none", "add --groups A.txt B.txt")
+        if self.groups is None and self.model is None and self.statistic != "normal":
+            hint = "add --groups A.txt B.txt, or --model"
+            raise OptionError("--statistic compares groups or tests a model, and there are none", hint)
+        for option, given in {"--metadata": self.metadata, "--blocks": self.blocks}.items():
+            if given is not None and self.model is None:
+                raise OptionError(f"{option} is for a model, and there is none", "add --model 'shape ~ ...'")
+        if self.model is not None and self.space is not None:
+            space = {"keep": "form", "remove": "shape"}.get(self.space, self.space)
+            if parse(self.model).space != space:
+                hint = f"write '{space} ~ ...', or leave out --space"
+                raise OptionError(f"the formula is not of {space}, which --space asks for", hint)
+
+    @property
+    def scale(self) -> Literal["keep", "remove"]:
+        """Whether sizes are kept: as the model's formula says, if it is not said otherwise."""
+        space = self.space if self.model is None else parse(self.model).space
+        return "remove" if space in ("shape", "remove") else "keep"
 
 
 @grouped
@@ -68,12 +103,14 @@ def atlas(
     """Learn the mean shape of a collection and the modes in which its shapes vary.
 
     Writes arrays, tables, pictures, the modes as morph targets, and page.html with a slider for each mode. With
-    --groups, also tests where two groups differ (permutation test, corrected for multiple comparisons).
+    --groups, also tests where two groups differ (permutation test, corrected for multiple comparisons); with --model,
+    how much of the variation the terms of a linear model explain, and where.
     """
     from meshmatch.collections.atlas_files import record, write_folder
+    from meshmatch.collections.model_files import anova_rows
 
     how.check()
-    check_outputs([Path(fits), *(how.groups or ())], output)
+    check_outputs([Path(fits), *(how.groups or ()), *([how.metadata] if how.metadata else [])], output)
     console = Console(quiet)
     with folder_on_success(output) as folder, _shapes(fits, how.poor) as shapes, thread_limit(threads):
         for name, verdict in shapes.left_out.items():
@@ -84,6 +121,8 @@ def atlas(
         names = write_folder(folder, made, found, rotation=shapes.rotation, title=output.name)
     about = record(made, found)
     _tell(console, about)
+    if "model" in about and not json and not quiet:
+        print_rows(anova_rows(about["model"]))
     console.say(f"wrote {output}: {', '.join(names)}")
     if json:
         print_json({"output": output, "left_out": shapes.left_out, "files": names} | about)
@@ -123,11 +162,18 @@ def _find(console: Console, made: Any, shapes: "Registered", how: AtlasOptions) 
         comparison = made.compare(
             first, second, kind=how.statistic, permutations=how.permutations, seed=how.seed
         )  # fmt: skip
+    explained = None
+    if how.model is not None:
+        explained = made.anova(
+            how.model, how.metadata, blocks=how.blocks, kind=how.statistic, permutations=how.permutations, seed=how.seed
+        )
+        for name, column in explained.left_out.items():
+            console.warn(f"{name}: left out of the model, for its {column} is missing")
     measures = None
     if how.measures and len(shapes.names) > 3:
         with console.progress() as progress:
             measures = measure_atlas(made, shapes.points, seed=how.seed, progress=progress)
-    return Findings(measures, comparison, names, how.samples, how.seed)
+    return Findings(measures, comparison, names, explained, how.samples, how.seed)
 
 
 def _tell(console: Console, about: dict[str, Any]) -> None:
@@ -147,9 +193,20 @@ def _tell(console: Console, about: dict[str, Any]) -> None:
         first, second = found["names"]
         console.say(
             f"{first} and {second} ({found['counts'][0]} and {found['counts'][1]} shapes): p = {found['p_overall']:.4g} "
-            f"overall; {found['vertices_corrected']} of {about['vertices']} vertices differ at "
+            f"overall, {found['p_anywhere']:.4g} anywhere (largest statistic); "
+            f"{found['vertices_corrected']} of {about['vertices']} vertices differ at "
             f"a family-wise error of {found['level']:g}, "
             f"{found['vertices_fdr']} at a false discovery rate of {found['level']:g}"
+        )
+    if "model" in about:
+        found = about["model"]
+        for column, taken in found["columns"].items():
+            console.say(f"{column}: {taken}")
+        blocks = f" within {found['blocks']}" if found["blocks"] else ""
+        every = "all " if found["exact"] else ""
+        console.say(
+            f"{found['formula']}, {found['shapes']} shapes, sequential sums of squares, {every}{found['permutations']:,} "
+            f"permutations{blocks} of residuals"
         )
 
 

@@ -6,25 +6,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from meshmatch.arrays import Brief, Float, Floats, Int, Ints, Pickled, as_numbers, frozen
+from meshmatch.collections.atlas_arrays import load_arrays, save_arrays
+from meshmatch.collections.covariates import Columns, covariates
+from meshmatch.collections.explain import Explained, explain
 from meshmatch.collections.groups import Comparison, Statistic, compare_groups
-from meshmatch.collections.modes import components
+from meshmatch.collections.modes import components, outward
 from meshmatch.collections.superimpose import Poses, Scale, Shapes, Superimposed, blocks, superimpose
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit, facing_out
-from meshmatch.outputs import replace_on_success
-from meshmatch.shapes.input_files import read_npz
-from meshmatch.shapes.shape import LARGEST, Shape
-
-VERSION = 1
-"""Of the arrays in ``atlas.npz``."""
-FILE = "atlas.npz"
-_ROUNDED = 0.01  # a sum of weights in half precision
+from meshmatch.shapes.shape import Shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +150,7 @@ class Atlas(Brief, Pickled):
         laid = superimpose(points, faces, scale, robust)
         found = components(points, laid, modes, robust)
         mean = laid.consensus + found.center
-        sign = _outward(found.modes, mean, laid.weights)
+        sign = outward(found.modes, mean, laid.weights)
         kept, scores = sign[:, None, None] * found.modes, sign * found.scores
         sizes = np.concatenate([laid.poses(some).sizes for _, some in blocks(points)])
         for array in (mean, kept, found.deviations, scores, sizes, faces, laid.weights):
@@ -409,6 +405,63 @@ class Atlas(Brief, Pickled):
             kind=kind, permutations=permutations, seed=seed,
         )  # fmt: skip
 
+    def anova(
+        self,
+        formula: str,
+        table: str | Path | Columns | None = None,
+        *,
+        blocks: str | None = None,
+        kind: Statistic = "normal",
+        permutations: int = 10_000,
+        seed: int = 0,
+    ) -> Explained:
+        """How much of the variation of the shapes a linear model explains, and where: Procrustes analysis of variance.
+
+        Sums of squares are sequential: each term is given those before it. What the modes do not keep plays no part.
+
+        Parameters
+        ----------
+        formula
+            ``"shape ~ log(size) + sex * age"``, or ``"form ~ ..."`` of an atlas that keeps sizes. Names are columns of the
+            table; ``size`` is the centroid size (``sizes``) unless there is such a column; ``factor()`` takes numbers for
+            categories; ``a * b`` is ``a + b + a:b``.
+        table
+            A file (.csv, .tsv, .txt) or columns by name, such as a data frame. A column ``name``, else a file's first one,
+            names the shapes; columns without it are in the order of ``names``.
+        blocks
+            A column: shapes are exchanged only where its value is the same, as for repeated measures.
+        kind
+            What is tested at vertices. "normal": displacement along the normal of the mean; "hotelling": in any direction.
+        permutations
+            How many permutations the p-values come from.
+        seed
+            Of the permutations.
+
+        Returns
+        -------
+        Explained
+            The table of variances, with a map of each effect; and how shape goes with size, if the model has it.
+
+        Raises
+        ------
+        InputError
+            A shape has no row, a column is missing or says nothing, shapes are too few.
+        OptionError
+            The formula is none, or is of shapes with sizes where the atlas has none, or the other way round.
+        """
+        return explain(
+            formula,
+            covariates(table, self.names, self.sizes),
+            self.scores * self.deviations,
+            lambda points: self.offsets(points / self.deviations),
+            self.mean_shape.vertex_normals,
+            self.scale,
+            blocks=blocks,
+            kind=kind,
+            permutations=permutations,
+            seed=seed,
+        )
+
     def save(self, path: str | Path) -> None:
         """Write ``atlas.npz``: the attributes as arrays, and the version.
 
@@ -422,10 +475,7 @@ class Atlas(Brief, Pickled):
         OutputError
             It cannot be written.
         """
-        arrays: dict[str, Any] = {each.name: np.asarray(getattr(self, each.name)) for each in fields(self)}
-        arrays["version"] = np.int64(VERSION)
-        with replace_on_success(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, **arrays)
+        save_arrays(path, {each.name: np.asarray(getattr(self, each.name)) for each in fields(self)})
 
     @classmethod
     def load(cls, path: str | Path) -> Atlas:
@@ -446,55 +496,4 @@ class Atlas(Brief, Pickled):
         InputError
             There is none, or it is damaged or of another version.
         """
-        file = Path(path) / FILE if Path(path).is_dir() else Path(path)
-        if not file.is_file():
-            raise InputError(f"there is no atlas at {path}", "give the folder that `meshmatch atlas` made")
-        return cls(**_strict(file, read_npz(file, (*(each.name for each in fields(cls)), "version"))))
-
-
-def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
-    """The arrays of a file as an `Atlas` has them; `InputError` for anything else."""
-    version = given.pop("version", np.empty(0))
-    if version.dtype.kind not in "iu" or version.shape != () or version != VERSION:
-        raise InputError(f"{file} is not an atlas of version {VERSION}", "make it again with this meshmatch")
-    M, V, S, F = (
-        len(given[name]) if np.ndim(given.get(name, 0)) else -1 for name in ("modes", "mean", "names", "faces")
-    )
-    layout: dict[str, tuple[str, tuple[int, ...]]] = {  # kinds and sizes
-        **{"mean": ("f", (V, 3)), "modes": ("f", (M, V, 3)), "deviations": ("f", (M,)), "scores": ("f", (S, M))},
-        **{
-            "sizes": ("f", (S,)),
-            "faces": ("i", (F, 3)),
-            "weights": ("f", (V,)),
-            "names": ("U", (S,)),
-            "total": ("f", ()),
-        },
-        **{"scale": ("U", ()), "robust": ("b", ()), "template": ("U", ())},
-    }
-    fits = {n: n in given and (given[n].dtype.kind, given[n].shape) == about for n, about in layout.items()}
-    numbers = {n: given[n].astype(np.float64) for n in layout if fits[n] and layout[n][0] == "f"}  # any float is read
-    wrong = [n for n in layout if not fits[n] or not (np.abs(numbers.get(n, 0.0)) < LARGEST).all()]
-    if not wrong:
-        weights, faces = numbers["weights"], given["faces"]
-        right = {
-            "deviations": (numbers["deviations"] > 0).all(),
-            "sizes": (numbers["sizes"] > 0).all(),
-            "weights": (weights >= 0).all() and abs(weights.sum() - 1) <= _ROUNDED,
-            "faces": F > 0 and faces.min() >= 0 and faces.max() < V,
-            "scale": str(given["scale"]) in get_args(Scale),
-        }
-        wrong = [name for name, holds in right.items() if not holds]
-    if wrong:
-        raise InputError(f"{file} is damaged: {', '.join(wrong)}", "make it again")
-    found: dict[str, Any] = {name: frozen(array) for name, array in (given | numbers).items()}
-    words = {"names": tuple(map(str, given["names"])), "scale": str(given["scale"]), "template": str(given["template"])}
-    return found | words | {"total": float(given["total"]), "robust": bool(given["robust"])}
-
-
-def _outward(modes: Floats, mean: Floats, weights: Floats) -> Floats:
-    """Signs (M,) with which the modes make the mean larger; where they leave its size, with the largest entry positive."""
-    growth = np.einsum("mvi,v,vi->m", modes, weights, mean, optimize=True)
-    flat = modes.reshape(len(modes), -1)
-    largest = flat[np.arange(len(flat)), np.abs(flat).argmax(axis=1)]
-    size = np.sqrt(weights @ np.square(mean).sum(axis=1))
-    return np.asarray(np.where(np.abs(growth) > 1e-6 * size, np.sign(growth), np.sign(largest)))
+        return cls(**load_arrays(path, [each.name for each in fields(cls)]))

@@ -8,6 +8,7 @@ scores.csv          a line for each shape: size, distance from the mean, scores 
 distances.npy       (V, S) 32-bit floats: distance of each vertex of each shape from the mean
 measures.csv        compactness, generalisation and specificity
 groups.csv          where two groups differ, a line for each vertex
+anova.csv, effects.csv, effects.vtp, allometry.csv   a linear model, see `model_files`
 atlas.json          all that is one number, or a few
 modes.png           the mean and the first three modes at -2 and +2 standard deviations
 distances.png       distance from the mean: of all shapes, and of those that are furthest
@@ -29,9 +30,12 @@ from typing import Any
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.collections.atlas import FILE, Atlas
+from meshmatch.collections.atlas import Atlas
+from meshmatch.collections.atlas_arrays import FILE
+from meshmatch.collections.explain import Explained
 from meshmatch.collections.groups import Comparison
 from meshmatch.collections.measures import Measures
+from meshmatch.collections.model_files import LEVEL, model_record, short, write_model
 from meshmatch.render.charts import draw_beside, draw_histogram
 from meshmatch.render.facing import facing
 from meshmatch.render.figures import Panel
@@ -47,8 +51,6 @@ MORPHS = 10
 """Modes in modes.glb."""
 REACH = 2.0
 """Standard deviations at which modes are shown."""
-LEVEL = 0.05
-"""At which a difference between groups is shown as one."""
 _SHOWN, _FURTHEST = 3, 3  # modes and shapes in pictures
 _BLOCK = 64  # shapes at a time
 
@@ -60,6 +62,7 @@ class Findings:
     measures: Measures | None = None
     comparison: Comparison | None = None
     groups: tuple[str, str] = ("A", "B")
+    explained: Explained | None = None
     samples: int = 0
     seed: int = 0
 
@@ -86,6 +89,8 @@ def write_folder(
     if findings.comparison is not None:
         _write_comparison(folder / "groups.csv", findings.comparison)
         _draw_comparison(folder / "groups.png", atlas, findings, turn)
+    if findings.explained is not None:
+        write_model(folder, atlas.mean_shape, findings.explained)
     (folder / "atlas.json").write_text(json.dumps(record(atlas, findings), indent=1) + "\n", encoding="utf-8")
     _draw_modes(folder / "modes.png", atlas, turn)
     _draw_distances(folder / "distances.png", atlas, turn)
@@ -109,21 +114,22 @@ def record(atlas: Atlas, findings: Findings) -> dict[str, Any]:
         "modes": len(atlas.modes),
         "scale": atlas.scale,
         "robust": atlas.robust,
-        "deviations": _short(atlas.deviations),
-        "compactness": _short(atlas.compactness),
-        "furthest": {atlas.names[k]: _short(atlas.distances[k]) for k in _furthest(atlas)},
+        "deviations": short(atlas.deviations),
+        "compactness": short(atlas.compactness),
+        "furthest": {atlas.names[k]: short(atlas.distances[k]) for k in _furthest(atlas)},
         "samples": findings.samples,
         "seed": findings.seed,
     }
     if findings.measures is not None:
-        found["measures"] = {each.name: _short(getattr(findings.measures, each.name)) for each in fields(Measures)}
+        found["measures"] = {each.name: short(getattr(findings.measures, each.name)) for each in fields(Measures)}
     if findings.comparison is not None:
         about = findings.comparison
         found["groups"] = {
             "names": list(findings.groups),
             "counts": list(about.counts),
             "statistic": about.kind,
-            "p_overall": _short(about.p_overall),
+            "p_overall": short(about.p_overall),
+            "p_anywhere": short(float(about.p_corrected.min())),
             "vertices_corrected": int((about.p_corrected <= LEVEL).sum()),
             "vertices_fdr": int((about.p_fdr <= LEVEL).sum()),
             "level": LEVEL,
@@ -131,14 +137,9 @@ def record(atlas: Atlas, findings: Findings) -> dict[str, Any]:
             "exact": about.exact,
             "seed": about.seed,
         }
+    if findings.explained is not None:
+        found["model"] = model_record(findings.explained)
     return found
-
-
-def _short(values: Any) -> Any:
-    """Numbers of six digits, as JSON has them."""
-    if isinstance(values, np.ndarray):
-        return [_short(value) for value in values.tolist()]
-    return float(f"{values:.6g}") if isinstance(values, float) else values
 
 
 def _furthest(atlas: Atlas) -> list[int]:
@@ -156,9 +157,9 @@ def _write_morphs(path: Path, atlas: Atlas) -> None:
 
 
 def _write_scores(path: Path, atlas: Atlas) -> None:
-    header = ["name", "size", "distance", *(f"mode_{k + 1}" for k in range(len(atlas.modes)))]
+    header = ["name", "centroid_size", "distance", *(f"mode_{k + 1}" for k in range(len(atlas.modes)))]
     table = np.column_stack([atlas.sizes, atlas.distances, atlas.scores])
-    write_rows(path, header, ([name, *_short(row)] for name, row in zip(atlas.names, table, strict=True)))
+    write_rows(path, header, ([name, *short(row)] for name, row in zip(atlas.names, table, strict=True)))
 
 
 def _write_distances(path: Path, atlas: Atlas) -> None:
@@ -172,14 +173,14 @@ def _write_distances(path: Path, atlas: Atlas) -> None:
 
 def _write_measures(path: Path, measures: Measures) -> None:
     names = [each.name for each in fields(Measures) if isinstance(getattr(measures, each.name), np.ndarray)]
-    columns = [_short(getattr(measures, name)) for name in names]
+    columns = [short(getattr(measures, name)) for name in names]
     write_rows(path, ["modes", *names[1:]], zip(*columns, strict=True))
 
 
 def _write_comparison(path: Path, found: Comparison) -> None:
     names = ["along_normal", "statistic", "p", "p_corrected", "p_fdr"]
     table = np.column_stack([found.difference, *(getattr(found, name) for name in names)])
-    rows = ([k, *_short(row)] for k, row in enumerate(table))
+    rows = ([k, *short(row)] for k, row in enumerate(table))
     write_rows(path, ["vertex", "dx", "dy", "dz", *names], rows)
 
 

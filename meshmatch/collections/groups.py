@@ -1,8 +1,6 @@
 """Where two groups of shapes differ, and whether by more than chance: permutation tests at every vertex.
 
-Sources: Hotelling, The generalization of Student's ratio (1931); the largest statistic of each permutation: Westfall and
-Young, Resampling-based multiple testing (1993), Nichols and Holmes, Human Brain Mapping 15 (2002); Benjamini and
-Hochberg, JRSS B 57 (1995).
+Source: Hotelling, The generalization of Student's ratio (1931); of the tests: `permutation`.
 """
 
 from __future__ import annotations
@@ -15,12 +13,12 @@ from typing import Literal
 import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, frozen
+from meshmatch.collections.permutation import HAIR, tested, whitened
 from meshmatch.errors import OptionError
 
 Statistic = Literal["normal", "hotelling"]
 STATISTICS: tuple[Statistic, ...] = ("normal", "hotelling")
 _CHUNK = 2_000_000  # numbers at a time
-_HAIR = 1e-9  # statistics of one labelling that rounding tells apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +74,7 @@ def compare_groups(
         raise OptionError(f"invalid statistic {kind!r}", f"choose one of {', '.join(STATISTICS)}")
     if permutations < 1:
         raise OptionError("a permutation test needs at least one permutation", "1,000 or more are usual")
-    S, V = offsets.shape[:2]
+    S = len(offsets)
     second = int(in_second.sum())
     if min(second, S - second) < 2:
         raise OptionError("a group needs two shapes or more", "add names to its list")
@@ -87,27 +85,22 @@ def compare_groups(
     shares = np.where(labels, 1 / second, -1 / (S - second))
     moved = offsets - offsets.mean(axis=0)
     values = moved if kind == "hotelling" else np.einsum("svi,vi->sv", moved, normals)[:, :, None]
-    own = np.empty(V)
-    as_large, largest = np.zeros(V), np.zeros(len(labels))
-    step = max(1, _CHUNK // max(len(labels), 3 * S))
-    for low in range(0, V, step):
-        part = slice(low, low + step)
-        found = _statistics(values[:, part], shares, second * (S - second) / S)
-        own[part] = found[0]
-        as_large[part] = (found >= own[part] * (1 - _HAIR)).sum(axis=0)
-        np.maximum(largest, found.max(axis=1), out=largest)
+    unit = shares * np.sqrt(second * (S - second) / S)
+
+    def statistic(along: Floats, total: Floats) -> Floats:
+        """Scatter within the groups is the scatter of all, here 1 in every direction, less that along the labelling:
+        the shares of the latter say all (Sherman and Morrison 1950)."""
+        return np.asarray((S - 2) * along[:, 0] / np.maximum(1 - along[:, 0], 1e-12))
+
+    step = max(1, _CHUNK // S)
+    found = tested(whitened(values), (unit[low : low + step, None] for low in range(0, len(unit), step)), statistic)
     products = np.einsum("svi,v,tvi->st", moved, weights, moved, optimize=True)
     apart = np.einsum("ps,st,pt->p", shares, products, shares, optimize=True)
-    ordered = np.sort(largest)
-    above = len(labels) - np.searchsorted(ordered, own * (1 - _HAIR), side="left")
-    p = as_large / len(labels)
-    from scipy.stats import false_discovery_control
-
     difference = np.tensordot(shares[0], offsets, 1)
     return Comparison(
-        kind, frozen(difference), frozen(np.einsum("vi,vi->v", difference, normals)), frozen(own), frozen(p),
-        frozen(above / len(labels)), frozen(np.asarray(false_discovery_control(p))),
-        float((apart >= apart[0] * (1 - _HAIR)).mean()), len(labels), exact, seed, (S - second, second),
+        kind, frozen(difference), frozen(np.einsum("vi,vi->v", difference, normals)), frozen(found.statistic),
+        frozen(found.p), frozen(found.p_corrected), frozen(found.p_fdr), float((apart >= apart[0] * (1 - HAIR)).mean()),
+        len(labels), exact, seed, (S - second, second),
     )  # fmt: skip
 
 
@@ -120,21 +113,3 @@ def _labellings(in_second: Bool[Bools, " S"], most: int, seed: int) -> tuple[Boo
         return np.stack([in_second, *others]), True
     random = np.random.default_rng(seed)
     return np.stack([in_second, *(random.permutation(in_second) for _ in range(most))]), False
-
-
-def _statistics(values: Float[Floats, "S N D"], shares: Float[Floats, "P S"], factor: float) -> Float[Floats, "P N"]:
-    """Squared t (D = 1) or Hotelling's T squared for every labelling and vertex; the values have mean 0.
-
-    Scatter within the groups is the scatter of all, T, less ``factor`` d d', whatever the labelling: so that d' T^-1 d
-    says all (Sherman and Morrison 1950).
-    """
-    S = len(values)
-    scatter = np.einsum("sni,snj->nij", values, values)
-    size, axes = np.linalg.eigh(scatter)
-    known = size > 1e-12 * np.maximum(size[:, -1:], 1e-300)  # in a direction in which nothing moves, nothing differs
-    white = values.transpose(1, 0, 2) @ (axes * np.where(known, 1 / np.sqrt(np.where(known, size, 1)), 0)[:, None])
-    found = np.zeros((len(shares), values.shape[1]))
-    for k in range(values.shape[2]):
-        found += np.square(shares @ white[:, :, k].T)
-    found *= factor
-    return np.asarray((S - 2) * found / np.maximum(1 - found, 1e-12))

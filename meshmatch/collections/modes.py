@@ -188,3 +188,14 @@ def _spatial_median(products: Float[Floats, "S S"]) -> Float[Floats, " S"]:
         if change < 1e-12:
             break
     return center
+
+
+def outward(
+    modes: Float[Floats, "M V 3"], mean: Float[Floats, "V 3"], weights: Float[Floats, " V"]
+) -> Float[Floats, " M"]:
+    """Signs (M,) with which the modes make the mean larger; where they leave its size, with the largest entry positive."""
+    growth = np.einsum("mvi,v,vi->m", modes, weights, mean, optimize=True)
+    flat = modes.reshape(len(modes), -1)
+    largest = flat[np.arange(len(flat)), np.abs(flat).argmax(axis=1)]
+    size = np.sqrt(weights @ np.square(mean).sum(axis=1))
+    return np.asarray(np.where(np.abs(growth) > 1e-6 * size, np.sign(growth), np.sign(largest)))

@@ -1,13 +1,14 @@
 """``meshmatch atlas`` on meshes that share their vertices."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from meshmatch import Atlas
-from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from tests.cli.conftest import Run
 from tests.collections.ellipsoids import ellipsoids
@@ -67,6 +68,34 @@ def test_what_is_chosen_is_done(run: Run, shapes: Path, tmp_path: Path) -> None:
     assert not (output / "measures.csv").exists()
 
 
+def test_a_model_is_explained(run: Run, shapes: Path, tmp_path: Path) -> None:
+    output, table = tmp_path / "atlas", tmp_path / "table.csv"
+    rows = [f"egg-{k}.ply,{'ab'[k % 2]},{30 + k if k else 'NA'}" for k in range(8)]
+    table.write_text("\n".join(["name,kind,age", *rows]) + "\n")
+    words = ("atlas", shapes, "-o", output, "--metadata", table, "--permutations", 99, "--no-measures")
+    answer = run(*words, "--model", "shape ~ log(size) + kind")
+    assert answer.status == 0
+    assert Atlas.load(output).scale == "remove"
+    head, size, kind, *others = [line.split() for line in answer.out.splitlines()]
+    assert head[:8] == ["term", "df", "SS", "MS", "R2", "F", "Z", "p"]
+    assert (size[:2], kind[:2]) == (["log(size)", "1"], ["kind", "1"])
+    assert [line[:2] for line in others] == [["residuals", "5"], ["total", "7"]]
+    assert "kind: 2 categories (a 4, b 4), compared with a" in answer.err
+    shutil.rmtree(output)
+    answer = run(*words, "--model", "form ~ age", "--json", "-q")
+    assert "egg-0: left out of the model, for its age is missing" in answer.err
+    told = json.loads(answer.out)["model"]
+    assert (told["formula"], told["shapes"], told["permutations"]) == ("form ~ age", 7, 100)
+    assert told["left_out"] == {"egg-0": "age"}
+    (age,) = told["terms"]
+    assert age["SS"] + told["residuals"]["SS"] == pytest.approx(told["total"]["SS"], rel=1e-4)
+    lines = (output / "anova.csv").read_text().splitlines()
+    assert lines[1].startswith(f"age,1,{age['SS']}")
+    assert len((output / "effects.csv").read_text().splitlines()) == 1 + len(Atlas.load(output).mean)
+    assert load_shape(output / "effects.vtp").V == len(Atlas.load(output).mean)
+    assert not (output / "allometry.csv").exists()
+
+
 def test_other_units_are_told(run: Run, shapes: Path, tmp_path: Path) -> None:
     given = ellipsoids(8, splits=1)
     save_shape(shapes / "egg-2.ply", Shape(1000 * given.points[2], given.faces))
@@ -76,15 +105,20 @@ def test_other_units_are_told(run: Run, shapes: Path, tmp_path: Path) -> None:
     assert answer.err == ""
 
 
-@pytest.mark.parametrize("wrong", ["nowhere", "file", "input", "both", "unknown", "statistic"])
+@pytest.mark.parametrize("wrong", ["nowhere", "file", "input", "both", "unknown", "statistic", "table", "space", "row"])
 def test_what_is_refused_leaves_nothing(run: Run, shapes: Path, tmp_path: Path, wrong: str) -> None:
     output, one = tmp_path / "atlas", group(tmp_path / "one.txt", range(4))
     other = group(tmp_path / "other.txt", range(3, 7) if wrong == "both" else range(7, 12))
+    table = tmp_path / "table.csv"
+    table.write_text("name,x\negg-0,1\n")
     where = {"nowhere": tmp_path / "gone", "file": one}.get(wrong, shapes)
     more = {
         "both": ("--groups", one, other),
         "unknown": ("--groups", one, other),
         "statistic": ("--statistic", "hotelling"),
+        "table": ("--metadata", one),
+        "space": ("--model", "shape ~ size", "--space", "form"),
+        "row": ("--model", "shape ~ x", "--metadata", table),
     }
     before = sorted(tmp_path.rglob("*"))
     answer = run("atlas", where, "-o", shapes if wrong == "input" else output, *more.get(wrong, ()))

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from meshmatch.collections.atlas import FILE, Atlas
+from meshmatch.collections.atlas import Atlas
+from meshmatch.collections.atlas_arrays import FILE
 from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.triangles import vertex_areas

@@ -59,13 +59,13 @@ def test_every_file_says_what_the_atlas_knows(tmp_path: Path, atlas: Atlas) -> N
     given = ellipsoids(8, splits=1)
     measures = measure_atlas(atlas, given.points, samples=2)
     comparison = atlas.compare(atlas.names[:4], atlas.names[4:])
-    findings = Findings(measures, comparison, ("thin", "thick"), 2, 7)
+    findings = Findings(measures, comparison, ("thin", "thick"), samples=2, seed=7)
     names = write_folder(tmp_path, atlas, findings, rotation=np.eye(3), title="eggs")
     assert names == sorted(path.name for path in tmp_path.iterdir())
     assert np.array_equal(Atlas.load(tmp_path).modes, atlas.modes)
     assert np.allclose(load_shape(tmp_path / "mean.ply").verts, atlas.mean)
     head, rows = table(tmp_path / "scores.csv")
-    assert head[:4] == ["name", "size", "distance", "mode_1"]
+    assert head[:4] == ["name", "centroid_size", "distance", "mode_1"]
     assert tuple(row[0] for row in rows) == atlas.names
     numbers = np.array([[float(cell) for cell in row[1:]] for row in rows])
     assert np.allclose(numbers, np.column_stack([atlas.sizes, atlas.distances, atlas.scores]), rtol=1e-5, atol=1e-6)

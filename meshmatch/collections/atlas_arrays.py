@@ -1,0 +1,74 @@
+"""The arrays of an atlas in its file: what is damaged, or of another version, is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from meshmatch.arrays import frozen
+from meshmatch.collections.superimpose import Scale
+from meshmatch.errors import InputError
+from meshmatch.outputs import replace_on_success
+from meshmatch.shapes.input_files import read_npz
+from meshmatch.shapes.shape import LARGEST
+
+FILE = "atlas.npz"
+VERSION = 1
+"""Of the arrays in ``atlas.npz``."""
+_ROUNDED = 0.01  # a sum of weights in half precision
+
+
+def save_arrays(path: str | Path, arrays: Mapping[str, Any]) -> None:
+    """Write the arrays and their version; `OutputError` where they cannot be written."""
+    with replace_on_success(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **arrays, version=np.int64(VERSION))
+
+
+def load_arrays(path: str | Path, names: Sequence[str]) -> dict[str, Any]:
+    """The arrays of these names in a folder's file, or a file; `InputError` where there is none, or it is damaged."""
+    file = Path(path) / FILE if Path(path).is_dir() else Path(path)
+    if not file.is_file():
+        raise InputError(f"there is no atlas at {path}", "give the folder that `meshmatch atlas` made")
+    return _strict(file, read_npz(file, (*names, "version")))
+
+
+def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
+    """The arrays of a file as an `Atlas` has them; `InputError` for anything else."""
+    version = given.pop("version", np.empty(0))
+    if version.dtype.kind not in "iu" or version.shape != () or version != VERSION:
+        raise InputError(f"{file} is not an atlas of version {VERSION}", "make it again with this meshmatch")
+    M, V, S, F = (
+        len(given[name]) if np.ndim(given.get(name, 0)) else -1 for name in ("modes", "mean", "names", "faces")
+    )
+    layout: dict[str, tuple[str, tuple[int, ...]]] = {  # kinds and sizes
+        **{"mean": ("f", (V, 3)), "modes": ("f", (M, V, 3)), "deviations": ("f", (M,)), "scores": ("f", (S, M))},
+        **{
+            "sizes": ("f", (S,)),
+            "faces": ("i", (F, 3)),
+            "weights": ("f", (V,)),
+            "names": ("U", (S,)),
+            "total": ("f", ()),
+        },
+        **{"scale": ("U", ()), "robust": ("b", ()), "template": ("U", ())},
+    }
+    fits = {n: n in given and (given[n].dtype.kind, given[n].shape) == about for n, about in layout.items()}
+    numbers = {n: given[n].astype(np.float64) for n in layout if fits[n] and layout[n][0] == "f"}  # any float is read
+    wrong = [n for n in layout if not fits[n] or not (np.abs(numbers.get(n, 0.0)) < LARGEST).all()]
+    if not wrong:
+        weights, faces = numbers["weights"], given["faces"]
+        right = {
+            "deviations": (numbers["deviations"] > 0).all(),
+            "sizes": (numbers["sizes"] > 0).all(),
+            "weights": (weights >= 0).all() and abs(weights.sum() - 1) <= _ROUNDED,
+            "faces": F > 0 and faces.min() >= 0 and faces.max() < V,
+            "scale": str(given["scale"]) in get_args(Scale),
+        }
+        wrong = [name for name, holds in right.items() if not holds]
+    if wrong:
+        raise InputError(f"{file} is damaged: {', '.join(wrong)}", "make it again")
+    found: dict[str, Any] = {name: frozen(array) for name, array in (given | numbers).items()}
+    words = {"names": tuple(map(str, given["names"])), "scale": str(given["scale"]), "template": str(given["template"])}
+    return found | words | {"total": float(given["total"]), "robust": bool(given["robust"])}

@@ -1,0 +1,212 @@
+"""What is known of each shape beside its surface: a table with a row for each, and the columns of a linear model."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from meshmatch.arrays import Bool, Bools, Float, Floats
+from meshmatch.collections.formula import Factor, Formula, term_name
+from meshmatch.errors import InputError, OptionError
+from meshmatch.shapes.tables import is_missing, is_number, number, read_by_suffix, read_table
+
+Columns: TypeAlias = Mapping[str, Sequence[Any]]
+"""Values of the shapes by the names of columns; with a column ``name`` in any order, else in that of the shapes."""
+NAMES = "name"
+SIZE = "size"
+_SOME = 5  # names in a message
+_NONE = ("none", "null")  # missing among numbers; a category such as "no treatment" among words
+
+
+@dataclass(frozen=True, eq=False)
+class Covariates:
+    """Cells of a table as text, a row for each of the shapes, in their order."""
+
+    names: tuple[str, ...]
+    cells: dict[str, tuple[str, ...]]
+
+    def column(self, name: str) -> tuple[str, ...]:
+        """The cells of a column; `InputError` where there is none of that name."""
+        if name not in self.cells:
+            close = get_close_matches(name, self.cells, n=1)
+            known = ", ".join(self.cells)
+            raise InputError(
+                f"there is no column called {name}", f"did you mean {close[0]}?" if close else f"there are: {known}"
+            )
+        return self.cells[name]
+
+    def missing(self, name: str) -> Bool[Bools, " S"]:
+        """Of which shapes a column says nothing."""
+        cells = self.column(name)
+        kept = () if _are_numbers(cells) else _NONE
+        return np.array([is_missing(cell) and cell.strip().lower() not in kept for cell in cells], bool)
+
+    def some(self, rows: Bool[Bools, " S"]) -> Covariates:
+        """Of these shapes alone."""
+        kept = np.flatnonzero(rows).tolist()
+        return Covariates(
+            tuple(self.names[k] for k in kept),
+            {name: tuple(cells[k] for k in kept) for name, cells in self.cells.items()},
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class DesignTerm:
+    """A term of a model: its columns (S, C) in the design, and what the coefficient of each is called."""
+
+    name: str
+    columns: Float[Floats, "S C"]
+    coefficients: tuple[str, ...]
+
+
+def covariates(table: str | Path | Columns | None, names: Sequence[str], sizes: Float[Floats, " S"]) -> Covariates:
+    """What a table, or a file of one, says about shapes. Their centroid sizes are the column ``size`` if it has none.
+
+    Rows are found by the names in the column ``name``, or else the first one: those of the shapes, or of their files.
+    `InputError` for shapes without a row, or with two, and for what is no table.
+    """
+    if table is None:
+        found: dict[str, tuple[str, ...]] = {}
+    elif isinstance(table, (str, Path)):
+        header, rows = read_by_suffix(
+            table, dict.fromkeys((".csv", ".tsv", ".txt"), _read), "tables", "the first row has the names of columns"
+        )
+        key = next((k for k, title in enumerate(header) if title.lower() == NAMES), 0)
+        order = _matched([row[key] for row in rows], names, Path(table).name)
+        found = {title: tuple(rows[k][column] for k in order) for column, title in enumerate(header) if column != key}
+    else:
+        found = _in_order(
+            {str(title): ["" if cell is None else str(cell) for cell in table[title]] for title in table}, names
+        )
+    found.setdefault(SIZE, tuple(map(repr, sizes.tolist())))
+    return Covariates(tuple(names), found)
+
+
+def _read(path: Path) -> tuple[list[str], list[list[str]]]:
+    table = read_table(path)
+    table.check_no_doubt()
+    header, *rows = table.rows() or [[]]
+    if len(header) < 2 or not rows:
+        raise InputError("it has no rows, or one column only", "write a row for each shape, commas between the cells")
+    table.check_marks(rows)
+    twice = next((title for title in header if header.count(title) > 1), None)
+    if twice is not None:
+        raise InputError(f"two columns are called {twice or 'nothing'}", "the first row has the names of columns")
+    return header, rows
+
+
+def _in_order(cells: dict[str, list[str]], names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    key = cells.pop(NAMES, None)
+    for title, column in cells.items():
+        if len(column) != len(names if key is None else key):
+            hint = "add a column 'name' if there are others"
+            raise InputError(f"the column {title} has {len(column)} values for {len(names)} shapes", hint)
+    order = range(len(names)) if key is None else _matched(key, names, "the table")
+    return {title: tuple(column[k] for k in order) for title, column in cells.items()}
+
+
+def _matched(known: Sequence[str], names: Sequence[str], what: str) -> list[int]:
+    """Which row is whose; a name in the table may be a file's, with its suffix."""
+    rows: dict[str, int] = {}
+    wanted = set(names)
+    for k, word in enumerate(known):
+        name = word if word in wanted else os.path.splitext(word)[0]
+        if name in rows and name in wanted:
+            raise InputError(f"{what} has two rows for {name}", "keep one of them")
+        rows[name] = k
+    without = [name for name in names if name not in rows]
+    if without:
+        close = get_close_matches(without[0], known, n=1)
+        hint = f"is {close[0]} meant for {without[0]}?" if close else "its first column, or 'name', names the shapes"
+        raise InputError(f"{what} has no row for {some(without)}", hint)
+    return [rows[name] for name in names]
+
+
+def some(names: Sequence[str]) -> str:
+    """The first names of a list, and how many more there are."""
+    more = f" and {len(names) - _SOME} more" if len(names) > _SOME else ""
+    return f"{', '.join(names[:_SOME])}{more}"
+
+
+def design(formula: Formula, known: Covariates) -> tuple[list[DesignTerm], dict[str, str]]:
+    """The terms of a model, without the mean, and what each column was taken for: words for people.
+
+    Categories are compared with the first of them in alphabetical order. `InputError` for columns that say nothing, and
+    for models of more coefficients than shapes.
+    """
+    coded: dict[Factor, tuple[Floats, tuple[str, ...]]] = {}
+    taken: dict[str, str] = {}
+    for term in formula.terms:
+        for factor in term:
+            if factor not in coded:
+                values, titles, taken[str(factor)] = _coded(factor, known)
+                coded[factor] = values, titles
+    width = [int(np.prod([len(coded[factor][1]) for factor in term])) for term in formula.terms]
+    if sum(width) + 1 >= len(known.names):
+        raise InputError(
+            f"{len(known.names)} shapes are too few for a model of {sum(width) + 1} coefficients",
+            "leave out terms; each category but the first has a coefficient",
+        )
+    terms = []
+    for term in formula.terms:
+        columns, titles = coded[term[0]]
+        for factor in term[1:]:
+            more, others = coded[factor]
+            columns = (columns[:, :, None] * more[:, None]).reshape(len(columns), -1)
+            titles = tuple(f"{one}:{other}" for one in titles for other in others)
+        terms.append(DesignTerm(term_name(term), columns, titles))
+    return terms, taken
+
+
+def _coded(factor: Factor, known: Covariates) -> tuple[Floats, tuple[str, ...], str]:
+    """Columns of a factor, a name for each, and what it was taken for."""
+    cells = known.column(factor.column)
+    if factor.function != "factor" and _are_numbers(cells):
+        values = np.array([number(cell) for cell in cells])
+        if not np.isfinite(values).all():
+            raise InputError(f"{factor.column} is not finite for {known.names[int(np.argmin(np.isfinite(values)))]}")
+        if factor.function == "log":
+            if not (values > 0).all():
+                name = known.names[int(np.argmin(values))]
+                raise InputError(f"{factor} needs numbers above 0, and {name} has {values.min():g}")
+            values = np.log(values)
+        if not np.ptp(values) > 1e-12 * np.abs(values).max():
+            raise InputError(f"{factor} is the same for all shapes in the model", "leave it out")
+        return values[:, None], (str(factor),), f"a number, {values.min():.4g} to {values.max():.4g}"
+    if factor.function == "log":
+        word = next(cell for cell in cells if not is_number(cell))
+        raise InputError(f"{factor} needs numbers, and a cell is {word[:40]!r}", "use the column without log()")
+    levels = sorted(set(cells))
+    if len(levels) < 2:
+        raise InputError(f"{factor.column} is the same for all shapes in the model", "leave it out")
+    counts = [f"{level} {cells.count(level)}" for level in levels[:_SOME]]
+    if len(levels) > _SOME:
+        counts.append("...")
+    columns = np.array([[cell == level for level in levels[1:]] for cell in cells], np.float64)
+    titles = tuple(f"{factor.column}: {level} - {levels[0]}" for level in levels[1:])
+    return columns, titles, f"{len(levels)} categories ({', '.join(counts)}), compared with {levels[0]}"
+
+
+def complete(formula: Formula, blocks: str | None, known: Covariates) -> tuple[Bool[Bools, " S"], dict[str, str]]:
+    """Which shapes have all that a model asks for, and what the others lack."""
+    lacking: dict[str, str] = {}
+    for column in (*formula.columns, *([blocks] if blocks else [])):
+        for k in np.flatnonzero(known.missing(column)).tolist():
+            lacking.setdefault(known.names[k], column)
+    rows = np.array([name not in lacking for name in known.names], bool)
+    if rows.sum() < 4:
+        raise OptionError(
+            f"{int(rows.sum())} shapes have all of {', '.join(formula.columns)}", "four or more are needed"
+        )
+    return rows, lacking
+
+
+def _are_numbers(cells: Sequence[str]) -> bool:
+    """Whether all cells that hold anything hold numbers, and some do."""
+    return all(map(is_number, cells)) and not all(map(is_missing, cells))

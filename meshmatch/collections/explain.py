@@ -1,0 +1,159 @@
+"""A linear model of the shapes of an atlas: `formula` read, `covariates` joined, analysed, and how shape goes with size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from meshmatch.arrays import Float, Floats, frozen
+from meshmatch.collections.anova import Variances, analyse
+from meshmatch.collections.covariates import SIZE, Covariates, DesignTerm, complete, design
+from meshmatch.collections.formula import Factor, parse
+from meshmatch.collections.groups import STATISTICS, Statistic
+from meshmatch.errors import OptionError
+
+
+@dataclass(frozen=True, eq=False)
+class Allometry:
+    """How shape goes with size, of the S shapes of a model.
+
+    Attributes
+    ----------
+    label : the size as the model has it, such as log(size)
+    sizes : (S,) its values
+    axis : (V, 3) the common allometric component: displacement of the surface by one unit of ``cac``
+    cac : (S,) scores along it, the direction in which shapes change with size within groups (Mitteroecker et al. 2004)
+    regression_scores : (S,) scores along the regression of shape on size alone (Drake and Klingenberg 2008)
+    predicted : (S,) first principal component of what the whole model predicts (Adams and Nistri 2010)
+    residual : (S,) first principal component of what is across the common allometric component
+    """
+
+    label: str
+    sizes: Float[Floats, " S"]
+    axis: Float[Floats, "V 3"]
+    cac: Float[Floats, " S"]
+    regression_scores: Float[Floats, " S"]
+    predicted: Float[Floats, " S"]
+    residual: Float[Floats, " S"]
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """What a linear model explains of the shapes of an atlas.
+
+    Attributes
+    ----------
+    formula : as it was understood
+    kind : what is tested at vertices: displacements along the normal, or in all directions ("hotelling")
+    names : of the S shapes in the model
+    left_out : shapes of which the table does not say all, and the column that is missing
+    columns : what each column was taken for: a number, categories
+    blocks : the column within whose values shapes were exchanged; "" for none
+    groups : (S,) values of the first column of categories; empty if there is none
+    table : sums of squares, effects and their tests
+    allometry : where the model has a size
+    """
+
+    formula: str
+    kind: Statistic
+    names: tuple[str, ...]
+    left_out: dict[str, str]
+    columns: dict[str, str]
+    blocks: str
+    groups: tuple[str, ...]
+    table: Variances
+    allometry: Allometry | None
+
+
+def explain(
+    formula: str,
+    known: Covariates,
+    points: Float[Floats, "S M"],
+    offsets: Callable[[Floats], Floats],
+    normals: Float[Floats, "V 3"],
+    scale: Literal["keep", "remove"],
+    *,
+    blocks: str | None = None,
+    kind: Statistic = "normal",
+    permutations: int = 1000,
+    seed: int = 0,
+) -> Explained:
+    """Explain shapes by a formula; see `Atlas.anova`. ``offsets`` makes displacements (N, V, 3) of points (N, M)."""
+    if kind not in STATISTICS:
+        raise OptionError(f"invalid statistic {kind!r}", f"choose one of {', '.join(STATISTICS)}")
+    if permutations < 1:
+        raise OptionError("a permutation test needs at least one permutation", "1,000 or more are usual")
+    model = parse(formula)
+    if (model.space == "shape") != (scale == "remove"):
+        kept = "keeps the shapes' sizes" if scale == "keep" else "has shapes of one size"
+        other = "form" if scale == "keep" else "shape"
+        raise OptionError(f"the atlas {kept}, and the formula is of {model.space}", f"write {other} ~ ...")
+    rows, left_out = complete(model, blocks, known)
+    used = known.some(rows)
+    terms, taken = design(model, used)
+    inside = points[rows] - points[rows].mean(axis=0)
+    groups = None if blocks is None else np.unique(used.column(blocks), return_inverse=True)[1]
+    table = analyse(
+        inside,
+        offsets(inside),
+        terms,
+        normals,
+        along=kind == "normal",
+        blocks=groups,
+        permutations=permutations,
+        seed=seed,
+    )
+    singles = {term[0]: design_term for term, design_term in zip(model.terms, terms, strict=True) if len(term) == 1}
+    categories = [factor for factor, term in singles.items() if term.coefficients != (str(factor),)]
+    return Explained(
+        formula=str(model),
+        kind=kind,
+        names=used.names,
+        left_out=left_out,
+        columns=taken,
+        blocks=blocks or "",
+        groups=used.column(categories[0].column) if categories else (),
+        table=table,
+        allometry=_allometry(inside, offsets, terms, singles, categories),
+    )
+
+
+def _allometry(
+    points: Float[Floats, "S M"],
+    offsets: Callable[[Floats], Floats],
+    terms: list[DesignTerm],
+    singles: dict[Factor, DesignTerm],
+    categories: list[Factor],
+) -> Allometry | None:
+    """If the model has a size; the points have mean 0."""
+    size = next((each for each in singles if each.column == SIZE and each not in categories), None)
+    if size is None:
+        return None
+    x = singles[size].columns[:, 0]
+    pooled = _left(np.column_stack([x, points]), [singles[each].columns for each in categories])
+    common = _unit(pooled[:, 0] @ pooled[:, 1:])
+    alone = _unit((x - x.mean()) @ points)
+    across = points - np.outer(points @ common, common)
+    fitted = points - _left(points, [term.columns for term in terms])
+    scores = [points @ common, points @ alone, _first(fitted, x), _first(across, x)]
+    return Allometry(str(size), frozen(x), frozen(offsets(common[None])[0]), *(frozen(each) for each in scores))
+
+
+def _left(values: Float[Floats, "S N"], columns: list[Float[Floats, "S C"]]) -> Float[Floats, "S N"]:
+    """What columns and the mean do not explain."""
+    given = np.concatenate([np.ones((len(values), 1)), *columns], axis=1)
+    given = given / np.linalg.norm(given, axis=0)
+    return np.asarray(values - given @ np.linalg.lstsq(given, values, rcond=1e-7)[0])
+
+
+def _unit(direction: Float[Floats, " M"]) -> Float[Floats, " M"]:
+    return np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-300))
+
+
+def _first(points: Float[Floats, "S M"], x: Float[Floats, " S"]) -> Float[Floats, " S"]:
+    """Scores along the first principal component, turned so that they grow with x."""
+    scores = points @ np.linalg.svd(points, full_matrices=False)[2][0]
+    return np.asarray(scores * (1 if (x - x.mean()) @ scores >= 0 else -1))

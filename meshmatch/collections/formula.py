@@ -1,0 +1,138 @@
+"""Formulas of linear models, ``shape ~ log(size) + sex * age``: read without evaluating anything.
+
+A term is the name of a column, ``log(name)`` or ``factor(name)``, or up to three of these joined by ``:``, their
+interaction. ``a * b`` is ``a + b + a:b``. A name that is no plain word stands in backticks or double quotes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal, NoReturn, TypeAlias, get_args
+
+from meshmatch.errors import OptionError
+
+Space = Literal["form", "shape"]
+Term: TypeAlias = "tuple[Factor, ...]"
+_LONGEST, _MOST_TERMS, _MOST_FACTORS = 1000, 50, 3
+_TOKEN = re.compile(r"\s*(?:`([^`]+)`|\"([^\"]+)\"|([^\W\d][\w.]*)|(\S))")
+_FUNCTIONS = "log", "factor"
+_HINT = "such as 'shape ~ log(size) + sex * age': names of columns, log(), factor(), +, : and *"
+
+
+@dataclass(frozen=True)
+class Factor:
+    """A column, as it is; its natural logarithm; or its values as categories."""
+
+    column: str
+    function: Literal["", "log", "factor"] = ""
+
+    def __str__(self) -> str:
+        return f"{self.function}({self.column})" if self.function else self.column
+
+
+@dataclass(frozen=True)
+class Formula:
+    """What is explained, shapes without or with their sizes ("form"), by which terms: main effects before interactions."""
+
+    space: Space
+    terms: tuple[Term, ...]
+
+    def __str__(self) -> str:
+        return f"{self.space} ~ {' + '.join(map(term_name, self.terms))}"
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns, each once."""
+        return tuple(dict.fromkeys(factor.column for term in self.terms for factor in term))
+
+
+def term_name(term: Sequence[Factor]) -> str:
+    """As the term is written."""
+    return ":".join(map(str, term))
+
+
+def parse(text: str) -> Formula:
+    """The formula in a text; `OptionError` where it is none."""
+    if len(text) > _LONGEST:
+        raise OptionError(f"a formula of {len(text)} letters is too long", f"at most {_LONGEST}")
+    return _Reader(text).formula()
+
+
+class _Reader:
+    """Reads a formula from left to right: a sum of products of interactions of factors."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text.strip()
+        self._tokens = [(quoted or also or word, mark) for quoted, also, word, mark in _TOKEN.findall(text)]
+        self._at = 0
+
+    def formula(self) -> Formula:
+        space = self._word("begins with 'shape ~' or 'form ~'")
+        if space not in get_args(Space) or not self._accept("~"):
+            self._refuse("does not begin with 'shape ~' or 'form ~'")
+        terms: dict[frozenset[Factor], Term] = {}
+        while True:
+            for term in self._product():
+                terms.setdefault(frozenset(term), term)
+            if not self._accept("+"):
+                break
+        if self._at < len(self._tokens):
+            word, mark = self._tokens[self._at]
+            self._refuse(f"has {word or mark!r} where + : * or its end was expected")
+        if len(terms) > _MOST_TERMS:
+            self._refuse(f"has {len(terms)} terms, more than {_MOST_TERMS}")
+        for term in terms.values():
+            missing = [factor for factor in term if frozenset([factor]) not in terms]
+            if missing:
+                raise OptionError(
+                    f"the formula has {term_name(term)} without {missing[0]}", f"write {'*'.join(map(str, term))}"
+                )
+        return Formula(space, tuple(sorted(terms.values(), key=len)))  # type: ignore[arg-type]
+
+    def _product(self) -> list[Term]:
+        parts = [self._interaction()]
+        while self._accept("*"):
+            parts.append(self._interaction())
+            if len(parts) > _MOST_FACTORS:
+                self._refuse(f"joins more than {_MOST_FACTORS} names")
+        chosen = (some for count in range(1, len(parts) + 1) for some in combinations(parts, count))
+        found = [tuple(dict.fromkeys(factor for part in some for factor in part)) for some in chosen]
+        if max(map(len, found)) > _MOST_FACTORS:
+            self._refuse(f"joins more than {_MOST_FACTORS} names")
+        return found
+
+    def _interaction(self) -> Term:
+        factors = [self._factor()]
+        while self._accept(":"):
+            factors.append(self._factor())
+        return tuple(dict.fromkeys(factors))
+
+    def _factor(self) -> Factor:
+        name = self._word("has no name")
+        if not self._accept("("):
+            return Factor(name)
+        if name not in _FUNCTIONS:
+            self._refuse(f"has the function {name!r}, which is none of {', '.join(_FUNCTIONS)}")
+        found = Factor(self._word(f"has nothing in {name}()"), name)  # type: ignore[arg-type]
+        if not self._accept(")"):
+            self._refuse(f"has no ) behind {found.column}")
+        return found
+
+    def _word(self, problem: str) -> str:
+        word, mark = self._tokens[self._at] if self._at < len(self._tokens) else ("", "")
+        if not word:
+            self._refuse(f"{problem}, but {mark!r}" if mark else f"{problem}: it ends early")
+        self._at += 1
+        return word
+
+    def _accept(self, mark: str) -> bool:
+        if self._at < len(self._tokens) and self._tokens[self._at] == ("", mark):
+            self._at += 1
+            return True
+        return False
+
+    def _refuse(self, problem: str) -> NoReturn:
+        raise OptionError(f"the formula '{self._text[:60]}' {problem}", _HINT)

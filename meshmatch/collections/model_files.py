@@ -1,0 +1,110 @@
+"""What the folder of an atlas holds of a linear model.
+
+=============  ===================================================================================================
+anova.csv      a line for each term, what is left, and all: df, SS, MS, R2, F, Z, p, and p anywhere
+effects.csv    a line for each vertex: displacement by each coefficient; F and p-values of each term
+effects.vtp    the same on the mean, for ParaView and 3D Slicer
+allometry.csv  a line for each shape: size, scores that go with it, group
+=============  ===================================================================================================
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshmatch.collections.anova import Effect
+from meshmatch.collections.explain import Allometry, Explained
+from meshmatch.errors import visible
+from meshmatch.shapes.formats.vtk import write_vtp
+from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.tables import write_rows
+
+LEVEL = 0.05
+"""At which a difference is shown as one."""
+_HEADER = "term", "df", "SS", "MS", "R2", "F", "Z", "p", "p_anywhere"
+
+
+def write_model(folder: Path, mean: Shape, found: Explained) -> None:
+    """Write the tables of a model into a folder."""
+    write_rows(folder / "anova.csv", _HEADER, _lines(model_record(found)))
+    arrays: dict[str, np.ndarray] = {}
+    for effect in found.table.effects:
+        for name, change, along in zip(effect.coefficients, effect.change, effect.along_normal, strict=True):
+            arrays[name] = change
+            arrays[f"{name}, along the normal"] = along
+        if effect.places is not None:
+            about = effect.places
+            values = {"F": about.statistic, "p": about.p, "p corrected": about.p_corrected, "p fdr": about.p_fdr}
+            arrays |= {f"{effect.name}, {what}": each for what, each in values.items()}
+    arrays = {visible(name): values for name, values in arrays.items()}
+    write_vtp(folder / "effects.vtp", mean, arrays)
+    header = ["vertex"]
+    for name, array in arrays.items():
+        header += [name] if array.ndim == 1 else [f"{name}, {axis}" for axis in "xyz"]
+    table = np.column_stack(list(arrays.values()))
+    write_rows(folder / "effects.csv", header, ([k, *short(row)] for k, row in enumerate(table)))
+    if found.allometry is not None:
+        _write_allometry(folder / "allometry.csv", found, found.allometry)
+
+
+def _write_allometry(path: Path, found: Explained, about: Allometry) -> None:
+    scores = [about.sizes, about.cac, about.regression_scores, about.predicted, about.residual]
+    groups = found.groups or ("",) * len(found.names)
+    rows = zip(found.names, np.column_stack(scores), groups, strict=True)
+    header = ["name", about.label, "CAC", "RegScore", "predicted_PC1", "residual_PC1", "group"]
+    write_rows(path, header, ([name, *short(row), group] for name, row, group in rows))
+
+
+def model_record(found: Explained) -> dict[str, Any]:
+    """A model and its table, for JSON; what was not tested is None."""
+    about = found.table
+    left = {"term": "residuals", "df": about.residual_df, "SS": about.residual_ss}
+    left |= {"MS": about.residual_ss / about.residual_df, "R2": about.residual_ss / about.total_ss}
+    return {
+        "formula": found.formula,
+        "shapes": len(found.names),
+        "left_out": found.left_out,
+        "columns": found.columns,
+        "statistic": found.kind,
+        "blocks": found.blocks,
+        "permutations": about.permutations,
+        "exact": about.exact,
+        "seed": about.seed,
+        "level": LEVEL,
+        "terms": [_effect_record(effect) for effect in about.effects],
+        "residuals": {name: short(value) for name, value in left.items()},
+        "total": {"term": "total", "df": about.total_df, "SS": short(about.total_ss)},
+    }
+
+
+def _effect_record(effect: Effect) -> dict[str, Any]:
+    numbers = effect.ss, effect.ms, effect.r2, effect.f, effect.z, effect.p, effect.p_anywhere
+    told = [None if np.isnan(number) else short(number) for number in numbers]
+    found: dict[str, Any] = dict(zip(_HEADER, (effect.name, effect.df, *told), strict=True))
+    if effect.places is not None:
+        found["vertices_corrected"] = int((effect.places.p_corrected <= LEVEL).sum())
+        found["vertices_fdr"] = int((effect.places.p_fdr <= LEVEL).sum())
+    return found
+
+
+def _lines(record: dict[str, Any]) -> list[list[Any]]:
+    rows = [*record["terms"], record["residuals"], record["total"]]
+    return [["" if row.get(name) is None else row[name] for name in _HEADER] for row in rows]
+
+
+def anova_rows(record: dict[str, Any]) -> list[list[str]]:
+    """The table of a model as text, with the number of vertices where a term is found."""
+    titles = [*_HEADER[:-1], "p anywhere", f"vertices p <= {LEVEL:g}", f"FDR <= {LEVEL:g}"]
+    numbers = [[cell if isinstance(cell, str) else f"{cell:.4g}" for cell in line] for line in _lines(record)]
+    counts = [[str(term.get(name, "")) for name in ("vertices_corrected", "vertices_fdr")] for term in record["terms"]]
+    return [titles, *(line + count for line, count in zip(numbers, [*counts, ["", ""], ["", ""]], strict=True))]
+
+
+def short(values: Any) -> Any:
+    """Numbers of six digits, as JSON has them."""
+    if isinstance(values, np.ndarray):
+        return [short(value) for value in values.tolist()]
+    return float(f"{values:.6g}") if isinstance(values, float) else values
