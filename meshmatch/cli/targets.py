@@ -17,12 +17,15 @@ from typing import Annotated, Any, get_type_hints
 from typer import Argument, Option
 
 import meshmatch
+from meshmatch.cli.options import check_outputs, check_writable
 from meshmatch.cli.transfer_options import MapOptions
 from meshmatch.cli.words import Console, Json, print_json
 from meshmatch.errors import InputError, MeshmatchError, OptionError, OutputError
 from meshmatch.models.registry import check_model
 
 Verb = Callable[..., Json]
+Gather = Callable[[Path, Mapping[str, Any], str, Mapping[str, Path]], str]
+"""Writes one table of all, from its path, the verb's arguments, the source's name and the outputs by name; what to say."""
 TABLE = "transfers.csv"
 _COLUMNS = ("name", "file", "output", "verdict", "confidence", "seconds", "error", "made")
 _ROW = "{:<28} {:<8} {:>10} {:>8}"
@@ -38,21 +41,23 @@ _Targets = Annotated[
 ]
 
 
-def to_targets(suffix: str, *own: str) -> Callable[[Verb], Callable[..., None]]:
+def to_targets(suffix: str, *own: str, gather: Gather | None = None) -> Callable[[Verb], Callable[..., None]]:
     """Let a verb of one target, which returns its record for --json, take several.
 
     What it writes for each ends in ``suffix``, or as the target does where that is one of ``own``; if ``suffix`` is empty,
-    as the garment does.
+    as the garment does. ``gather`` writes what the verb's option ``table`` asks for.
     """
 
     def wrapped(verb: Verb) -> Callable[..., None]:
         @wraps(verb)
         def called(*, target: list[Path], ending: str | None, **rest: Any) -> None:
             if _several(target):
-                _transfer_all(verb, target, lambda file: _ending(file, ending, suffix, own, rest), rest)
+                _transfer_all(verb, target, lambda file: _ending(file, ending, suffix, own, rest), rest, gather)
                 return
             if ending is not None:
                 raise OptionError("--format is for several targets", "end the name of the output in it")
+            if gather is not None and rest["table"] is not None:
+                raise OptionError("--table is for several targets", "name them, their folder, or a folder of fits")
             record = verb(target=target[0], **rest)
             if rest["run"].json:
                 print_json(record)
@@ -123,14 +128,19 @@ def _check_ending(verb: str, name: str, rest: Mapping[str, Any]) -> None:
     checks[verb](Path(name))
 
 
-def _transfer_all(verb: Verb, target: Sequence[Path], ending: Callable[[Path], str], rest: dict[str, Any]) -> None:
+def _transfer_all(
+    verb: Verb, target: Sequence[Path], ending: Callable[[Path], str], rest: dict[str, Any], gather: Gather | None
+) -> None:
     """Transfer to each target, say a row for each, and fail in the end if one failed."""
     from meshmatch.collections.stores import Store
 
-    run, output, picture = rest["run"], rest["output"], rest["picture"]
+    run, output, picture, table = rest["run"], rest["output"], rest["picture"], rest.get("table")
     _check_folders(output, picture)
     rest["maps"].check()
-    files, maps = _files(target, output, rest["maps"], (rest["source"], rest.get("garment")))
+    files, maps, source = _files(target, output, rest["maps"], (rest["source"], rest.get("garment")))
+    if table is not None:
+        rest["table"] = None
+        _check_table(table, source, files, rest)
     for each, name in {ending(file): name for name, file in reversed(files.items())}.items():
         _check_ending(verb.__name__, f"{name.rpartition('/')[2]}{each}", rest)
     if maps.map is None:
@@ -153,8 +163,8 @@ def _transfer_all(verb: Verb, target: Sequence[Path], ending: Callable[[Path], s
                 row, record = _transfer(verb, name, rest | {"target": file, "output": written, "picture": drawn}, made)
                 if not _outlives(before, row):
                     rows[name] = row
-                    with (output / TABLE).open("a", encoding="utf-8", newline="") as table:
-                        csv.writer(table, lineterminator="\n").writerow(asdict(row).values())
+                    with (output / TABLE).open("a", encoding="utf-8", newline="") as lines:
+                        csv.writer(lines, lineterminator="\n").writerow(asdict(row).values())
             else:
                 row, record = before, {"output": before.output, "verdict": before.verdict, "kept": True}
             told.append(row)
@@ -163,6 +173,9 @@ def _transfer_all(verb: Verb, target: Sequence[Path], ending: Callable[[Path], s
             if row.error:
                 console.warn(f"{name}: {row.error}")
         _write(output / TABLE, rows.values())
+        written = {row.name: Path(row.output) for row in told if row.verdict != _FAILED}
+        if gather is not None and table is not None and written:
+            console.say(gather(table, rest, source, written))
     _tell(console, output, told, records, run.json)
 
 
@@ -204,6 +217,18 @@ def _tell(console: Console, output: Path, rows: Sequence[_Row], records: list[Js
         raise InputError(f"{len(failed)} of {len(rows)} targets failed: {names}", hint)
 
 
+def _check_table(table: Path, source: str, files: Mapping[str, Path], rest: Mapping[str, Any]) -> None:
+    """Refuse a table of all that could not be written afterwards (`OptionError`, `OutputError`)."""
+    from meshmatch.transfer.landmarks import check_table_suffix
+
+    check_table_suffix(table)
+    if source in files:
+        problem = f"the source and a target are both called {source}"
+        raise OptionError(problem, "rename one: a table has specimens by name")
+    check_outputs([*files.values(), rest["source"], rest["landmarks"]], table)
+    check_writable(table)
+
+
 def _check_folders(output: Path, picture: Path | None) -> None:
     """Refuse files where folders are needed (`OptionError`)."""
     from meshmatch.shapes.files import SUFFIXES
@@ -215,8 +240,10 @@ def _check_folders(output: Path, picture: Path | None) -> None:
 
 def _files(
     target: Sequence[Path], output: Path, maps: MapOptions, others: tuple[Path, Path | None]
-) -> tuple[dict[str, Path], MapOptions]:
-    """The targets by name, without other inputs, of which the source is the first; and where their maps come from."""
+) -> tuple[dict[str, Path], MapOptions, str]:
+    """The targets by name, without other inputs, of which the source is the first; where their maps come from; and what
+    the source is called among them.
+    """
     from meshmatch.collections.sources import find_sources
     from meshmatch.collections.stores import Store
 
@@ -231,10 +258,12 @@ def _files(
         sources = find_sources([str(each) for each in target], Store.of(output))
         found = {source.name: Path(source.path) for source in sources}
     taken = {os.path.realpath(path) for path in others if path is not None}
+    own = os.path.realpath(others[0])
+    source = next((name for name, file in found.items() if os.path.realpath(file) == own), others[0].stem)
     found = {name: file for name, file in found.items() if os.path.realpath(file) not in taken}
     if not found:
         raise InputError(f"there is no target in {target[0]}", "name files or folders of shapes")
-    return found, maps
+    return found, maps, source
 
 
 def _inner(name: str, table: Path) -> str:

@@ -1,7 +1,8 @@
 """The verbs that transfer what vertices, faces or points have: colors, labels, skin weights, landmarks."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from typer import Option
 
@@ -11,6 +12,7 @@ from meshmatch.cli.targets import to_targets
 from meshmatch.cli.transfer_options import MapOptions, MapOptionsWithPairs, Picture, Source, Target, Transfer
 from meshmatch.cli.words import Json
 from meshmatch.errors import InputError, OptionError
+from meshmatch.outputs import replace_on_success
 
 _FAR = 0.02  # of the size of a shape: a landmark this far from its surface is worth a warning
 On = Literal["vertices", "faces"]
@@ -192,29 +194,51 @@ def transfer_weights(
     return transfer.record(counts | low, result.maps, float(result.confidence.mean()))
 
 
+def _landmark_table(table: Path, given: Mapping[str, Any], source: str, written: Mapping[str, Path]) -> str:
+    """Write the landmarks of SRC and all targets as one table."""
+    from meshmatch.shapes.landmark_files import mesh_space
+    from meshmatch.transfer.landmarks import landmark_positions, load_landmarks, save_specimens
+
+    path = given["source"]
+    own, _ = load_landmarks(given["landmarks"], meshmatch.load_shape(path), mesh_space(path))
+    specimens = {source: own.points} | {name: landmark_positions(file) for name, file in written.items()}
+    for name, points in specimens.items():
+        if len(points) != len(own.names):
+            problem = f"{written[name]} has {len(points)} landmarks, {given['landmarks']} has {len(own.names)}"
+            raise InputError(problem, "remove it, and give the same command")
+    with replace_on_success(table) as temporary:
+        save_specimens(temporary, specimens, own.names)
+    return f"wrote {table}: {len(own.names)} landmarks of {len(specimens)} specimens, {source} among them"
+
+
 @grouped
-@to_targets(".csv")
+@to_targets(".csv", gather=_landmark_table)
 def transfer_landmarks(
     *,
     source: Source,
     target: Target,
-    output: Path = output_option("FILE", "Landmarks of TGT: .csv, .json, .pp, .fcsv or .mrk.json."),
+    output: Path = output_option("FILE", "Landmarks of TGT: .csv, .json, .pp, .fcsv, .mrk.json or .tps."),
     landmarks: Path = Option(
         ...,
         "--landmarks",
         metavar="FILE",
         help="Landmarks of SRC, as vertices or positions: .csv, .txt, .npy or .json, MeshLab's .pp, 3D Slicer's .fcsv and "
-        ".mrk.json, .pts or .tps.",
+        ".mrk.json, .pts, .tps, or Morphologika's .txt.",
     ),
     maps: MapOptionsWithPairs,
     run: RunOptions,
     min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Landmarks below this confidence are listed."),
+    table: Path | None = optional(
+        "FILE",
+        "With several targets, also one table of all specimens, SRC among them: .csv, .tps, Morphologika's .txt, or .npz.",
+    ),
     picture: Picture = None,
 ) -> Json:
     """Transfer landmarks to exact points on the surface of another shape.
 
     For each landmark, .csv and .json files have its vertex, position, face with barycentric weights, and confidence;
-    .pp, .fcsv and .mrk.json files its name and position. A position in FILE stands for the nearest point of SRC.
+    .pp, .fcsv and .mrk.json files its name and position, .tps files positions alone. A position in FILE stands for the
+    nearest point of SRC.
     """
     import numpy as np
 

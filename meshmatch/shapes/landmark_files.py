@@ -1,5 +1,6 @@
-"""Landmarks in files: tables of vertices or positions, JSON, MeshLab's picked points, 3D Slicer's markups, and the .pts and
-.tps of landmark editors. What a file says of each point is read here; `meshmatch.transfer.landmarks` puts it on a shape.
+"""Landmarks in files: tables of vertices or positions, JSON, MeshLab's picked points, 3D Slicer's markups, the .pts and
+.tps of landmark editors, Morphologika's text. What a file says of each point is read here; `meshmatch.transfer.landmarks`
+puts it on a shape.
 
 3D Slicer writes points and meshes in one of two frames, which differ in the signs of x and y, and says which: LPS or RAS.
 """
@@ -8,7 +9,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
 from typing import Any, Literal
@@ -16,6 +17,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from meshmatch.arrays import Floats
 from meshmatch.errors import InputError
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.input_files import check_memory, read_bytes, read_json, read_npy, read_text
@@ -82,7 +84,7 @@ def read_landmark_file(path: Path, shape: str = "", space: Space = "") -> Landma
         The file holds no landmarks, or some that cannot be read.
     """
     reader = LANDMARK_READERS[path.suffix.lower()]
-    records = reader(path, Path(shape).stem) if reader is _read_tps else reader(path)
+    records = reader(path, Path(shape).stem) if reader in READERS_OF_SEVERAL else reader(path)
     if not records:
         raise InputError(f"{path.name} holds no landmark")
     if len(spaces := {_SPACES.get(str(record.get("space")), "") for record in records}) > 1:
@@ -97,8 +99,7 @@ def read_landmark_file(path: Path, shape: str = "", space: Space = "") -> Landma
 
 def _place(record: Record, number: int, turned: bool) -> Place:
     given = record.get("name")
-    words = "".join(c if c.isprintable() else " " for c in str(number if given in (None, "") else given))
-    name = plain_text(" ".join(words.split()))
+    name = _one_line(str(number if given in (None, "") else given))
     face, weights, vertex = record.get("face"), record.get("barycentric"), record.get("vertex")
     if face is not None and face != -1 and weights is not None:
         return Place(name, "face", (_whole(face, name), _three(weights, name)))
@@ -112,6 +113,11 @@ def _place(record: Record, number: int, turned: bool) -> Place:
     if not {"vertex", "position"} & set(record):
         raise InputError(f"landmark {name} has no vertex and no position")
     return Place(name, "missing", " is vertex -1" if vertex == -1 else " has no vertex and no position")
+
+
+def _one_line(name: str) -> str:
+    words = "".join(c if c.isprintable() else " " for c in name)
+    return plain_text(" ".join(words.split()))
 
 
 def _whole(value: Any, name: str) -> int:
@@ -146,8 +152,12 @@ def _read_npy(path: Path) -> list[Record]:
     return [{"vertex": vertex} for vertex in flat.tolist()]
 
 
-def _read_table(path: Path) -> list[Record]:
-    """A row for each: a vertex, three coordinates, or these behind a name; or columns that are named."""
+def _read_table(path: Path, shape: str) -> list[Record]:
+    """A row for each: a vertex, three coordinates, or these behind a name; or columns that are named, of which one may
+    name the specimen.
+    """
+    if path.suffix.lower() == ".txt" and (text := read_text(path, _RECORD)).lstrip().startswith("["):
+        return _morphologika(text, shape)
     table = read_table(path, comments="ends" if path.suffix.lower() == ".txt" else "lines", whole=True)
     rows = table.rows()
     if not rows:
@@ -164,6 +174,11 @@ def _read_table(path: Path) -> list[Record]:
         numbers = [k for k, name in enumerate(head) if name != "name"]
         if len(rows) > 1 and not any(is_number(rows[0][k]) for k in numbers):
             rows = rows[1:] if all(is_number(rows[1][k]) for k in numbers) else rows  # names of other columns
+    if "specimen" in head:
+        at = head.index("specimen")
+        specimens = list(dict.fromkeys(row[at] for row in rows))
+        chosen = specimens[_chosen([{each} for each in specimens], shape)]
+        rows = [row for row in rows if row[at] == chosen]
     own = next((name for name in _NAMES if name in head), "")
     counted = [k for k, name in enumerate(head) if name in ("x", "y", "z", "w0", "w1", "w2")]
     table.check_marks([[row[k] for k in counted] for row in rows])
@@ -304,15 +319,45 @@ def _read_tps(path: Path, shape: str) -> list[Record]:
             if len(words) == 2:
                 raise InputError("its landmarks lie in a plane", "those of a shape have three coordinates: LM3=")
             specimens[-1][0].append(_three(words, str(len(specimens[-1][0]))))
-    named = [{PureWindowsPath(facts.get(key, "")).stem for key in ("ID", "IMAGE")} for _, facts in specimens]
-    own = [one for one, names in zip(specimens, named, strict=True) if shape and shape in names]
-    chosen = own if len(specimens) > 1 else specimens
-    if specimens and len(chosen) != 1:
-        problem = f"it holds landmarks of {len(specimens)} shapes, {len(chosen)} of them of {shape or 'this one'}"
-        raise InputError(problem, "write the name of the shape's file behind ID=, or save each in a file of its own")
-    points, facts = chosen[0] if chosen else ([], {})
+    if not specimens:
+        return []
+    points, facts = specimens[_chosen([{facts.get("ID", ""), facts.get("IMAGE", "")} for _, facts in specimens], shape)]
     scale = number(facts.get("SCALE", "1"))
     return [{"position": [scale * each for each in point]} for point in points]
+
+
+def _morphologika(text: str, shape: str) -> list[Record]:
+    """Landmarks of one specimen of Morphologika's file: sections behind words in brackets, the points of all in one."""
+    sections: dict[str, list[str]] = {}
+    for line in filter(None, map(str.strip, text.splitlines())):
+        if line.startswith("["):
+            found = sections.setdefault(line.strip("[]").lower(), [])
+        else:
+            found.append(line)
+    counts = [sections.get(name, [""])[:1] for name in ("individuals", "landmarks", "dimensions")]
+    if not all(each and each[0].isdecimal() for each in counts):
+        raise InputError("it does not say how many individuals, landmarks and dimensions it has")
+    S, L, dimensions = (int(each[0]) for each in counts)
+    if dimensions != 3:
+        raise InputError(f"its landmarks have {dimensions} dimensions", "those of a shape have three")
+    points = [line.split() for line in sections.get("rawpoints", []) if not line.startswith("'")]
+    if S == 0 or len(points) != S * L:
+        raise InputError(f"it has {len(points)} points, not {L} landmarks of {S} individuals")
+    names = sections.get("names", [])
+    first = L * _chosen([{name} for name in names] if len(names) == S else [set()] * S, shape)
+    return [{"position": _three(words, str(k))} for k, words in enumerate(points[first : first + L])]
+
+
+def _chosen(ids: Sequence[Collection[str]], shape: str) -> int:
+    """Which of the specimens a shape is, by what each is called: as the shape, or as its file with a suffix."""
+    own = [0] if len(ids) == 1 else []
+    for part in ("name", "stem"):
+        called = [{getattr(PureWindowsPath(name), part) for name in names} for names in ids]
+        own = own or [k for k, names in enumerate(called) if shape and shape in names]
+    if len(own) != 1:
+        problem = f"it holds landmarks of {len(ids)} shapes, {len(own)} of them of {shape or 'this one'}"
+        raise InputError(problem, "call each specimen as the file of its shape, or save each in a file of its own")
+    return own[0]
 
 
 def _read_pp(path: Path) -> list[Record]:
@@ -344,6 +389,27 @@ LANDMARK_READERS: Mapping[str, Callable[..., list[Record]]] = {
     ".txt": _read_table,
     ".npy": _read_npy,
 }
+
+READERS_OF_SEVERAL = (_read_tps, _read_table)  # those that take the name of one specimen as well
+
+
+def tps_lines(specimens: Mapping[str, Floats]) -> Iterable[str]:
+    """The lines of a .tps file, from the positions (L, 3) of each specimen's landmarks."""
+    for name, points in specimens.items():
+        yield f"LM3={len(points)}"
+        yield from (f"{x!r} {y!r} {z!r}" for x, y, z in points.tolist())
+        yield f"ID={_one_line(name)}"
+
+
+def morphologika_lines(specimens: Mapping[str, Floats]) -> Iterable[str]:
+    """The lines of Morphologika's text, from the positions (L, 3) of each specimen's landmarks."""
+    names = [_one_line(name) for name in specimens]
+    length = len(next(iter(specimens.values())))
+    yield from ("[individuals]", str(len(names)), "[landmarks]", str(length), "[dimensions]", "3", "[names]", *names)
+    yield "[rawpoints]"
+    for name, points in zip(names, specimens.values(), strict=True):
+        yield f"'{name}"
+        yield from (f"{x!r} {y!r} {z!r}" for x, y, z in points.tolist())
 
 
 def fcsv_lines(points: Iterable[tuple[str, Sequence[float], float]], space: Space) -> Iterable[str]:

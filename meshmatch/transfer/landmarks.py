@@ -4,7 +4,7 @@ docs/formats.md says how.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,18 +23,24 @@ from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes import tables
 from meshmatch.shapes.landmark_files import (
     LANDMARK_READERS,
+    READERS_OF_SEVERAL,
     LandmarkFile,
     Space,
     fcsv_lines,
     markups_record,
+    morphologika_lines,
     read_landmark_file,
+    tps_lines,
 )
 from meshmatch.shapes.shape import Shape
 
 # A landmark this far from the surface, in diagonals of the shape, belongs to another shape.
 _ELSEWHERE = 0.25
-LANDMARK_SUFFIXES = (".csv", ".json", ".pp", ".fcsv", ".mrk.json")
+LANDMARK_SUFFIXES = (".csv", ".json", ".pp", ".fcsv", ".mrk.json", ".tps")
 check_landmarks_suffix = partial(tables.check_suffix, suffixes=LANDMARK_SUFFIXES, what="landmarks")
+check_table_suffix = partial(
+    tables.check_suffix, suffixes=(".csv", ".tps", ".txt", ".npz"), what="a table of landmarks"
+)
 _HINT = "a row each: name,vertex or name,x,y,z; MeshLab's .pp, 3D Slicer's .mrk.json or .fcsv, .pts, .tps, .json"
 
 
@@ -205,14 +211,16 @@ def save_landmarks(path: Path, landmarks: Landmarks, space: Space = "LPS", name:
     """Write landmarks; `OptionError` if the suffix is not one of `LANDMARK_SUFFIXES`.
 
     `space` is the frame that a file for 3D Slicer (.fcsv, .mrk.json) states; it takes a mesh that states none to be in
-    LPS. `name` is what the file will be called, where `path` is a temporary name.
+    LPS. `name` is what the file will be called, where `path` is a temporary name: a specimen in a .tps file is called so.
     """
     suffix = check_landmarks_suffix(path)
     columns = (landmarks.vertex, landmarks.points, landmarks.face, landmarks.barycentric)
     sure = tables.short_floats(landmarks.confidence)
     rows = list(zip(landmarks.names, *(column.tolist() for column in columns), sure, strict=True))
     points = zip(landmarks.names, landmarks.points.tolist(), landmarks.confidence.tolist(), strict=True)
-    if suffix == ".fcsv":
+    if suffix == ".tps":
+        save_specimens(path, {Path(name or path.name).stem: landmarks.points}, landmarks.names)
+    elif suffix == ".fcsv":
         path.write_text("\n".join(fcsv_lines(points, space)) + "\n", encoding="utf-8")
     elif (name or path.name).lower().endswith(".mrk.json"):
         tables.write_json(path, markups_record(points, space), indent=1)
@@ -230,3 +238,33 @@ def save_landmarks(path: Path, landmarks: Landmarks, space: Space = "LPS", name:
         ElementTree.indent(root, " ")
         text = ElementTree.tostring(root, encoding="unicode")
         path.write_text(f"<!DOCTYPE PickedPoints>\n{text}\n", encoding="utf-8")
+
+
+def landmark_positions(path: Path) -> Float[Floats, "L 3"]:
+    """The positions of landmarks in a file that `save_landmarks` wrote and others may have corrected since; nan where one
+    is missing.
+    """
+
+    def read(path: Path) -> Floats:
+        reader = LANDMARK_READERS[path.suffix.lower()]
+        records = reader(path, "") if reader in READERS_OF_SEVERAL else reader(path)
+        return np.array([record.get("position") or [np.nan] * 3 for record in records], np.float64).reshape(-1, 3)
+
+    return tables.read_by_suffix(path, dict.fromkeys(LANDMARK_READERS, read), "landmarks", _HINT)
+
+
+def save_specimens(path: Path, specimens: Mapping[str, Float[Floats, "L 3"]], names: Sequence[str]) -> None:
+    """Write one table of the same landmarks of several specimens, for R and other programs; `OptionError` if it has another
+    suffix than .csv (specimen,landmark,x,y,z), .tps, .txt (Morphologika), .npz (points (S, L, 3), specimens, landmarks).
+    """
+    suffix = check_table_suffix(path)
+    if suffix == ".npz":
+        points = np.stack(list(specimens.values()))
+        tables.write_npz(path, {"points": points, "specimens": list(specimens), "landmarks": list(names)})
+    elif suffix == ".csv":
+        each = ((specimen, zip(names, points.tolist(), strict=True)) for specimen, points in specimens.items())
+        rows = ([specimen, name, *xyz] for specimen, landmarks in each for name, xyz in landmarks)
+        tables.write_rows(path, ["specimen", "landmark", "x", "y", "z"], rows)
+    else:
+        lines = tps_lines(specimens) if suffix == ".tps" else morphologika_lines(specimens)
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")

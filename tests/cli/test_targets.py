@@ -13,6 +13,7 @@ from meshmatch.api import matching
 from meshmatch.api.results import MatchResult
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.landmarks import landmark_positions
 from tests.cli.conftest import FakeMatching, Run, refused, well
 
 LABELS = ("transfer-labels", "a.ply", "in", "--labels", "labels.txt", "-o", "out")
@@ -181,6 +182,51 @@ def test_a_format_that_cannot_be_is_told_once(
     before = {path.name for path in files.iterdir()}
     words = verb, *garment, "a.ply", "in", "-o", "out", *MORE.get(verb, ()), "--format", suffix
     refused(run(*words), "b." if suffix != "../x.glb" else "is a suffix", files, before)
+
+
+LANDMARKS = ("transfer-landmarks", "a.ply", "in", "--landmarks", "points.txt", "-o", "out")
+
+
+@pytest.mark.parametrize("format", [".csv", ".mrk.json"])
+def test_landmarks_of_all_are_one_table(run: Run, files: Path, stub: FakeMatching, format: str) -> None:
+    words = *LANDMARKS, "--format", format, "--table", "all.npz"
+    answer = well(run(*words))
+    assert "wrote all.npz: 2 landmarks of 3 specimens, a among them" in answer.err
+    with np.load("all.npz") as found:
+        assert (found["specimens"].tolist(), found["landmarks"].tolist()) == (["a", "b", "sub/c"], ["0", "1"])
+        assert np.array_equal(found["points"][0], load_shape("a.ply").verts[[0, 5]])
+        assert np.array_equal(found["points"][1], landmark_positions(Path(f"out/b{format}")))
+        before = found["points"]
+    Path("all.npz").unlink()
+    assert well(run(*words)).err.count("kept") == 2  # a table of what was there
+    with np.load("all.npz") as found:
+        assert np.array_equal(found["points"], before)
+    Path("in/a-bad.ply").write_text("nothing")
+    answer = run(*words[:-1], "all.csv")
+    assert answer.status == 1 and "wrote all.csv: 2 landmarks of 3 specimens" in answer.err
+    rows = Path("all.csv").read_text().splitlines()
+    assert (rows[0], len(rows), rows[3].startswith("b,0,")) == ("specimen,landmark,x,y,z", 7, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((*LANDMARKS, "--table", "all.ods"), "'.ods' is not a format for a table of landmarks"),
+        ((*LANDMARKS, "--table", "in/b.ply"), "'.ply' is not a format"),
+        ((*LANDMARKS, "--table", "points.txt"), "cannot write points.txt: it is an input"),
+        (
+            (*LANDMARKS[:2], "in/b.ply", *LANDMARKS[3:-1], "b.csv", "--table", "all.csv"),
+            "--table is for several targets",
+        ),
+        ((*LANDMARKS[:2], "in/b.ply", "more/a.ply", *LANDMARKS[3:], "--table", "all.csv"), "are both called a"),
+    ],
+)
+def test_a_table_that_cannot_be_is_told_first(
+    run: Run, files: Path, stub: FakeMatching, words: tuple[str, ...], message: str
+) -> None:
+    Path("more").mkdir()
+    save_shape("more/a.ply", load_shape("in/b.ply"))
+    refused(run(*words), message, files, {path.name for path in files.iterdir()})
 
 
 def test_a_failure_leaves_rows_of_other_files(run: Run, files: Path, stub: FakeMatching) -> None:

@@ -58,6 +58,18 @@ FILES = {
     "Landmark": ("a.pts", "Version 1.0\n4\n" + rows("S00{0} {2} {3} {4}") + "S003 9999.0 9999.0 9999.0\n"),
     "tps": ("a.tps", "LM3=4\n" + rows("{2} {3} {4}") + "NA NA NA\nID=a\n"),
     "tps of several": ("a.tps", "LM3=1\n0 0 9\nID=other\nLM3=3\n" + rows("{2} {3} {4}") + "ID=sphere1\n"),
+    "tps of names with dots": (
+        "a.tps",
+        "LM3=1\n0 0 9\nID=sphere1.left\nLM3=3\n" + rows("{2} {3} {4}") + "ID=sphere1\n",
+    ),
+    "Morphologika": (
+        "a.txt",
+        "[individuals]\n2\n[landmarks]\n3\n[dimensions]\n3\n[names]\nother\nsphere1\n[labels]\nsex\n[rawpoints]\n'#1\n"
+        + "9 9 9\n" * 3
+        + "\n'#2\n"
+        + rows("{2} {3} {4}"),
+    ),
+    "a table of specimens": ("a.csv", "specimen,landmark,x,y,z\nother,a,9,9,9\n" + rows('sphere1,"{1}",{2},{3},{4}')),
     "picked with commas": (
         "a.pp",
         "<PickedPoints>" + rows('<point x="{2}" y="{3}" z="{4}" name="{1}"/>', comma=True) + "</PickedPoints>",
@@ -147,6 +159,10 @@ def test_what_slicer_gets_states_its_frame(tmp_path: Path, suffix: str, space: s
         ("a.tps", "LM=2\n1 2\n3 4\nID=a\n", "lie in a plane"),
         ("a.tps", "LM3=1\n0 0 1\nID=a\nLM3=1\n0 0 1\nID=b\n", "landmarks of 2 shapes, 0 of them of sphere1"),
         ("a.tps", "0 0 1\n", "it begins with"),
+        ("a.csv", "specimen,x,y,z\na,0,0,1\nb,0,0,1\n", "landmarks of 2 shapes, 0 of them of sphere1"),
+        ("a.txt", "[individuals]\n1\n[landmarks]\n2\n[rawpoints]\n0 0 1\n0 1 0\n", "does not say how many"),
+        ("a.txt", "[individuals]\n1\n[landmarks]\n2\n[dimensions]\n2\n[rawpoints]\n0 0\n0 1\n", "have 2 dimensions"),
+        ("a.txt", "[individuals]\n9\n[landmarks]\n2\n[dimensions]\n3\n[rawpoints]\n0 0 1\n", "it has 1 points, not 2"),
         ("a.pts", "version: 1\nn_points: 1\n{\n1 2\n}\n", "lie in a plane"),
         ("a.pts", "0 0 1 255 255 255 255\n", "is not a point"),
         ("a.fcsv", "# CoordinateSystem = IJK\n1,0,0,1\n", "not LPS or RAS"),
