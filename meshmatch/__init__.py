@@ -58,6 +58,9 @@ if TYPE_CHECKING:
     from meshmatch.maps.evaluate import Evaluation as Evaluation
     from meshmatch.maps.files import load_map as load_map
     from meshmatch.maps.files import save_map as save_map
+    from meshmatch.maps.functional import LaplacianBasis as LaplacianBasis
+    from meshmatch.maps.functional import laplacian_basis as laplacian_basis
+    from meshmatch.maps.functional import map_from_functional as map_from_functional
     from meshmatch.maps.vertex_map import VertexMap as VertexMap
     from meshmatch.models.registry import load_model as load_model
     from meshmatch.models.trained import TrainedModel as TrainedModel
@@ -96,6 +99,7 @@ _NAMES = {
     "implicit.training": "train_implicit",
     "maps.evaluate": "Errors Evaluation",
     "maps.files": "load_map save_map",
+    "maps.functional": "LaplacianBasis laplacian_basis map_from_functional",
     "maps.vertex_map": "VertexMap",
     "models.registry": "load_model",
     "models.trained": "TrainedModel",

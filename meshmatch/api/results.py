@@ -321,10 +321,11 @@ def evaluate(
     target: ShapeLike,
     truth: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
     *,
+    backward: VertexMap | str | Path | None = None,
     seed: int = 0,
     progress: ProgressCallback | None = None,
 ) -> Evaluation:
-    """Measure a map: its coverage, its distortion, and its errors where the truth is known.
+    """Measure a map: its coverage, distortion and Dirichlet energy, and its errors where the truth is known.
 
     Errors are geodesic distances on the target, divided by the square root of its area; or in centimetres with the
     target scaled to 1.9 square metres, the skin area of a person.
@@ -340,6 +341,8 @@ def evaluate(
     truth
         The true target vertex of every source vertex (V_source,); or N vertices of the source and those of the target,
         ((N,), (N,)).
+    backward
+        A map from target to source, or its file, for ``bijectivity``; for instance ``result.backward()`` of a match.
     seed
         Of the random pairs of points between which distortion is measured.
     progress
@@ -364,8 +367,12 @@ def evaluate(
     source, target = as_shape(source, "source"), as_shape(target, "target")
     if isinstance(found, str | Path):
         found = load_map(found, source, target)
+    if isinstance(backward, str | Path):
+        backward = load_map(backward, target, source)
     vertex_map = found.map if isinstance(found, MatchResult) else found
-    check_map(vertex_map)
+    for each in (vertex_map, *([] if backward is None else [backward])):
+        check_map(each)
     known = truth if isinstance(truth, tuple) and len(truth) == 2 else (None, truth)
+    rng = np.random.default_rng(seed)
     with thread_limit(1):
-        return evaluate_map(vertex_map, source, target, *known, rng=np.random.default_rng(seed), progress=progress)
+        return evaluate_map(vertex_map, source, target, *known, backward=backward, rng=rng, progress=progress)

@@ -172,6 +172,9 @@ def evaluate(
     target: Path = Argument(..., metavar="TARGET", help="The shape that it maps to."),
     truth: options.Truth = None,
     points: options.Points = None,
+    backward: Path | None = optional(
+        "MAP", "The map from TARGET to SOURCE, to measure how far both together lead astray."
+    ),
     threshold: float = Option(15.0, min=0.0, metavar="CM", help="Report the share of errors above this many cm."),
     curve: Path | None = optional("FILE", "Plot the cumulative error curve: .png, .svg or .pdf (needs ground truth)."),
     picture: Path | None = optional("PNG", "Draw both shapes, errors as a color map (needs ground truth)."),
@@ -183,24 +186,30 @@ def evaluate(
 ) -> None:
     """Measure how good a map is.
 
-    Reports coverage and, between meshes, distortion and folds. With --truth or --points also geodesic errors on TARGET:
-    in percent of the square root of its area, and in centimetres with TARGET scaled to 1.9 square metres,
-    the skin area of a person.
+    Reports coverage and, between meshes, distortion, Dirichlet energy and folds. With --truth or --points also geodesic
+    errors on TARGET: in percent of the square root of its area, and in centimetres with TARGET scaled to 1.9 square
+    metres, the skin area of a person. With --backward also how far from itself a vertex arrives by both maps.
     """
     told = options.check_truth(truth, points)
     for what, file in (("curve", curve), ("picture", picture)):
         if file is not None and not told:
             raise OptionError(f"a {what} of errors needs ground truth", "give it with --truth or --points")
-    check_outputs([map_file, source, target, truth, *(points or ())], chart=curve, picture=picture)
+    check_outputs([map_file, source, target, truth, backward, *(points or ())], chart=curve, picture=picture)
     shapes = meshmatch.load_shape(source), meshmatch.load_shape(target)
+    back = None if backward is None else meshmatch.load_map(backward, *shapes[::-1])
     if map_file.is_dir():
-        found = meshmatch.Collection(map_file).maps_between(*shapes).forward
+        if backward is not None:
+            raise OptionError(
+                "--backward does not go with a folder of fits", "leave it out: the folder knows the way back"
+            )
+        both = meshmatch.Collection(map_file).maps_between(*shapes)
+        found, back = both.forward, both.backward
     else:
         found = meshmatch.load_map(map_file, *shapes)
     known = options.load_truth(truth, points, shapes[0])
     console = Console()
     with console.progress() as report:
-        result = meshmatch.evaluate(found, *shapes, known, seed=seed, progress=report)
+        result = meshmatch.evaluate(found, *shapes, known, backward=back, seed=seed, progress=report)
     if known is not None and result.errors is not None:
         if curve is not None:
             from meshmatch.render.charts import draw_curves
@@ -233,6 +242,10 @@ def _rows(result: "Evaluation", threshold: float) -> list[tuple[str, str, str]]:
     ]
     if result.distortion is not None:
         rows.append(("distortion", f"{result.distortion:.4f}", "sqrt(area), between random pairs of points"))
+    if result.dirichlet is not None:
+        rows.append(("dirichlet", f"{result.dirichlet:.3f}", "energy; 1 for an isometry"))
+    if result.bijectivity is not None:
+        rows.append(("bijectivity", f"{result.bijectivity:.4f}", "sqrt(area), from where the ways there and back lead"))
     if (folds := result.folds) is not None:
         rows += [
             ("flipped", f"{100 * folds.flipped:.2f} %", "of the source's area is turned over"),

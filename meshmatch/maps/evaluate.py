@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from meshmatch.arrays import Brief, Float, Floats, Floats32, Pickled, frozen, off_torch, table_html
 from meshmatch.errors import InputError
+from meshmatch.geometry.triangles import dot, squared_lengths, triangle_vectors
 from meshmatch.maps.folds import Folds
 from meshmatch.maps.geodesics import GEODESIC, GeodesicDistances
 from meshmatch.maps.vertex_map import VertexMap
@@ -174,6 +175,26 @@ def distortion(
     return float(np.abs(before - after)[pairs].mean()) if len(chosen) > 1 else 0.0
 
 
+def dirichlet_energy(found: VertexMap, source: Shape, target: Shape) -> float:
+    """Half of the integral of the squared gradient of a map over its source, both shapes scaled to area 1.
+
+    1 for an isometry; the rougher a map, the more. Triangles without area are left out.
+    """
+    images, verts = found.points(target) / np.sqrt(target.area), source.verts
+    faces = source.faces[source.valid_faces & (source.face_areas > 0)]
+    double, energy = np.sqrt(squared_lengths(triangle_vectors(verts, faces))), 0.0
+    for corner, left, right in (faces.T, faces.T[[1, 2, 0]], faces.T[[2, 0, 1]]):
+        cotangent = dot(verts[left] - verts[corner], verts[right] - verts[corner]) / double
+        energy += 0.25 * float((cotangent * squared_lengths(images[left] - images[right])).sum())
+    return energy
+
+
+def round_trip(found: VertexMap, backward: VertexMap, source: GeodesicDistances) -> float:
+    """How far from itself a vertex of the source arrives by a map and the one back, on average, in units of sqrt(area)."""
+    there_and_back = found.compose(backward).index
+    return float(source.between(np.arange(source.V), there_and_back).mean())
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """All measures of one map.
@@ -191,6 +212,12 @@ class Evaluation:
         Distances from the truth; None where it is not known.
     geodesic
         How distances along a surface are measured.
+    dirichlet
+        Dirichlet energy, both shapes scaled to area 1: 1 for an isometry, more for a rough map; None unless both are
+        meshes.
+    bijectivity
+        Mean distance between a vertex of the source and where the maps there and back lead, in units of sqrt(area); None
+        where the map back is not given, and for a cloud.
 
     Examples
     --------
@@ -204,6 +231,8 @@ class Evaluation:
     folds: Folds | None = None
     errors: Errors | None = None
     geodesic: str = GEODESIC
+    dirichlet: float | None = None
+    bijectivity: float | None = None
 
     def _repr_html_(self) -> str:
         rows = {name: f"{value:.4g}" for name, value in self.as_dict().items() if isinstance(value, float | int)}
@@ -226,6 +255,8 @@ class Evaluation:
             "coverage_vertices": self.coverage.vertices,
             "coverage_area": self.coverage.area,
             "distortion": self.distortion,
+            "dirichlet": self.dirichlet,
+            "bijectivity": self.bijectivity,
             **({} if self.folds is None else asdict(self.folds)),
         }
         if self.errors is not None:
@@ -249,17 +280,20 @@ def evaluate_map(
     source_points: ArrayLike | None = None,
     target_points: ArrayLike | None = None,
     *,
+    backward: VertexMap | None = None,
     rng: np.random.Generator | None = None,
     progress: ProgressCallback | None = None,
 ) -> Evaluation:
-    """Coverage, distortion and folds (if both shapes are meshes) and, where the truth is given as in `map_errors`, errors.
+    """Coverage, distortion, Dirichlet energy and folds (if both shapes are meshes), bijectivity where the map back is given
+    and, where the truth is given as in `map_errors`, errors.
 
     With `target_points` alone, entry i belongs to vertex i of the source. `rng` chooses the points of `distortion`;
     ``default_rng(0)`` if none is given. `InputError` if the map does not belong to these shapes, or the truth to them;
     or if the truth is given and the target is a cloud.
     """
     vertex_map = vertex_map.for_shapes(source, target)
-    over = errors = stretched = folds = None
+    over = errors = stretched = folds = energy = astray = None
+    backward = None if backward is None else backward.for_shapes(target, source, "the map back")
     report = Progress(progress, target.name).stage("measuring errors")
     if target_points is not None:
         source_points = np.arange(source.V) if source_points is None else source_points
@@ -268,5 +302,8 @@ def evaluate_map(
     if not source.is_cloud and not target.is_cloud:
         both = GeodesicDistances(source), over or GeodesicDistances(target)
         stretched = distortion(vertex_map.index, *both, rng or np.random.default_rng(0))
-        folds = Folds.of(vertex_map, source, target)
-    return Evaluation(coverage(vertex_map.index, target), stretched, folds, errors)
+        folds, energy = Folds.of(vertex_map, source, target), dirichlet_energy(vertex_map, source, target)
+    if backward is not None and not source.is_cloud:
+        astray = round_trip(vertex_map, backward, GeodesicDistances(source))
+    measured: dict[str, Any] = {"dirichlet": energy, "bijectivity": astray}
+    return Evaluation(coverage(vertex_map.index, target), stretched, folds, errors, **measured)

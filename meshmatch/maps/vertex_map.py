@@ -328,11 +328,14 @@ class VertexMap(Pickled):
             raise InputError(f"the map {_way(self)} needs {needed}, not an array of {numbers.shape}")
         return np.asarray(matrix @ numbers)
 
-    def functional(self, basis_source: ArrayLike, basis_target: ArrayLike) -> Float[Floats, "K_source K_target"]:
+    def functional(
+        self, basis_source: ArrayLike, basis_target: ArrayLike, mass: ArrayLike | None = None
+    ) -> Float[Floats, "K_source K_target"]:
         """The functional map C of this map (Ovsjanikov et al. 2012), which goes the other way: it takes coefficients of
         a function on the *target* to those of the pulled-back function on the *source*.
 
-        ``basis_source @ C`` is the least-squares fit to ``apply(basis_target)``.
+        ``basis_source @ C`` is the least-squares fit to ``apply(basis_target)``. With the vertex areas of the source for
+        ``mass`` it is that of the literature, and pyFM's for points within triangles. `map_from_functional` is the way back.
 
         Parameters
         ----------
@@ -340,6 +343,8 @@ class VertexMap(Pickled):
             (V_source, K_source) linearly independent functions, such as Laplacian eigenvectors, one a column.
         basis_target
             (V_target, K_target), the same on the target.
+        mass
+            (V_source,) how much each vertex of the source counts, positive; all the same by default.
 
         Returns
         -------
@@ -349,13 +354,20 @@ class VertexMap(Pickled):
         Raises
         ------
         InputError
-            As for `apply`; the source's functions do not have a row for each vertex; or a value is not finite.
+            As for `apply`; functions or masses of the source are not one for each vertex; or a value is not finite, or a
+            mass not positive.
         """
         basis = as_numbers(basis_source, "a basis", finite=True)
         V = self.source_vertices
         if basis.ndim != 2 or len(basis) != V:
             raise InputError(f"a basis of the source must be an array of ({V}, K), not {basis.shape}")
         pulled = self.apply(as_numbers(basis_target, "a basis", finite=True)).reshape(len(basis), -1)
+        if mass is not None:
+            areas = as_numbers(mass, "the masses", finite=True)
+            if areas.shape != (V,) or not (areas > 0).all():
+                raise InputError(f"the masses must be {V} positive numbers, one for each vertex of the source")
+            root = np.sqrt(areas)[:, None]
+            basis, pulled = root * basis, root * pulled
         return np.asarray(np.linalg.lstsq(basis, pulled, rcond=None)[0])
 
     def compose(self, other: VertexMap) -> VertexMap:

@@ -49,6 +49,14 @@ def test_without_truth_it_says_coverage_and_distortion(evaluate: Callable[[str],
     assert "mean error" not in answer.out
 
 
+def test_with_the_map_back_it_says_where_both_lead(evaluate: Callable[[str], Answer], folder: Path) -> None:
+    shown = evaluate("--backward map.npy").out
+    assert "bijectivity" in shown and "dirichlet" in shown
+    record = json.loads(evaluate("--backward map.npy --json").out)
+    assert 0.0 < record["bijectivity"] < 0.2 and record["dirichlet"] > 1.0
+    assert json.loads(evaluate("--json").out)["bijectivity"] is None
+
+
 @pytest.mark.parametrize(
     "truth",
     [
