@@ -7,10 +7,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from meshmatch.api.bound import bound_to, carried_along
 from meshmatch.api.results import MapPair, MovedMesh
 from meshmatch.api.transfer import MapLike, find_maps
 from meshmatch.arrays import Int, Ints
+from meshmatch.outputs import as_path
 from meshmatch.shapes.files import ShapeLike, as_shape
+from meshmatch.shapes.moved_files import check_into, save_moved
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.garment import carry_garment
 
@@ -35,6 +38,10 @@ class GarmentResult(MovedMesh):
         Time beside the match.
     original
         The garment's file, if it came from one.
+    binding
+        The skeleton that moves the garment in a .glb: the target's, or else its own, carried along.
+    body
+        The target's file, if it came from one.
 
     Examples
     --------
@@ -46,6 +53,29 @@ class GarmentResult(MovedMesh):
     sunk: Int[Ints, " M"]
     maps: MapPair
     seconds: float
+    body: Path | None = None
+
+    def save(self, path: str | Path, join: bool = False) -> None:
+        """Write the garment, as `MovedMesh.save`; or the target with the garment in it.
+
+        Parameters
+        ----------
+        path
+            Where to.
+        join
+            Put the garment into the target's file, a .glb, .gltf or .vrm, and write both as one .glb; a skeleton of the
+            target moves both.
+
+        Raises
+        ------
+        OptionError
+            The suffix is unknown, a material would replace another file, or the two cannot be joined.
+        OutputError
+            A file cannot be written.
+        """
+        if join:
+            check_into(self.body, as_path(path))
+        save_moved(path, self.original, self.shape, self.turns, self.binding, self.body if join else None)
 
     def _repr_html_(self) -> str:
         from meshmatch.api.notebook import carried_html
@@ -70,7 +100,8 @@ def transfer_garment(garment: ShapeLike, source: ShapeLike, target: ShapeLike, m
     source
         The body that it sits on: a mesh.
     target
-        The body that it will sit on. Out of a point cloud nothing is pushed.
+        The body that it will sit on; if its file has a skeleton, that moves the garment too. Out of a point cloud nothing
+        is pushed.
     match
         As in `find_maps`.
 
@@ -93,11 +124,15 @@ def transfer_garment(garment: ShapeLike, source: ShapeLike, target: ShapeLike, m
     """
     original = Path(garment) if isinstance(garment, str | Path) else None
     cloth = as_shape(garment, "garment")
+    body = Path(target) if isinstance(target, str | Path) else None
     source, target = as_shape(source, "source"), as_shape(target, "target")
     maps = find_maps(source, target, match)
     began = time.monotonic()
     with thread_limit(1):
         found = carry_garment(cloth, maps.forward, maps.source, maps.target, maps.threads)
-    shape = replace(cloth, verts=found.verts)
+        shape = replace(cloth, verts=found.verts)
+        binding = bound_to(maps, body, cloth, original) or carried_along(original, shape, target.upright)
     seconds = time.monotonic() - began
-    return GarmentResult(shape, found.turns, found.pushed, found.sunk, maps, seconds, original=original)
+    return GarmentResult(
+        shape, found.turns, found.pushed, found.sunk, maps, seconds, body, original=original, binding=binding
+    )

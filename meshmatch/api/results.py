@@ -24,6 +24,7 @@ from meshmatch.maps.unfold import unfolded
 from meshmatch.maps.vertex_map import VertexMap, check_map
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
+from meshmatch.shapes.formats.gltf_rigged import Binding
 from meshmatch.shapes.moved_files import save_moved
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
@@ -48,11 +49,14 @@ class MovedMesh(Brief):
         (V, 3, 3) how each vertex was turned.
     original
         The mesh's file, if it came from one.
+    binding
+        The skeleton that moves it in a .glb, if there is one.
     """
 
     shape: Shape
     turns: Float[Floats, "V 3 3"]
     original: Path | None = field(default=None, kw_only=True)
+    binding: Binding | None = field(default=None, kw_only=True)
 
     def save(self, path: str | Path) -> None:
         """Write the mesh; an .obj from an .obj keeps all of its text but the positions and the directions of normals, and
@@ -71,7 +75,7 @@ class MovedMesh(Brief):
         OutputError
             A file cannot be written.
         """
-        save_moved(path, self.original, self.shape, self.turns)
+        save_moved(path, self.original, self.shape, self.turns, self.binding)
 
 
 @dataclass(frozen=True, eq=False)

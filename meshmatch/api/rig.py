@@ -9,6 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from meshmatch.api.bound import INFLUENCES
 from meshmatch.api.results import MapPair
 from meshmatch.api.transfer import MapLike, find_maps
 from meshmatch.api.upright import trust
@@ -31,8 +32,6 @@ from meshmatch.transfer.weight_files import SkinWeights, load_weights
 
 Pose = Literal["rest", "source"]
 """How a rigged target stands: as it came, or as the source does."""
-INFLUENCES = 4
-"""Joints that may move a vertex: what all programs read."""
 check_rig_suffix = partial(tables.check_suffix, suffixes=(".glb",), what="rigs")
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from meshmatch.api import matching
+from meshmatch.api.bound import carried_along
 from meshmatch.api.inputs import LandmarkPairs
 from meshmatch.api.results import MatchResult, MovedMesh
 from meshmatch.arrays import Bool, Bools, Float, Floats
@@ -50,6 +51,8 @@ class WrapResult(MovedMesh):
         Time of the projection.
     original
         The base's file, if it came from one.
+    binding
+        The base's skeleton, with its joints where the skin around them lies now; in a .glb it moves the mesh.
 
     Examples
     --------
@@ -139,7 +142,9 @@ def wrap(
     with thread_limit(1):
         wrapped = wrap_onto(mesh, near.verts, surface, kept, found.threads)
     shape = replace(mesh, verts=wrapped.verts)
-    return WrapResult(shape, wrapped.turns, wrapped.distance, kept, found, time.monotonic() - began, original=original)
+    binding = carried_along(original, shape, surface.upright)
+    seconds = time.monotonic() - began
+    return WrapResult(shape, wrapped.turns, wrapped.distance, kept, found, seconds, original=original, binding=binding)
 
 
 def _free(base: Shape, numbers: ArrayLike) -> Bools:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from typer import Argument
+from typer import Argument, Option
 
 import meshmatch
 from meshmatch.cli.options import RunOptions, grouped, output_option
@@ -25,25 +25,28 @@ def transfer_garment(
     ),
     maps: MapOptions,
     run: RunOptions,
+    join: bool = Option(False, "--join", help="Write TGT, a .glb, .gltf or .vrm, with GARMENT in it, as one .glb."),
     picture: Picture = None,
 ) -> Json:
     """Transfer clothes, hair or other things that sit on one shape to another.
 
     GARMENT must lie on SRC, in its place and unit. Its vertices follow SRC to TGT, with their distance from the skin
     turned and scaled as the body is there, and are pushed out where they would sink below the skin of TGT. Vertex
-    order, polygons, texture coordinates, groups and materials stay.
+    order, polygons, texture coordinates, groups and materials stay. In a .glb GARMENT moves with the skeleton of TGT.
     """
-    from meshmatch.shapes.moved_files import MovedFile
+    from meshmatch.shapes.moved_files import MovedFile, check_into
 
     transfer = Transfer(source, target, output, maps, run, picture)
     console = transfer.console
+    if join:
+        check_into(target, output)
     worn = meshmatch.load_shape(garment)
     plan = MovedFile.planned(output, garment)
     plan.make_folders()
     with transfer.outputs(garment, files=plan.files) as temporary:
-        a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
-        result = meshmatch.transfer_garment(worn, a, b, transfer)
-        plan.write(temporary, result.shape, result.turns)
+        result = meshmatch.transfer_garment(garment, source, target, transfer)
+        plan.write(temporary, result.shape, result.turns, result.binding, target if join else None)
+    a, b = result.maps.source, result.maps.target
     if b.is_cloud:
         console.say(f"note: {transfer.names[1]} is a point cloud: nothing was pushed out of it")
     elif len(result.pushed):
@@ -51,6 +54,8 @@ def transfer_garment(
         console.say(f"{len(result.pushed)} of {worn.V} vertices ({share:.1f} %) were pushed out of {transfer.names[1]}")
     if len(result.sunk):
         console.warn(f"{len(result.sunk)} of {worn.V} vertices are below the skin of {transfer.names[1]}")
+    if result.binding is not None and output.suffix.lower() == ".glb":
+        console.say(f"{len(result.binding.rig.joints)} joints move {garment.name}")
     written = " ".join(str(file) for file in plan.files)
     console.say(f"wrote {written}: {garment.name} on {transfer.names[1]} ({result.seconds:.1f} s)")
     if picture is not None:
@@ -58,5 +63,5 @@ def transfer_garment(
 
         transfer.draw(result.maps, compose_worn((a, b), (worn, result.shape)))
     record = {"picture": picture, "files": [str(file) for file in plan.files], "vertices": worn.V}
-    record |= {"pushed_out": len(result.pushed), "below_skin": len(result.sunk)}
+    record |= {"joined": join, "pushed_out": len(result.pushed), "below_skin": len(result.sunk)}
     return transfer.record(record, result.maps, float(result.maps.forward.confidence.mean()))

@@ -42,6 +42,7 @@ def wrap(
     """
     import numpy as np
 
+    from meshmatch.api.bound import carried_along
     from meshmatch.outputs import replace_all_on_success
     from meshmatch.shapes.moved_files import MovedFile
 
@@ -64,7 +65,8 @@ def wrap(
             )  # fmt: skip
         found = result.match.map
         words.refuse_poor(run.strict, found.verdict, found.reasons, "the map")
-        plan.write(temporary, result.shape, result.turns)
+        binding = carried_along(base, result.shape, b.upright)
+        plan.write(temporary, result.shape, result.turns, binding)
     words.tell_match(console, result.match, names)
     words.tell_verdict(console, found.verdict, found.reasons, "the map")
     apart = result.distance[~result.free & a.valid]
@@ -72,6 +74,8 @@ def wrap(
     told = ", ".join(f"{what} {value:.4g}" for what, value in numbers.items())
     kept = f"; {len(np.unique(rows))} vertices kept their shape" if len(rows) else ""
     console.say(f"distance to {names[1]} (its size is {np.sqrt(b.area):.4g}): {told}{kept}")
+    if binding is not None and output.suffix.lower() == ".glb":
+        console.say(f"the {len(binding.rig.joints)} joints of {names[0]} have moved along")
     console.say(f"wrote {' '.join(map(str, plan.files))}: {names[0]} on {names[1]} ({result.seconds:.1f} s)")
     if picture is not None:
         from meshmatch.render.compose import compose_fit

@@ -7,19 +7,28 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError, warn
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.outputs import make_folder, replace_all_on_success
 from meshmatch.shapes.appearance import Appearance, BakedMaterial
+from meshmatch.shapes.colors import bytes_of
 from meshmatch.shapes.dressed_files import Dressed
 from meshmatch.shapes.files import check_suffix, save_shape
 from meshmatch.shapes.formats import gltf, obj_look, obj_text
+from meshmatch.shapes.formats.gltf_join import joined
 from meshmatch.shapes.formats.gltf_moved import moved
+from meshmatch.shapes.formats.gltf_rigged import Binding, rigged
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import find_appearance
+
+_WHITE = (1.0, 1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +79,27 @@ class MovedFile:
             if copy.parent != self.output.parent:
                 make_folder(copy.parent)
 
-    def write(self, places: Sequence[Path], shape: Shape, turns: Float[Floats, "V 3 3"]) -> None:
+    def write(
+        self,
+        places: Sequence[Path],
+        shape: Shape,
+        turns: Float[Floats, "V 3 3"],
+        binding: Binding | None = None,
+        into: Path | None = None,
+    ) -> None:
         """Write the moved mesh and the copies where they wait to get the names of `files`.
 
-        The shape has the original's vertices in its order; ``turns`` is the rotation around each of them. What the format
-        does not hold is told.
+        The shape has the original's vertices in its order; ``turns`` is the rotation around each of them. A skeleton moves
+        them in a glb, if there is a ``binding``; the glb may be put ``into`` another one, whose joints these are. What the
+        format does not hold is told.
         """
+        self._write_mesh(places, shape, turns, still=binding is None)
+        place = places[0]
+        if place.suffix.lower() == ".glb" and (binding is not None or into is not None):
+            add = partial(_added, shape=shape, binding=binding, into=into)
+            place.write_bytes(gltf.understood(self.output, place.read_bytes(), "scene makes", add))
+
+    def _write_mesh(self, places: Sequence[Path], shape: Shape, turns: Float[Floats, "V 3 3"], still: bool) -> None:
         for place, (_, file) in zip(places[1:], self.copies, strict=True):
             place.write_bytes(read_bytes(file))
         suffix, original = places[0].suffix.lower(), self.original
@@ -85,13 +109,13 @@ class MovedFile:
             return
         as_it_came = None
         if original is not None and suffix == ".glb" and original.suffix.lower() in gltf.SUFFIXES:
-            as_it_came = _scene(self.output, original, shape, turns)
+            as_it_came = _scene(self.output, original, shape, turns, still)
         if as_it_came is not None:
             places[0].write_bytes(as_it_came)
             return
         look = None
         with suppress(InputError):  # an image that is not there is no reason to lose the mesh
-            look = None if original is None or shape.is_cloud else find_appearance(original, shape)
+            look = None if original is None or shape.is_cloud else find_appearance(original, shape, plain=True)
         worn = _one_image(shape, look) if suffix == ".glb" and look is not None else None
         if worn is not None:
             worn.write(self.output, places[:1])
@@ -101,19 +125,48 @@ class MovedFile:
             warn(f"{self.output.name} does not have {lost} of {getattr(original, 'name', '')}")
 
 
-def save_moved(path: str | Path, original: Path | None, shape: Shape, turns: Float[Floats, "V 3 3"]) -> None:
+def save_moved(
+    path: str | Path,
+    original: Path | None,
+    shape: Shape,
+    turns: Float[Floats, "V 3 3"],
+    binding: Binding | None = None,
+    into: Path | None = None,
+) -> None:
     """Write a mesh that was read from a file and has moved; all files appear, or none. Errors as `MovedFile.planned`, and
     `OutputError` if a file cannot be written.
     """
     plan = MovedFile.planned(Path(path), original)
     plan.make_folders()
     with replace_all_on_success(plan.files) as places:
-        plan.write(places, shape, turns)
+        plan.write(places, shape, turns, binding, into)
 
 
-def _scene(output: Path, original: Path, shape: Shape, turns: Float[Floats, "V 3 3"]) -> bytes | None:
+def check_into(file: Path | None, output: Path) -> None:
+    """Refuse a file that nothing can be put into, or an output that is no glb (`OptionError`)."""
+    if file is None or file.suffix.lower() not in gltf.SUFFIXES:
+        name = "the target" if file is None else file.name
+        raise OptionError(f"nothing can be put into {name}", f"the target must be one of {', '.join(gltf.SUFFIXES)}")
+    if output.suffix.lower() != ".glb":
+        raise OptionError(f"{output.name} cannot hold the target and what is put into it", "end the output in .glb")
+
+
+def _added(document: gltf.Document, shape: Shape, binding: Binding | None, into: Path | None) -> bytes:
+    """The glb of a mesh with its skeleton, or in another one."""
+    if binding is not None:
+        verts = document.scene().verts
+        # where a texture has seams there are copies of vertices
+        rows = np.arange(shape.V) if len(verts) == shape.V else cKDTree(shape.verts).query(verts)[1]
+        binding = binding.of(rows)
+    if into is not None:
+        return gltf.understood(into, read_bytes(into), "scene makes", lambda body: joined(body, document, binding))
+    assert binding is not None
+    return rigged(document, binding)[0]
+
+
+def _scene(output: Path, original: Path, shape: Shape, turns: Float[Floats, "V 3 3"], still: bool) -> bytes | None:
     """The original's scene with its vertices moved; None where it draws copies of a mesh, which cannot move apart. That
-    joints do not move is told.
+    joints stay ``still`` is told.
     """
 
     def made(document: gltf.Document) -> tuple[bytes, bool] | None:
@@ -122,18 +175,22 @@ def _scene(output: Path, original: Path, shape: Shape, turns: Float[Floats, "V 3
         return moved(document, shape.verts_or_nan, turns), bool(document.json.get("skins"))
 
     found = gltf.understood(original, read_bytes(original), "scene makes", made)
-    if found is not None and found[1]:
-        still = f"the joints of {original.name} stay where they are in {output.name}"
-        warn(f"{still}: `meshmatch transfer-rig {original.name} {output.name}` moves them")
+    if found is not None and found[1] and still:
+        where = f"the joints of {original.name} stay where they are in {output.name}"
+        warn(f"{where}: `meshmatch transfer-rig {original.name} {output.name}` moves them")
     return None if found is None else found[0]
 
 
 def _one_image(shape: Shape, look: Appearance) -> Dressed | None:
-    """The mesh with its texture, if that is all that its look says."""
+    """The mesh with its texture, or its one color, if that is all that its look says."""
     made = look.materials[0]
-    if len(look.materials) != 1 or look.colors is not None or made.image is None:
+    if len(look.materials) != 1 or look.colors is not None or (made.image is None and made.factor == _WHITE):
         return None
-    return Dressed(shape, None, look.uv, False, BakedMaterial(made.image, made.alpha, made.cutoff, made.name))
+    image, uv = made.image, look.uv
+    if image is None:
+        color = np.append(bytes_of(np.array(made.factor[:3], np.float32)), np.uint8(round(255 * made.factor[3])))
+        image, uv = np.tile(color.astype(np.uint8), (4, 4, 1)), np.full_like(uv, 0.5)
+    return Dressed(shape, None, uv, False, BakedMaterial(image, made.alpha, made.cutoff, made.name))
 
 
 def _lost(original: Path | None, look: Appearance | None, textured: bool) -> str:

@@ -47,9 +47,11 @@ def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
 
 
 def find_appearance(
-    path: str | Path, shape: Shape, image: str | Path | None = None, finished: bool = False
+    path: str | Path, shape: Shape, image: str | Path | None = None, finished: bool = False, plain: bool = False
 ) -> Appearance | None:
-    """As `load_appearance`, but None where the file has no look at all, and with a finish only if that is asked for."""
+    """As `load_appearance`, but None where the file has no look at all, unless ``plain`` looks of one color are wanted too;
+    and with a finish only if that is asked for.
+    """
     path = Path(path)
     suffix, reader = path.suffix.lower(), ImageReader()
     picture = None if image is None else reader.decode(read_bytes(Path(image)), Path(image).name)
@@ -64,7 +66,7 @@ def find_appearance(
         raise InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
     if finished and suffix in _FINISHES:
         found = replace(found, finish=_FINISHES[suffix](path, read_bytes(path), shape, reader))
-    return None if found.plain else appearance.visible(found, path.name)
+    return None if found.plain and not plain else appearance.visible(found, path.name)
 
 
 def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] | None:

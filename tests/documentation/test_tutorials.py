@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from meshmatch.cli import main
+from meshmatch.maps.files import load_map
+from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.dressed_files import save_textured
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.formats import Textured
+from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.formats.gltf_rig import Clip, Rig, Track
+from meshmatch.shapes.formats.gltf_rigged import Binding, rigged
+from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.textured_files import load_appearance
+from tests.shapes.painted import quarters
+from tests.transfer.rigs import played
 
 ROOT = Path(__file__).resolve().parents[2]
 WRITTEN = {
@@ -29,6 +46,75 @@ def run(words: list[str], source: str, folder: Path) -> None:
         words, input=source, cwd=folder, env=os.environ | {"PATH": path}, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
+
+
+def write_hero(folder: Path) -> None:
+    """A small dancer with a picture, a skeleton of three joints and a clip; a shirt on it; and a small climber."""
+    body = decimate(load_shape(ROOT / "templates" / "samples" / "dancer.ply"), 1500)
+    low, high = body.bounds
+    x, y = ((body.verts[:, k] - low[k]) / (high[k] - low[k]) for k in (0, 1))
+    uv = np.stack([x, 1 - y], axis=1)[body.faces]
+    plain = folder / "plain.glb"
+    save_textured(plain, Textured(body.verts, body.faces, uv), quarters(64))
+    weights = np.stack([np.clip(5 * y - 2, 0, 1), np.clip(2 - 5 * y, 0, 1)], axis=1)  # above and below the hips
+    turns = Rotation.from_rotvec(np.sin(np.linspace(0, 2 * np.pi, 9))[:, None] * [0.0, 1, 0]).as_quat()
+    clip = Clip("walk", (Track(2, "rotation", np.linspace(0, 1, 9), turns, "LINEAR"),))
+    hips = np.array([(low + high)[0] / 2, low[1] + 0.4 * (high - low)[1], (low + high)[2] / 2])
+    places = np.array([[0.0, 0, 0], hips, [0, 0, 0]])
+    still = np.tile([0.0, 0, 0, 1], (3, 1))
+    names, parents = ("root", "hips", "chest"), np.array([-1, 0, 1])
+    rig = Rig(names, parents, np.array([1, 2]), still, places, np.ones((3, 3)), (clip,))
+    document = Document(plain, plain.read_bytes())
+    seen = cKDTree(body.verts).query(load_shape(plain).verts)[1]
+    joints = np.tile(np.array([1, 0], np.int32), (len(seen), 1))
+    binding = Binding(rig, rig.worlds(), joints, weights[seen].astype(np.float32))
+    (folder / "hero.glb").write_bytes(rigged(document, binding)[0])
+    plain.unlink()
+    upper = ((y > 0.5) & (y < 0.8) & (np.abs(x - 0.5) < 0.2))[body.faces].all(axis=1)
+    used, faces = np.unique(body.faces[upper], return_inverse=True)
+    shirt = Shape(body.verts[used] + 0.01 * np.ptp(y) * body.vertex_normals[used], faces.reshape(-1, 3))
+    save_shape(folder / "jacket.obj", shirt)
+    text = (folder / "jacket.obj").read_text()
+    (folder / "jacket.obj").write_text(f"mtllib jacket.mtl\nusemtl wool\n{text}")
+    (folder / "jacket.mtl").write_text("newmtl wool\nKd 0.5 0 0\n")
+    save_shape(folder / "body.ply", decimate(load_shape(ROOT / "templates" / "samples" / "climber.ply"), 1500))
+
+
+@pytest.mark.filterwarnings("ignore::meshmatch.errors.MeshmatchWarning")
+def test_two_files_become_a_walking_textured_dressed_character(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In at most eight commands; what each of them writes is what the page says."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("meshmatch.render.picture.HEIGHT", 160)
+    write_hero(tmp_path)
+    section = (ROOT / "docs" / "artist.md").read_text(encoding="utf-8").split("## 6. A walking")[1].split("\n## ")[0]
+    block = re.search(r"^```text\n(.*?)^```$", section, re.MULTILINE | re.DOTALL)
+    assert block is not None
+    commands = block[1].splitlines()
+    assert 0 < len(commands) <= 8
+    for command in commands:
+        assert main(shlex.split(command)[1:]) == 0, command
+    body = load_shape("body.ply")
+    assert load_map("map.npz", "hero.glb", body).verdict != "poor"
+    for name in ("walking", "textured", "character"):
+        path = tmp_path / f"{name}.glb"
+        there = load_shape(path)
+        before, after = played(path), played(path, "walk", 0.25)
+        heights = there.verts[:, 1] - there.verts[:, 1].min()
+        upper = heights > 0.7 * heights.max()
+        assert np.linalg.norm(after - before, axis=1)[upper].mean() > 0.05 * heights.max(), name
+        assert np.ptp(there.verts[:, 1]) == pytest.approx(np.ptp(body.verts[:, 2]), rel=1e-3)  # it stands along y
+    pixels = np.asarray(load_appearance("textured.glb", load_shape("textured.glb")).materials[0].image)
+    colors, many = np.unique(pixels.reshape(-1, 4) // 128, axis=0, return_counts=True)
+    assert (many > 0.02 * len(pixels) ** 2).sum() >= 4, colors  # all four quarters of the picture
+    document = Document(tmp_path / "character.glb", (tmp_path / "character.glb").read_bytes())
+    worn = [node for node in document.nodes if "mesh" in node]
+    assert [node.get("name") for node in worn] == ["body.ply", "jacket"]
+    first, second = (document.json["skins"][node["skin"]]["joints"] for node in worn)
+    assert first == second
+    skin, jacket = load_shape("textured.glb"), load_shape("character.glb").verts[load_shape("textured.glb").V :]
+    away = cKDTree(skin.verts).query(jacket)[0] / np.sqrt(skin.area)
+    assert len(jacket) > 50 and away.max() < 0.1
+    assert Path("character.png").stat().st_size > 1000
 
 
 @pytest.mark.slow

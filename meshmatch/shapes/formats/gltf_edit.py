@@ -72,6 +72,19 @@ class Editor:
         self._size += len(padded)
         return start
 
+    def add_buffer(self, other: Editor) -> None:
+        """Put the data of another document behind this one's, and let its buffer views point there."""
+        start = self._append(b"".join(other._chunks))
+        for view in other.json.get("bufferViews", []):
+            view["byteOffset"] = view.get("byteOffset", 0) + start
+
+    def draw(self, document: Document, node: int) -> None:
+        """Let a new node hang from nothing in the scene."""
+        if self.json.get("scenes"):
+            self.json["scenes"][self.json.get("scene", 0)].setdefault("nodes", []).append(node)
+        else:
+            self.json |= {"scenes": [{"nodes": [*document.roots(), node]}], "scene": 0}
+
     def add_view(self, data: bytes, target: int | None = None) -> int:
         """The number of a new buffer view."""
         view = {"buffer": 0, "byteOffset": self._append(data), "byteLength": len(data)}

@@ -72,12 +72,12 @@ def rigged(document: Document, binding: Binding) -> tuple[bytes, int]:
     seen = 0
     for number, parts in drawn(document).items():
         node = editor.json["nodes"][number]
-        frame = _frame(document, number, parts)
+        frame = frame_of(document, number, parts)
         mesh = editor.own_mesh(number)  # other weights for each node
         for k, part in parts.items():
             own = mesh["primitives"][k]
             if frame is None:
-                _straighten(editor, document, number, part, own)
+                straighten(editor, document, number, part, own)
             attributes = own["attributes"]
             for key in [key for key in attributes if key.startswith(("JOINTS_", "WEIGHTS_"))]:
                 del attributes[key]
@@ -90,7 +90,9 @@ def rigged(document: Document, binding: Binding) -> tuple[bytes, int]:
         if standing.tobytes() not in skins:
             inverse = (back @ standing).swapaxes(1, 2).reshape(-1, 16)
             entry: dict[str, Any] = {"name": rig.names[0], "joints": [names[joint] for joint in rig.joints.tolist()]}
-            entry |= {"inverseBindMatrices": editor.add_array(inverse.astype("<f4")), "skeleton": names[0]}
+            entry["inverseBindMatrices"] = editor.add_array(inverse.astype("<f4"))
+            if (rig.parents < 0).sum() == 1:
+                entry["skeleton"] = names[0]
             skins[standing.tobytes()] = editor.add("skins", entry)
         if "skin" in node:
             before.add(node["skin"])
@@ -127,16 +129,16 @@ def _add_nodes(editor: Editor, document: Document, rig: Rig) -> list[int]:
     """The numbers of the skeleton's nodes in the document."""
     names = [editor.add_node(*each) for each in zip(rig.names, rig.rotations, rig.translations, strict=True)]
     for node, parent in enumerate(rig.parents.tolist()):
+        if np.any(rig.scales[node] != 1.0):
+            editor.json["nodes"][names[node]]["scale"] = rig.scales[node].tolist()
         if parent >= 0:
             editor.json["nodes"][names[parent]].setdefault("children", []).append(names[node])
-    if editor.json.get("scenes"):
-        editor.json["scenes"][editor.json.get("scene", 0)].setdefault("nodes", []).append(names[0])
-    else:
-        editor.json |= {"scenes": [{"nodes": [*document.roots(), names[0]]}], "scene": 0}
+        else:
+            editor.draw(document, names[node])
     return names
 
 
-def _frame(document: Document, number: int, parts: dict[int, dict[str, Any]]) -> Float[Floats, "4 4"] | None:
+def frame_of(document: Document, number: int, parts: dict[int, dict[str, Any]]) -> Float[Floats, "4 4"] | None:
     """What puts the vertices of a node where they stand in the scene; None where a skin bends them."""
     place = document.world[number]
     if "skin" not in document.nodes[number]:
@@ -156,7 +158,7 @@ def _frame(document: Document, number: int, parts: dict[int, dict[str, Any]]) ->
     return frame
 
 
-def _straighten(editor: Editor, document: Document, number: int, part: dict[str, Any], own: dict[str, Any]) -> None:
+def straighten(editor: Editor, document: Document, number: int, part: dict[str, Any], own: dict[str, Any]) -> None:
     """Store the vertices of a primitive where a skin puts them, and turn what belongs to them."""
     place = document.world[number]
 

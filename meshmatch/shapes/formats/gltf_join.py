@@ -1,0 +1,95 @@
+"""One glTF scene put into another: what is drawn in it is added, with its materials and images.
+
+Specification: Khronos glTF 2.0, sections 3.5 and 3.7.3.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+
+from meshmatch.arrays import Floats
+from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.formats.gltf_attributes import joint_nodes
+from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor, drawn
+from meshmatch.shapes.formats.gltf_prune import references
+from meshmatch.shapes.formats.gltf_rigged import Binding, frame_of, straighten
+
+_KINDS = ("bufferViews", "accessors", "images", "samplers", "textures", "materials", "meshes")
+_VARIANTS = "KHR_materials_variants"
+
+
+def joined(document: Document, added: Document, binding: Binding | None) -> bytes:
+    """A scene as a glb with all that another one draws, each mesh on a node of its own, as it stands there.
+
+    Parameters
+    ----------
+    document
+        The scene; what is in it stays as it is.
+    added
+        What is put into it. Its clips, cameras and lights stay out.
+    binding
+        How the joints of the scene, in the order of `joint_nodes`, move the vertices that are added; a scene without joints
+        moves none.
+    """
+    editor, joints = Editor(document), joint_nodes(document)
+    parts = drawn(added)
+    meshes, frames = _taken_over(editor, added, parts)
+    where, shares = (None, None) if binding is None or not joints else binding.table()
+    seen = 0
+    for (number, own), mesh, frame in zip(parts.items(), meshes, frames, strict=True):
+        held = editor.json["meshes"][mesh]
+        entry: dict[str, Any] = {"mesh": mesh}
+        if name := added.nodes[number].get("name") or held.get("name"):
+            entry["name"] = name
+        for k, part in own.items():
+            some = slice(seen, seen + added.count(part["attributes"]["POSITION"]))
+            seen = some.stop
+            attributes = held["primitives"][k]["attributes"]
+            for key in [key for key in attributes if key.startswith(("JOINTS_", "WEIGHTS_"))]:
+                del attributes[key]
+            if where is not None and shares is not None:
+                attributes["JOINTS_0"] = editor.add_array(where[some], target=VERTICES)
+                attributes["WEIGHTS_0"] = editor.add_array(shares[some], target=VERTICES)
+        if binding is None or not joints:
+            entry["matrix"] = frame.T.ravel().tolist()
+        else:
+            back = np.linalg.inv(binding.bind[binding.rig.joints]) @ frame
+            inverse = editor.add_array(back.swapaxes(1, 2).reshape(-1, 16).astype("<f4"))
+            entry["skin"] = editor.add("skins", {"joints": joints, "inverseBindMatrices": inverse})
+        editor.draw(document, editor.add("nodes", entry))
+    return editor.to_bytes()
+
+
+def _taken_over(
+    editor: Editor, added: Document, parts: dict[int, dict[int, dict[str, Any]]]
+) -> tuple[list[int], list[Floats]]:
+    """Put the meshes of nodes, with all that they refer to, into another document; returns their numbers there, and what
+    puts their vertices where they stand.
+    """
+    other = Editor(added)
+    offset = {kind: len(editor.json.get(kind, [])) for kind in _KINDS}
+    meshes = [copy.deepcopy(other.json["meshes"][added.nodes[number]["mesh"]]) for number in parts]
+    frames = []
+    for (number, own), mesh in zip(parts.items(), meshes, strict=True):
+        frame = frame_of(added, number, own)
+        for k, part in own.items() if frame is None else ():
+            straighten(other, added, number, part, mesh["primitives"][k])
+        frames.append(np.eye(4) if frame is None else frame)
+    other.json |= {"meshes": meshes, "skins": [], "animations": []}
+    for kind, holder, key in references(other.json):
+        holder[key] += offset[kind]
+    for primitive in [primitive for mesh in meshes for primitive in mesh["primitives"]]:
+        primitive.get("extensions", {}).pop(_VARIANTS, None)
+        if "material" in primitive:
+            primitive["material"] += offset["materials"]
+    editor.add_buffer(other)
+    for kind in _KINDS:
+        if entries := other.json.get(kind):
+            editor.json.setdefault(kind, []).extend(entries)
+    for key in ("extensionsUsed", "extensionsRequired"):
+        if listed := [*editor.json.get(key, []), *other.json.get(key, [])]:
+            editor.json[key] = list(dict.fromkeys(listed))
+    return [offset["meshes"] + k for k in range(len(meshes))], frames
