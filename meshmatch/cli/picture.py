@@ -246,9 +246,10 @@ def _compose_fit(
     """The template over a shape, from the file of a fit or by a model, which is fitted now."""
     from meshmatch.render.compose import compose_fit
     from meshmatch.shapes.files import SUFFIXES
+    from meshmatch.shapes.input_files import suffix_of
 
     file = Path(fit)
-    if file.is_file() or file.suffix.lower() in SUFFIXES:
+    if file.is_file() or suffix_of(file) in SUFFIXES:
         return compose_fit(shape, meshmatch.load_shape(file), limits=shown.range)
     locate_model(fit)
     config = meshmatch.FitConfig(seed=shown.seed, up=look.up, front=look.front)

@@ -246,6 +246,7 @@ def _files(
     """
     from meshmatch.collections.sources import find_sources
     from meshmatch.collections.stores import Store
+    from meshmatch.shapes.input_files import stem_of
 
     fits = target[0] / _FITS
     if len(target) == 1 and fits.is_file():
@@ -259,7 +260,7 @@ def _files(
         found = {source.name: Path(source.path) for source in sources}
     taken = {os.path.realpath(path) for path in others if path is not None}
     own = os.path.realpath(others[0])
-    source = next((name for name, file in found.items() if os.path.realpath(file) == own), others[0].stem)
+    source = next((name for name, file in found.items() if os.path.realpath(file) == own), stem_of(others[0]))
     found = {name: file for name, file in found.items() if os.path.realpath(file) not in taken}
     if not found:
         raise InputError(f"there is no target in {target[0]}", "name files or folders of shapes")

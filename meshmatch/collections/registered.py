@@ -17,7 +17,7 @@ from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.superimpose import Scale
 from meshmatch.errors import InputError
 from meshmatch.shapes.files import PLAIN_SUFFIXES, load_shape
-from meshmatch.shapes.input_files import read_text
+from meshmatch.shapes.input_files import read_text, stem_of, suffix_of
 from meshmatch.shapes.tables import read_by_suffix
 
 _IN_MEMORY = 256 * 2**20  # bytes; more are kept in a temporary file
@@ -52,8 +52,8 @@ def registered_meshes(folder: str | Path) -> Iterator[Registered]:
 
     `InputError`: fewer than three meshes, two of one name, or meshes that do not share vertices and faces.
     """
-    files = sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in PLAIN_SUFFIXES and path.is_file())
-    names = tuple(path.stem for path in files)
+    files = sorted(path for path in Path(folder).iterdir() if suffix_of(path) in PLAIN_SUFFIXES and path.is_file())
+    names = tuple(stem_of(path) for path in files)
     if len(files) < 3:
         raise InputError(f"{folder} holds {len(files)} meshes", "an atlas needs three or more, registered")
     twice = next((name for name in names if names.count(name) > 1), None)

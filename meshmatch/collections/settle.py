@@ -16,7 +16,6 @@ from meshmatch.api.kinds import choose_model
 from meshmatch.collections.setting import FIRST, FIRST_TEMPLATE, TEMPLATE, Setting, Source
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError, OptionError
-from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.fitting.without_model import mean_shape, template_of
 from meshmatch.models.registry import AUTO, NO_MODEL
@@ -42,9 +41,9 @@ def settled(wish: Setting, sources: Sequence[Source]) -> Setting:
     check_config(wish.config)
     store, about, model = wish.store, read_about(wish.store), wish.model
     if model == AUTO:
-        model = _chosen(sources, wish.config) if about is None else str(about["model"])
+        model = _chosen(sources, wish) if about is None else str(about["model"])
     if model == NO_MODEL:
-        template, file = _first_template(store, sources, about is None), FIRST_TEMPLATE
+        template, file = _first_template(wish, sources, about is None), FIRST_TEMPLATE
     else:
         trained = as_model(model)
         template, file = trained.template, TEMPLATE
@@ -71,16 +70,16 @@ def _differing(name: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> 
     return f"{name}: {then}, not {wanted}" if isinstance(then, str | int | float) else name
 
 
-def _first_template(store: Store, sources: Sequence[Source], new: bool) -> Template:
+def _first_template(wish: Setting, sources: Sequence[Source], new: bool) -> Template:
     """Without a model, the shape that is nearest to some others, as a template; the one of before, if there is one."""
     if not new:
-        with store.reading(FIRST_TEMPLATE) as path:
+        with wish.store.reading(FIRST_TEMPLATE) as path:
             return load_template(path)
     some = np.unique(np.linspace(0, len(sources) - 1, min(len(sources), _COMPARED)).astype(int))
     found = []
     for number in some:
         with suppress(MeshmatchError):
-            found.append(validated(sources[number].load()))
+            found.append(validated(sources[number].load(wish.only, wish.without)))
     if not found:
         raise InputError(f"none of {len(some)} shapes can be a template", "are they meshes?")
     chosen = found[medoid(found, "rigid", "area", 0)]
@@ -103,12 +102,12 @@ def on_the_mean(setting: Setting, names: Sequence[str]) -> Setting:
     return replace(setting, template_file=TEMPLATE, template_hash=mean.hash)
 
 
-def _chosen(sources: Sequence[Source], config: FitConfig) -> str:
+def _chosen(sources: Sequence[Source], wish: Setting) -> str:
     """The installed model that knows the kind of the first shape which can be read and is of a known kind."""
     trouble: MeshmatchError | None = None
     for source in sources[:_READ_AHEAD]:
         try:
-            chosen = choose_model([usable(source.load())], [config]).model
+            chosen = choose_model([usable(source.load(wish.only, wish.without))], [wish.config]).model
         except MeshmatchError as error:
             trouble = trouble or error
         else:

@@ -14,6 +14,7 @@ from meshmatch.collections.stores import Store, is_url
 from meshmatch.errors import InputError, warn
 from meshmatch.outputs import as_path, plain_text
 from meshmatch.shapes.files import SUFFIXES
+from meshmatch.shapes.input_files import stem_of, suffix_of
 
 _COMPANIONS = {
     ".mtl",
@@ -51,6 +52,8 @@ _COMPANIONS = {
     ".tps",
     ".pp",
     ".safetensors",
+    ".raw",
+    ".zraw",
     ".zip",
 }  # what lies beside shapes and is none
 _NAMED = 5  # of the files that are not read
@@ -95,21 +98,21 @@ def _sources(given: str | Path, output: Store) -> Iterable[Source]:
         return _of_folder(Store.of(path), output)
     if not path.exists() and any(mark in str(given) for mark in _PATTERN):
         files = [Path(match) for match in glob.glob(str(path), recursive=True)]
-        files = [file for file in files if file.suffix.lower() in SUFFIXES]
+        files = [file for file in files if suffix_of(file) in SUFFIXES]
     else:
         files = [path]
-    return [Source(file.stem, Store.of(file.parent), file.name) for file in files]
+    return [Source(stem_of(file), Store.of(file.parent), file.name) for file in files]
 
 
 def _of_folder(folder: Store, output: Store) -> list[Source]:
     """The shapes of a folder. Files of unknown formats are told."""
     found = [PurePosixPath(name) for name in folder.names()]
     found = [file for file in found if not f"{folder.location}/{file}".startswith(f"{output.location}/")]
-    files = [file for file in found if file.suffix.lower() in SUFFIXES]
-    other = [str(file) for file in found if file.suffix.lower() not in (*SUFFIXES, *_COMPANIONS) and file.suffix]
+    files = [file for file in found if suffix_of(file) in SUFFIXES]
+    other = [str(file) for file in found if suffix_of(file) not in (*SUFFIXES, *_COMPANIONS) and file.suffix]
     if other:
         names = ", ".join(other[:_NAMED]) + (f" and {len(other) - _NAMED} more" if len(other) > _NAMED else "")
         warn(f"{folder.location}: files of unknown format are left out: {plain_text(names)}")
     for beside in (set(blender.SUFFIXES), {".npy"}):
         files = [file for file in files if file.suffix.lower() not in beside] or files
-    return [Source(str(file.with_suffix("")), folder, str(file)) for file in files]
+    return [Source(str(file.with_name(stem_of(file))), folder, str(file)) for file in files]

@@ -18,7 +18,7 @@ from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import is_watertight
 from meshmatch.shapes.files import PLAIN_SUFFIXES, load_shape
-from meshmatch.shapes.input_files import existing, read_npz
+from meshmatch.shapes.input_files import existing, read_npz, suffix_of
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -50,7 +50,7 @@ def read_implicit_samples(folder: str | Path, seed: int = 0) -> ImplicitSamples:
 
     `InputError` if there are fewer than two, or one cannot be read or tells no inside: a mesh with holes.
     """
-    files = sorted(file for file in Path(folder).glob("*") if file.suffix.lower() in _KINDS)
+    files = sorted(file for file in Path(folder).glob("*") if suffix_of(file) in _KINDS)
     names = tuple(file.stem for file in files)
     if len(files) < 2 or len(set(names)) < len(names):
         hint = f"give a folder of watertight meshes, clouds or .npz ({', '.join(sorted(_KINDS))}), each once"

@@ -13,7 +13,7 @@ from meshmatch.shapes.blend_shapes import BlendShapes
 from meshmatch.shapes.files import SUFFIXES, load_shape
 from meshmatch.shapes.formats import gltf
 from meshmatch.shapes.formats.gltf_morphs import read_morphs
-from meshmatch.shapes.input_files import existing, read_bytes, read_npz
+from meshmatch.shapes.input_files import existing, read_bytes, read_npz, suffix_of
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import write_npz
 
@@ -48,7 +48,7 @@ def load_blend_shapes(given: str | Path | Sequence[str | Path], neutral: Shape) 
     files = [as_path(given)] if isinstance(given, str | Path) else [as_path(each) for each in given]
     if len(files) == 1 and files[0].is_dir():
         folder = files[0]
-        files = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
+        files = sorted(file for file in folder.iterdir() if suffix_of(file) in SUFFIXES and file.is_file())
         if not files:
             raise InputError(f"there are no shapes in {folder}", _HINT)
     elif len(files) == 1 and files[0].suffix.lower() in (".npz", *gltf.SUFFIXES):

@@ -23,8 +23,8 @@ from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import as_path, plain_text, replace_on_success
 from meshmatch.shapes import tables
 from meshmatch.shapes.colors import INVISIBLE
-from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, obj, off, plain, ply, stl, vtk, vtk_xml
-from meshmatch.shapes.input_files import existing, read_bytes
+from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, label_maps, obj, off, plain, ply, stl, vtk, vtk_xml
+from meshmatch.shapes.input_files import LABEL_MAP_SUFFIXES, existing, read_bytes, suffix_of
 from meshmatch.shapes.other_libraries import HINT, arrays_of, as_faces
 from meshmatch.shapes.parts import Parts
 from meshmatch.shapes.shape import Shape
@@ -42,6 +42,7 @@ _FORMATS: dict[str, tuple[Callable[[Path, bytes], Raw], Callable[[Path, Shape], 
     ".vtk": (vtk.read, vtk.write_vtk),
     ".vtp": (vtk_xml.read, vtk.write_vtp),
     ".vtu": (vtk_xml.read, None),
+    **dict.fromkeys(LABEL_MAP_SUFFIXES, (label_maps.read, None)),
 }
 _WRITERS = {suffix: write for suffix, (_, write) in _FORMATS.items() if write is not None}
 SUFFIXES = tuple(_FORMATS)
@@ -49,6 +50,8 @@ SUFFIXES = tuple(_FORMATS)
 PLAIN_SUFFIXES = tuple(suffix for suffix in SUFFIXES if suffix not in blender.SUFFIXES)
 """Those that need no Blender: what is looked for in a folder."""
 check_suffix = partial(tables.check_suffix, suffixes=_WRITERS, what="shapes")
+
+_NAMED = 10  # labels in one line
 
 Choice: TypeAlias = str | int | Sequence[str | int]
 """Meshes of a scene by name, or parts of a mesh by number: one or several."""
@@ -101,6 +104,13 @@ def load_shapes(paths: Sequence[str | Path], *, only: Choice = (), without: Choi
     chosen, left_out = ([str(name) for name in each] for each in names)
     found = [_read(path) for path in paths]
     if not (chosen or left_out):
+        for shape, raw in found:
+            if len(raw.meshes) > 1 and _is_label_map(shape):
+                labels = ", ".join(" or ".join(names) for names, _ in raw.meshes[:_NAMED])
+                more = f" and {len(raw.meshes) - _NAMED} more" if len(raw.meshes) > _NAMED else ""
+                warn(
+                    f"{shape.name} holds {len(raw.meshes)} labels, and all are read: {labels}{more}; choose with --only"
+                )
         return [shape for shape, _ in found]
     known = [_Named(shape, raw.meshes) for shape, raw in found]
     for pattern in (*chosen, *left_out):
@@ -121,10 +131,14 @@ class _Named:
         return Parts.of(self.shape)
 
     def of(self, pattern: str) -> Bool[Bools, " V"] | None:
-        """The vertices of the meshes of a name, or of the part of a number; None if there is none."""
+        """The vertices of the meshes of a name, or of the part of a number; None if there is none. Numbers of a label map
+        are those of labels alone.
+        """
         called = [any(fnmatchcase(each.lower(), pattern.lower()) for each in names) for names, _ in self.meshes]
         if any(called):
             return np.repeat(np.array(called), [count for _, count in self.meshes])
+        if _is_label_map(self.shape):
+            return None
         if pattern.isdecimal() and len(pattern) < 10 and 0 < int(pattern) <= len(self.parts):
             return np.asarray(self.parts.number == int(pattern))
         return None
@@ -143,21 +157,26 @@ class _Named:
         return replace(self.shape, weights=kept.astype(float))
 
 
+def _is_label_map(shape: Shape) -> bool:
+    return suffix_of(Path(shape.name)) in LABEL_MAP_SUFFIXES
+
+
 def _nothing_called(pattern: str, known: Sequence[_Named]) -> InputError:
     files = " or ".join(each.shape.name for each in known)
-    if pattern.isdecimal():
+    what = "label" if any(_is_label_map(each.shape) for each in known) else "mesh"
+    if pattern.isdecimal() and what == "mesh":
         last = ", ".join(f"{each.shape.name}: {len(each.parts)}" for each in known)
         return InputError(f"{files} has no part {pattern[:20]}", f"number of parts: {last}; see `meshmatch info`")
     names = ", ".join(dict.fromkeys(names[0] for each in known for names, _ in each.meshes if names))
     if not any(each.meshes for each in known):
         hint = "meshes of .glb and .gltf files have names; of others choose parts by number, see `meshmatch info`"
         return InputError(f"{files} names no meshes to choose from", hint)
-    return InputError(f"no mesh of {files} is called {pattern[:80]!r}", f"there are: {names[:200] or 'none'}")
+    return InputError(f"no {what} of {files} is called {pattern[:80]!r}", f"there are: {names[:200] or 'none'}")
 
 
 def _read(path: str | Path) -> tuple[Shape, Raw]:
     path = existing(as_path(path), suffixes=SUFFIXES)
-    suffix = path.suffix.lower()
+    suffix = suffix_of(path)
     if suffix not in _FORMATS:
         unknown = f"{path.name}: unsupported file format {suffix or '(no suffix)'}"
         raise InputError(unknown, f"meshmatch reads {', '.join(SUFFIXES)}")
@@ -180,13 +199,14 @@ def _visible(name: str, colors: Floats | None) -> Floats | None:
 
 
 def mesh_list(path: str | Path) -> list[tuple[str, int]]:
-    """The names of a scene's meshes, as ``only`` and ``without`` of `load_shape` know them, and how many vertices each has,
-    in the order of the vertices; none for formats without names. Errors are those of `load_shape`.
+    """The names of a scene's meshes or a label map's labels, as ``only`` and ``without`` of `load_shape` know them, and how
+    many vertices each has, in the order of the vertices; none for formats without names. Errors are those of `load_shape`.
     """
     path = existing(as_path(path), suffixes=SUFFIXES)
-    if path.suffix.lower() not in gltf.SUFFIXES:
+    suffix = suffix_of(path)
+    if suffix not in (*gltf.SUFFIXES, *LABEL_MAP_SUFFIXES):
         return []
-    meshes = gltf.read(path, read_bytes(path)).meshes
+    meshes = _FORMATS[suffix][0](path, read_bytes(path)).meshes
     return [(names[0] if names else "(no name)", count) for names, count in meshes]
 
 

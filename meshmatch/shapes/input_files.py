@@ -12,7 +12,7 @@ import warnings
 import zipfile
 from collections.abc import Iterable
 from difflib import get_close_matches
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import IO, Any
 
 import numpy as np
@@ -30,11 +30,24 @@ LARGEST = 1 << 30
 """Uncompressed bytes of one array in an npz file; a million vertices with 120 dense weights fit."""
 ROOM = 800_000_000
 """Bytes that a file may take besides four times its size; the rest of a gigabyte is the program's."""
+LABEL_MAP_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
+"""Of volumes of labels, whose surfaces are shapes (`meshmatch.shapes.formats.label_maps`)."""
 _MAYBE_TEXT = (".ply", ".obj", ".mtl", ".off", ".stl", ".gltf", ".xyz", ".pcd")  # tables are read by `read_text`
 _COPIES = 24  # bytes for each number of an array: it becomes one of 64 bits, and is compared and copied
 _LAST_CHARACTER = 0x10FFFF
 _NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1f\x7f]")  # what no editor puts into a text
 _LINE_ENDS = b"\n\r\x0b\x0c\x1c\x1d\x1e\x85"  # where `str.splitlines` splits
+
+
+def suffix_of(path: PurePath) -> str:
+    """The suffix that tells the format, in small letters; that of a.nii.gz is .nii.gz."""
+    suffix = path.suffix.lower()
+    return ".nii.gz" if suffix == ".gz" and path.stem.lower().endswith(".nii") else suffix
+
+
+def stem_of(path: PurePath) -> str:
+    """The name of a file without the suffix that tells its format."""
+    return path.name[: len(path.name) - len(suffix_of(path))]
 
 
 def existing(path: Path, hint: str = "", suffixes: tuple[str, ...] = ()) -> Path:

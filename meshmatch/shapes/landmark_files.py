@@ -20,7 +20,15 @@ import numpy as np
 from meshmatch.arrays import Floats
 from meshmatch.errors import InputError
 from meshmatch.outputs import plain_text
-from meshmatch.shapes.input_files import check_memory, read_bytes, read_json, read_npy, read_text
+from meshmatch.shapes.input_files import (
+    LABEL_MAP_SUFFIXES,
+    check_memory,
+    read_bytes,
+    read_json,
+    read_npy,
+    read_text,
+    suffix_of,
+)
 from meshmatch.shapes.tables import DECIMAL_COMMA, is_missing, is_number, number, read_table
 
 Space = Literal["", "LPS", "RAS"]
@@ -57,7 +65,9 @@ class LandmarkFile:
 
 
 def mesh_space(path: str | Path) -> Space:
-    """The frame that 3D Slicer wrote into the header of a mesh's file; "" if it is not said."""
+    """The frame that 3D Slicer wrote into the header of a mesh's file; "" if it is not said. Label maps are read in LPS."""
+    if suffix_of(Path(path)) in LABEL_MAP_SUFFIXES:
+        return "LPS"
     try:
         with Path(path).open("rb") as file:
             found = re.search(rb"SPACE=(LPS|RAS)\b", file.read(_HEAD))
@@ -84,7 +94,7 @@ def read_landmark_file(path: Path, shape: str = "", space: Space = "") -> Landma
         The file holds no landmarks, or some that cannot be read.
     """
     reader = LANDMARK_READERS[path.suffix.lower()]
-    records = reader(path, Path(shape).stem) if reader in READERS_OF_SEVERAL else reader(path)
+    records = reader(path, Path(shape.removesuffix(".gz")).stem) if reader in READERS_OF_SEVERAL else reader(path)
     if not records:
         raise InputError(f"{path.name} holds no landmark")
     if len(spaces := {_SPACES.get(str(record.get("space")), "") for record in records}) > 1:

@@ -15,6 +15,7 @@ from meshmatch.outputs import as_path, folder_on_success, make_folder
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.decimate import Quality, decimate
 from meshmatch.shapes.files import PLAIN_SUFFIXES, load_shape, save_shape
+from meshmatch.shapes.input_files import suffix_of
 from meshmatch.shapes.landmark_files import mesh_space
 from meshmatch.shapes.normalise import Align, Mirroring, sqrt_area_frame
 from meshmatch.shapes.repair import Repaired, repair
@@ -200,7 +201,7 @@ def _read_shapes(
     folder: Path, config: PrepareConfig, notes: list[str], progress: Progress
 ) -> tuple[list[Repaired], list[Float[Floats, "L 3"] | None]]:
     """The usable shapes of a folder, repaired, and the landmarks of each."""
-    files = sorted(path for path in folder.glob("*") if path.suffix.lower() in PLAIN_SUFFIXES)
+    files = sorted(path for path in folder.glob("*") if suffix_of(path) in PLAIN_SUFFIXES)
     landmark_files = find_landmarks(config.landmarks, folder, files)
     pairs = [pair for pair in zip(files, landmark_files, strict=True) if pair[0] not in landmark_files]
     if not pairs:
