@@ -63,6 +63,7 @@ class AtlasOptions:
         "--measures/--no-measures",
         help="Measure compactness, generalisation and specificity, which takes a while.",
     )
+    format: Literal["png", "svg", "pdf"] = Option("png", help="Format of the charts, which need matplotlib.")
     seed: options.Seed = 0
 
     def check(self) -> None:
@@ -70,6 +71,10 @@ class AtlasOptions:
         if self.groups is None and self.model is None and self.statistic != "normal":
             hint = "add --groups A.txt B.txt, or --model"
             raise OptionError("--statistic compares groups or tests a model, and there are none", hint)
+        if self.format != "png":
+            from meshmatch.render.charts import check_chart
+
+            check_chart(f"charts.{self.format}")
         for option, given in {"--metadata": self.metadata, "--blocks": self.blocks}.items():
             if given is not None and self.model is None:
                 raise OptionError(f"{option} is for a model, and there is none", "add --model 'shape ~ ...'")
@@ -143,11 +148,18 @@ def _shapes(fits: str, poor: bool) -> AbstractContextManager["Registered"]:
 
 
 def _warn(console: Console, made: Any, how: AtlasOptions) -> None:
-    from meshmatch.collections.registered import size_ratio
+    from meshmatch.collections.covariates import some
+    from meshmatch.collections.registered import outlying, size_ratio
 
     times = size_ratio(made.sizes)
     if how.scale == "keep" and times > _ODD:
         console.warn(f"the largest shape is {times:.3g} times as large as the smallest: do the files have one unit?")
+    elif len(rows := outlying(made.distances)) and not how.robust:
+        share = sum(made.scores[rows, 0] ** 2) / sum(made.scores[:, 0] ** 2)
+        console.warn(
+            f"{some([made.names[k] for k in rows])}: unlike the others, and {100 * share:.0f} % of mode 1: "
+            "cut, broken, mirrored or of another kind? Leave out what is, or try --robust"
+        )
 
 
 def _find(console: Console, made: Any, shapes: "Registered", how: AtlasOptions) -> "Findings":
@@ -156,9 +168,11 @@ def _find(console: Console, made: Any, shapes: "Registered", how: AtlasOptions) 
     from meshmatch.collections.registered import read_group
 
     comparison, names = None, ("A", "B")
+    members: dict[str, str] = {}
     if how.groups is not None:  # first: a wrong name is told before the long work
         first, second = (read_group(path, shapes) for path in how.groups)
         names = how.groups[0].stem, how.groups[1].stem
+        members = dict.fromkeys(first, names[0]) | dict.fromkeys(second, names[1])
         comparison = made.compare(
             first, second, kind=how.statistic, permutations=how.permutations, seed=how.seed
         )  # fmt: skip
@@ -173,7 +187,7 @@ def _find(console: Console, made: Any, shapes: "Registered", how: AtlasOptions) 
     if how.measures and len(shapes.names) > 3:
         with console.progress() as progress:
             measures = measure_atlas(made, shapes.points, seed=how.seed, progress=progress)
-    return Findings(measures, comparison, names, explained, how.samples, how.seed)
+    return Findings(measures, comparison, names, explained, how.samples, how.seed, how.format, members)
 
 
 def _tell(console: Console, about: dict[str, Any]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, frozen
 from meshmatch.collections.covariates import DesignTerm
-from meshmatch.collections.permutation import Tested, orders, permuted, tested, whitened
+from meshmatch.collections.permutation import PlaceTests, orders, permuted, tested, whitened
 from meshmatch.errors import InputError
 
 _INDEPENDENT = 1e-7  # of the length of a column: less is what earlier ones say
@@ -55,7 +55,7 @@ class Effect:
     coefficients: tuple[str, ...]
     change: Float[Floats, "C V 3"]
     along_normal: Float[Floats, "C V"]
-    places: Tested | None
+    places: PlaceTests | None
 
     @property
     def p_anywhere(self) -> float:
@@ -150,7 +150,7 @@ def analyse(
 
 def _test(
     values: Float[Floats, "S N D"], basis: _Basis, term: int, rest: int, order: Int[Ints, "P S"], white: bool = False
-) -> Tested:
+) -> PlaceTests:
     """F of a term for each permutation of the residuals that the terms before it leave."""
     before = basis.directions[:, basis.term < term]
     left = values - np.tensordot(before, np.tensordot(before.T, values, 1), 1)

@@ -13,7 +13,8 @@ atlas.json          all that is one number, or a few
 modes.png           the mean and the first three modes at -2 and +2 standard deviations
 distances.png       distance from the mean: of all shapes, and of those that are furthest
 groups.png          where two groups differ
-histogram.png, measures.png   charts, where matplotlib is installed
+histogram.png, measures.png, scree.png, components.png, allometry.png   charts, where matplotlib is installed
+effect-1-sex-m-f.png   what each coefficient of a model moves, and where that is more than chance
 samples/            random shapes
 page.html           a page with a slider for each mode
 ==================  ==============================================================================================
@@ -22,7 +23,8 @@ page.html           a page with a slider for each mode
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -32,32 +34,40 @@ import numpy as np
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.atlas_arrays import FILE
+from meshmatch.collections.atlas_pictures import (
+    REACH,
+    ChartFormat,
+    draw_allometry,
+    draw_charts,
+    draw_distances,
+    draw_effect,
+    draw_effects,
+    draw_modes,
+    draw_scores,
+    furthest,
+)
 from meshmatch.collections.explain import Explained
 from meshmatch.collections.groups import Comparison
 from meshmatch.collections.measures import Measures
 from meshmatch.collections.model_files import LEVEL, model_record, short, write_model
-from meshmatch.render.charts import draw_beside, draw_histogram
+from meshmatch.collections.registered import outlying
 from meshmatch.render.facing import facing
-from meshmatch.render.figures import Panel
-from meshmatch.render.picture import Look, render_shapes
-from meshmatch.render.scales import Scale
 from meshmatch.render.viewer.single_pages import Varying, write_atlas_page
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.formats.gltf_out import write_morphs
-from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import write_rows
 
 MORPHS = 10
 """Modes in modes.glb."""
-REACH = 2.0
-"""Standard deviations at which modes are shown."""
-_SHOWN, _FURTHEST = 3, 3  # modes and shapes in pictures
+_NOT_ON_PAGE = ("modes", "distances", "histogram")
 _BLOCK = 64  # shapes at a time
 
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What was found out about an atlas beside itself; what was not asked for is None. ``groups`` are names of A and B."""
+    """What was found out about an atlas beside itself; what was not asked for is None. ``groups`` are names of A and B,
+    ``members`` say which shape is in which; ``charts`` is the format of charts.
+    """
 
     measures: Measures | None = None
     comparison: Comparison | None = None
@@ -65,6 +75,15 @@ class Findings:
     explained: Explained | None = None
     samples: int = 0
     seed: int = 0
+    charts: ChartFormat = "png"
+    members: Mapping[str, str] = field(default_factory=dict)
+
+    def classes(self, atlas: Atlas) -> list[str]:
+        """The group of each shape in charts, "" where it has none: as it was compared, or else in the model."""
+        known = self.members
+        if self.explained is not None and not known:
+            known = dict(zip(self.explained.names, self.explained.groups, strict=False))
+        return [known.get(name, "") for name in atlas.names]
 
 
 def write_folder(
@@ -88,22 +107,37 @@ def write_folder(
         _write_measures(folder / "measures.csv", findings.measures)
     if findings.comparison is not None:
         _write_comparison(folder / "groups.csv", findings.comparison)
-        _draw_comparison(folder / "groups.png", atlas, findings, turn)
+        first, second = findings.groups
+        about = findings.comparison
+        name = f"{second} - {first}"
+        draw_effect(folder / "groups.png", atlas.mean_shape, name, about.along_normal, about, turn)
     if findings.explained is not None:
         write_model(folder, atlas.mean_shape, findings.explained)
+        draw_effects(folder, atlas.mean_shape, findings.explained, turn)
     (folder / "atlas.json").write_text(json.dumps(record(atlas, findings), indent=1) + "\n", encoding="utf-8")
-    _draw_modes(folder / "modes.png", atlas, turn)
-    _draw_distances(folder / "distances.png", atlas, turn)
+    draw_modes(folder / "modes.png", atlas, turn)
+    draw_distances(folder / "distances.png", atlas, turn)
     if find_spec("matplotlib") is not None:
-        _draw_charts(folder, atlas, findings.measures)
+        draw_charts(folder, atlas, findings.measures, findings.charts)
+        draw_scores(folder, atlas, findings.classes(atlas), findings.charts)
+        if findings.explained is not None and findings.explained.allometry is not None:
+            draw_allometry(folder, findings.explained, findings.explained.allometry, findings.charts)
     if findings.samples:
         (folder / "samples").mkdir()
         for shape in atlas.sample(findings.samples, findings.seed):
             save_shape(folder / "samples" / f"{shape.name}.ply", shape)
     by_one = atlas.modes * atlas.deviations[:, None, None]
-    varying = Varying(atlas.mean_shape, by_one, atlas.variances / atlas.total, atlas.scores, atlas.names)
+    varying = Varying(
+        atlas.mean_shape, by_one, atlas.variances / atlas.total, atlas.scores, atlas.names, _figures(folder)
+    )
     write_atlas_page(folder / "page.html", varying, rotation=turn, title=title)
     return sorted(path.name for path in folder.iterdir())
+
+
+def _figures(folder: Path) -> list[Path]:
+    """What the page shows: charts of the shapes, and effects; the modes themselves are on it."""
+    shown = [path for path in folder.iterdir() if path.suffix in (".png", ".svg")]
+    return sorted(path for path in shown if path.stem not in _NOT_ON_PAGE)
 
 
 def record(atlas: Atlas, findings: Findings) -> dict[str, Any]:
@@ -116,7 +150,8 @@ def record(atlas: Atlas, findings: Findings) -> dict[str, Any]:
         "robust": atlas.robust,
         "deviations": short(atlas.deviations),
         "compactness": short(atlas.compactness),
-        "furthest": {atlas.names[k]: short(atlas.distances[k]) for k in _furthest(atlas)},
+        "outliers": [atlas.names[k] for k in outlying(atlas.distances)],
+        "furthest": {atlas.names[k]: short(atlas.distances[k]) for k in furthest(atlas)},
         "samples": findings.samples,
         "seed": findings.seed,
     }
@@ -140,11 +175,6 @@ def record(atlas: Atlas, findings: Findings) -> dict[str, Any]:
     if findings.explained is not None:
         found["model"] = model_record(findings.explained)
     return found
-
-
-def _furthest(atlas: Atlas) -> list[int]:
-    rows: list[int] = np.argsort(-atlas.distances, kind="stable")[:_FURTHEST].tolist()
-    return rows
 
 
 def _write_morphs(path: Path, atlas: Atlas) -> None:
@@ -182,71 +212,3 @@ def _write_comparison(path: Path, found: Comparison) -> None:
     table = np.column_stack([found.difference, *(getattr(found, name) for name in names)])
     rows = ([k, *short(row)] for k, row in enumerate(table))
     write_rows(path, ["vertex", "dx", "dy", "dz", *names], rows)
-
-
-def _draw_modes(path: Path, atlas: Atlas, turn: Float[Floats, "3 3"]) -> None:
-    """In one scale; colors say where the surface moves in and out, of each mode by itself."""
-    mean, normals = atlas.mean_shape, atlas.mean_shape.vertex_normals
-    scores = np.zeros((2 * min(_SHOWN, len(atlas.modes)), len(atlas.modes)))
-    for row in range(len(scores)):
-        scores[row, row // 2] = REACH if row % 2 else -REACH
-    offsets = atlas.offsets(scores)
-    along = np.einsum("nvi,vi->nv", offsets, normals)
-    along /= np.maximum(np.linalg.norm(offsets, axis=2).max(axis=1), 1e-300)[:, None]
-    scale = Scale(-1, 1, "displacement outwards, as a share of the mode's largest displacement")
-    unit = float(np.sqrt(mean.area))
-    panels = [Panel(mean, label="mean", rotation=turn, unit=unit)]
-    for row, offset in enumerate(offsets):
-        share = 100 * atlas.variances[row // 2] / atlas.total
-        label = f"mode {row // 2 + 1} ({share:.3g} %), {'+' if row % 2 else '-'}{REACH:g} sd"
-        moved = Shape(mean.verts + offset, mean.faces)
-        panels.append(Panel(moved, scale.colors(along[row]), label, rotation=turn, unit=unit))
-    render_shapes(panels, path, Look(legend=scale))
-
-
-def _draw_distances(path: Path, atlas: Atlas, turn: Float[Floats, "3 3"]) -> None:
-    mean = atlas.mean_shape
-    spread = np.sqrt(np.einsum("m,mvi->v", atlas.variances, np.square(atlas.modes)))
-    rows = _furthest(atlas)
-    offsets = atlas.offsets(atlas.scores[rows])
-    apart = np.linalg.norm(offsets, axis=2)
-    scale = Scale.of(np.concatenate([spread, apart.ravel()]), "distance from the mean (unit of the files)")
-    unit = float(np.sqrt(mean.area))
-    panels = [Panel(mean, scale.colors(spread), "all: root mean square", rotation=turn, unit=unit)]
-    for row, offset, far in zip(rows, offsets, apart, strict=True):
-        shape = Shape(mean.verts + offset, mean.faces)
-        panels.append(Panel(shape, scale.colors(far), atlas.names[row], rotation=turn, unit=unit))
-    render_shapes(panels, path, Look(legend=scale))
-
-
-def _draw_comparison(path: Path, atlas: Atlas, findings: Findings, turn: Float[Floats, "3 3"]) -> None:
-    found, (first, second) = findings.comparison, findings.groups
-    assert found is not None
-    along = found.along_normal
-    title = f"{second} - {first}, along the outward normal (unit of the files)"
-    scale = Scale.of(np.concatenate([along, -along]), title)
-    panels = [
-        Panel(atlas.mean_shape, scale.colors(np.where(shown, along, np.nan)), label, rotation=turn)
-        for label, shown in {
-            "difference": np.ones(len(along), bool),
-            f"false discovery rate <= {LEVEL:.0%}": found.p_fdr <= LEVEL,
-            f"family-wise p <= {LEVEL:g}": found.p_corrected <= LEVEL,
-        }.items()
-    ]
-    render_shapes(panels, path, Look(legend=scale))
-
-
-def _draw_charts(folder: Path, atlas: Atlas, measures: Measures | None) -> None:
-    furthest = _furthest(atlas)[0]
-    apart = atlas.distances.tolist()
-    marks = {apart[furthest]: atlas.names[furthest]}
-    draw_histogram(folder / "histogram.png", apart, "distance from the mean (unit of the files)", "shapes", marks)
-    if measures is None:
-        return
-    x, unit = measures.counts.tolist(), "distance (unit of the files)"
-    both = {"generalisation": "left out one by one", "specificity": "random shapes"}
-    charts: dict[str, Any] = {"compactness": ("share of the variance", {"": (x, measures.compactness.tolist())})}
-    for name, title in both.items():
-        lines = {"points": getattr(measures, name), "surfaces": getattr(measures, f"{name}_surface")}
-        charts[f"{name}: {title}"] = (unit, {key: (x, values.tolist()) for key, values in lines.items()})
-    draw_beside(charts, folder / "measures.png", "modes")

@@ -23,7 +23,7 @@ _FLAT = 1e-12  # of the largest scatter at a vertex: directions of less have non
 
 
 @dataclass(frozen=True, eq=False)
-class Tested:
+class PlaceTests:
     """The ``statistic`` (N,) at each place; the share of the labellings where it is as large there, ``p``, and anywhere,
     ``p_corrected``; ``p_fdr`` by which of the places found a share is found by chance; and the ``largest`` statistic of each
     labelling (P,), the given one first.
@@ -80,7 +80,7 @@ def tested(
     values: Float[Floats, "S N D"],
     bases: Iterable[Float[Floats, "B R S"]],
     statistic: Callable[[Float[Floats, "B R N"], Float[Floats, " N"]], Float[Floats, "B N"]],
-) -> Tested:
+) -> PlaceTests:
     """Test values of S shapes at N places, such as their displacements, for something that labels of shapes say.
 
     ``bases`` are R orthonormal directions for each labelling, the given one first, some labellings at a time. The
@@ -109,4 +109,4 @@ def tested(
     p = as_large / len(every)
     from scipy.stats import false_discovery_control
 
-    return Tested(own, p, above / len(every), np.asarray(false_discovery_control(p)), every)
+    return PlaceTests(own, p, above / len(every), np.asarray(false_discovery_control(p)), every)

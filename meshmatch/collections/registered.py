@@ -21,6 +21,7 @@ from meshmatch.shapes.input_files import read_text, stem_of, suffix_of
 from meshmatch.shapes.tables import read_by_suffix
 
 _IN_MEMORY = 256 * 2**20  # bytes; more are kept in a temporary file
+_TELLING, _UNLIKE = 8, 6.0  # shapes; deviations, by the median absolute one
 _LINE = 200  # bytes of memory for a line
 
 
@@ -116,3 +117,14 @@ def read_group(path: str | Path, shapes: Registered) -> list[str]:
 def size_ratio(sizes: Sequence[float] | Floats) -> float:
     """How many times as large the largest shape is as the smallest."""
     return float(np.max(sizes) / np.min(sizes))
+
+
+def outlying(distances: Float[Floats, " S"]) -> Int[Ints, " N"]:
+    """Rows of shapes that are so much further from the mean than most that they are probably cut, or of another kind.
+
+    One collection in thirty of normal shapes has one; of fewer than eight nothing is said.
+    """
+    if len(distances) < _TELLING:
+        return np.empty(0, np.int64)
+    beyond = distances - np.median(distances)
+    return np.flatnonzero(beyond > _UNLIKE * 1.4826 * np.median(np.abs(beyond)) + 1e-9 * distances.max())

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -34,7 +35,8 @@ _METADATA: dict[str, dict[str, None]] = {
     ".svg": {"Date": None, "Creator": None},
     ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
 }
-_MOST_TERMS = 12
+_MOST_TERMS, _MOST_BARS, _MOST_GROUPS = 12, 20, 14
+_MARKERS = "os^Dv"  # one for each round through the colors
 _STYLE = Path(__file__).with_name("charts.mplstyle")
 # What the error axis counts: units in one sqrt(area), the unit's name, the words under the axis.
 _UNITS = {
@@ -117,6 +119,90 @@ def draw_histogram(
         _mark(axes, marks, np.asarray(values))
         axes.set(xlabel=short(xlabel), ylabel=short(ylabel), xlim=(0, None))
         axes.locator_params(axis="y", nbins=6, integer=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Dots:
+    """Places (N,) of dots in a chart, the words at its axes, and names of some of the dots."""
+
+    x: Sequence[float]
+    y: Sequence[float]
+    xlabel: str
+    ylabel: str
+    names: Mapping[int, str] = field(default_factory=dict)
+
+
+def draw_scree(path: str | Path, shares: Sequence[float], most: int) -> None:
+    """Draw the shares of the variance that modes explain, and those of the pieces of a stick that breaks into ``most`` at
+    random: modes above it say more than chance.
+    """
+    count = min(len(shares), _MOST_BARS)
+    sticks = np.cumsum(1 / np.arange(most, 0, -1))[::-1] / most
+    with saved(path, 4.8, 3.2) as figure:
+        axes = figure.subplots()
+        axes.bar(range(1, count + 1), 100 * np.array(shares[:count]), color=COLORS[0], label="modes")
+        known = sticks[:count]
+        axes.plot(range(1, len(known) + 1), 100 * known, "o-", color=COLORS[1], label="broken stick")
+        axes.set(xlabel="mode", ylabel="share of the variance", xlim=(0.3, count + 0.7))
+        axes.yaxis.set_major_formatter("{x:.0f} %")
+        axes.locator_params(axis="x", integer=True)
+        axes.legend(loc="upper right")
+
+
+def draw_dots(path: str | Path, charts: Sequence[Dots], groups: Sequence[str], *, hulls: bool) -> None:
+    """Draw charts of dots side by side, each dot in the color of its group ("" for none), with the convex hull of each
+    group, or its regression line.
+    """
+    known = sorted({group for group in groups if group})
+    members = {group: np.flatnonzero(np.array(groups) == group) for group in [*known, *([""] if "" in groups else [])]}
+    with saved(path, 4.2 * len(charts) + 1.2, 3.8) as figure:
+        row = figure.subplots(1, len(charts), squeeze=False)[0]
+        for axes, dots in zip(row, charts, strict=True):
+            points = np.column_stack([dots.x, dots.y])
+            for number, (group, rows) in enumerate(members.items()):
+                rounds, color = divmod(number, len(COLORS))
+                ink = COLORS[color] if group or not known else _GREY
+                marker = _MARKERS[rounds % len(_MARKERS)]
+                about: dict[str, Any] = {"color": ink, "markersize": 5, "alpha": 0.85}
+                axes.plot(*points[rows].T, marker, label=short(group, 24) or "others", **about)
+                outline = _outline(points[rows]) if hulls else _regression(points[rows])
+                if outline is not None and (group or not known):
+                    axes.plot(*outline.T, color=ink, linewidth=1.1)
+                    if hulls:
+                        axes.fill(*outline.T, color=ink, alpha=0.12, linewidth=0)
+            for number, name in dots.names.items():
+                about = {"textcoords": "offset points", "color": _GREY, "fontsize": 7.5}
+                axes.annotate(short(name, 24), points[number], (4, 4), **about)
+            axes.set(xlabel=short(dots.xlabel), ylabel=short(dots.ylabel))
+            if hulls:  # a square in which both axes have one scale
+                low, high = points.min(axis=0), points.max(axis=0)
+                reach = 0.55 * float((high - low).max()) or 1.0
+                middle = (low + high) / 2
+                axes.set(xlim=middle[0] + [-reach, reach], ylim=middle[1] + [-reach, reach], box_aspect=1)
+        if len(members) > 1:
+            handles, labels = row[0].get_legend_handles_labels()
+            figure.legend(handles[:_MOST_GROUPS], labels[:_MOST_GROUPS], loc="outside right upper")
+
+
+def _outline(points: Floats) -> Floats | None:
+    """The convex hull of points (N, 2), closed; None where they have no area."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        corners = ConvexHull(points).vertices
+    except (QhullError, ValueError):  # a point, or a line
+        return None
+    return np.asarray(points[[*corners, corners[0]]])
+
+
+def _regression(points: Floats) -> Floats | None:
+    """Both ends of the regression line; None where there is none."""
+    x = points[:, 0]
+    if len(points) < 3 or not np.ptp(x) > 0:
+        return None
+    slope, start = np.polyfit(x, points[:, 1], 1)
+    ends = np.array([x.min(), x.max()])
+    return np.column_stack([ends, slope * ends + start])
 
 
 def draw_losses(

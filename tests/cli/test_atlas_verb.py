@@ -17,7 +17,7 @@ from tests.collections.ellipsoids import ellipsoids
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is in the folder has tests of its own."""
-    monkeypatch.setattr("meshmatch.collections.atlas_files.render_shapes", lambda *_: None)
+    monkeypatch.setattr("meshmatch.collections.atlas_pictures.render_shapes", lambda *_: None)
 
 
 @pytest.fixture
@@ -103,6 +103,19 @@ def test_other_units_are_told(run: Run, shapes: Path, tmp_path: Path) -> None:
     assert "do the files have one unit?" in answer.err
     answer = run("atlas", shapes, "-o", tmp_path / "b", "--no-measures", "-q", "--scale", "remove")
     assert answer.err == ""
+
+
+def test_a_shape_unlike_the_others_is_told(run: Run, shapes: Path, tmp_path: Path) -> None:
+    given = ellipsoids(8, splits=1)
+    save_shape(shapes / "egg-2.ply", Shape(given.points[2] * [1, 1, 0.2], given.faces))
+    words = ("atlas", shapes, "--no-measures", "--permutations", 9, "--model", "form ~ size", "--format", "svg")
+    answer = run(*words, "-o", tmp_path / "a", "--json", "-q")
+    assert "warning: egg-2: unlike the others, and 86 % of mode 1" in answer.err
+    told = json.loads(answer.out)
+    assert told["outliers"] == ["egg-2"]
+    charts = {"allometry.svg", "components.svg", "histogram.svg", "scree.svg"}
+    assert charts <= set(told["files"])
+    assert not any(name.endswith(".png") for name in told["files"])
 
 
 @pytest.mark.parametrize("wrong", ["nowhere", "file", "input", "both", "unknown", "statistic", "table", "space", "row"])

@@ -12,9 +12,12 @@ from PIL import Image
 
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.atlas_files import Findings, record, write_folder
+from meshmatch.collections.atlas_pictures import draw_effect
 from meshmatch.collections.measures import Measures, measure_atlas
+from meshmatch.collections.permutation import PlaceTests
 from meshmatch.shapes.files import load_shape
-from tests.collections.ellipsoids import ellipsoids
+from meshmatch.shapes.shape import Shape
+from tests.collections.ellipsoids import AXES, ellipsoids
 
 
 @pytest.fixture(autouse=True)
@@ -31,8 +34,8 @@ def atlas() -> Atlas:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without pictures and charts, which have tests of their own."""
-    for name in ("render_shapes", "draw_beside", "draw_histogram"):
-        monkeypatch.setattr(f"meshmatch.collections.atlas_files.{name}", lambda *_, **__: None)
+    for name in ("render_shapes", "draw_beside", "draw_histogram", "draw_scree", "draw_dots"):
+        monkeypatch.setattr(f"meshmatch.collections.atlas_pictures.{name}", lambda *_, **__: None)
 
 
 def table(path: Path) -> tuple[list[str], list[list[str]]]:
@@ -59,7 +62,8 @@ def test_every_file_says_what_the_atlas_knows(tmp_path: Path, atlas: Atlas) -> N
     given = ellipsoids(8, splits=1)
     measures = measure_atlas(atlas, given.points, samples=2)
     comparison = atlas.compare(atlas.names[:4], atlas.names[4:])
-    findings = Findings(measures, comparison, ("thin", "thick"), samples=2, seed=7)
+    explained = atlas.anova("form ~ log(size)", permutations=20)
+    findings = Findings(measures, comparison, ("thin", "thick"), explained, 2, 7)
     names = write_folder(tmp_path, atlas, findings, rotation=np.eye(3), title="eggs")
     assert names == sorted(path.name for path in tmp_path.iterdir())
     assert np.array_equal(Atlas.load(tmp_path).modes, atlas.modes)
@@ -89,7 +93,8 @@ def test_every_file_says_what_the_atlas_knows(tmp_path: Path, atlas: Atlas) -> N
     assert told["seed"] == 7
     assert told["measures"]["counts"] == measures.counts.tolist()
     assert "<title>eggs</title>" in (tmp_path / "page.html").read_text(encoding="utf-8")
-    for name in ("modes", "distances", "groups", "histogram", "measures"):
+    pictures = ["modes", "distances", "groups", "histogram", "measures", "scree", "components", "allometry"]
+    for name in [*pictures, "effect-1-log-size"]:
         with Image.open(tmp_path / f"{name}.png") as image:
             assert np.asarray(image.convert("L")).std() > 5, name
 
@@ -130,6 +135,21 @@ def test_the_same_atlas_gives_the_same_bytes(
     first, second = ({path.name: path.read_bytes() for path in folder.iterdir()} for folder in folders)
     assert first == second
     assert not {"measures.csv", "measures.png", "groups.csv", "groups.png", "samples"} & set(first)
+
+
+def test_an_effect_is_seen_from_where_it_is(tmp_path: Path) -> None:
+    """A bump on the far side of a ball; the first panel shows it, and the last but one, the others are grey or blank."""
+    ball = ellipsoids(1, splits=3, spread=np.zeros(3))
+    mean = Shape(ball.points[0], ball.faces)
+    away = np.array([-0.6, 0.0, -0.8])
+    bump = np.exp(-20 * np.square(mean.verts / AXES - away).sum(axis=1))
+    p = np.where(bump > 0.5, 0.01, 1.0)
+    tested = PlaceTests(bump, p, p, np.ones_like(p), bump)
+    draw_effect(tmp_path / "a.png", mean, "bump", bump, tested, np.eye(3))
+    with Image.open(tmp_path / "a.png") as image:
+        pixels = np.asarray(image.convert("RGB"), int)[: image.height * 2 // 3]
+    red = np.array_split(pixels[:, :, 0] - pixels[:, :, 2] > 80, 6, axis=1)
+    assert [bool(panel.sum() > 20) for panel in red] == [True, False, False, False, True, False]
 
 
 def test_no_charts_without_matplotlib(tmp_path: Path, atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -297,7 +297,7 @@ def test_maps_of_unfinished_fits_are_refused(made: tuple[Path, tuple[Record, ...
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Folders of atlases without pictures."""
-    monkeypatch.setattr("meshmatch.collections.atlas_files.render_shapes", lambda *_: None)
+    monkeypatch.setattr("meshmatch.collections.atlas_pictures.render_shapes", lambda *_: None)
 
 
 def test_a_collection_has_an_atlas(made: tuple[Path, tuple[Record, ...]], tmp_path: Path, undrawn: None) -> None:

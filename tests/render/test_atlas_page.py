@@ -1,6 +1,7 @@
 """The page of a mean and its modes: what is in the file, and what its sliders do in headless Chromium (skipped without)."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,25 @@ def test_sliders_change_the_shape(running: Any, tmp_path: Path, make_sphere: Cal
         for vertex in (0, 7, 300):
             normal = seen.page.evaluate("v => meshmatch.normal(v)", vertex)
             assert normal == pytest.approx(ball.vertex_normals[vertex].tolist(), abs=1e-3)
+
+
+def test_figures_are_on_the_page(running: Any, tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
+    path, red = tmp_path / "a.html", tmp_path / "red.png"
+    Image.new("RGB", (60, 40), (255, 0, 0)).save(red)
+    (tmp_path / "b.svg").write_text('<svg xmlns="http://www.w3.org/2000/svg" width="9" height="9"/>')
+    shown = replace(varying(make_sphere(1)), figures=[red, tmp_path / "b.svg"])
+    write_atlas_page(path, shown, rotation=np.eye(3), title="balls")
+    with opened(running, path) as seen:
+        assert nameless(seen) == []
+        assert seen.page.locator("#figures img").evaluate_all("all => all.map(i => i.naturalWidth)") == [60, 9]
+        seen.page.click("#figures button")
+        pixels = np.asarray(Image.open(seen.picture(tmp_path / "1.png")).convert("RGB"))
+        assert (pixels[:, 560:720] == [255, 0, 0]).all(axis=2).sum() == 60 * 40
+        seen.page.keyboard.press("n")  # a letter behind the figure changes nothing
+        assert seen.state()["scores"] == [0, 0]
+        seen.page.click("#large button")
+        seen.page.keyboard.press("n")
+        assert any(seen.state()["scores"])
 
 
 @pytest.mark.slow

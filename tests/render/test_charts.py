@@ -9,7 +9,16 @@ from PIL import Image
 from meshmatch.errors import OptionError, OutputError
 from meshmatch.maps.evaluate import Errors
 from meshmatch.render import charts
-from meshmatch.render.charts import draw_beside, draw_curves, draw_histogram, draw_lines, draw_losses
+from meshmatch.render.charts import (
+    Dots,
+    draw_beside,
+    draw_curves,
+    draw_dots,
+    draw_histogram,
+    draw_lines,
+    draw_losses,
+    draw_scree,
+)
 from tests.render.spots import middle, spots
 
 STEPS = list(range(50, 2050, 50))
@@ -128,3 +137,29 @@ def test_a_histogram_is_high_where_many_are(tmp_path: Path) -> None:
     wide = np.flatnonzero(blue > 10)
     left, right = np.array_split(blue[wide], 2)
     assert right.max() == pytest.approx(3 * left.max(), rel=0.05)
+
+
+def test_dots_have_the_colors_and_hulls_of_their_groups(tmp_path: Path) -> None:
+    x, y = [0.0, 1.0, 0.0, 1.0, 3.0, 4.0, 3.0, 4.0, 2.0], [0.0, 0.0, 1.0, 1.0, 2.0, 2.0, 3.0, 3.0, 0.5]
+    groups = [*"aaaa", *"bbbb", ""]
+    dots = Dots(x, y, "PC1", "PC2", {8: "odd"})
+    draw_dots(tmp_path / "a.png", [dots], groups, hulls=True)
+    a, b = (spots(tmp_path / "a.png", k, top=0.0, right=0.72) for k in (0, 1))
+    across, up = middle(b) - middle(a)
+    assert across / up == pytest.approx(1.5, rel=0.05)  # one scale
+    draw_dots(tmp_path / "b.png", [Dots(x, y, "size", "score")] * 2, groups, hulls=False)
+    line = spots(tmp_path / "b.png", 1, top=0.0, right=0.45)
+    assert line[:, 1].max() > spots(tmp_path / "b.png", 0, top=0.0, right=0.45)[:, 1].max()
+    for groups in (["a"], ["a", "a"], ["", ""], ["b", "a", "a"]):  # no area, no line
+        some = Dots([1.0] * len(groups), [2.0] * len(groups), "", "")
+        draw_dots(tmp_path / "c.svg", [some], groups, hulls=True)
+        draw_dots(tmp_path / "c.pdf", [some], groups, hulls=False)
+
+
+def test_a_scree_stands_beside_a_broken_stick(tmp_path: Path) -> None:
+    draw_scree(tmp_path / "a.png", [0.75, 0.25], 2)  # the pieces of a stick broken once are 3/4 and 1/4 long
+    bars = spots(tmp_path / "a.png", 0, top=0.0, right=1.0)
+    stick = spots(tmp_path / "a.png", 1, top=0.2, right=1.0)
+    ends = [bars[bars[:, 0] < 0.3 * bars[:, 0].max()], bars[bars[:, 0] > 0.9 * bars[:, 0].max()]]
+    assert ends[0][:, 1].max() > 2 * ends[1][:, 1].max() - 60
+    assert stick[stick[:, 0].argmax(), 1] == pytest.approx(ends[1][:, 1].max(), abs=12)

@@ -146,7 +146,7 @@ function write() {
 }
 
 function keys(event) {
-  if (event.ctrlKey || event.metaKey || event.altKey || event.target === $('shape')) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target === $('shape') || $('large').open) return;
   const key = event.key.toLowerCase();
   if (key === 'k') play(!state.playing);
   else if (key === 'm') choose(-1);
@@ -189,6 +189,18 @@ function introduce() {
   );
 }
 
+function showFigures() {
+  for (const [name, address] of words.figures) {
+    const image = element('img', { src: address, alt: name });
+    const button = element('button', { type: 'button', title: `${name}, larger` }, image, name);
+    button.addEventListener('click', () => {
+      Object.assign($('picture'), { src: address, alt: name });
+      $('large').showModal();
+    });
+    $('figures').append(button);
+  }
+}
+
 function prepare(found) {
   arrays = found;
   mean = Float32Array.from(arrays.position, (value, i) => value / 65535 + words.low[i % 3]);
@@ -209,6 +221,7 @@ function prepare(found) {
 
 async function begin() {
   show();
+  showFigures();
   $('shape').addEventListener('change', () => choose(Number($('shape').value)));
   $('mean').addEventListener('click', () => choose(-1));
   $('random').addEventListener('click', random);

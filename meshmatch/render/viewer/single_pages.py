@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,6 +79,7 @@ def write_motion(
 class Varying:
     """A mean shape and how it varies: M modes, each a displacement (V, 3) by one standard deviation, and which ``shares``
     (M,) of the variance they explain; the ``scores`` (S, M) of known shapes, in standard deviations, and their names.
+    ``figures`` are files (.png, .svg) of pictures and charts of it.
     """
 
     mean: Shape
@@ -85,6 +87,7 @@ class Varying:
     shares: Float[Floats, " M"]
     scores: Float[Floats, "S M"]
     names: Sequence[str]
+    figures: Sequence[Path] = ()
 
 
 def write_atlas_page(
@@ -123,9 +126,16 @@ def write_atlas_page(
         "high": f"{scale.high:.4g}",
         "ramp": Scale(0.0, 1.0).colors(np.linspace(0, 1, _RAMP)).round(4).tolist(),
         "clay": list(CLAY),
+        "figures": [[plain_text(figure.stem), _address(figure)] for figure in atlas.figures],
     }
     note = f"{len(atlas.names):,} shapes, {part.note or f'{atlas.mean.V:,} vertices'}"
     return _write(path, "atlas", title, note, words | cube, arrays)
+
+
+def _address(figure: Path) -> str:
+    """A picture as an address that holds it."""
+    kind = {".png": "image/png", ".svg": "image/svg+xml"}[figure.suffix]
+    return f"data:{kind};base64,{base64.b64encode(figure.read_bytes()).decode('ascii')}"
 
 
 def _write(

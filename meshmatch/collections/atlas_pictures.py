@@ -1,0 +1,167 @@
+"""Pictures and charts of an atlas: its modes, its shapes, and what was found out about them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.collections.atlas import Atlas
+from meshmatch.collections.explain import Allometry, Explained
+from meshmatch.collections.groups import Comparison
+from meshmatch.collections.measures import Measures
+from meshmatch.collections.model_files import LEVEL
+from meshmatch.collections.permutation import PlaceTests
+from meshmatch.render.charts import Dots, draw_beside, draw_dots, draw_histogram, draw_scree
+from meshmatch.render.figures import Panel
+from meshmatch.render.picture import Look, render_shapes
+from meshmatch.render.scales import Scale, nice_step
+from meshmatch.shapes.shape import Shape
+
+ChartFormat = Literal["png", "svg", "pdf"]
+REACH = 2.0
+"""Standard deviations at which modes are shown."""
+SHOWN, FURTHEST = 3, 3
+"""Modes and shapes in pictures."""
+_MOST_EFFECTS = 12  # pictures of a model
+_BACK = np.diag([-1.0, 1.0, -1.0])
+_ABOVE = 0.95  # cosine: seen from straight above or below
+_AROUND = 0.1  # roots of the area: how far around the strongest effect the surface tells from where it is seen
+
+
+def furthest(atlas: Atlas) -> list[int]:
+    """Rows of the shapes that are furthest from the mean."""
+    rows: list[int] = np.argsort(-atlas.distances, kind="stable")[:FURTHEST].tolist()
+    return rows
+
+
+def draw_modes(path: Path, atlas: Atlas, turn: Float[Floats, "3 3"]) -> None:
+    """In one scale; colors say where the surface moves in and out, of each mode by itself."""
+    mean, normals = atlas.mean_shape, atlas.mean_shape.vertex_normals
+    scores = np.zeros((2 * min(SHOWN, len(atlas.modes)), len(atlas.modes)))
+    for row in range(len(scores)):
+        scores[row, row // 2] = REACH if row % 2 else -REACH
+    offsets = atlas.offsets(scores)
+    along = np.einsum("nvi,vi->nv", offsets, normals)
+    along /= np.maximum(np.linalg.norm(offsets, axis=2).max(axis=1), 1e-300)[:, None]
+    scale = Scale(-1, 1, "displacement outwards, as a share of the mode's largest displacement")
+    unit = float(np.sqrt(mean.area))
+    panels = [Panel(mean, label="mean", rotation=turn, unit=unit)]
+    for row, offset in enumerate(offsets):
+        share = 100 * atlas.variances[row // 2] / atlas.total
+        label = f"mode {row // 2 + 1} ({share:.3g} %), {'+' if row % 2 else '-'}{REACH:g} sd"
+        moved = Shape(mean.verts + offset, mean.faces)
+        panels.append(Panel(moved, scale.colors(along[row]), label, rotation=turn, unit=unit))
+    render_shapes(panels, path, Look(legend=scale))
+
+
+def draw_distances(path: Path, atlas: Atlas, turn: Float[Floats, "3 3"]) -> None:
+    mean = atlas.mean_shape
+    spread = np.sqrt(np.einsum("m,mvi->v", atlas.variances, np.square(atlas.modes)))
+    rows = furthest(atlas)
+    offsets = atlas.offsets(atlas.scores[rows])
+    apart = np.linalg.norm(offsets, axis=2)
+    scale = Scale.of(np.concatenate([spread, apart.ravel()]), "distance from the mean (unit of the files)")
+    unit = float(np.sqrt(mean.area))
+    panels = [Panel(mean, scale.colors(spread), "all: root mean square", rotation=turn, unit=unit)]
+    for row, offset, far in zip(rows, offsets, apart, strict=True):
+        shape = Shape(mean.verts + offset, mean.faces)
+        panels.append(Panel(shape, scale.colors(far), atlas.names[row], rotation=turn, unit=unit))
+    render_shapes(panels, path, Look(legend=scale))
+
+
+def draw_effects(folder: Path, mean: Shape, found: Explained, turn: Float[Floats, "3 3"]) -> None:
+    """A picture of each coefficient of a model that was tested, up to a dozen."""
+    shown = [
+        (name, along, effect.places)
+        for effect in found.table.effects
+        for name, along in zip(effect.coefficients, effect.along_normal, strict=True)
+        if effect.places is not None
+    ]
+    for number, (name, along, places) in enumerate(shown[:_MOST_EFFECTS], 1):
+        slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:40]
+        draw_effect(folder / f"effect-{number}-{slug}.png", mean, name, along, places, turn)
+
+
+def draw_effect(
+    path: Path,
+    mean: Shape,
+    name: str,
+    along: Float[Floats, " V"],
+    found: Comparison | PlaceTests,
+    turn: Float[Floats, "3 3"],
+) -> None:
+    """A displacement of the mean along its normals, all of it and where it is more than chance, from where the strongest
+    effect is, and from behind.
+    """
+    most = float(np.abs(along).max()) or 1.0
+    step = nice_step(most, 4)
+    most = step * np.ceil(most / step)
+    scale = Scale.of(along, f"{name}: displacement outwards (unit of the files)", (-most, most))
+    front = _towards(mean, int(np.argmax(found.statistic)), turn)
+    shown = {
+        "displacement": np.ones(len(along), bool),
+        f"false discovery rate <= {LEVEL:g}": found.p_fdr <= LEVEL,
+        f"family-wise p <= {LEVEL:g}": found.p_corrected <= LEVEL,
+    }
+    panels = []
+    for label, kept in shown.items():
+        colors = scale.colors(np.where(kept, along, np.nan))
+        panels.append(Panel(mean, colors, label, rotation=front))
+        panels.append(Panel(mean, colors, "from behind", rotation=_BACK @ front))
+    render_shapes(panels, path, Look(turn=0, tilt=0, legend=scale))
+
+
+def _towards(mean: Shape, vertex: int, turn: Float[Floats, "3 3"]) -> Float[Floats, "3 3"]:
+    """The rotation that shows a place of a surface to the viewer, with as much of the shape's up as can be."""
+    near = np.linalg.norm(mean.verts - mean.verts[vertex], axis=1) < _AROUND * np.sqrt(mean.area)
+    ahead = mean.vertex_normals[near].sum(axis=0)
+    ahead = ahead / np.linalg.norm(ahead) if np.linalg.norm(ahead) > 1e-9 else turn[2]
+    right = np.cross(turn[1] if abs(turn[1] @ ahead) < _ABOVE else -turn[2], ahead)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(ahead, right), ahead])
+
+
+def draw_charts(folder: Path, atlas: Atlas, measures: Measures | None, kind: ChartFormat) -> None:
+    """How far shapes are from the mean, and how the measures change with the number of modes."""
+    apart = atlas.distances.tolist()
+    far = furthest(atlas)[0]
+    marks = {apart[far]: atlas.names[far]}
+    draw_histogram(folder / f"histogram.{kind}", apart, "distance from the mean (unit of the files)", "shapes", marks)
+    if measures is None:
+        return
+    x, unit = measures.counts.tolist(), "distance (unit of the files)"
+    both = {"generalisation": "left out one by one", "specificity": "random shapes"}
+    charts: dict[str, Any] = {"compactness": ("share of the variance", {"": (x, measures.compactness.tolist())})}
+    for name, title in both.items():
+        lines = {"points": getattr(measures, name), "surfaces": getattr(measures, f"{name}_surface")}
+        charts[f"{name}: {title}"] = (unit, {key: (x, values.tolist()) for key, values in lines.items()})
+    draw_beside(charts, folder / f"measures.{kind}", "modes")
+
+
+def draw_scores(folder: Path, atlas: Atlas, groups: Sequence[str], kind: ChartFormat) -> None:
+    """The share of the variance of each mode, and the shapes along the first two, with the hulls of groups."""
+    shares = atlas.variances / atlas.total
+    draw_scree(folder / f"scree.{kind}", shares.tolist(), len(atlas.names) - 1)
+    if len(shares) < 2:
+        return
+    points = (atlas.scores * atlas.deviations)[:, :2]
+    names = {row: atlas.names[row] for row in furthest(atlas)}
+    axes = [f"PC{k + 1} ({100 * shares[k]:.3g} %), unit of the files" for k in range(2)]
+    dots = Dots(points[:, 0].tolist(), points[:, 1].tolist(), axes[0], axes[1], names)
+    draw_dots(folder / f"components.{kind}", [dots], groups, hulls=True)
+
+
+def draw_allometry(folder: Path, found: Explained, about: Allometry, kind: ChartFormat) -> None:
+    """Scores that go with size, of each shape of a model, and their regression in each group."""
+    scores = {
+        "common allometric component (CAC)": about.cac,
+        "regression score (RegScore)": about.regression_scores,
+        "PC1 of predicted shapes": about.predicted,
+    }
+    dots = [Dots(about.sizes.tolist(), values.tolist(), about.label, title) for title, values in scores.items()]
+    draw_dots(folder / f"allometry.{kind}", dots, found.groups or [""] * len(found.names), hulls=False)
