@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
@@ -13,7 +13,7 @@ import numpy as np
 from meshmatch.api.results import MapPair
 from meshmatch.api.transfer import MapLike, find_maps
 from meshmatch.api.upright import turn_upright
-from meshmatch.arrays import Brief
+from meshmatch.arrays import Brief, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import as_path
 from meshmatch.progress import Progress, ProgressCallback
@@ -22,14 +22,18 @@ from meshmatch.shapes.dressed_files import Dressed
 from meshmatch.shapes.files import ShapeLike, as_shape, load_shape
 from meshmatch.shapes.formats import gltf, obj_text
 from meshmatch.shapes.input_files import read_bytes
+from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import find_appearance, load_appearance, load_coordinates
 from meshmatch.threads import thread_limit
 from meshmatch.transfer import bake
 from meshmatch.transfer.bake import Baked, BakeOptions
-from meshmatch.transfer.unwrap import Atlas, Keep, atlas_of
+from meshmatch.transfer.unwrap import Atlas, Keep, atlas_of, new_atlas
 
 if TYPE_CHECKING:
     from meshmatch.render.compose import Composition
+
+_CONTRADICTED = 0.1
+"""Of the surface that shares its places in the image: if more looks otherwise than what it shares them with, it must not."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -177,9 +181,26 @@ def transfer_texture(
     began = time.monotonic() - unwrapped
     report = Progress(progress, mesh.name, "baking")
     with thread_limit(1):
+        if atlas.shared:
+            atlas = _checked(
+                atlas, bake.contradicted(shape, look, mesh, maps.backward, atlas), mesh, options, uv, polygons
+            )
         baked = bake.transfer_texture(shape, look, mesh, maps.backward, atlas, options, report)
     turn = np.eye(3)
     if file is None or file.suffix.lower() not in gltf.SUFFIXES:
         turn = turn_upright(maps, Path(shape.name).suffix.lower() in gltf.SUFFIXES)
     dressed = Dressed(mesh, file, atlas.uv, atlas.own, baked.material, turn)
     return TexturedResult(dressed, baked, atlas, maps, time.monotonic() - began)
+
+
+def _checked(
+    atlas: Atlas, contradicted: float, mesh: Shape, options: BakeOptions, uv: Keep, polygons: Ints | None
+) -> Atlas:
+    """Coordinates that give several places one place in the image, if these look alike; else new ones, or an error."""
+    if contradicted > _CONTRADICTED:
+        problem = f"they overlap, and {100 * contradicted:.0f} % of what lies there looks otherwise"
+        return new_atlas(mesh, options.size, options.padding, uv, polygons, problem)
+    words = (
+        f"{mesh.name}: its own texture coordinates give {100 * atlas.shared:.0f} % of their texels to several places"
+    )
+    return replace(atlas, note=f"{words}, as to mirrored halves; these look alike, and are baked once")

@@ -18,6 +18,7 @@ from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32
 from meshmatch.errors import OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Alpha, Appearance, BakedMaterial, Finish, Layer, Pixels
+from meshmatch.shapes.colors import bytes_of
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map
 from meshmatch.transfer.layers import ColorPainter, NormalPainter, Painter, Spots, SurfacePainter, painted_bytes
@@ -31,6 +32,9 @@ _LARGEST = 8192  # texels along a side
 _OVERHANG = 2
 # A texel that covers more than this many of the source's is sampled several times.
 _COARSE = 1.25
+# Where several places have one place in the image, they are compared at the size of a texel of so small an image, and
+# found in one of that size; their colors are alike if they differ by no more than so many steps of 255.
+_GLANCE, _SEARCH, _ALIKE = 128, 1024, 32
 _CHUNK = 1 << 16
 _BAND = 1 << 22  # texels that are painted together
 
@@ -146,6 +150,28 @@ def transfer_texture(
     plain = BakedMaterial(image, alpha, color.sampler.cutoff, _name_of(look))
     material = _finished(plain, look, dict(zip(painters, others, strict=True)))
     return Baked(material, float(inside.mean()), _share_of_surface(target, on[inside], low[inside.reshape(-1)]), torn)
+
+
+def contradicted(source: Shape, look: Appearance, target: Shape, back: VertexMap, atlas: Atlas) -> float:
+    """The share of the surface that has its places in the image together with others, and looks otherwise than these."""
+    walker, look = _arranged(source, look)
+    locator, sampler = TexelLocator(walker, target, back, atlas.uv * _GLANCE), MaterialSampler(look, walker)
+    on = faces_on(atlas.uv * _SEARCH, _SEARCH)[0]
+    center = atlas.uv.mean(axis=1)
+    column, row = np.minimum(center * _SEARCH, _SEARCH - 1).astype(np.int64).T
+    held = on[row, column]
+    apart = (target.faces[:, :, None] != target.faces[held][:, None, :]).all(axis=(1, 2))
+    face = np.flatnonzero((held >= 0) & apart & target.valid_faces & (target.face_areas > 0)).astype(np.int32)
+    if not len(face):
+        return 0.0
+    x, y = (center[face] * _GLANCE).astype(np.float32).T
+    one, other = (
+        bytes_of(sampler.colors(place, weights, sampler.footprint(place, locator.reach.take(each)))[:3]).astype(int)
+        for each in (face, held[face])
+        for _, place, weights in [locator.locate(each, x, y)]
+    )
+    differ = np.abs(one - other).max(axis=0) > _ALIKE
+    return float(target.face_areas[face[differ]].sum() / target.face_areas[face].sum())
 
 
 def _name_of(look: Appearance) -> str:

@@ -18,11 +18,14 @@ Keep = Literal["auto", "keep", "new"]
 _OVERLAP = 0.002
 # Share up to which they are used all the same: layouts made by hand overlap here and there.
 _FEW = 0.02
+# How often the image may be covered: as by mirrored halves, or by legs that look alike.
+_LAYERS = 8.0
 # Coordinates must use this share of the image, and may leave this share of the surface without room.
 _MIN_USED, _MAX_STARVED = 0.05, 0.02
 # A triangle is starved if it has this share of the room that its area deserves.
 _STARVED = 1e-3
 _MARGIN = 2
+_NEW = "leave out --uv keep: new ones are made"
 # Length of an edge, in units of sqrt(area): xatlas takes seconds at this one, and hours at a few times as much.
 _MAX_EDGE = 500.0
 
@@ -34,6 +37,9 @@ class Atlas:
     uv: Float[Floats, "F 3 2"]  # within 0..1, u to the right, v down; zeros for a face without area
     own: bool  # True if they are those of the file
     note: str = ""  # why the file's own are not used, or what is odd about them
+    shared: float = (
+        0.0  # share of the used texels that several places have, as mirrored halves do: is there one answer?
+    )
 
 
 def atlas_of(
@@ -51,48 +57,58 @@ def atlas_of(
         raise OptionError(problem, "its points can have colors: end the output in .ply")
     if not (shape.face_areas > 0).any():
         raise InputError(f"{name} has no triangle with an area", "is it a mesh?")
-    words, note = f"{name} has no texture coordinates to keep", ""
     if own is not None and keep != "new":
-        within, problem, doubt = _checked(own, shape, size)
+        within, problem, twice = _checked(own, shape, size)
         if not problem:
-            return Atlas(within, True, f"{name}: its own texture coordinates {doubt}" if doubt else "")
-        words = f"{name}: its own texture coordinates cannot be used: {problem}"
-        note = f"{words}; new ones were made"
+            words = f"{name}: its own texture coordinates overlap on {100 * twice:.1f} % of their texels"
+            note = f"{words}, which show one of two places" if twice > _OVERLAP else ""
+            return Atlas(within, True, note, twice if twice > _FEW else 0.0)
+        return new_atlas(shape, size, padding, keep, polygons, problem)
     if keep == "keep":
-        raise OptionError(words, "leave out --uv keep: new ones are made")
-    return Atlas(unwrapped(shape, size, padding, polygons), False, note)
+        raise OptionError(f"{name} has no texture coordinates to keep", _NEW)
+    return Atlas(unwrapped(shape, size, padding, polygons), False)
 
 
-def _checked(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str, str]:
+def new_atlas(shape: Shape, size: int, padding: int, keep: Keep, polygons: Ints | None, problem: str) -> Atlas:
+    """New coordinates in the place of the file's own, with the problem that these have; `OptionError` if they are to be
+    kept, `InputError` if xatlas fails.
+    """
+    words = f"{shape.name or 'the target'}: its own texture coordinates cannot be used: {problem}"
+    if keep == "keep":
+        raise OptionError(words, _NEW)
+    return Atlas(unwrapped(shape, size, padding, polygons), False, f"{words}; new ones were made")
+
+
+def _checked(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str, float]:
     """Coordinates brought into 0..1 by whole numbers, a triangle at a time; why they are no atlas, empty if they are; and
-    what is odd all the same.
+    the share of the used texels that several places have.
     """
     real = shape.face_areas > 0
     if not np.isfinite(uv[real]).all():
-        return uv, "some are not numbers", ""
+        return uv, "some are not numbers", 0.0
     if np.abs(uv[real]).max() > 1e6:
-        return uv, "some are absurdly large", ""
+        return uv, "some are absurdly large", 0.0
     out = np.where(real[:, None, None], uv, 0.0)
     out = out - np.floor(out.min(axis=1, keepdims=True) + 1e-5)
     beyond = int((out.max(axis=(1, 2)) > 1.0 + 1e-5).sum())
     if beyond:
-        return out, f"{beyond} faces reach out of range, over the edge of the image", ""
+        return out, f"{beyond} faces reach out of range, over the edge of the image", 0.0
     uv = np.clip(out, 0.0, 1.0)
     room = flat_areas(uv)
     if room.sum() < _MIN_USED:
-        return uv, f"they use only {100 * room.sum():.1f} % of the image", ""
-    if room.sum() > 1.0 + _FEW or rows_of(uv * size).sum() > MOST_ROWS:
-        return uv, f"they overlap ({room.sum():.1f} times the image)", ""
+        return uv, f"they use only {100 * room.sum():.1f} % of the image", 0.0
+    if room.sum() > _LAYERS or rows_of(uv * size).sum() > MOST_ROWS:
+        return uv, f"they overlap ({room.sum():.1f} times the image)", 0.0
     deserved = shape.face_areas / shape.face_areas.sum()
     starved = float(deserved[room < _STARVED * deserved].sum())
     if starved > _MAX_STARVED:
-        return uv, f"{100 * starved:.0f} % of the surface has no room in the image", ""
+        return uv, f"{100 * starved:.0f} % of the surface has no room in the image", 0.0
     found, twice = faces_on(uv * size, size)
-    share = twice / max(int((found >= 0).sum()), 1)
-    words = f"overlap on {100 * share:.1f} % of their texels"
-    if share > _FEW:
-        return uv, f"they {words}", ""
-    return uv, "", f"{words}, which show one of two places" if share > _OVERLAP else ""
+    held = found >= 0
+    if twice <= _FEW * held.sum():
+        return uv, "", twice / max(int(held.sum()), 1)
+    other = faces_on(uv[::-1] * size, size)[0]
+    return uv, "", float((other[held] != shape.F - 1 - found[held]).mean())
 
 
 def unwrapped(shape: Shape, size: int, padding: int, polygons: Ints | None = None) -> Floats:

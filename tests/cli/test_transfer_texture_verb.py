@@ -130,16 +130,56 @@ def test_the_targets_own_coordinates_are_used_replaced_or_demanded(run: Run, pai
     assert (found.shape == own.shape and np.allclose(found, own, atol=1e-6)) == (used == "own")
 
 
+def folded(shape: Shape) -> np.ndarray:
+    """Texture coordinates that both halves of a ball, left and right, have in common."""
+    x, y, z = np.moveaxis(shape.verts[shape.faces], 2, 0)
+    angle = np.arctan2(np.sign(x.mean(axis=1, keepdims=True) + 1e-9) * x, z)
+    angle = np.clip(np.where(angle < -np.pi / 2, angle + 2 * np.pi, angle), -0.3, np.pi + 0.3)
+    return 0.1 + 0.8 * np.stack([angle / np.pi, (y + 1) / 2], axis=-1)
+
+
 def test_overlapping_coordinates_are_replaced_with_a_note(run: Run, pair: Path) -> None:
     b = load_shape("b.ply")
-    mirrored = np.abs(b.verts[b.faces][:, :, :2]) * 0.9
-    save_textured("b.obj", Textured(b.verts, b.faces, mirrored), picture())
+    save_textured("b.obj", Textured(b.verts, b.faces, folded(b)), picture())
     save_map("ab2.npz", replace(load_map("ab.npz"), target_hash=load_shape("b.obj").hash))
     answer = run(*call("--json", target="b.obj", map="ab2.npz"))
     assert told(answer)["uv_note"]
     assert "note: b.obj: its own texture coordinates cannot be used: they overlap" in answer.err
     before = {path.name for path in pair.iterdir()}
-    refused(run(*call("--uv keep", target="b.obj", map="ab2.npz")), "they overlap", pair, before)
+    refused(run(*call("--uv keep --quiet", target="b.obj", map="ab2.npz")), "they overlap", pair, before)
+
+
+def test_mirrored_coordinates_are_used_where_both_halves_look_alike(run: Run, pair: Path) -> None:
+    """The source is symmetric."""
+    a, b = load_shape("a.glb"), load_shape("b.ply")
+    save_shape("a.ply", replace(a, colors=np.insert(np.abs(a.verts), 3, 1.0, axis=1)))
+    save_map("ab2.npz", replace(load_map("ab.npz"), source_hash=load_shape("a.ply").hash))
+    mirrored = folded(b)
+    save_textured("b.obj", Textured(b.verts, b.faces, mirrored), picture())
+    words = [
+        "transfer-texture",
+        "a.ply",
+        "b.obj",
+        "-o",
+        "out.obj",
+        "--map",
+        "ab2.npz",
+        *SMALL,
+        "--uv",
+        "keep",
+        "--json",
+    ]
+    answer = run(*words)
+    assert told(answer)["uv"] == "own"
+    assert "% of their texels to several places, as to mirrored halves; these look alike" in answer.err
+    out = load_shape("out.obj")
+    found = load_appearance("out.obj", out)
+    assert np.allclose(found.uv, mirrored, atol=1e-6)
+    image = found.materials[0].image
+    assert image is not None
+    column, row = (64 * mirrored.mean(axis=1)).astype(int).T
+    expected = 255 * np.abs(b.verts[b.faces].mean(axis=1))
+    assert np.abs(image[row, column, :3] - expected).mean() < 12
 
 
 def test_size_samples_and_padding(run: Run, pair: Path) -> None:

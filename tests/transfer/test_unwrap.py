@@ -89,17 +89,22 @@ def test_a_few_texels_that_are_shared_are_told() -> None:
     uv[1] += (0.004, 0.004)
     atlas = atlas_of(SQUARE, uv, 512, 2)
     assert atlas.own and "of their texels, which show one of two places" in atlas.note
+    assert atlas.shared == 0.0
     uv[1] += (0.02, 0.02)
-    assert not atlas_of(SQUARE, uv, 512, 2).own
+    assert 0.01 < atlas_of(SQUARE, uv, 512, 2).shared < 0.1
+
+
+def test_places_that_share_a_place_are_counted() -> None:
+    """Whether they look alike is asked later."""
+    atlas = atlas_of(SQUARE, np.stack([OWN[0], OWN[0]]), 64, 2, "keep")
+    assert atlas.own and atlas.shared == 1.0
 
 
 @pytest.mark.parametrize(
     ("uv", "word"),
     [
-        (np.stack([OWN[0], OWN[0]]), "overlap on 100.0 % of their texels"),
         (OWN * 2.0, "reach out of range, over the edge of the image"),
         (OWN + 0.5, "reach out of range"),
-        (np.concatenate([OWN[:1], OWN[:1]]) * 1.0, "overlap"),
         (OWN * 0.01, "use only 0.0 % of the image"),
         (np.stack([OWN[0], np.zeros((3, 2))]), "50 % of the surface has no room"),
         (np.where(np.arange(6).reshape(2, 3, 1) == 4, np.nan, OWN), "not numbers"),
