@@ -27,6 +27,10 @@ class Progress:
         """A range of the bar of another stage."""
         return replace(self, stage_name=name, start=start, end=end)
 
+    def named(self, name: str) -> Progress:
+        """This range, as another stage."""
+        return replace(self, stage_name=name)
+
     def between(self, start: float, end: float) -> Progress:
         """A part of this range; both ends are shares of it."""
         width = self.end - self.start

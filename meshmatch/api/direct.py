@@ -17,7 +17,8 @@ from meshmatch.shapes.repair import Repaired
 from meshmatch.threads import thread_limit, worker_slot
 
 if TYPE_CHECKING:
-    from meshmatch.fitting.direct import DirectMatch, KnownPairs
+    from meshmatch.fitting.direct import DirectMatch
+    from meshmatch.fitting.one_way import DirectConfig, KnownPairs
 
 _UNKNOWN = "no installed model knows these shapes: they were matched directly"
 _BETTER = "the model {} fits these shapes less well than they fit each other: they were matched directly"
@@ -34,17 +35,21 @@ def match_without_model(
     unknown: bool = False,
     guess: MatchResult | None = None,
 ) -> MatchResult:
-    """The map of two repaired shapes, of which the first is the template of both; ``unknown`` says that no model knew them.
-    What a model found, and does not call good, is a ``guess``, and given back where nothing better is found.
+    """The map of two repaired shapes, of which one is the template of both; ``unknown`` says that no model knew them. What a
+    model found, and does not call good, is a ``guess``, and given back where nothing better is found.
 
     `InputError` where a shape cannot be matched: large parts far apart, or a cloud that is no surface.
     """
+    from meshmatch.fitting.one_way import DirectConfig
+
     source, target = clean
     pairs = None if landmarks is None else landmark_vertices(clean, landmarks)
     known = None if pairs is None else (source.original.verts[pairs[0]], target.original.verts[pairs[1]])
     by_model = None if guess is None else (guess.source_fit.points_in_file, guess.target_fit.points_in_file)
-    fits, found = fit_to_first(clean, configs, threads, progress, known, by_model)
-    verdict = fits[1].verdict
+    direct = DirectConfig(seed=configs[0].seed)
+    found = _matched(source, target, configs[0], direct, threads, progress, known, by_model)
+    fits = replace(found.source, repaired=source), replace(found.target, repaired=target)
+    verdict = found.verdict
     if guess is not None and verdict != "good" and (verdict == "poor" or found.over_guess < _CLEARLY):
         return guess
     with thread_limit(1):
@@ -60,28 +65,37 @@ def match_without_model(
 
 
 def fit_to_first(
-    clean: Sequence[Repaired],
-    configs: Sequence[FitConfig],
+    clean: Sequence[Repaired], configs: Sequence[FitConfig], threads: int, progress: ProgressCallback | None
+) -> tuple[list[Fit], DirectMatch]:
+    """Fits of two or more repaired shapes, whose template is the first of them, and how it was matched to the second; errors
+    as `match_without_model`."""
+    from meshmatch.fitting.one_way import DirectConfig
+
+    first, *others = clean
+    direct = DirectConfig(seed=configs[0].seed, from_source=True)
+    found = [_matched(first, each, configs[0], direct, threads, progress) for each in others]
+    fits = [replace(found[0].source, repaired=first)]
+    fits += [replace(each.target, repaired=own) for each, own in zip(found, others, strict=True)]
+    return fits, found[0]
+
+
+def _matched(
+    source: Repaired,
+    target: Repaired,
+    config: FitConfig,
+    direct: DirectConfig,
     threads: int,
     progress: ProgressCallback | None,
     known: KnownPairs | None = None,
     guess: KnownPairs | None = None,
-) -> tuple[list[Fit], DirectMatch]:
-    """Fits of two or more repaired shapes, whose template is the first of them, and how it was matched to the second; errors
-    as `match_without_model`. ``known`` are pairs of positions on these two, and ``guess`` what a model says of them.
-    """
-    from meshmatch.fitting.direct import DirectConfig, match_directly, match_either_side
+) -> DirectMatch:
+    from meshmatch.fitting.direct import match_directly, match_either_side
 
-    for each in clean:
+    for each in (source, target):
         refuse_far_parts(each)
-    first, *others = clean
-    config = DirectConfig(seed=configs[0].seed)
+    match = match_directly if config.mirror == "no" else match_either_side
     with thread_limit(1), worker_slot(threading.Semaphore(threads)):
-        match = match_directly if configs[0].mirror == "no" else match_either_side
-        found = [match(first.shape, each.shape, config, known, progress, guess) for each in others]
-    fits = [replace(found[0].source, repaired=first)]
-    fits += [replace(each.target, repaired=own) for each, own in zip(found, others, strict=True)]
-    return fits, found[0]
+        return match(source.shape, target.shape, direct, known, progress, guess)
 
 
 def direct_notes(clean: Sequence[Repaired], configs: Sequence[FitConfig], unknown: bool) -> tuple[str, ...]:

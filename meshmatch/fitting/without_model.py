@@ -18,7 +18,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.derived import derived
 from meshmatch.errors import InputError
 from meshmatch.fields.shape_functions import build_field
-from meshmatch.fitting.direct import MIRROR, MIRRORED_SHARE, DirectConfig, match_directly
+from meshmatch.fitting.direct import MIRROR, MIRRORED_SHARE, match_directly
 from meshmatch.fitting.fit import Fit, judged_fit
 from meshmatch.fitting.fit_config import Schedule
 from meshmatch.fitting.fitter import cap_verdict
@@ -26,6 +26,7 @@ from meshmatch.fitting.judge.direct import DirectFeatures
 from meshmatch.fitting.judge.features import compute_features
 from meshmatch.fitting.judge.reasons import Reason
 from meshmatch.fitting.judge.verdict import judge
+from meshmatch.fitting.one_way import DirectConfig
 from meshmatch.fitting.search.task import take_samples
 from meshmatch.fitting.solve.blend import FieldPath
 from meshmatch.fitting.solve.driver import Problem, minimise
@@ -45,7 +46,9 @@ from meshmatch.templates.template import Template
 
 _ALIGNED_BY = 2400  # samples
 # Where the template roughly belongs is all that is asked of a search.
-_ROUGHLY = DirectConfig(coarse=1200, fine=2400, samples=3000, few=1200, fewer=700, better=8, best=3)
+_ROUGHLY = DirectConfig(
+    coarse=1200, fine=2400, samples=3000, few=1200, fewer=700, better=8, best=3, both_ways=False, from_source=True
+)
 _ONTO = Schedule(steps=6, prior=(1e-2, 1e-3), scale=(1.0, 1.0), damping=1e-6)
 # Set by hand, on femurs, hearts, ants and four-legged animals: a shape to which the template comes so near, and stretches so
 # little (0.6 for hearts, 0.8 and more for ants in other poses), stands as the template does;

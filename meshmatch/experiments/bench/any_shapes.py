@@ -32,9 +32,10 @@ from meshmatch.api.matcher import Matcher
 from meshmatch.api.results import map_of_fits
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.experiments import runner
-from meshmatch.fitting.direct import DirectConfig, match_either_side
+from meshmatch.fitting.direct import match_either_side
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.calibration import DirectCalibration
+from meshmatch.fitting.one_way import DirectConfig
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.shapes.files import load_shape
 from meshmatch.templates.make import edge_graph
@@ -148,7 +149,7 @@ def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[
         found = match_either_side(clean[0].shape, clean[1].shape, DirectConfig(seed=seed))
         fits = replace(found.source, repaired=clean[0]), replace(found.target, repaired=clean[1])
         mapped = map_of_fits(fits, fits, 1)
-        evidence = {"energy": found.tried[0][1].energy, "leads": found.leads}
+        evidence = {"energy": found.energy, "leads": found.leads, "both_ways": found.both_ways}
     else:
         mapped = Matcher(model, FitConfig(seed=seed), threads=1).match(source, target).map
     spent = time.process_time() - began

@@ -57,3 +57,13 @@ DIRECT = DirectCalibration(
     data="90 pairs of experiments.bench.any_shapes, six of each class, of which 76 are right",
     date="2026-11-26",
 )
+
+# Of energies that are means of both directions.
+DIRECT_BOTH_WAYS = DirectCalibration(
+    offset=6.952,
+    energy=145.4,
+    lead=371.8,
+    most=0.008,
+    data="48 pairs of twelve classes of experiments.bench.any_shapes, of which 42 are right; ridge 0.02",
+    date="2026-11-27",
+)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.fitting.judge.calibration import DIRECT
+from meshmatch.fitting.judge.calibration import DIRECT, DirectCalibration
 from meshmatch.fitting.judge.reasons import Reason, Verdict
 from meshmatch.fitting.search.discontinuities import Pairs, discontinuous_share
 from meshmatch.fitting.search.predictor import two_way_residual
@@ -61,10 +61,12 @@ class DirectFeatures:
         return self.residual + _STRETCH * self.stretch + _TORN * self.discontinuous
 
 
-def judge_direct(energy: float, leads: Sequence[float]) -> tuple[Verdict, float, tuple[Reason, ...]]:
+def judge_direct(
+    energy: float, leads: Sequence[float], calibration: DirectCalibration = DIRECT
+) -> tuple[Verdict, float, tuple[Reason, ...]]:
     """Verdict, trust (0..1) and reasons of the best fit; ``leads`` are how much higher the energies are of other fits, which
     differ from it clearly."""
-    trust = float(1 / (1 + np.exp(-DIRECT.logit(energy, leads))))
+    trust = float(1 / (1 + np.exp(-calibration.logit(energy, leads))))
     reasons = []
     if equal := sum(each < _TIE for each in leads):
         count = f"{min(equal, _TOLD) + 1}{' or more' if equal > _TOLD else ''}"

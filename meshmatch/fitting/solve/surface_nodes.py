@@ -13,13 +13,15 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from meshmatch.arrays import Bool, Bools, Float, Floats
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.fields.shape_functions import build_surface_field
 from meshmatch.fitting.solve.priors import ViscousGradient
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
+
+_NEAR = 0.2  # share of the distance to look for neighbours in, at first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,8 +64,7 @@ class SurfaceNodes:
         field = build_surface_field(verts, nodes, radii, (vertex, node))
         system = NodeSystem(shape, field, self.gradient_points)
         points = system.gradient_points
-        apart = np.asarray(dijkstra(graph, directed=False, indices=points, limit=far))[:, points]
-        return system, ViscousGradient.by_distance(apart, self.neighbours)
+        return system, ViscousGradient.by_distance(_apart(graph, points, self.neighbours, far), self.neighbours)
 
     def _grown(
         self, straight: Float[Floats, "K V"], lengths: Float[Floats, "K V"]
@@ -85,3 +86,14 @@ class SurfaceNodes:
             radii[closest] = np.maximum(radii[closest], 1.5 * straight[closest, vertex])
             reached[closest, vertex] = True
         return radii, reached
+
+
+def _apart(graph: csr_matrix, points: Int[Ints, " G"], count: int, far: float) -> Float[Floats, "G G"]:
+    """Distances along edges between some vertices, as far as it takes to know so many nearest ones of each, or ``far``;
+    infinite beyond."""
+    limit = _NEAR * far
+    while True:
+        found = np.asarray(dijkstra(graph, directed=False, indices=points, limit=limit))[:, points]
+        if limit >= far or (np.isfinite(found).sum(1) >= count).all():
+            return found
+        limit *= 2

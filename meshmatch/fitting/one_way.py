@@ -1,0 +1,282 @@
+"""One shape fitted to another without a model: guesses of where its vertices belong, fitted coarse to fine.
+
+Proposals (`meshmatch.fitting.search.proposals`) are fitted on few nodes, all for a few steps, then those that look better,
+and the best of these on more nodes. Their energies say which is right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.fitting.fit_config import NodeRefineConfig, Schedule
+from meshmatch.fitting.judge.direct import DirectFeatures
+from meshmatch.fitting.search.discontinuities import Pairs, neighbours
+from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh
+from meshmatch.fitting.search.proposals import (
+    Proposal,
+    differ,
+    extremity_proposals,
+    rigid_proposals,
+    spectral_proposals,
+)
+from meshmatch.fitting.solve.driver import Problem, minimise
+from meshmatch.fitting.solve.priors import Prior, RotatedReference, ViscousGradient
+from meshmatch.fitting.solve.surface_nodes import SurfaceNodes
+from meshmatch.fitting.solve.system import NodeSystem
+from meshmatch.fitting.solve.terms import GoalTerm, LandmarkTerm, PairTerm, Term
+from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.trees import cKDTree
+from meshmatch.progress import Progress
+from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.shape import Shape
+from meshmatch.threads import parallel_map
+
+KnownPairs = tuple[Float[Floats, "N 3"], Float[Floats, "N 3"]]
+"""Positions on the source and on the target that belong together."""
+_KNOWN_WEIGHT = 0.05  # of each known pair; all other pairs together have about 1
+_NEAR = 3  # vertices of the coarse mesh by which one of the fine mesh moves
+
+
+def _pairs(steps: int, prior: tuple[float, float], scale: tuple[float, float], back: int) -> NodeRefineConfig:
+    schedule = Schedule(steps=steps, prior=prior, scale=scale, damping=1e-6)
+    return NodeRefineConfig(schedule=schedule, point_share=0.1, back_points=back)
+
+
+_COARSE_NODES = SurfaceNodes(K=120, radius=0.2, gradient_points=400)
+_FINE_NODES = SurfaceNodes(K=320, radius=0.13)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DirectConfig:
+    """How two shapes are matched without a model; lengths in units of sqrt(area). Set by hand on 30 pairs of 15 kinds.
+
+    Attributes
+    ----------
+    coarse, fine : triangles of the thinned meshes that are fitted first and last
+    samples, few, fewer : points of the target: for the last fits, for the better coarse ones, and for all
+    coarse_nodes, fine_nodes : nodes of both meshes
+    first, second, third, last : least squares of all proposals, of the better ones, of the best on the fine mesh, of which
+        the energies decide, and of the one that is taken, which may stretch more
+    better, best : how many proposals are fitted a second, and a third time
+    unlike : share of vertices by which these differ at least
+    both_ways : whether the target is fitted to the source as well, where the one way leaves doubt
+    from_source : whether the source is to be the template, and not the one that fits the other better
+    seed : of all random numbers
+    """
+
+    coarse: int = 2400
+    fine: int = 6000
+    samples: int = 8000
+    few: int = 2500
+    fewer: int = 1200
+    coarse_nodes: SurfaceNodes = _COARSE_NODES
+    fine_nodes: SurfaceNodes = _FINE_NODES
+    first: NodeRefineConfig = field(default_factory=lambda: _pairs(4, (3e-3, 1e-3), (0.12, 0.07), 1200))
+    second: NodeRefineConfig = field(default_factory=lambda: _pairs(8, (1e-3, 1e-4), (0.1, 0.03), 1500))
+    third: NodeRefineConfig = field(default_factory=lambda: _pairs(8, (3e-4, 1e-4), (0.06, 0.02), 4000))
+    last: NodeRefineConfig = field(default_factory=lambda: _pairs(6, (1e-4, 3e-5), (0.03, 0.02), 4000))
+    better: int = 16
+    best: int = 6
+    unlike: float = 0.03
+    both_ways: bool = True
+    from_source: bool = False
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """A thinned shape, its least squares, and the prior by which its parts may stretch."""
+
+    mesh: ThinMesh
+    system: NodeSystem
+    viscous: ViscousGradient
+    known: tuple[LandmarkTerm, ...]
+
+    @classmethod
+    def of(cls, mesh: ThinMesh, nodes: SurfaceNodes, known: KnownPairs | None, seed: int) -> Level:
+        terms: tuple[LandmarkTerm, ...] = ()
+        if known is not None:
+            nearest = np.asarray(cKDTree(mesh.verts).query(known[0])[1])
+            terms = (LandmarkTerm((nearest, known[1]), _KNOWN_WEIGHT),)
+        return cls(mesh, *nodes.system(mesh.shape, mesh.graph, seed), terms)
+
+    def features(
+        self, samples: OrientedPoints, vectors: Float[Floats, "K 3"], pairs: Pairs | None = None
+    ) -> DirectFeatures:
+        """Of node vectors; how far known pairs are missed counts as a residual."""
+        found = DirectFeatures.of(self.system, samples, vectors, pairs)
+        for term in self.known:
+            at, goal = term.landmarks
+            off = np.linalg.norm(self.system.moved(vectors)[at] - goal, axis=1).mean()
+            found = replace(found, residual=found.residual + float(off))
+        return found
+
+    @property
+    def rigid(self) -> Prior:
+        """As rigid as possible, about the shape as it is."""
+        return RotatedReference(np.tile(np.eye(3), (len(self.system.gradient_points), 1, 1)))
+
+    def onto(self, goals: Float[Floats, "V 3"], schedule: Schedule, prior: Prior) -> Float[Floats, "K 3"]:
+        """Node vectors that bring each vertex near a goal of its own."""
+        problem = Problem(system=self.system, terms=[GoalTerm(goals), *self.known], schedule=schedule)
+        return minimise(problem, prior, np.zeros((self.system.K, 3)))
+
+    def begun(self, proposal: Proposal) -> Float[Floats, "K 3"]:
+        """Near a proposal: as rigid as possible, or with limbs that may be longer or shorter than its own."""
+        if proposal.kind in ("rigid", "affine"):
+            return self.onto(proposal.points, _ONTO, self.rigid)
+        return self.onto(proposal.points, _ONTO_STRETCHED, self.viscous)
+
+    def refined(
+        self,
+        samples: OrientedPoints,
+        vectors: Float[Floats, "K 3"],
+        config: NodeRefineConfig,
+        prior: Prior | None = None,
+    ) -> Float[Floats, "K 3"]:
+        """Node vectors after pairing with the samples of the target."""
+        facing = samples.facing(self.system.surface(vectors))
+        terms: list[Term] = [PairTerm(facing, config), *self.known]
+        problem = Problem(system=self.system, terms=terms, schedule=config.schedule)
+        return minimise(problem, prior or self.rigid, vectors)
+
+
+_ONTO = Schedule(steps=6, prior=(3e-2, 1e-3), scale=(1.0, 0.15), damping=1e-6)
+_ONTO_STRETCHED = Schedule(steps=6, prior=(3e-2, 1e-3), scale=(1.0, 0.3), damping=1e-6)
+_ONTO_AGAIN = Schedule(steps=4, prior=(1e-3, 3e-4), scale=(1.0, 0.15), damping=1e-6)
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """Node vectors of one proposal, where they take the vertices, and how well."""
+
+    proposal: Proposal
+    vectors: Float[Floats, "K 3"]
+    moved: Float[Floats, "V 3"]
+    features: DirectFeatures
+
+    @property
+    def energy(self) -> float:
+        return self.features.energy
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One of two shapes; what it needs to be fitted to the other one, and the other one to it.
+
+    ``frame`` is that of its file; all else is in units of sqrt(area). ``thin`` is the coarse mesh, and ``known`` are
+    positions (N, 3) on it, and (N, 3) on the other one.
+    """
+
+    original: Shape
+    frame: Frame
+    shape: Shape
+    thin: ThinMesh
+    known: KnownPairs | None
+    config: DirectConfig
+
+    @cached_property
+    def coarse(self) -> Level:
+        return Level.of(self.thin, self.config.coarse_nodes, self.known, self.config.seed)
+
+    @cached_property
+    def fine(self) -> Level:
+        mesh = ThinMesh.of(self.shape, self.config.fine)
+        return Level.of(mesh, self.config.fine_nodes, self.known, self.config.seed)
+
+    @cached_property
+    def intrinsic(self) -> Intrinsic:
+        return Intrinsic(self.thin)
+
+    @cached_property
+    def samples(self) -> OrientedPoints:
+        return sample_surface(self.shape, self.config.samples, np.random.default_rng(self.config.seed))
+
+    @cached_property
+    def neighbours(self) -> Pairs:
+        return neighbours(self.samples)
+
+
+def finished(
+    own: Side, onto: Side, begun: Sequence[tuple[Proposal, Float[Floats, "V 3"]]], report: Progress
+) -> list[Tried]:
+    """The fine mesh of one shape fitted to another from where its vertices (V, 3) may belong, for each proposal."""
+    fine, samples, near, config = own.fine, onto.samples, onto.neighbours, own.config
+
+    def fit(proposal: Proposal, goals: Float[Floats, "V 3"]) -> Tried:
+        vectors = fine.refined(samples, fine.onto(goals, _ONTO_AGAIN, fine.rigid), config.third)
+        return Tried(proposal, vectors, fine.system.moved(vectors), fine.features(samples, vectors, near))
+
+    report(0.0)
+    found = parallel_map(fit, [proposal for proposal, _ in begun], [goals for _, goals in begun])
+    report(1.0)
+    return found
+
+
+def fitted(own: Side, onto: Side, guess: KnownPairs | None, report: Progress) -> list[Tried]:
+    """The best fits of one shape to another, best first; ``guess`` is one more proposal."""
+    config, rested, verts = own.config, own.thin.verts, own.fine.mesh.verts
+    proposals = _proposals(own, onto, report.named("guesses without a model").between(0.0, 0.4))
+    if guess is not None:
+        proposals.append(Proposal("guess", carried(rested, *guess)))
+    trying = report.named(f"fits of {len(proposals)} guesses").between(0.4, 0.8)
+    tried = _screened(own.coarse, proposals, onto.samples, config, trying)
+    goals = [(each.proposal, verts + carried(verts, rested, each.moved - rested)) for each in tried]
+    report = report.named("fits of the best guesses").between(0.8, 1.0)
+    return sorted(finished(own, onto, goals, report), key=lambda each: each.energy)
+
+
+def _proposals(source: Side, target: Side, report: Progress) -> list[Proposal]:
+    found = rigid_proposals(source.thin, target.thin)
+    for number, make in enumerate((extremity_proposals, spectral_proposals)):
+        found += make(source.intrinsic, target.intrinsic)
+        report((number + 1) / 2)
+    return found
+
+
+def _screened(
+    level: Level, proposals: list[Proposal], samples: OrientedPoints, config: DirectConfig, report: Progress
+) -> list[Tried]:
+    """Proposals fitted on few nodes: all for a few steps, then those that look better; the best, no two alike."""
+    done = 0
+
+    def fit(
+        proposal: Proposal, some: OrientedPoints, vectors: Floats, how: NodeRefineConfig, pairs: Pairs | None = None
+    ) -> Tried:
+        nonlocal done
+        vectors = level.refined(some, vectors, how)
+        features = level.features(some, vectors, pairs)
+        done += 1
+        report(min(done / (len(proposals) + config.better), 1.0))
+        return Tried(proposal, vectors, level.system.moved(vectors), features)
+
+    fewer, few = samples.first(config.fewer), samples.first(config.few)
+    first = parallel_map(lambda each: fit(each, fewer, level.begun(each), config.first), proposals)
+    better = _distinct(first, config.better, config.unlike)
+    pairs = neighbours(few)
+    tried = parallel_map(lambda each: fit(each.proposal, few, each.vectors, config.second, pairs), better)
+    return _distinct(tried, config.best, config.unlike)
+
+
+def carried(
+    points: Float[Floats, "V D"], at: Float[Floats, "T D"], values: Float[Floats, "T 3"]
+) -> Float[Floats, "V 3"]:
+    """Values at some points carried to others, from the nearest ones."""
+    distance, near = cKDTree(at).query(points, _NEAR)
+    weights = 1 / (np.asarray(distance) + 1e-3)
+    return np.asarray((weights[..., None] * values[near]).sum(1) / weights.sum(1, keepdims=True))
+
+
+def _distinct(tried: list[Tried], count: int, unlike: float) -> list[Tried]:
+    """The best of the fits, no two of which are alike."""
+    kept: list[Tried] = []
+    for each in sorted(tried, key=lambda each: each.energy):
+        if len(kept) < count and all(differ(each.moved, other.moved) > unlike for other in kept):
+            kept.append(each)
+    return kept
