@@ -217,7 +217,7 @@ class _Search:
         leads = _leads(found, config.unlike)
         judged, backwards = judge_direct(found[0].energy, leads), False
         chosen = there[0]
-        if config.both_ways and judged[0] != "good":
+        if config.both_ways == "always" or (config.both_ways == "in doubt" and judged[0] != "good"):
             found = both = self.both_ways(there, report.stage("", 0.6, 0.95))
             leads = _leads(found, _SAME)
             judged = judge_direct(found[0].energy, leads, DIRECT_BOTH_WAYS)

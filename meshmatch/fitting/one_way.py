@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
@@ -65,7 +66,7 @@ class DirectConfig:
         the energies decide, and of the one that is taken, which may stretch more
     better, best : how many proposals are fitted a second, and a third time
     unlike : share of vertices by which these differ at least
-    both_ways : whether the target is fitted to the source as well, where the one way leaves doubt
+    both_ways : when the target is fitted to the source as well; "in doubt" is where the one way is not good
     from_source : whether the source is to be the template, and not the one that fits the other better
     seed : of all random numbers
     """
@@ -84,7 +85,7 @@ class DirectConfig:
     better: int = 16
     best: int = 6
     unlike: float = 0.03
-    both_ways: bool = True
+    both_ways: Literal["no", "in doubt", "always"] = "in doubt"
     from_source: bool = False
     seed: int = 0
 

@@ -47,7 +47,7 @@ from meshmatch.templates.template import Template
 _ALIGNED_BY = 2400  # samples
 # Where the template roughly belongs is all that is asked of a search.
 _ROUGHLY = DirectConfig(
-    coarse=1200, fine=2400, samples=3000, few=1200, fewer=700, better=8, best=3, both_ways=False, from_source=True
+    coarse=1200, fine=2400, samples=3000, few=1200, fewer=700, better=8, best=3, both_ways="no", from_source=True
 )
 _ONTO = Schedule(steps=6, prior=(1e-2, 1e-3), scale=(1.0, 1.0), damping=1e-6)
 # Set by hand, on femurs, hearts, ants and four-legged animals: a shape to which the template comes so near, and stretches so

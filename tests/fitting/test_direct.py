@@ -265,3 +265,14 @@ def test_goals_are_reached_by_vectors(thin: ThinMesh) -> None:
         Problem(system=system, terms=[GoalTerm(goals)], schedule=schedule), prior, np.zeros((system.K, 3))
     )
     assert np.linalg.norm(system.moved(vectors) - goals, axis=1).mean() < 0.01
+
+
+def test_one_correspondence_is_found_from_either_side() -> None:
+    quick = replace(QUICK, coarse=300, fine=600, samples=1000, few=400, fewer=300, better=4, best=2, both_ways="always")
+    box = trimesh.creation.box((1.0, 0.7, 0.4)).subdivide().subdivide()
+    first = Shape(np.asarray(box.vertices), np.asarray(box.faces), "box")
+    second = Shape(first.verts * [1.05, 1.0, 0.97], first.faces, "longer box")
+    there, back = match_directly(first, second, quick), match_directly(second, first, replace(quick, from_source=True))
+    assert there.both_ways and back.both_ways
+    assert there.energy == pytest.approx(back.energy, rel=1e-6)
+    assert not np.any(back.source.vectors) and np.any(back.target.vectors)
