@@ -256,7 +256,7 @@ def _files(
         if maps.map is None and meshmatch.Collection(target[0]).holds(others[0]):
             maps = _changed(maps, map=target[0])
     else:
-        sources = find_sources([str(each) for each in target], Store.of(output))
+        sources, _ = find_sources([str(each) for each in target], Store.of(output))
         found = {source.name: Path(source.path) for source in sources}
     taken = {os.path.realpath(path) for path in others if path is not None}
     own = os.path.realpath(others[0])

@@ -15,7 +15,7 @@ from meshmatch.api.results import MapPair
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.export import Exported, Place, check_export, export
-from meshmatch.collections.fit_all import TABLE, Fitted, elsewhere_words, fit_all, fit_other_kinds
+from meshmatch.collections.fit_all import TABLE, Fitted, elsewhere_words, fit_all, fit_other_kinds, with_left_out
 from meshmatch.collections.fit_files import load_words
 from meshmatch.collections.map_all import Pair, map_all
 from meshmatch.collections.registered import Registered, held
@@ -127,7 +127,7 @@ class Collection:
             There is no shape, two have the same name, none could be fitted, or the folder holds fits of another model
             or made in another way, or another process writes to it.
         """
-        sources = find_sources(shapes, self.store)
+        sources, left_out = find_sources(shapes, self.store)
         wish = Setting(self.store, str(model), config or FitConfig(), tuple(only), tuple(without), sequence)
         with self.store.alone(), hired(self.workers) as crew:
             setting = settled(wish, sources)
@@ -136,6 +136,7 @@ class Collection:
                 made = fit_other_kinds(made, wish, sources, crew, agree, self.progress, tell)
             else:
                 made = fit_all(setting, sources, crew, agree, self.progress, tell)
+            made = with_left_out(made, self.store, left_out)
         forget()
         return made
 

@@ -136,6 +136,15 @@ def fit_other_kinds(
     return replace(made, records=tuple(records), elsewhere=elsewhere)
 
 
+def with_left_out(made: Fitted, store: Store, left_out: Sequence[Record]) -> Fitted:
+    """The same with files that were not taken; the table has their rows."""
+    if not left_out:
+        return made
+    made = replace(made, records=(*made.records, *left_out))
+    _write_table(store, made.records)
+    return made
+
+
 def elsewhere_words(elsewhere: Mapping[str, str]) -> list[str]:
     """A line for each folder of fits of another kind: which names are there."""
     lines = []

@@ -6,10 +6,10 @@ import glob
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 
 from meshmatch import blender
-from meshmatch.collections.setting import Source
+from meshmatch.collections.setting import Record, Source
 from meshmatch.collections.stores import Store, is_url
 from meshmatch.errors import InputError, warn
 from meshmatch.outputs import as_path, plain_text
@@ -60,18 +60,23 @@ _NAMED = 5  # of the files that are not read
 _PATTERN = "*?["
 
 
-def find_sources(shapes: str | Path | Sequence[str | Path], output: Store) -> list[Source]:
-    """The shapes of files, folders, patterns and URLs of folders, sorted by name.
+def find_sources(shapes: str | Path | Sequence[str | Path], output: Store) -> tuple[list[Source], list[Record]]:
+    """The shapes of files, folders, patterns and URLs of folders, sorted by name; and what was left out, with the reason.
 
-    A shape of a folder is called by its path in it, without the suffix; any other by its file's name. What lies in the
-    folder of the fits is left out; so are arrays (.npy), and files that Blender reads, of a folder that holds other shapes.
+    A shape of a folder is called by its path in it, without the suffix; any other by its file's name. Left out, which is
+    told, are files of unknown formats, and those that Blender reads of a folder that holds other shapes. No shapes are what
+    lies in the folder of the fits, and arrays (.npy), images, tables and the like beside shapes.
 
     `InputError` if there is nothing, or two shapes have one name.
     """
     given = [shapes] if isinstance(shapes, str | Path) else list(shapes)
     if any(Store.of(each).location == output.location for each in given if is_url(each) or as_path(each).is_dir()):
         raise InputError(f"cannot fit {output.location} into itself", "choose another folder with --output")
-    found = sorted((source for each in given for source in _sources(each, output)), key=lambda source: source.name)
+    found: list[Source] = []
+    left_out: list[Record] = []
+    for each in given:
+        _find(each, output, found, left_out)
+    found.sort(key=lambda source: source.name)
     if not found:
         raise InputError(
             f"there are no shapes in {given[0] if given else 'nothing'}", f"read are {', '.join(SUFFIXES)}"
@@ -81,7 +86,7 @@ def find_sources(shapes: str | Path | Sequence[str | Path], output: Store) -> li
         if counts[source.name] > 1:
             both = " and ".join(each.file for each in found if each.name == source.name)
             raise InputError(f"two shapes are called {source.name}: {both}", "rename one, or put them into two folders")
-    return found
+    return found, left_out
 
 
 def natural(name: str) -> list[tuple[int, str]]:
@@ -90,29 +95,41 @@ def natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
-def _sources(given: str | Path, output: Store) -> Iterable[Source]:
-    if is_url(given):
-        return _of_folder(Store.of(given), output)
-    path = as_path(given)
-    if path.is_dir():
-        return _of_folder(Store.of(path), output)
+def _find(given: str | Path, output: Store, found: list[Source], left_out: list[Record]) -> None:
+    """Add the shapes of a file, a folder, a pattern or a URL, and what is left out of it."""
+    path = None if is_url(given) else as_path(given)
+    if path is None or path.is_dir():
+        folder = Store.of(given)
+        names = [PurePosixPath(name) for name in folder.names()]
+        inside = [file for file in names if not f"{folder.location}/{file}".startswith(f"{output.location}/")]
+        _leave_out(
+            folder.location, "files of unknown format", filter(_is_unknown, inside), left_out, f"{folder.location}/"
+        )
+        shapes = [file for file in inside if suffix_of(file) in SUFFIXES]
+        plain = [file for file in shapes if suffix_of(file) not in blender.SUFFIXES] or shapes
+        taken = [file for file in plain if suffix_of(file) != ".npy"] or plain
+        known = {file.with_name(stem_of(file)) for file in (*taken, *plain)}
+        projects = (file for file in shapes if file.with_name(stem_of(file)) not in known)
+        _leave_out(folder.location, "files for Blender beside other shapes", projects, left_out, f"{folder.location}/")
+        found += [Source(str(file.with_name(stem_of(file))), folder, str(file)) for file in taken]
+        return
+    files = [path]
     if not path.exists() and any(mark in str(given) for mark in _PATTERN):
         files = [Path(match) for match in glob.glob(str(path), recursive=True)]
+        unknown = (file for file in files if _is_unknown(file) and file.is_file())
+        _leave_out(str(given), "files of unknown format", unknown, left_out)
         files = [file for file in files if suffix_of(file) in SUFFIXES]
-    else:
-        files = [path]
-    return [Source(stem_of(file), Store.of(file.parent), file.name) for file in files]
+    found += [Source(stem_of(file), Store.of(file.parent), file.name) for file in files]
 
 
-def _of_folder(folder: Store, output: Store) -> list[Source]:
-    """The shapes of a folder. Files of unknown formats are told."""
-    found = [PurePosixPath(name) for name in folder.names()]
-    found = [file for file in found if not f"{folder.location}/{file}".startswith(f"{output.location}/")]
-    files = [file for file in found if suffix_of(file) in SUFFIXES]
-    other = [str(file) for file in found if suffix_of(file) not in (*SUFFIXES, *_COMPANIONS) and file.suffix]
-    if other:
-        names = ", ".join(other[:_NAMED]) + (f" and {len(other) - _NAMED} more" if len(other) > _NAMED else "")
-        warn(f"{folder.location}: files of unknown format are left out: {plain_text(names)}")
-    for beside in (set(blender.SUFFIXES), {".npy"}):
-        files = [file for file in files if file.suffix.lower() not in beside] or files
-    return [Source(str(file.with_name(stem_of(file))), folder, str(file)) for file in files]
+def _is_unknown(file: PurePath) -> bool:
+    return bool(file.suffix) and suffix_of(file) not in (*SUFFIXES, *_COMPANIONS)
+
+
+def _leave_out(given: str, why: str, files: Iterable[PurePath], left_out: list[Record], folder: str = "") -> None:
+    """Say which files of a folder or a pattern are left out, and keep a record of each."""
+    names = [str(file) for file in files]
+    if names:
+        shown = ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+        warn(f"{given}: {why} are left out: {plain_text(shown)}")
+        left_out += [Record(name, f"{folder}{name}", reasons=f"left out: {why}") for name in names]

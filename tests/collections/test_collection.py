@@ -17,7 +17,7 @@ import meshmatch
 from meshmatch.cli import main
 from meshmatch.collections.fit_files import load_fit, load_words, save_fit
 from meshmatch.collections.setting import Record
-from meshmatch.errors import InputError, MeshmatchError, OptionError, OutputError
+from meshmatch.errors import InputError, MeshmatchError, MeshmatchWarning, OptionError, OutputError
 from meshmatch.experiments.hostile.learned import write_eggs
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.solve.agreement import agree_step
@@ -432,9 +432,22 @@ def test_where_no_fit_is_to_be_trusted_maps_can_be_made(tmp_path: Path) -> None:
 
 
 def test_a_shape_of_another_kind_is_called_so(tmp_path: Path) -> None:
+    """And a file that no reader knows has a row, too."""
     shutil.copy(SAMPLES / "dancer.ply", tmp_path)
-    (record,) = meshmatch.Collection(tmp_path / "fits", workers=1).fit(tmp_path, model="quadruped").records
+    (tmp_path / "scan.wrl").write_text("#VRML")
+    with pytest.warns(MeshmatchWarning, match=r"unknown format are left out: scan\.wrl"):
+        made = meshmatch.Collection(tmp_path / "fits", workers=1).fit(tmp_path, model="quadruped")
+    record, other = made.records
     assert (record.verdict, record.reasons.split("; ")[0]) == ("poor", "it is of another kind: human")
+    with (tmp_path / "fits" / "fits.csv").open(newline="") as table:
+        rows = list(csv.DictReader(table))
+    told = "scan.wrl", str(tmp_path / "scan.wrl"), "failed", "left out: files of unknown format"
+    assert [row["name"] for row in rows] == ["dancer", "scan.wrl"] and made.counts["failed"] == 1
+    assert (
+        tuple(rows[1][name] for name in ("name", "file", "verdict", "reasons"))
+        == told
+        == (*(other.name, other.file, other.verdict, other.reasons),)
+    )
 
 
 def test_each_shape_of_a_mixed_folder_gets_the_model_of_its_kind(tmp_path: Path) -> None:

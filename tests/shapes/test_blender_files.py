@@ -187,9 +187,14 @@ def test_works_of_an_artist_beside_shapes_of_a_folder_are_left_alone(tmp_path: P
     with pytest.raises(InputError, match="two shapes are called a"):
         find_sources(tmp_path, fits)
     (tmp_path / "a.blend").unlink()
-    assert [source.file for source in find_sources(tmp_path, fits)] == ["a.fbx", "b.fbx"]
-    (tmp_path / "c.ply").write_bytes(b"x")
-    assert [source.file for source in find_sources(tmp_path, fits)] == ["c.ply"]
+    found, left_out = find_sources(tmp_path, fits)
+    assert ([source.file for source in found], left_out) == (["a.fbx", "b.fbx"], [])
+    for name in ("c.ply", "c.blend", "c.npy"):
+        (tmp_path / name).write_bytes(b"x")
+    with pytest.warns(MeshmatchWarning, match=r"files for Blender beside other shapes are left out: a\.fbx, b\.fbx$"):
+        found, left_out = find_sources(tmp_path, fits)
+    assert [source.file for source in found] == ["c.ply"]
+    assert [record.name for record in left_out] == ["a.fbx", "b.fbx"]
 
 
 @needs_blender

@@ -299,6 +299,7 @@ def test_a_folder_of_them_is_fitted_whole(tmp_path: Path) -> None:
     for name in ("c.mtl", "notes.txt", "README", "scan.wrl", "volume.dcm"):
         (tmp_path / name).write_text("something")
     with pytest.warns(MeshmatchWarning, match=r"files of unknown format are left out: scan\.wrl, volume\.dcm$"):
-        found = find_sources(tmp_path, Store.of(tmp_path / "out"))
+        found, left_out = find_sources(tmp_path, Store.of(tmp_path / "out"))
+    assert [(record.name, record.verdict) for record in left_out] == [("scan.wrl", "failed"), ("volume.dcm", "failed")]
     assert [source.file for source in found] == ["a.vtk", "b.vtp", "c.ply"]
     assert meshmatch.load_shape(tmp_path / "b.vtp").F == icosphere(1).F
