@@ -108,9 +108,9 @@ def off_torch(values: Any) -> Any:
     as it is. `TypeError` for a tensor that holds no plain numbers, such as a sparse one.
     """
     if isinstance(values, list | tuple):
-        some = len(values) > 0 and _is_tensor(values[0])
+        some = len(values) > 0 and is_tensor(values[0])
         return [off_torch(each) for each in values] if some else values
-    if not _is_tensor(values):
+    if not is_tensor(values):
         return values
     try:
         try:
@@ -121,7 +121,8 @@ def off_torch(values: Any) -> Any:
         raise TypeError(str(error).splitlines()[0]) from error
 
 
-def _is_tensor(values: Any) -> bool:
+def is_tensor(values: Any) -> bool:
+    """Whether this is a tensor of torch, which is not loaded for it."""
     return callable(getattr(values, "detach", None)) and callable(getattr(values, "numpy", None))
 
 

@@ -32,7 +32,8 @@ from scipy.sparse import csr_matrix
 
 from meshmatch.arrays import Float, Floats, Int, Ints, as_numbers
 from meshmatch.errors import InputError, OptionError, TemplateError, warn
-from meshmatch.geometry.kernels import KERNELS, MINIMUM_EIGENVALUE, Kernel, support_pairs, support_scale
+from meshmatch.fields.local_fits import LocalFits
+from meshmatch.geometry.kernels import KERNELS, Kernel
 
 FieldName = Literal["mls", "rbf", "pointwise"]
 FIELDS: tuple[FieldName, ...] = get_args(FieldName)
@@ -113,19 +114,29 @@ def build_field(points: ArrayLike, nodes: ArrayLike, radius: ArrayLike, kernel: 
     functions sum to more than `AMPLIFIED`, that is a warning (`MeshmatchWarning`). `InputError` for positions or radii that
     are not finite numbers of these shapes, `OptionError` for a kernel that is not known.
     """
-    if kernel not in KERNELS:
-        raise OptionError(f"invalid kernel {kernel!r}", f"choose one of {', '.join(KERNELS)}")
-    points, nodes = _positions(points, "points"), _positions(nodes, "nodes")
-    radii = as_numbers(radius, "the radius", finite=True)
-    if radii.shape not in ((), (len(nodes),)) or not (radii > 0).all():
-        what = f"the radius must be positive, one number or one for each of {len(nodes)} nodes"
-        raise InputError(f"{what}, not {radii if radii.ndim == 0 else radii.shape}")
-    radii = np.broadcast_to(radii, (len(nodes),))
-    fit = _LocalFits.of(points, nodes, radii, kernel)
-    phi = (fit.weight * fit.along).astype(np.float32)
-    _tell_amplification(np.bincount(fit.at, np.abs(phi), len(points)).astype(np.float64))
+    check_kernel(kernel)
+    points, nodes = checked_positions(points, "points"), checked_positions(nodes, "nodes")
+    radii = checked_radii(radius, len(nodes))
+    fit = LocalFits.of(points, nodes, radii, kernel)
+    phi = fit.values.astype(np.float32)
+    tell_amplification(np.bincount(fit.at, np.abs(phi), len(points)).astype(np.float64))
     values = csr_matrix((phi, (fit.at, fit.of_node)), (len(points), len(nodes)))
     return ShapeFunctions(values, lambda some: _gradient(points[some], nodes, radii, kernel))
+
+
+def check_kernel(kernel: Kernel) -> None:
+    """`OptionError` for one that is not known."""
+    if kernel not in tuple(KERNELS):  # anything else may not be hashable
+        raise OptionError(f"invalid kernel {kernel!r}", f"choose one of {', '.join(KERNELS)}")
+
+
+def checked_radii(radius: ArrayLike, K: int) -> Float[Floats, " K"]:
+    """The radius of each of K nodes; `InputError` for what cannot be one."""
+    radii = as_numbers(radius, "the radius", finite=True)
+    if radii.shape not in ((), (K,)) or not (radii > 0).all():
+        what = f"the radius must be positive, one number or one for each of {K} nodes"
+        raise InputError(f"{what}, not {radii if radii.ndim == 0 else radii.shape}")
+    return np.broadcast_to(radii, (K,))
 
 
 def build_surface_field(
@@ -140,12 +151,12 @@ def build_surface_field(
     two limbs that touch, can have nodes of their own. These may lie in a plane: moment matrices are regularised by
     `_FLAT` of their weight, so that across it the field is nearly constant. Rows of ``phi`` sum to one nearly.
     """
-    fit = _LocalFits.of(points, nodes, radii, "smooth", pairs, _FLAT)
-    values = csr_matrix((fit.weight * fit.along, (fit.at, fit.of_node)), (len(points), len(nodes)))
+    fit = LocalFits.of(points, nodes, radii, "smooth", pairs, _FLAT)
+    values = csr_matrix((fit.values, (fit.at, fit.of_node)), (len(points), len(nodes)))
     return ShapeFunctions(values, _gradient_of(fit, len(points), len(nodes)))
 
 
-def _positions(values: ArrayLike, what: str) -> Float[Floats, "N 3"]:
+def checked_positions(values: ArrayLike, what: str) -> Float[Floats, "N 3"]:
     """A copy of positions; `InputError` for anything but finite numbers in three columns."""
     found = as_numbers(values, what, finite=True)
     if found.ndim != 2 or found.shape[1] != 3 or not len(found):
@@ -153,90 +164,20 @@ def _positions(values: ArrayLike, what: str) -> Float[Floats, "N 3"]:
     return np.array(found)
 
 
-@dataclass(frozen=True, eq=False)
-class _LocalFits:
-    """The least squares of P points: N pairs of a point (``at``) and a node that reaches it, sorted by point."""
-
-    at: Int[Ints, " N"]
-    of_node: Int[Ints, " N"]
-    offset: Float[Floats, "N 3"]
-    weight: Float[Floats, " N"]
-    slope: Float[Floats, " N"]  # (dw/dd) / d
-    scale: Float[Floats, " N"]
-    basis: Float[Floats, "N 4"]  # p(q_i) seen from x
-    inverse: Float[Floats, "P 4 4"]  # of the moment matrices
-
-    @classmethod
-    def of(
-        cls,
-        points: Float[Floats, "P 3"],
-        nodes: Float[Floats, "K 3"],
-        radii: Float[Floats, " K"],
-        kernel: Kernel,
-        pairs: tuple[Int[Ints, " N"], Int[Ints, " N"]] | None = None,
-        flat: float = 0.0,
-    ) -> _LocalFits:
-        at, of_node = support_pairs(points, nodes, radii) if pairs is None else pairs
-        offset = points[at] - nodes[of_node]
-        weight, slope = KERNELS[kernel](np.linalg.norm(offset, axis=1), radii[of_node])
-        scale = support_scale(at, of_node, radii, len(points))[at]
-        basis = np.concatenate([np.ones((len(at), 1)), -offset / scale[:, None]], 1)
-        moment = (_summed(at, len(points)) @ (weight[:, None] * _outer(basis))).reshape(-1, 4, 4)
-        if flat:
-            moment += flat * moment[:, :1, :1] * np.diag([0.0, 1.0, 1.0, 1.0])
-        else:
-            _check_support(moment)
-        return cls(at, of_node, offset, weight, slope, scale, basis, np.linalg.inv(moment))
-
-    @property
-    def along(self) -> Float[Floats, " N"]:
-        """p(x)^T M^-1 p(q_i) with p(x) = [1, 0, 0, 0]."""
-        return np.asarray((self.inverse[:, 0][self.at] * self.basis).sum(1))
-
-
-def _summed(at: Int[Ints, " N"], P: int) -> Any:
-    """The matrix (P, N) that sums over the nodes of each point."""
-    return csr_matrix((np.ones(len(at)), (at, np.arange(len(at)))), (P, len(at)))
-
-
-def _outer(basis: Float[Floats, "N 4"]) -> Float[Floats, "N 16"]:
-    return (basis[:, :, None] * basis[:, None, :]).reshape(-1, 16)
-
-
 def _gradient(
     points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radii: Float[Floats, " K"], kernel: Kernel
 ) -> Any:
     """The gradient of moving least squares (3 P, K)."""
-    return _gradient_of(_LocalFits.of(points, nodes, radii, kernel), len(points), len(nodes))
+    return _gradient_of(LocalFits.of(points, nodes, radii, kernel), len(points), len(nodes))
 
 
-def _gradient_of(fit: _LocalFits, P: int, K: int) -> Any:
-    at, weight, inverse = fit.at, fit.weight, fit.inverse
-    sums, outer, along, constant = _summed(at, P), _outer(fit.basis), fit.along, inverse[:, 0]
-    slope_vector = fit.slope[:, None] * fit.offset  # dw/dx
-    solved = (inverse[at] @ fit.basis[..., None])[..., 0]  # M^-1 p(q_i)
-    gradient = np.empty((len(at), 3))
-    for k in range(3):
-        moment_slope = (sums @ (slope_vector[:, k, None] * outer)).reshape(P, 4, 4)
-        left = (constant[:, None] @ moment_slope)[:, 0]  # p^T M^-1 dM
-        gradient[:, k] = (
-            weight * solved[:, k + 1] / fit.scale - weight * (left[at] * solved).sum(1) + slope_vector[:, k] * along
-        )
-    rows = 3 * at[:, None] + np.arange(3)
+def _gradient_of(fit: LocalFits, P: int, K: int) -> Any:
+    rows = 3 * fit.at[:, None] + np.arange(3)
     columns = np.broadcast_to(fit.of_node[:, None], rows.shape)
-    return csr_matrix((gradient.astype(np.float32).ravel(), (rows.ravel(), columns.ravel())), (3 * P, K))
+    return csr_matrix((fit.gradient.astype(np.float32).ravel(), (rows.ravel(), columns.ravel())), (3 * P, K))
 
 
-def _check_support(moment: Float[Floats, "P 4 4"]) -> None:
-    trace = np.maximum(np.trace(moment, axis1=1, axis2=2), 1e-30)
-    bad = np.flatnonzero(np.linalg.eigvalsh(moment)[:, 0] / trace < MINIMUM_EIGENVALUE)
-    if len(bad):
-        some = ", ".join([*map(str, bad[:5]), *(["..."] if len(bad) > 5 else [])])
-        problem = f"{len(bad)} points have fewer than four non-coplanar nodes in reach (points {some})"
-        raise TemplateError(problem, "use more nodes or a larger radius")
-
-
-def _tell_amplification(total: Float[Floats, " P"]) -> None:
+def tell_amplification(total: Float[Floats, " P"]) -> None:
     """Warn of nodes from which a point is extrapolated, by the sum of its absolute shape functions (whose maximum is the
     Lebesgue constant): an error in the nodes' vectors can grow by so much on its way there.
     """
@@ -253,7 +194,7 @@ def build_rbf(points: ArrayLike, nodes: ArrayLike) -> ShapeFunctions:
     lengths are measured in the largest distance of a node from the middle of all: the functions do not depend on the unit.
     `TemplateError` if two nodes are (nearly) in one place; `InputError` as `build_field`.
     """
-    points, nodes = _positions(points, "points"), _positions(nodes, "nodes")
+    points, nodes = checked_positions(points, "points"), checked_positions(nodes, "nodes")
     unit = float(np.linalg.norm(nodes - nodes.mean(0), axis=1).max())
     q = nodes / unit
     among = multiquadric(q[:, None] - q)

@@ -37,6 +37,20 @@ def _smooth(distance: Any, radius: Any) -> tuple[Any, Any]:
 KERNELS: dict[Kernel, Callable[[Any, Any], tuple[Any, Any]]] = {"cubic": _cubic, "smooth": _smooth}
 
 
+def _cubic_curvature(distance: Any, radius: Any) -> Any:
+    inside = (1 - distance / radius).clip(min=0)
+    d = distance.clip(min=1e-12 * radius)
+    return (6 * inside / (radius * d) + 3 * inside**2 / d**2) / (radius * d) * (distance > 1e-12 * radius)
+
+
+def _smooth_curvature(distance: Any, radius: Any) -> Any:
+    return 24 * (1 - (distance / radius) ** 2).clip(min=0) / radius**4
+
+
+# (distance, radius) -> (ds/dd) / d of the slope s above; of the cubic one it has no limit at the node, and is set to 0
+CURVATURES: dict[Kernel, Callable[[Any, Any], Any]] = {"cubic": _cubic_curvature, "smooth": _smooth_curvature}
+
+
 def support_pairs(
     points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radii: Float[Floats, " K"]
 ) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
@@ -65,8 +79,9 @@ def poorly_supported(
     nodes: Float[Floats, "K 3"],
     radius: float | Float[Floats, " K"],
     kernel: Kernel = "smooth",
+    margin: float = 30.0,
 ) -> Int[Ints, " N"]:
-    """Indices of the points without four non-coplanar nodes in reach (with a safety margin)."""
+    """Indices of the points without four non-coplanar nodes in reach, with a safety margin."""
     radii = np.broadcast_to(np.asarray(radius, np.float64), (len(nodes),))
     row, column = support_pairs(points, nodes, radii)
     offset = points[row] - nodes[column]
@@ -77,4 +92,4 @@ def poorly_supported(
     np.add.at(moment, row, weight[:, None, None] * basis[:, :, None] * basis[:, None, :])
     trace = np.trace(moment, axis1=1, axis2=2)
     smallest = np.linalg.eigvalsh(moment)[:, 0] / np.maximum(trace, 1e-30)
-    return np.flatnonzero(smallest < 30 * MINIMUM_EIGENVALUE)
+    return np.flatnonzero(smallest < margin * MINIMUM_EIGENVALUE)

@@ -16,6 +16,7 @@ from meshmatch.arrays import Floats
 from meshmatch.collections.atlas import Projection
 from meshmatch.collections.groups import Comparison
 from meshmatch.collections.measures import Measures
+from meshmatch.fields import NodeField, node_field
 from meshmatch.templates.prepare import Prepared
 from meshmatch.transfer.label_files import Labels
 from meshmatch.transfer.landmarks import Landmarks
@@ -83,3 +84,4 @@ chairs = meshmatch.load_implicit("chairs")
 assert_type(chairs, meshmatch.ImplicitModel)
 assert_type(meshmatch.fit_implicit(chairs, "a.ply"), meshmatch.ImplicitFit)
 assert_type(meshmatch.__version__, str)
+assert_type(node_field(verts, verts, 1.0, outside="mask"), NodeField)

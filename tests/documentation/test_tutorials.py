@@ -6,6 +6,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -115,6 +116,15 @@ def test_two_files_become_a_walking_textured_dressed_character(tmp_path: Path, m
     away = cKDTree(skin.verts).query(jacket)[0] / np.sqrt(skin.area)
     assert len(jacket) > 50 and away.max() < 0.1
     assert Path("character.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("page", ["fields"])
+def test_the_code_of_a_page_runs(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, remembered_fits: Any
+) -> None:
+    (tmp_path / "templates").symlink_to(ROOT / "templates")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(script(page, "python"), f"{page}.md", "exec"), {})
 
 
 @pytest.mark.slow
