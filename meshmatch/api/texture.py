@@ -27,13 +27,16 @@ from meshmatch.shapes.textured_files import find_appearance, load_appearance, lo
 from meshmatch.threads import thread_limit
 from meshmatch.transfer import bake
 from meshmatch.transfer.bake import Baked, BakeOptions
-from meshmatch.transfer.unwrap import Atlas, Keep, atlas_of, new_atlas
+from meshmatch.transfer.source_layout import check_layout, source_layout
+from meshmatch.transfer.unwrap import Atlas, Keep, atlas_of, check_surface, new_atlas, shared_texels
 
 if TYPE_CHECKING:
     from meshmatch.render.compose import Composition
 
 _CONTRADICTED = 0.1
 """Of the surface that shares its places in the image: if more looks otherwise than what it shares them with, it must not."""
+
+_WORTH_SAYING = 0.002
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -127,8 +130,8 @@ def transfer_texture(
     image
         A picture for the source's texture coordinates, instead of the one that its file names.
     uv
-        Reuse the target's texture coordinates if they are valid ("auto"); reuse them or fail ("keep"); or unwrap the
-        target anew ("new").
+        Reuse the target's texture coordinates if they are valid ("auto"); reuse them or fail ("keep"); unwrap the target
+        anew ("new"); or carry over those of the source ("source").
     options
         Size, sampling and padding of the texture, and what is done where the map is not to be trusted.
     look
@@ -156,7 +159,7 @@ def transfer_texture(
     if uv not in get_args(Keep):
         raise OptionError(f"invalid uv {uv!r}", f"choose one of {', '.join(get_args(Keep))}")
     mesh = as_shape(target, "target")
-    own = load_coordinates(target, mesh) if uv != "new" and isinstance(target, str | Path) else None
+    own = load_coordinates(target, mesh) if uv in ("auto", "keep") and isinstance(target, str | Path) else None
     shape = as_shape(source, "source")
     if look is None:
         if isinstance(source, str | Path):
@@ -175,13 +178,20 @@ def transfer_texture(
         polygons = obj_text.polygons_of(file.name, read_bytes(file), mesh.verts_or_nan).of_triangles
     began = time.monotonic()
     with thread_limit(1):
-        atlas = atlas_of(mesh, own, options.size, options.padding, uv, polygons)
+        if uv == "source":
+            check_surface(mesh)
+            check_layout(shape, look)
+            atlas = None
+        else:
+            atlas = atlas_of(mesh, own, options.size, options.padding, uv, polygons)
     unwrapped = time.monotonic() - began
     maps = find_maps(shape, mesh, match)
     began = time.monotonic() - unwrapped
     report = Progress(progress, mesh.name, "baking")
     with thread_limit(1):
-        if atlas.shared:
+        if atlas is None:
+            atlas = _carried(shape, look, maps, polygons)
+        elif atlas.shared:
             atlas = _checked(
                 atlas, bake.contradicted(shape, look, mesh, maps.backward, atlas), mesh, options, uv, polygons
             )
@@ -204,3 +214,21 @@ def _checked(
         f"{mesh.name}: its own texture coordinates give {100 * atlas.shared:.0f} % of their texels to several places"
     )
     return replace(atlas, note=f"{words}, as to mirrored halves; these look alike, and are baked once")
+
+
+def _carried(shape: Shape, look: Appearance, maps: MapPair, polygons: Ints | None) -> Atlas:
+    """The coordinates of the source on the target; an error where places that look different would share one."""
+    coordinates, charts = source_layout(shape, look, maps.target, maps.backward, polygons)
+    atlas = Atlas(coordinates, False, shared=shared_texels(coordinates))
+    differ = bake.contradicted(shape, look, maps.target, maps.backward, atlas) if atlas.shared else 0.0
+    name = shape.name or "the source"
+    if differ * atlas.shared > _CONTRADICTED:
+        problem = (
+            f"the layout of {name} cannot be carried over: of its texels {100 * atlas.shared:.0f} % have several places"
+        )
+        raise OptionError(f"{problem}, which look different", "leave out --uv source")
+    pieces = f"{charts} chart{'s' if charts != 1 else ''}"
+    words = f"the layout of {name} ({pieces}) was carried over"
+    if atlas.shared > _WORTH_SAYING:
+        words += f"; {100 * atlas.shared:.1f} % of its texels have several places and show one of them"
+    return replace(atlas, note=words)

@@ -22,8 +22,10 @@ class TextureOptions:
     """What is baked, and how."""
 
     image: Path | None = optional("FILE", "Image for the texture coordinates of SRC, instead of its own.")
-    uv: Literal["auto", "keep", "new"] = Option(
-        "auto", help="Texture coordinates of TGT. auto: reuse valid ones; keep: reuse or fail; new: unwrap."
+    uv: Literal["auto", "keep", "new", "source"] = Option(
+        "auto",
+        help="Texture coordinates of TGT. auto: reuse valid ones; keep: reuse or fail; new: unwrap; source: carry over "
+        "those of SRC.",
     )
     size: int = Option(2048, metavar="TEXELS", help="Width and height of the texture.")
     samples: int = Option(2, metavar="N", help="N x N samples per texel at seams and fine detail of SRC.")
@@ -90,7 +92,7 @@ def transfer_texture(
                     a, target, transfer, uv=uv, options=baking, look=look, progress=report
                 )
             made.dressed.write(output, temporary)
-            record, pair = _tell_baked(transfer.console, made, rule, size), made.maps
+            record, pair = _tell_baked(transfer.console, made, rule, texture), made.maps
             if made.dressed.turned and output.suffix.lower() == ".glb":
                 turn = made.dressed.turn
                 transfer.console.say(f"note: a node turns {b.name} upright, along y")
@@ -108,7 +110,7 @@ def transfer_texture(
 
 
 def _tell_baked(
-    console: Console, made: "meshmatch.TexturedResult", rule: "meshmatch.ConfidenceRule", size: int
+    console: Console, made: "meshmatch.TexturedResult", rule: "meshmatch.ConfidenceRule", texture: TextureOptions
 ) -> Json:
     """What came out, in words and for --json."""
     from meshmatch.maps.folds import Folds
@@ -127,9 +129,11 @@ def _tell_baked(
             f"the map turns over {100 * folds.flipped:.2f} % of the surface and crushes {100 * folds.crushed:.2f} %; "
             f"the median stretch is {folds.stretch:.2f}-fold"
         )
-    whose = "its own texture coordinates" if atlas.own else "new texture coordinates"
-    console.say(f"{whose}: {100 * baked.used:.0f} % of the texture lies on the surface ({made.seconds:.1f} s)")
-    uv = {"size": size, "uv": "own" if atlas.own else "new", "uv_note": atlas.note, "used": baked.used}
+    whose = "own" if atlas.own else "source" if texture.uv == "source" else "new"
+    words = {"own": "its own texture coordinates", "source": "texture coordinates of the source"}
+    laid = words.get(whose, "new texture coordinates")
+    console.say(f"{laid}: {100 * baked.used:.0f} % of the texture lies on the surface ({made.seconds:.1f} s)")
+    uv = {"size": texture.size, "uv": whose, "uv_note": atlas.note, "used": baked.used}
     low = {"min_confidence": rule.minimum, "low_confidence_share": baked.low}
     low |= {"blank_share": baked.low * (rule.blank is not None), "filled_share": baked.low * rule.fill}
     return (

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Floats, Floats32, Ints, Ints32
+from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import blend, closest_on_triangles, same_rows, squared_lengths, triangle_areas
 from meshmatch.maps.mapped_mesh import length_of
@@ -67,6 +67,18 @@ class SurfaceWalker:
         np.maximum(weights, 0, out=weights)
         weights /= weights[0] + weights[1] + weights[2]
         return face, weights, distance
+
+    def cut(self, edges: Bools) -> None:
+        """Let no walk cross these edges (F, 3), each by the corner opposite to it."""
+        self.opposite[edges] = -1
+        self._opposite = list(np.ascontiguousarray(self.opposite.T))
+
+    def reach(self, points: Floats32, face: Ints32) -> tuple[Ints32, Floats32]:
+        """Where walks from faces (N,) to points (3, N) end: faces (N,), and weights (N, 3) that continue the plane of a face
+        beyond an edge that cannot be crossed.
+        """
+        face, weights, _, _ = self._walk(points, face, _STEPS)
+        return face, np.ascontiguousarray(weights.T)
 
     def _walk(self, points: Floats32, face: Ints32, steps: int) -> tuple[Ints32, Floats32, Ints, Ints]:
         """Face and weights where each walk ended; those that ended at an edge; those that did not end.

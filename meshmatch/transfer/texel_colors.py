@@ -40,12 +40,11 @@ class MaterialSampler:
         self._colors = None if look.colors is None else list(look.colors.T.astype(np.float32, order="C"))
         used = [self.materials[k] for k in np.unique(look.material).tolist()]
         self.alpha, self.cutoff, self._hard = _meaning(used)
-        pictured = np.array([m.image is not None for m in self.materials])[look.material]
         uv = _folded(look.uv)
         held = np.array(["clamp" in m.wrap for m in self.materials])[look.material]
         uv[held] = look.uv[held]
         self._uv = [list(uv[:, :, k].T.astype(np.float32, order="C")) for k in range(2)]
-        self.chart = _charts(walker, look, pictured)
+        self.chart = charts_of(walker, look)
         self._density = _densities(walker, self.materials, look.material, look.uv)
         self._pyramids = pyramids_of(look, known_texels)
 
@@ -153,10 +152,9 @@ def reach_of(first: Floats, second: Floats) -> Floats:
     return np.asarray(np.maximum(np.sqrt(area), longest / 2))
 
 
-def _charts(walker: SurfaceWalker, look: Appearance, pictured: Bools) -> Ints32:
-    """(F,) faces joined over edges where material and texture coordinates agree; without an image, by material."""
-    F = len(walker.faces)
-    joined = []
+def seams_of(walker: SurfaceWalker, look: Appearance) -> Bools:
+    """(F, 3) True for an edge, by the corner opposite to it, over which material or texture coordinates do not go on."""
+    found = np.ones(walker.opposite.shape, bool)
     for k in range(3):
         face = np.flatnonzero(walker.opposite[:, k] >= 0)
         other, edge = (each[face, k].astype(np.int64) for each in (walker.opposite, walker.opposite_edge))
@@ -167,10 +165,17 @@ def _charts(walker: SurfaceWalker, look: Appearance, pictured: Bools) -> Ints32:
         for i in (0, 1):
             corner = np.where(same_way, theirs[i], theirs[1 - i])
             agree &= np.abs(look.uv[face, ends[i]] - look.uv[other, corner]).max(axis=1) < 1e-6
-        joined.append(np.stack([face[agree], other[agree]]))
-    pairs = np.concatenate(joined, axis=1)
-    graph = coo_array((np.ones(pairs.shape[1], np.int8), (pairs[0], pairs[1])), shape=(F, F))
+        found[face, k] = ~agree
+    return found
+
+
+def charts_of(walker: SurfaceWalker, look: Appearance) -> Ints32:
+    """(F,) faces joined over edges that are no seams; without an image, by material."""
+    F = len(walker.faces)
+    face, edge = np.nonzero(~seams_of(walker, look))
+    graph = coo_array((np.ones(len(face), np.int8), (face, walker.opposite[face, edge])), shape=(F, F))
     chart = np.asarray(connected_components(graph, directed=False)[1], np.int32)
+    pictured = np.array([made.image is not None for made in look.materials])[look.material]
     return np.where(pictured, chart, F + look.material).astype(np.int32)
 
 
@@ -179,8 +184,8 @@ class TexelLocator:
 
     The walker is that of the source, `back` a map from target to source, and corners (F, 3, 2) are those of the
     target's triangles in the atlas, counted in texels. `discontinuous` (F,) are triangles whose corners' images lie far
-    apart. Their texels continue the surface around the nearest corner, and meet in the middle: a cut, where
-    interpolation would smear. `reach` (F,) is the size of a texel on the source.
+    apart. Their texels continue the surface around the nearest corner, by the `jacobian` (V, 3, 3) there, and meet in the
+    middle: a cut, where interpolation would smear. `reach` (F,) is the size of a texel on the source.
     """
 
     def __init__(self, walker: SurfaceWalker, target: Shape, back: VertexMap, corners: Floats) -> None:
@@ -202,7 +207,7 @@ class TexelLocator:
         scale = float(np.median(length.ravel() / np.maximum(own_length.ravel(), 1e-300)))
         self.discontinuous = (length > _STRETCH * scale * own_length + _SLACK).any(axis=1) | ~target.valid_faces
         if self.discontinuous.any():
-            self._jacobian = _jacobians(target, held, ~self.discontinuous)
+            self.jacobian = _jacobians(target, held, ~self.discontinuous)
             bend = (scale * own_length.max(axis=1) / np.maximum(self._size, 1e-12)).astype(np.float32)
             self.reach[self.discontinuous] *= bend[self.discontinuous]
         self._steps = first, second
@@ -266,7 +271,7 @@ class TexelLocator:
         vertex = self.faces[face, corner]
         corners = self.verts[self.faces[face]]
         away = np.einsum("kn,nkd->nd", weights, corners) - self.verts[vertex]
-        points = self._image[vertex] + np.einsum("nij,nj->ni", self._jacobian[vertex], away)
+        points = self._image[vertex] + np.einsum("nij,nj->ni", self.jacobian[vertex], away)
         return np.asarray(points.T, np.float32)
 
 

@@ -13,7 +13,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.new_charts import flat_areas, new_charts
 from meshmatch.transfer.texels import MOST_ROWS, faces_on, rows_of
 
-Keep = Literal["auto", "keep", "new"]
+Keep = Literal["auto", "keep", "new", "source"]
 # Share of the used texels that two triangles may share: rounding at the edges of charts.
 _OVERLAP = 0.002
 # Share up to which they are used all the same: layouts made by hand overlap here and there.
@@ -52,11 +52,7 @@ def atlas_of(
     `OptionError` for a cloud, or coordinates to keep that are not valid; `InputError` without area, or if xatlas fails.
     """
     name = shape.name or "the target"
-    if shape.is_cloud:
-        problem = f"{name} is a point cloud, which has no surface for a texture"
-        raise OptionError(problem, "its points can have colors: end the output in .ply")
-    if not (shape.face_areas > 0).any():
-        raise InputError(f"{name} has no triangle with an area", "is it a mesh?")
+    check_surface(shape)
     if own is not None and keep != "new":
         within, problem, twice = _checked(own, shape, size)
         if not problem:
@@ -67,6 +63,16 @@ def atlas_of(
     if keep == "keep":
         raise OptionError(f"{name} has no texture coordinates to keep", _NEW)
     return Atlas(unwrapped(shape, size, padding, polygons), False)
+
+
+def check_surface(shape: Shape) -> None:
+    """Refuse a target that has no surface for a texture: `OptionError` for a cloud, `InputError` without area."""
+    name = shape.name or "the target"
+    if shape.is_cloud:
+        problem = f"{name} is a point cloud, which has no surface for a texture"
+        raise OptionError(problem, "its points can have colors: end the output in .ply")
+    if not (shape.face_areas > 0).any():
+        raise InputError(f"{name} has no triangle with an area", "is it a mesh?")
 
 
 def new_atlas(shape: Shape, size: int, padding: int, keep: Keep, polygons: Ints | None, problem: str) -> Atlas:
@@ -103,12 +109,17 @@ def _checked(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str, float]:
     starved = float(deserved[room < _STARVED * deserved].sum())
     if starved > _MAX_STARVED:
         return uv, f"{100 * starved:.0f} % of the surface has no room in the image", 0.0
+    return uv, "", shared_texels(uv, size)
+
+
+def shared_texels(uv: Float[Floats, "F 3 2"], size: int = 1024) -> float:
+    """The share of the used texels of an image that several triangles have."""
     found, twice = faces_on(uv * size, size)
     held = found >= 0
     if twice <= _FEW * held.sum():
-        return uv, "", twice / max(int(held.sum()), 1)
+        return twice / max(int(held.sum()), 1)
     other = faces_on(uv[::-1] * size, size)[0]
-    return uv, "", float((other[held] != shape.F - 1 - found[held]).mean())
+    return float((other[held] != len(uv) - 1 - found[held]).mean())
 
 
 def unwrapped(shape: Shape, size: int, padding: int, polygons: Ints | None = None) -> Floats:

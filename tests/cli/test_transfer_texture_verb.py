@@ -182,6 +182,19 @@ def test_mirrored_coordinates_are_used_where_both_halves_look_alike(run: Run, pa
     assert np.abs(image[row, column, :3] - expected).mean() < 12
 
 
+def test_the_layout_of_the_source_is_carried_over(run: Run, pair: Path) -> None:
+    """The image that comes out is that of the source."""
+    answer = run(*call("--uv source --json"))
+    assert told(answer)["uv"] == "source"
+    assert "note: the layout of a.glb (" in answer.err and "texture coordinates of the source: " in answer.err
+    before, after = (load_appearance(name, load_shape(name)) for name in ("a.glb", "out.glb"))
+    assert np.abs(np.sort(before.uv.mean(axis=(0, 1))) - np.sort(after.uv.mean(axis=(0, 1)))).max() < 0.02
+    column, row = (64 * after.uv.mean(axis=1)).astype(int).T
+    image, own = after.materials[0].image, before.materials[0].image
+    assert image is not None and own is not None
+    assert np.abs(image[row, column].astype(int) - own[row // 2, column // 2]).mean() < 12
+
+
 def test_size_samples_and_padding(run: Run, pair: Path) -> None:
     def image(words: str) -> np.ndarray:
         well(run(*call(words)))
