@@ -1,5 +1,6 @@
 """Small shapes made of nothing but NumPy, fits that tests share, and the evaluation data where it is there."""
 
+import base64
 import os
 import pickle
 from collections.abc import Callable, Iterator
@@ -7,6 +8,7 @@ from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: many small products, in several processes
 
@@ -143,3 +145,12 @@ def icosphere(splits: int) -> Shape:
         verts = np.concatenate([verts, verts[unique].mean(axis=1)])
         faces = np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))])
     return Shape(verts / np.linalg.norm(verts, axis=1, keepdims=True), faces, f"sphere{splits}")
+
+
+def vtp_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The numbers that a .vtp of ours has at its points."""
+    found = {}
+    for each in ElementTree.parse(path).iterfind(".//PointData/DataArray"):
+        kind = {"Float64": "f8", "Int64": "i8", "Int32": "i4"}[str(each.get("type"))]
+        found[str(each.get("Name"))] = np.frombuffer(base64.b64decode(str(each.text))[8:], kind)
+    return found

@@ -7,7 +7,7 @@ from typer import Argument, Option
 
 import meshmatch
 from meshmatch.cli import options
-from meshmatch.cli.options import output_option
+from meshmatch.cli.options import optional, output_option
 from meshmatch.cli.words import Console, print_json
 
 
@@ -15,15 +15,28 @@ def export(
     fits: Annotated[str, Argument(metavar="FITS", help="A folder that `meshmatch fit` made, or its URL.")],
     output: Path = output_option("FOLDER", "A new folder for the meshes or the table."),
     suffix: str = Option(
-        ".ply",
+        "",
         "--format",
         metavar="SUFFIX",
         help="A mesh of each shape: .vtp, .vtk, .ply, .obj, .off, .stl or .glb; or one table of all coordinates: .csv, a "
-        "row for each shape, or .npz with points (S, V, 3).",
+        "row for each shape, or .npz with points (S, V, 3). Default: .ply, or .vtp with --original.",
     ),
     place: Literal["files", "template"] = Option(
         "files",
         help="Coordinates: as the input files have them, or all turned as the template stands, about its center.",
+    ),
+    original: bool = Option(
+        False,
+        "--original",
+        help="Write the shapes themselves, as .vtp or .vtk, with what is known of their vertices: signed distance and "
+        "displacement from the mean shape, and parts of the template.",
+    ),
+    values: Path | None = optional(
+        "FILE",
+        "With --original: also these numbers, a row per vertex of the template (.npy or .csv), such as groups.csv.",
+    ),
+    metadata: Path | None = optional(
+        "TABLE", "What is known of each shape: a row each, with its name; metadata.csv then has it, too."
     ),
     poor: bool = Option(False, "--poor", help="Write poor fits too."),
     json: options.Json = False,
@@ -31,13 +44,17 @@ def export(
 ) -> None:
     """Write the registered meshes of a collection: all have the vertices and faces of one template.
 
-    Vertex i is the same point on every shape. Units are those of the files.
+    Vertex i is the same point on every shape. Units are those of the files. Beside a table of coordinates, metadata.csv has
+    a row for each shape: its centroid size, whether it is a mirror image, and the row of TABLE.
     """  # fmt: skip
     console = Console(quiet)
     with console.progress() as progress:
-        done = meshmatch.Collection(fits, progress=progress).export(output, suffix=suffix, place=place, poor=poor)
+        done = meshmatch.Collection(fits, progress=progress).export(
+            output, suffix=suffix, place=place, poor=poor, original=original, values=values, metadata=metadata
+        )
     if done.left_out:
         console.say(f"poor fits are left out: {', '.join(done.left_out)}; --poor writes them too")
-    console.say(f"wrote {output}: {done.count} shapes, {done.vertices} vertices each")
+    each = "with what is known of their vertices" if original else f"{done.vertices} vertices each"
+    console.say(f"wrote {output}: {done.count} shapes, {each}")
     if json:
         print_json({"output": output, "fits": fits, "files": list(done.files), "left_out": list(done.left_out)})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from difflib import get_close_matches
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -14,16 +13,16 @@ import numpy as np
 from meshmatch.api.results import MapPair
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.atlas import Atlas
-from meshmatch.collections.export import Exported, Place, check_export, export
-from meshmatch.collections.fit_all import TABLE, Fitted, elsewhere_words, fit_all, fit_other_kinds, with_left_out
-from meshmatch.collections.fit_files import load_words
+from meshmatch.collections.export import Export, Exported, Fits, Place, export
+from meshmatch.collections.fit_all import Fitted, elsewhere_words, files_of, fit_all, fit_other_kinds, with_left_out
+from meshmatch.collections.folder import FitsFolder
 from meshmatch.collections.map_all import Pair, map_all
 from meshmatch.collections.registered import Registered, held
-from meshmatch.collections.setting import FITS, SUFFIX, Record, Setting, finished_fit, forget, template_at
-from meshmatch.collections.settle import read_about, settled
+from meshmatch.collections.setting import Record, Setting, forget, template_at
+from meshmatch.collections.settle import settled
 from meshmatch.collections.sources import find_sources
 from meshmatch.collections.stores import Store
-from meshmatch.collections.superimpose import Scale
+from meshmatch.collections.superimpose import Scale, superimpose
 from meshmatch.collections.workers import hired
 from meshmatch.errors import InputError, warn
 from meshmatch.fitting.fit import Fit
@@ -40,7 +39,7 @@ from meshmatch.templates.prepared_folder import RegisteredShapes
 from meshmatch.templates.template import Template
 
 
-class Collection:
+class Collection(FitsFolder):
     """A folder of fits of shapes of one kind; `fit` fills it.
 
     Fits are read when they are asked for, and some are kept in memory. Of a folder without fits, all but `fit` is an
@@ -65,7 +64,7 @@ class Collection:
     def __init__(
         self, folder: str | Path, workers: int | str | None = None, progress: ProgressCallback | None = None
     ) -> None:
-        self.store = Store.of(folder)
+        super().__init__(folder)
         self.workers = workers
         self.progress = progress
 
@@ -281,33 +280,6 @@ class Collection:
         digest = as_shape(shape).hash
         return any(digest == each._hash_of(name) for each in (self, *self._others()) for name in each._fitted)
 
-    @property
-    def _fitted(self) -> list[str]:
-        """Names of all fits here, sorted, also of those that are of another kind."""
-        self._about()
-        found = [name.removesuffix(SUFFIX) for name in self.store.names(FITS) if name.endswith(SUFFIX)]
-        if not found:
-            raise InputError(f"{self.store.location} holds no finished fit", "run `meshmatch fit` to its end")
-        return found
-
-    def _others(self) -> list[Collection]:
-        """The collections of shapes of other kinds within this one that hold fits."""
-        found = [name.split("/") for name in self.store.names() if name.endswith(f"/{TABLE}")]
-        others = [Collection(f"{self.store.location}/{parts[0]}") for parts in found if len(parts) == 2]
-        return [each for each in others if each.store.names(FITS) and read_about(each.store) is not None]
-
-    def _elsewhere(self, names: Sequence[str]) -> dict[str, str]:
-        """Those of the names whose fits here are poor, for they are of another kind; and where their own fits are."""
-        found = {}
-        for other in self._others():
-            theirs = set(other._fitted)
-            for name in (name for name in names if name in theirs):
-                here, there = self._words(name), other._words(name)
-                same = here.get("shape_hash") == there.get("shape_hash")
-                if same and here["verdict"] == "poor" and here["model"] != there["model"]:
-                    found[name] = other.store.location
-        return found
-
     def _names_of_one_kind(self) -> list[str]:
         """`names`; with a warning about those that it does not have."""
         names = self.names
@@ -315,13 +287,6 @@ class Collection:
         for text in elsewhere_words(self._elsewhere([name for name in self._fitted if name not in known])):
             warn(text)
         return names
-
-    def _hash_of(self, name: str) -> str:
-        return str(self._words(name).get("shape_hash", ""))
-
-    def _words(self, name: str) -> dict[str, Any]:
-        with self.store.reading(f"{FITS}/{name}{SUFFIX}") as path:
-            return load_words(path)[0]
 
     def pairs(self, to: str | None = None) -> list[Pair]:
         """All ordered pairs of names, with a warning about shapes of another kind, which are left out.
@@ -377,7 +342,15 @@ class Collection:
             return map_all(self.store, maps, wanted, suffix, crew, self.progress)
 
     def export(
-        self, output: str | Path, *, suffix: str = ".ply", place: Place = "files", poor: bool = False
+        self,
+        output: str | Path,
+        *,
+        suffix: str = "",
+        place: Place = "files",
+        poor: bool = False,
+        original: bool = False,
+        values: str | Path | None = None,
+        metadata: str | Path | None = None,
     ) -> Exported:
         """Write the template on every shape, as meshes or as a table; vertex i is the same point on all of them.
 
@@ -386,13 +359,21 @@ class Collection:
         output
             A new folder.
         suffix
-            Of a mesh for each shape, named as it is; or .csv or .npz, one table of all coordinates: a row for each shape,
-            x, y and z of each vertex in turn; or arrays ``points`` (S, V, 3), ``faces`` (F, 3) and ``names`` (S,).
+            Of a mesh for each shape, named as it is, by default .ply; or .csv or .npz, one table of all coordinates: a row
+            for each shape, x, y and z of each vertex in turn; or arrays ``points`` (S, V, 3), ``faces`` (F, 3), ``names``,
+            ``centroid_size`` and ``mirrored`` (S,). Beside a table, metadata.csv has a row for each shape.
         place
             Where they lie: where the files have the shapes ("files"), or all with the axes of the template, about its
             center ("template"). Both are in the unit of the files; a mirror image is turned over in the second.
         poor
             Whether poor fits are written.
+        original
+            Write the shapes of the files instead, as .vtp or .vtk, with the signed distance and the displacement of each
+            vertex from the mean, and the template's parts.
+        values
+            A file of numbers of the template's vertices, which the originals then have too.
+        metadata
+            A table with a row for each shape, which metadata.csv then has too.
 
         Returns
         -------
@@ -402,16 +383,24 @@ class Collection:
         Raises
         ------
         MeshmatchError
-            The format or place is unknown, no fit is left, or the folder is not empty or cannot be written.
+            The format or place is unknown, no fit is left, an original is not as it was, or the folder is not empty or
+            cannot be written.
         """
-        suffix = check_export(suffix, place)
+        how = Export(suffix, place, original, values, metadata)
         verdicts = {name: str(self._words(name)["verdict"]) for name in self._names_of_one_kind()}
         left_out = tuple(name for name, verdict in verdicts.items() if verdict == "poor" and not poor)
         names = [name for name in verdicts if name not in left_out]
         if not names:
             raise InputError(f"all {len(verdicts)} fits of {self.store.location} are poor", "write them with --poor")
-        files = export(output, names, self.fit_of, suffix, place, self.progress)
-        return Exported(tuple(files), len(names), self.template.shape.V, left_out)
+        mean = None
+        if original and len(names) > 2:
+            with self.registered(poor) as shapes:
+                mean = superimpose(shapes.points, shapes.faces)
+        about = self._about()["sequence"]
+        fits = Fits(names, self.fit_of, self.places_of, files_of(self.store), self.template, bool(about))
+        return Exported(
+            tuple(export(output, fits, how, mean, self.progress)), len(names), fits.template.shape.V, left_out
+        )
 
     def atlas(self, *, modes: int = 100, scale: Scale = "keep", robust: bool = False, poor: bool = False) -> Atlas:
         """The mean and the modes of the fitted shapes.
@@ -469,26 +458,12 @@ class Collection:
         with held(len(names), self.template.shape.V, read) as points:
             yield Registered(points, faces, names, np.eye(3), left_out, self.template.hash)
 
-    def _about(self) -> dict[str, Any]:
-        about = read_about(self.store)
-        if about is None:
-            hint = "make one with `meshmatch fit SHAPES -o FOLDER`"
-            raise InputError(f"{self.store.location} is not a folder of fits", hint)
-        return about
-
     def _check(self, name: str) -> None:
         """`InputError` for a name that has no fit here, or whose fit is of another kind."""
         self.places_of(name)
         where = self._elsewhere([name]).get(name)
         if where is not None:
             raise InputError(f"{name} is of another kind", f"its fit is in {where}: map there")
-
-    def _read(self, name: str) -> tuple[Fit, Places]:
-        if not self.store.exists(f"{FITS}/{name}{SUFFIX}"):
-            close = get_close_matches(name, self._fitted, n=1)
-            hint = f"did you mean {close[0]}?" if close else "names are those of the fitted files, without the suffix"
-            raise InputError(f"the collection has no fit of {name}", hint)
-        return finished_fit(self.store, name)
 
 
 def _of_this_kind(tell: Callable[[Record], None] | None) -> Callable[[Record], None] | None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
+import html
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -11,17 +12,27 @@ from typing import Literal, get_args
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
+from meshmatch.collections.covariates import SIZE, Covariates, covariates
 from meshmatch.collections.registered import held
-from meshmatch.errors import OptionError
+from meshmatch.collections.sources import natural
+from meshmatch.collections.superimpose import Superimposed
+from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.triangles import vertex_normals
+from meshmatch.maps.places import Places
 from meshmatch.outputs import folder_on_success, make_folder
 from meshmatch.progress import ProgressCallback
-from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.formats.vtk import write_vtk, write_vtp
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.tables import write_rows
+from meshmatch.templates.template import Template
+from meshmatch.transfer.value_files import Values, load_values
 
 Place = Literal["files", "template"]
 """Where exported meshes lie: where their files have the shapes, or all with the axes of the template, about its center."""
 MESHES, TABLES = (".ply", ".vtp", ".vtk", ".obj", ".off", ".stl", ".glb"), (".csv", ".npz")
+ORIGINALS = (".vtp", ".vtk")
 
 
 @dataclass(frozen=True)
@@ -46,15 +57,55 @@ class Exported:
     left_out: tuple[str, ...]
 
 
-def check_export(suffix: str, place: str) -> str:
-    """A suffix with its dot; `OptionError` where nothing is exported in it, or the place is unknown."""
-    suffix = f".{suffix.removeprefix('.').lower()}"
-    if place not in get_args(Place):
-        raise OptionError(f"invalid place {place!r}", f"choose one of {', '.join(get_args(Place))}")
-    if suffix not in (*MESHES, *TABLES):
-        hint = f"choose one of {', '.join((*MESHES, *TABLES))}"
-        raise OptionError(f"registered meshes are not exported as {suffix[:20]}", hint)
-    return suffix
+@dataclass(frozen=True)
+class Export:
+    """How a collection is exported; `OptionError` for what cannot be.
+
+    Attributes
+    ----------
+    suffix
+        Of a mesh for each shape, or of one table of all coordinates.
+    place
+        Where the coordinates are.
+    original
+        Write the shapes themselves, with what is known of their vertices, instead of the template on each of them.
+    values
+        A file of numbers of the template's vertices that go with the shapes then.
+    metadata
+        A table with a row for each shape, which metadata.csv then has too.
+    """
+
+    suffix: str = ""
+    place: Place = "files"
+    original: bool = False
+    values: str | Path | None = None
+    metadata: str | Path | None = None
+
+    def __post_init__(self) -> None:
+        suffix = f".{self.suffix.removeprefix('.').lower()}" if self.suffix else ".vtp" if self.original else ".ply"
+        object.__setattr__(self, "suffix", suffix)
+        if self.place not in get_args(Place):
+            raise OptionError(f"invalid place {self.place!r}", f"choose one of {', '.join(get_args(Place))}")
+        known = ORIGINALS if self.original else (*MESHES, *TABLES)
+        if suffix not in known:
+            what = "original" if self.original else "registered"
+            raise OptionError(f"{what} meshes are not exported as {suffix[:20]}", f"choose one of {', '.join(known)}")
+        if self.original and self.place != "files":
+            raise OptionError("original meshes stay where their files have them", "leave the place out")
+        if self.values is not None and not self.original:
+            raise OptionError("values go with the original meshes", "ask for these: original, --original")
+
+
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """What is exported: names of shapes, and what gives the fit, the places and the file of each; the template of all."""
+
+    names: Sequence[str]
+    fit_of: Callable[[str], Fit]
+    places_of: Callable[[str], Places]
+    files: Mapping[str, str]
+    template: Template
+    sequence: bool
 
 
 def mesh_of(fit: Fit, place: Place) -> Shape:
@@ -63,40 +114,128 @@ def mesh_of(fit: Fit, place: Place) -> Shape:
 
 
 def export(
-    output: str | Path,
-    names: list[str],
-    fit_of: Callable[[str], Fit],
-    suffix: str,
-    place: Place,
-    progress: ProgressCallback | None = None,
+    output: str | Path, fits: Fits, how: Export, mean: Superimposed | None, progress: ProgressCallback | None = None
 ) -> list[str]:
     """Write a mesh for each name, or one table of all coordinates, into a new folder; the names of the files.
 
-    `OutputError` where the folder is not empty, or cannot be written.
+    ``mean`` is what the originals are compared with, where there is one. `OutputError` where the folder is not empty, or
+    cannot be written.
     """
+    names, facts = fits.names, _Facts()
+    values = None if how.values is None else load_values(how.values, fits.template.shape)
+    table = None if how.metadata is None else covariates(how.metadata, names, np.full(len(names), np.nan))
 
     def meshes() -> Iterator[tuple[str, Shape]]:
         for number, name in enumerate(names):
-            yield name, mesh_of(fit_of(name), place)
+            fit = fits.fit_of(name)
+            facts.add(name, fit)
+            yield name, mesh_of(fit, how.place)
             if progress is not None:
                 progress("exporting", name, (number + 1) / len(names))
 
     with folder_on_success(output) as folder:
-        if suffix == ".csv":
-            _write_table(folder / "coords.csv", meshes())
-            return ["coords.csv"]
-        if suffix == ".npz":
-            first = fit_of(names[0])
-            each = meshes()
-            with held(len(names), len(first.points), lambda number: next(each)[1].verts) as points:
-                np.savez(folder / "coords.npz", points=points, faces=first.faces, names=np.array(names))
-            return ["coords.npz"]
         files = []
-        for name, shape in meshes():
-            files.append(f"{name}{suffix}")
-            make_folder((folder / files[-1]).parent)
-            save_shape(folder / files[-1], shape)
+        if how.suffix == ".csv":
+            files.append("coords.csv")
+            _write_table(folder / files[0], meshes())
+        elif how.suffix == ".npz":
+            files.append("coords.npz")
+            each = meshes()
+            with held(len(names), fits.template.shape.V, lambda number: next(each)[1].verts) as points:
+                own = {"points": points, "faces": np.asarray(fits.template.shape.faces), "names": np.array(names)}
+                np.savez(folder / files[0], allow_pickle=False, **own, **facts.arrays())
+        else:
+            for name, shape in meshes():
+                files.append(f"{name}{how.suffix}")
+                make_folder((folder / files[-1]).parent)
+                if how.original:
+                    shape = _original(fits.files.get(name), fits.places_of(name))
+                    arrays = _on_original(fits, name, mean, values)
+                    (write_vtp if how.suffix == ".vtp" else write_vtk)(folder / files[-1], shape, arrays)
+                else:
+                    save_shape(folder / files[-1], shape)
+            if fits.sequence and how.suffix == ".vtp":
+                files += _write_series(folder, names)
+        if how.suffix in TABLES or table is not None:
+            files.append("metadata.csv")
+            facts.write(folder / files[-1], table)
         return files
+
+
+class _Facts:
+    """What is known of each shape that was exported, for a table."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self.sizes: list[float] = []
+        self.mirrored: list[bool] = []
+        self.verdicts: list[str] = []
+
+    def add(self, name: str, fit: Fit) -> None:
+        points = fit.points * fit.frame.scale
+        self.names.append(name)
+        self.sizes.append(float(np.linalg.norm(points - points.mean(axis=0))))
+        self.mirrored.append(fit.frame.mirrored)
+        self.verdicts.append(fit.verdict)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {"centroid_size": np.array(self.sizes), "mirrored": np.array(self.mirrored)}
+
+    def write(self, path: Path, table: Covariates | None) -> None:
+        """A row a shape: what is known, then the cells of the user's table."""
+        own = {"name": self.names, "centroid_size": self.sizes, "mirrored": [int(each) for each in self.mirrored]}
+        own["verdict"] = self.verdicts
+        more = {} if table is None else {title: cells for title, cells in table.cells.items() if title not in own}
+        if set(more.get(SIZE, ())) == {"nan"}:  # which a table without it has been given
+            del more[SIZE]
+        write_rows(path, [*own, *more], zip(*own.values(), *more.values(), strict=True))
+
+
+def _original(file: str | None, places: Places) -> Shape:
+    if file is None:
+        raise InputError(f"fits.csv does not say which file {places.name} was", "run `meshmatch fit` again")
+    shape = load_shape(file)
+    if shape.hash != places.hash:
+        raise InputError(f"{file} has changed since it was fitted", "run `meshmatch fit` again")
+    return shape
+
+
+def _on_original(fits: Fits, name: str, mean: Superimposed | None, values: Values | None) -> dict[str, np.ndarray]:
+    """Numbers at the vertices of a shape's file: how far each lies from the mean, in the file's axes and unit; parts of the
+    template; other values of it.
+    """
+    fit, template = fits.fit_of(name), fits.template
+    foot = fits.places_of(name).on(template.shape)
+    arrays: dict[str, np.ndarray] = {}
+    if mean is not None:
+        own = fit.points * fit.frame.scale
+        there = mean.poses(own[None]).undo(mean.consensus[None])[0]  # the mean, laid over this shape
+        moved = own - there
+        outwards = np.einsum("vi,vi->v", moved, vertex_normals(there, fit.faces))
+        carried = foot.values(fit.faces, np.column_stack([outwards, moved @ fit.frame.rotation]))
+        arrays |= {"distance_to_mean": carried[:, 0], "displacement": carried[:, 1:]}
+    if len(template.label_names) > 1:
+        arrays["label"] = template.labels[foot.vertex]
+    if values is not None:
+        numbers = values.numbers.reshape(template.shape.V, -1)
+        titles = values.names or tuple(f"value_{k}" for k in range(numbers.shape[1]))
+        arrays |= dict(zip(titles, foot.values(fit.faces, numbers).T, strict=True))
+    return arrays
+
+
+def _write_series(folder: Path, names: Sequence[str]) -> list[str]:
+    """ParaView's list of the frames of each folder, in their order."""
+    frames: dict[str, list[str]] = {}
+    for name in sorted(names, key=natural):
+        frames.setdefault(name.rpartition("/")[0], []).append(name.rpartition("/")[2])
+    files = []
+    for where, own in frames.items():
+        rows = [f'<DataSet timestep="{k}" file="{html.escape(name)}.vtp"/>' for k, name in enumerate(own)]
+        head = '<VTKFile type="Collection" version="1.0" byte_order="LittleEndian"><Collection>'
+        lines = ['<?xml version="1.0"?>', head, *rows, "</Collection></VTKFile>"]
+        files.append(f"{where}/sequence.pvd".lstrip("/"))
+        (folder / files[-1]).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return files
 
 
 def _write_table(path: Path, meshes: Iterator[tuple[str, Shape]]) -> None:

@@ -145,6 +145,12 @@ def with_left_out(made: Fitted, store: Store, left_out: Sequence[Record]) -> Fit
     return made
 
 
+def files_of(store: Store) -> dict[str, str]:
+    """The file of each shape, by its name, as ``fits.csv`` has them."""
+    with store.reading(TABLE) as path, path.open(encoding="utf-8", newline="") as file:
+        return {str(row.get("name")): str(row.get("file")) for row in csv.DictReader(file)}
+
+
 def elsewhere_words(elsewhere: Mapping[str, str]) -> list[str]:
     """A line for each folder of fits of another kind: which names are there."""
     lines = []

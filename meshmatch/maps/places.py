@@ -111,6 +111,10 @@ class Places:
             trust=fit.trust,
         )
 
+    def on(self, template: Shape) -> Footpoints:
+        """The points of the resting template where the vertices belong."""
+        return Surface(np.asarray(template.verts), np.asarray(template.faces)).query(self.resting.astype(np.float64))
+
     def nearest(
         self, resting: Float[Floats32, "N 3"], workers: int = 1, among: Int[Ints, " F"] | None = None
     ) -> Footpoints:

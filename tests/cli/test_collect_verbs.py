@@ -6,17 +6,23 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from meshmatch.collections.collection import Collection
-from meshmatch.collections.export import export
+from meshmatch.collections.export import Export, Fits, export
 from meshmatch.collections.fit_files import load_fit, save_fit
+from meshmatch.collections.superimpose import Superimposed
+from meshmatch.errors import InputError
+from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.maps.files import load_map
 from meshmatch.maps.mapped_mesh import MappedMesh
 from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.shape import Shape
 from tests.cli.conftest import Run
+from tests.conftest import vtp_arrays
 
 SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
 
@@ -90,18 +96,78 @@ def test_registered_meshes_are_exported(fits: Path, run: Run, tmp_path: Path, su
 
 
 def test_shapes_of_folders_are_exported_into_folders(fits: Path, tmp_path: Path) -> None:
-    fit = Collection(fits).fit_of("climber")
-    files = export(tmp_path / "out", ["left/a", "b"], lambda name: fit, ".ply", "files")
-    assert files == ["left/a.ply", "b.ply"] and (tmp_path / "out" / "left" / "a.ply").is_file()
+    """Frames of a sequence with ParaView's list of each folder."""
+    given = all_climber(fits, "left/f10", "left/f2", "b", sequence=True)
+    files = export(tmp_path / "out", given, Export(".vtp"), None)
+    assert files == ["left/f10.vtp", "left/f2.vtp", "b.vtp", "sequence.pvd", "left/sequence.pvd"]
+    assert {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")} == set(files)
+    frames = ElementTree.parse(tmp_path / "out" / "left" / "sequence.pvd").iter("DataSet")
+    assert [(frame.get("timestep"), frame.get("file")) for frame in frames] == [("0", "f2.vtp"), ("1", "f10.vtp")]
+
+
+def all_climber(folder: Path, *names: str, sequence: bool = False) -> Fits:
+    """The same fit under several names."""
+    own = Collection(folder)
+    fit, places = own.fit_of("climber"), own.places_of("climber")
+    files = dict.fromkeys(names, str(SAMPLES / "climber.ply"))
+    return Fits(names, lambda name: fit, lambda name: places, files, own.template, sequence)
+
+
+def test_originals_are_exported_with_what_is_known_of_them(fits: Path, tmp_path: Path) -> None:
+    given = all_climber(fits, "a")
+    fit, file = given.fit_of("a"), load_shape(SAMPLES / "climber.ply")
+    own = Shape(fit.points * fit.frame.scale, fit.faces)
+    away, areas = 0.001 * file.diagonal, vertex_areas(own.verts, own.faces)
+    thinner, weights = own.verts - away * own.vertex_normals, areas / areas.sum()
+    mean = Superimposed(thinner - weights @ thinner, weights, None)
+    np.save(tmp_path / "heights.npy", fit.points_in_file[:, 1])
+    export(tmp_path / "out", given, Export(original=True, values=tmp_path / "heights.npy"), mean)
+    np.testing.assert_array_equal(load_shape(tmp_path / "out" / "a.vtp").verts, file.verts)
+    arrays = vtp_arrays(tmp_path / "out" / "a.vtp")
+    assert set(arrays) == {"distance_to_mean", "displacement", "label", "value_0"}
+    assert np.median(arrays["distance_to_mean"]) == pytest.approx(away, rel=0.05)
+    outwards = np.einsum("vi,vi->v", arrays["displacement"].reshape(-1, 3), file.vertex_normals)
+    assert np.median(outwards) == pytest.approx(away, rel=0.1)
+    assert np.quantile(np.abs(arrays["value_0"] - file.verts[:, 1]), 0.9) < 0.01 * file.diagonal
+    assert len(np.unique(arrays["label"])) > 3
+
+
+def test_originals_of_the_verb(fits: Path, run: Run, tmp_path: Path) -> None:
+    answer = run("export", fits, "-o", tmp_path / "out", "--original", "--json")
+    assert json.loads(answer.out)["files"] == ["climber.vtp", "dancer.vtp"], answer.err
+    assert set(vtp_arrays(tmp_path / "out" / "climber.vtp")) == {"label"}  # two shapes have no mean
+    for words, told in {
+        ("--values", "v.npy"): "values go with the original meshes",
+        ("--original", "--format", "csv"): "original meshes are not exported as .csv",
+        ("--original", "--place", "template"): "original meshes stay where their files have them",
+    }.items():
+        answer = run("export", fits, "-o", tmp_path / "none", *words)
+        assert answer.status == 1 and told in answer.err and not (tmp_path / "none").exists()
+    changed = replace(all_climber(fits, "a"), files={"a": str(SAMPLES / "dancer.ply")})
+    with pytest.raises(InputError, match=r"dancer\.ply has changed since it was fitted"):
+        export(tmp_path / "none", changed, Export(original=True), None)
+    assert not (tmp_path / "none").exists()
 
 
 def test_coordinates_are_exported_as_tables(fits: Path, run: Run, tmp_path: Path) -> None:
     collection = Collection(fits)
+    (tmp_path / "table.csv").write_text("shape,sex,verdict\ndancer.ply,f,yes\nclimber,m,no\n")
     for suffix in (".csv", ".npz"):
         words = ["export", fits, "-o", tmp_path / suffix, "--format", suffix, "--place", "template", "-q"]
-        assert run(*words).status == 0
+        assert run(*words, "--metadata", tmp_path / "table.csv").status == 0
     with np.load(tmp_path / ".npz" / "coords.npz", allow_pickle=False) as found:
         points, faces, names = found["points"], found["faces"], found["names"].tolist()
+        sizes, mirrored = found["centroid_size"], found["mirrored"]
+    np.testing.assert_allclose(sizes, np.sqrt(((points - points.mean(axis=1, keepdims=True)) ** 2).sum(axis=(1, 2))))
+    rows = (tmp_path / ".csv" / "metadata.csv").read_text().splitlines()
+    assert (
+        rows
+        == [
+            "name,centroid_size,mirrored,verdict,sex",
+            *(f"{name},{size!r},0,good,{sex}" for name, size, sex in zip(names, sizes.tolist(), "mf", strict=True)),
+        ]
+        and not mirrored.any()
+    )
     assert names == ["climber", "dancer"] and points.shape == (2, len(collection.template.shape.verts), 3)
     np.testing.assert_array_equal(faces, collection.template.shape.faces)
     for name, own in zip(names, points, strict=True):
