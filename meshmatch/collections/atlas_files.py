@@ -3,11 +3,13 @@
 ==================  ==============================================================================================
 atlas.npz           the arrays of `Atlas`, for `Atlas.load`
 mean.ply            the mean
+mean.vtp            the mean, its spread and what the first modes move, for ParaView and 3D Slicer
 modes.glb           the mean; the first modes at +2 and -2 standard deviations as morph targets
 scores.csv          a line for each shape: size, distance from the mean, scores in standard deviations
 distances.npy       (V, S) 32-bit floats: distance of each vertex of each shape from the mean
 measures.csv        compactness, generalisation and specificity
 groups.csv          where two groups differ, a line for each vertex
+groups.vtp          the same on the mean
 anova.csv, effects.csv, effects.vtp, allometry.csv   a linear model, see `model_files`
 atlas.json          all that is one number, or a few
 modes.png           the mean and the first three modes at -2 and +2 standard deviations
@@ -55,6 +57,8 @@ from meshmatch.render.facing import facing
 from meshmatch.render.viewer.single_pages import Varying, write_atlas_page
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.formats.gltf_out import write_morphs
+from meshmatch.shapes.formats.vtk import write_vtp
+from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import write_rows
 
 MORPHS = 10
@@ -100,13 +104,14 @@ def write_folder(
     turn = facing(atlas.mean_shape) if rotation is None else rotation
     atlas.save(folder / FILE)
     save_shape(folder / "mean.ply", atlas.mean_shape)
+    _write_mean(folder / "mean.vtp", atlas)
     _write_morphs(folder / "modes.glb", atlas)
     _write_scores(folder / "scores.csv", atlas)
     _write_distances(folder / "distances.npy", atlas)
     if findings.measures is not None:
         _write_measures(folder / "measures.csv", findings.measures)
     if findings.comparison is not None:
-        _write_comparison(folder / "groups.csv", findings.comparison)
+        _write_comparison(folder, atlas.mean_shape, findings.comparison)
         first, second = findings.groups
         about = findings.comparison
         name = f"{second} - {first}"
@@ -177,6 +182,13 @@ def record(atlas: Atlas, findings: Findings) -> dict[str, Any]:
     return found
 
 
+def _write_mean(path: Path, atlas: Atlas) -> None:
+    """The mean with the spread of its vertices, and how one standard deviation of each of the first modes moves them."""
+    spread = np.sqrt(np.einsum("m,mvi->v", atlas.variances, np.square(atlas.modes)))
+    modes = {f"mode_{k + 1}": atlas.deviations[k] * mode for k, mode in enumerate(atlas.modes[:MORPHS])}
+    write_vtp(path, atlas.mean_shape, {"spread": spread} | modes)
+
+
 def _write_morphs(path: Path, atlas: Atlas) -> None:
     targets = {}
     for k in range(min(MORPHS, len(atlas.modes))):
@@ -207,8 +219,10 @@ def _write_measures(path: Path, measures: Measures) -> None:
     write_rows(path, ["modes", *names[1:]], zip(*columns, strict=True))
 
 
-def _write_comparison(path: Path, found: Comparison) -> None:
+def _write_comparison(folder: Path, mean: Shape, found: Comparison) -> None:
     names = ["along_normal", "statistic", "p", "p_corrected", "p_fdr"]
-    table = np.column_stack([found.difference, *(getattr(found, name) for name in names)])
+    arrays = {"difference": found.difference} | {name: getattr(found, name) for name in names}
+    write_vtp(folder / "groups.vtp", mean, arrays)
+    table = np.column_stack(list(arrays.values()))
     rows = ([k, *short(row)] for k, row in enumerate(table))
-    write_rows(path, ["vertex", "dx", "dy", "dz", *names], rows)
+    write_rows(folder / "groups.csv", ["vertex", "dx", "dy", "dz", *names], rows)

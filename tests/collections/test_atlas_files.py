@@ -18,6 +18,7 @@ from meshmatch.collections.permutation import PlaceTests
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from tests.collections.ellipsoids import AXES, ellipsoids
+from tests.conftest import vtp_arrays
 
 
 @pytest.fixture(autouse=True)
@@ -83,6 +84,15 @@ def test_every_file_says_what_the_atlas_knows(tmp_path: Path, atlas: Atlas) -> N
     head, rows = table(tmp_path / "groups.csv")
     assert len(rows) == len(atlas.mean)
     assert [float(row[head.index("p_corrected")]) for row in rows] == pytest.approx(comparison.p_corrected, rel=1e-5)
+    arrays = vtp_arrays(tmp_path / "groups.vtp")
+    assert list(arrays) == ["difference", "along_normal", "statistic", "p", "p_corrected", "p_fdr"]
+    assert np.array_equal(arrays["difference"].reshape(-1, 3), comparison.difference)
+    assert np.array_equal(arrays["p_corrected"], comparison.p_corrected)
+    arrays = vtp_arrays(tmp_path / "mean.vtp")
+    assert np.allclose(arrays["mode_2"].reshape(-1, 3), atlas.deviations[1] * atlas.modes[1])
+    every = np.linalg.norm(atlas.offsets(atlas.scores), axis=2)
+    assert np.allclose(arrays["spread"], np.sqrt((every**2).sum(axis=0) / (len(every) - 1)), rtol=1e-6)
+    assert np.allclose(load_shape(tmp_path / "mean.vtp").verts, atlas.mean)
     samples = sorted((tmp_path / "samples").iterdir())
     assert [path.name for path in samples] == ["sample-000.ply", "sample-001.ply"]
     assert np.allclose(load_shape(samples[1]).verts, atlas.sample(2, 7)[1].verts)
@@ -134,7 +144,7 @@ def test_the_same_atlas_gives_the_same_bytes(
         write_folder(folder, atlas)
     first, second = ({path.name: path.read_bytes() for path in folder.iterdir()} for folder in folders)
     assert first == second
-    assert not {"measures.csv", "measures.png", "groups.csv", "groups.png", "samples"} & set(first)
+    assert not {"measures.csv", "measures.png", "groups.csv", "groups.vtp", "groups.png", "samples"} & set(first)
 
 
 def test_an_effect_is_seen_from_where_it_is(tmp_path: Path) -> None:
