@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from meshmatch.api.transfer import transfer_weights as transfer_weights
     from meshmatch.api.wrap import WrapResult as WrapResult
     from meshmatch.api.wrap import wrap as wrap
+    from meshmatch.collections.asymmetry import measure_asymmetry as measure_asymmetry
     from meshmatch.collections.atlas import Atlas as Atlas
     from meshmatch.collections.collection import Collection as Collection
     from meshmatch.collections.measures import measure_atlas as measure_atlas
@@ -85,6 +86,7 @@ _NAMES = {
     "api.texture": "TexturedResult transfer_texture",
     "api.transfer": "find_maps transfer_colors transfer_labels transfer_landmarks transfer_values transfer_weights",
     "api.wrap": "WrapResult wrap",
+    "collections.asymmetry": "measure_asymmetry",
     "collections.atlas": "Atlas",
     "collections.collection": "Collection",
     "collections.measures": "measure_atlas",

@@ -56,6 +56,11 @@ class AtlasOptions:
         metavar="COLUMN",
         help="Exchange only shapes with the same value here: the individual of paired or repeated measures.",
     )
+    symmetry: bool = Option(
+        False,
+        "--symmetry",
+        help="Compare shapes that are symmetric by themselves, such as heads, with their mirror images.",
+    )
     permutations: int = Option(10_000, min=1, metavar="N", help="Maximum number of permutations in tests.")
     samples: int = Option(0, min=0, max=10_000, metavar="N", help="Number of random shapes to write.")
     measures: bool = Option(
@@ -68,9 +73,9 @@ class AtlasOptions:
 
     def check(self) -> None:
         """Refuse a choice that nothing obeys (`OptionError`)."""
-        if self.groups is None and self.model is None and self.statistic != "normal":
-            hint = "add --groups A.txt B.txt, or --model"
-            raise OptionError("--statistic compares groups or tests a model, and there are none", hint)
+        if self.groups is None and self.model is None and not self.symmetry and self.statistic != "normal":
+            hint = "add --groups A.txt B.txt, --model or --symmetry"
+            raise OptionError("--statistic is for groups, models and symmetry, and there are none", hint)
         if self.format != "png":
             from meshmatch.render.charts import check_chart
 
@@ -126,8 +131,9 @@ def atlas(
         names = write_folder(folder, made, found, rotation=shapes.rotation, title=output.name)
     about = record(made, found)
     _tell(console, about)
-    if "model" in about and not json and not quiet:
-        print_rows(anova_rows(about["model"]))
+    for table in ("model", "asymmetry"):
+        if table in about and not json and not quiet:
+            print_rows(anova_rows(about[table]))
     console.say(f"wrote {output}: {', '.join(names)}")
     if json:
         print_json({"output": output, "left_out": shapes.left_out, "files": names} | about)
@@ -163,6 +169,7 @@ def _warn(console: Console, made: Any, how: AtlasOptions) -> None:
 
 
 def _find(console: Console, made: Any, shapes: "Registered", how: AtlasOptions) -> "Findings":
+    from meshmatch.collections.asymmetry import measure_asymmetry
     from meshmatch.collections.atlas_files import Findings
     from meshmatch.collections.measures import measure_atlas
     from meshmatch.collections.registered import read_group
@@ -183,11 +190,14 @@ def _find(console: Console, made: Any, shapes: "Registered", how: AtlasOptions) 
         )
         for name, column in explained.left_out.items():
             console.warn(f"{name}: left out of the model, for its {column} is missing")
+    asymmetry = None
+    if how.symmetry:
+        asymmetry = measure_asymmetry(made, kind=how.statistic, permutations=how.permutations, seed=how.seed)
     measures = None
     if how.measures and len(shapes.names) > 3:
         with console.progress() as progress:
             measures = measure_atlas(made, shapes.points, seed=how.seed, progress=progress)
-    return Findings(measures, comparison, names, explained, how.samples, how.seed, how.format, members)
+    return Findings(measures, comparison, names, explained, how.samples, how.seed, how.format, members, asymmetry)
 
 
 def _tell(console: Console, about: dict[str, Any]) -> None:
@@ -222,6 +232,9 @@ def _tell(console: Console, about: dict[str, Any]) -> None:
             f"{found['formula']}, {found['shapes']} shapes, sequential sums of squares, {every}{found['permutations']:,} "
             f"permutations{blocks} of residuals"
         )
+    if "asymmetry" in about:
+        far = about["asymmetry"]["of_mean"]
+        console.say(f"the mean is {far:.4g} from its mirror image on average; of each shape: asymmetry.csv")
 
 
 _KINDS = "generalisation", "specificity"

@@ -16,6 +16,7 @@ modes.png           the mean and the first three modes at -2 and +2 standard dev
 distances.png       distance from the mean: of all shapes, and of those that are furthest
 groups.png          where two groups differ
 histogram.png, measures.png, scree.png, components.png, allometry.png   charts, where matplotlib is installed
+symmetry.csv, asymmetry.csv, asymmetry.vtp, asymmetry.png, fluctuating.png   shapes beside their mirror images
 effect-1-sex-m-f.png   what each coefficient of a model moves, and where that is more than chance
 samples/            random shapes
 page.html           a page with a slider for each mode
@@ -34,12 +35,14 @@ from typing import Any
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
+from meshmatch.collections.asymmetry import Asymmetry
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.atlas_arrays import FILE
 from meshmatch.collections.atlas_pictures import (
     REACH,
     ChartFormat,
     draw_allometry,
+    draw_asymmetry,
     draw_charts,
     draw_distances,
     draw_effect,
@@ -51,7 +54,7 @@ from meshmatch.collections.atlas_pictures import (
 from meshmatch.collections.explain import Explained
 from meshmatch.collections.groups import Comparison
 from meshmatch.collections.measures import Measures
-from meshmatch.collections.model_files import LEVEL, model_record, short, write_model
+from meshmatch.collections.model_files import LEVEL, asymmetry_record, model_record, short, write_asymmetry, write_model
 from meshmatch.collections.registered import outlying
 from meshmatch.render.facing import facing
 from meshmatch.render.viewer.single_pages import Varying, write_atlas_page
@@ -81,6 +84,7 @@ class Findings:
     seed: int = 0
     charts: ChartFormat = "png"
     members: Mapping[str, str] = field(default_factory=dict)
+    asymmetry: Asymmetry | None = None
 
     def classes(self, atlas: Atlas) -> list[str]:
         """The group of each shape in charts, "" where it has none: as it was compared, or else in the model."""
@@ -119,6 +123,9 @@ def write_folder(
     if findings.explained is not None:
         write_model(folder, atlas.mean_shape, findings.explained)
         draw_effects(folder, atlas.mean_shape, findings.explained, turn)
+    if findings.asymmetry is not None:
+        write_asymmetry(folder, atlas.mean_shape, findings.asymmetry)
+        draw_asymmetry(folder, atlas.mean_shape, findings.asymmetry, turn)
     (folder / "atlas.json").write_text(json.dumps(record(atlas, findings), indent=1) + "\n", encoding="utf-8")
     draw_modes(folder / "modes.png", atlas, turn)
     draw_distances(folder / "distances.png", atlas, turn)
@@ -179,6 +186,8 @@ def record(atlas: Atlas, findings: Findings) -> dict[str, Any]:
         }
     if findings.explained is not None:
         found["model"] = model_record(findings.explained)
+    if findings.asymmetry is not None:
+        found["asymmetry"] = asymmetry_record(findings.asymmetry)
     return found
 
 

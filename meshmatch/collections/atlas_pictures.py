@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
+from meshmatch.collections.asymmetry import Asymmetry
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.explain import Allometry, Explained
 from meshmatch.collections.groups import Comparison
@@ -114,6 +115,18 @@ def draw_effect(
         panels.append(Panel(mean, colors, label, rotation=front))
         panels.append(Panel(mean, colors, "from behind", rotation=_BACK @ front))
     render_shapes(panels, path, Look(turn=0, tilt=0, legend=scale))
+
+
+def draw_asymmetry(folder: Path, mean: Shape, found: Asymmetry, turn: Float[Floats, "3 3"]) -> None:
+    """Directional asymmetry as an effect, and how large fluctuating asymmetry is, from where it is largest."""
+    side = found.directional
+    if side.places is not None:
+        name = "a side less the mirror image of the other"
+        draw_effect(folder / "asymmetry.png", mean, name, side.along_normal[0], side.places, turn)
+    scale = Scale.of(found.fluctuating, "fluctuating asymmetry, root mean square (unit of the files)")
+    colors, front = scale.colors(found.fluctuating), _towards(mean, int(np.argmax(found.fluctuating)), turn)
+    panels = [Panel(mean, colors, rotation=front), Panel(mean, colors, "from behind", rotation=_BACK @ front)]
+    render_shapes(panels, folder / "fluctuating.png", Look(turn=0, tilt=0, legend=scale))
 
 
 def _towards(mean: Shape, vertex: int, turn: Float[Floats, "3 3"]) -> Float[Floats, "3 3"]:

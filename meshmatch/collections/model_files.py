@@ -1,21 +1,26 @@
-"""What the folder of an atlas holds of a linear model.
+"""What the folder of an atlas holds of a linear model, and of asymmetry.
 
 =============  ===================================================================================================
 anova.csv      a line for each term, what is left, and all: df, SS, MS, R2, F, Z, p, and p anywhere
 effects.csv    a line for each vertex: displacement by each coefficient; F and p-values of each term
 effects.vtp    the same on the mean, for ParaView and 3D Slicer
 allometry.csv  a line for each shape: size, scores that go with it, group
+asymmetry.csv  a line for each shape: how far it is from its mirror image, and without what all have in common
+asymmetry.vtp  directional and fluctuating asymmetry on the mean
+symmetry.csv   individuals, sides, and fluctuating asymmetry, as in anova.csv
 =============  ===================================================================================================
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from meshmatch.collections.anova import Effect
+from meshmatch.collections.anova import Effect, Variances
+from meshmatch.collections.asymmetry import Asymmetry
 from meshmatch.collections.explain import Allometry, Explained
 from meshmatch.errors import visible
 from meshmatch.shapes.formats.vtk import write_vtp
@@ -30,16 +35,7 @@ _HEADER = "term", "df", "SS", "MS", "R2", "F", "Z", "p", "p_anywhere"
 def write_model(folder: Path, mean: Shape, found: Explained) -> None:
     """Write the tables of a model into a folder."""
     write_rows(folder / "anova.csv", _HEADER, _lines(model_record(found)))
-    arrays: dict[str, np.ndarray] = {}
-    for effect in found.table.effects:
-        for name, change, along in zip(effect.coefficients, effect.change, effect.along_normal, strict=True):
-            arrays[name] = change
-            arrays[f"{name}, along the normal"] = along
-        if effect.places is not None:
-            about = effect.places
-            values = {"F": about.statistic, "p": about.p, "p corrected": about.p_corrected, "p fdr": about.p_fdr}
-            arrays |= {f"{effect.name}, {what}": each for what, each in values.items()}
-    arrays = {visible(name): values for name, values in arrays.items()}
+    arrays = _arrays(found.table.effects)
     write_vtp(folder / "effects.vtp", mean, arrays)
     header = ["vertex"]
     for name, array in arrays.items():
@@ -48,6 +44,28 @@ def write_model(folder: Path, mean: Shape, found: Explained) -> None:
     write_rows(folder / "effects.csv", header, ([k, *short(row)] for k, row in enumerate(table)))
     if found.allometry is not None:
         _write_allometry(folder / "allometry.csv", found, found.allometry)
+
+
+def write_asymmetry(folder: Path, mean: Shape, found: Asymmetry) -> None:
+    """Write the tables of asymmetry into a folder."""
+    write_rows(folder / "symmetry.csv", _HEADER, _lines(asymmetry_record(found)))
+    rows = zip(found.names, short(found.total_of), short(found.fluctuating_of), strict=True)
+    write_rows(folder / "asymmetry.csv", ["name", "asymmetry", "fluctuating"], rows)
+    write_vtp(folder / "asymmetry.vtp", mean, _arrays([found.directional]) | {"fluctuating": found.fluctuating})
+
+
+def _arrays(effects: Sequence[Effect]) -> dict[str, np.ndarray]:
+    """Values of vertices, by names that a terminal may show."""
+    arrays: dict[str, np.ndarray] = {}
+    for effect in effects:
+        for name, change, along in zip(effect.coefficients, effect.change, effect.along_normal, strict=True):
+            arrays[name] = change
+            arrays[f"{name}, along the normal"] = along
+        if effect.places is not None:
+            about = effect.places
+            values = {"F": about.statistic, "p": about.p, "p corrected": about.p_corrected, "p fdr": about.p_fdr}
+            arrays |= {f"{effect.name}, {what}": each for what, each in values.items()}
+    return {visible(name): values for name, values in arrays.items()}
 
 
 def _write_allometry(path: Path, found: Explained, about: Allometry) -> None:
@@ -60,9 +78,6 @@ def _write_allometry(path: Path, found: Explained, about: Allometry) -> None:
 
 def model_record(found: Explained) -> dict[str, Any]:
     """A model and its table, for JSON; what was not tested is None."""
-    about = found.table
-    left = {"term": "residuals", "df": about.residual_df, "SS": about.residual_ss}
-    left |= {"MS": about.residual_ss / about.residual_df, "R2": about.residual_ss / about.total_ss}
     return {
         "formula": found.formula,
         "shapes": len(found.names),
@@ -70,12 +85,30 @@ def model_record(found: Explained) -> dict[str, Any]:
         "columns": found.columns,
         "statistic": found.kind,
         "blocks": found.blocks,
+        **_table_record(found.table),
+    }
+
+
+def asymmetry_record(found: Asymmetry) -> dict[str, Any]:
+    """Asymmetry and its table, for JSON."""
+    told = {
+        "of_mean": short(found.of_mean),
+        "of_shapes": dict(zip(found.names, short(found.total_of), strict=True)),
+        "fluctuating_of_shapes": dict(zip(found.names, short(found.fluctuating_of), strict=True)),
+    }
+    return told | _table_record(found.table, "fluctuating")
+
+
+def _table_record(about: Variances, left: str = "residuals") -> dict[str, Any]:
+    rest = {"SS": about.residual_ss, "MS": about.residual_ss / about.residual_df}
+    rest["R2"] = about.residual_ss / about.total_ss
+    return {
         "permutations": about.permutations,
         "exact": about.exact,
         "seed": about.seed,
         "level": LEVEL,
         "terms": [_effect_record(effect) for effect in about.effects],
-        "residuals": {name: short(value) for name, value in left.items()},
+        "residuals": {"term": left, "df": about.residual_df} | {name: short(value) for name, value in rest.items()},
         "total": {"term": "total", "df": about.total_df, "SS": short(about.total_ss)},
     }
 

@@ -87,6 +87,15 @@ def nearer_mirrored(source: Shape, target: Shape, seed: int) -> float:
     return float(np.log(same / image))
 
 
+def laid_mirrored(shape: Shape, seed: int) -> Shape:
+    """The mirror image of a shape as it lies nearest to the shape, its vertices in their order, facing out."""
+    frame = unit_frame(shape, "area", 0.5)
+    part = _samples(shape, "area", [seed])
+    pose = align(part, _image(part), "rigid")[0].pose
+    laid = frame.undo(pose.to_world(frame.apply(shape.verts) * _MIRROR))
+    return Shape(laid, shape.faces[:, ::-1])
+
+
 def _samples(shape: Shape, scale: Scale, seed: list[int]) -> OrientedPoints:
     return sample_surface(shape, _SAMPLES, np.random.default_rng(seed)).in_frame(unit_frame(shape, scale, 0.5))
 

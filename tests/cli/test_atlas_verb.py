@@ -118,6 +118,24 @@ def test_a_shape_unlike_the_others_is_told(run: Run, shapes: Path, tmp_path: Pat
     assert not any(name.endswith(".png") for name in told["files"])
 
 
+def test_mirror_images_are_compared(run: Run, shapes: Path, tmp_path: Path) -> None:
+    output = tmp_path / "a"
+    answer = run("atlas", shapes, "-o", output, "--no-measures", "--permutations", 20, "--symmetry")
+    assert answer.status == 0
+    assert "from its mirror image" in answer.err
+    assert [line.split()[0] for line in answer.out.splitlines()] == [
+        "term",
+        "individual",
+        "side",
+        "fluctuating",
+        "total",
+    ]
+    assert len((output / "asymmetry.csv").read_text().splitlines()) == 9
+    told = json.loads((output / "atlas.json").read_text())["asymmetry"]
+    assert told["of_mean"] < 0.01
+    assert (output / "asymmetry.vtp").exists()
+
+
 @pytest.mark.parametrize("wrong", ["nowhere", "file", "input", "both", "unknown", "statistic", "table", "space", "row"])
 def test_what_is_refused_leaves_nothing(run: Run, shapes: Path, tmp_path: Path, wrong: str) -> None:
     output, one = tmp_path / "atlas", group(tmp_path / "one.txt", range(4))
