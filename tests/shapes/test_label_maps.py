@@ -193,6 +193,15 @@ BAD: dict[str, tuple[str, bytes, str]] = {
     "NIfTI-2": ("a.nii", struct.pack("<i", 540) + bytes(600), "not a NIfTI-1 file"),
     "a list of files": ("a.mhd", meta(where="LIST"), "no file LIST beside it"),
     "an archive": ("a.tar.gz", gzip.compress(b"nothing"), "unsupported file format .gz"),
+    "too many layers": (
+        "a.nrrd",
+        nrrd()
+        .replace(b"dimension: 3", b"dimension: 4")
+        .replace(b"sizes: 22 18 14", b"sizes: 1001 2 2 2")
+        .replace(b"directions: ", b"directions: none ")
+        + bytes(8008),
+        "has 1001 layers, of 1000 at most",
+    ),
     "no header": ("a.nrrd", b"NRRD0004\n", "cannot be read"),
     "not at all": ("a.mha", b"solid\n", "it has no ElementDataFile"),
 }
@@ -205,6 +214,17 @@ def test_what_is_no_label_map_is_told_in_words(tmp_path: Path, case: str) -> Non
     with pytest.raises(InputError, match=words) as told:
         load_shape(tmp_path / name)
     assert "\n" not in told.value.message
+
+
+def test_labels_all_over_the_image_are_refused_before_hours_of_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("meshmatch.shapes.formats.label_surfaces._MOST_WORK", 3 * LABELS.size)
+    corners = np.zeros(SIZES, int)
+    for k in range(5):
+        corners[2 * k : 2 * k + 2, 1:3, 1:3] = corners[-2 * k - 3 : -2 * k - 1, -3:-1, -3:-1] = k + 1
+    with pytest.raises(InputError, match="the 5 labels are scattered over the whole image"):
+        load_shape_of(tmp_path, corners)
 
 
 HUGE = 2000, 2000, 2000

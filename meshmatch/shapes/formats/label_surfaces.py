@@ -8,7 +8,7 @@ are 7 degrees off; marching cubes (scikit-image 0.26) on the same labels leave s
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -25,6 +25,8 @@ from meshmatch.shapes.input_files import check_memory
 
 CODE_BYTES = 3
 """Bytes of memory that a voxel takes beside its own: a small number for its label, and a comparison."""
+_SLAB = 1 << 20  # voxels at a time
+_MOST_WORK = 4 << 30  # voxels in the boxes of all labels
 _BOX_BYTES = 8  # and those within the box around a label
 _SHARES = 4 * (0.7, -0.73)  # of the way to the mean of the neighbours, and back: nothing shrinks (Taubin 1995)
 _MOST_LABELS = 1000
@@ -60,18 +62,24 @@ def label_surfaces(
     InputError
         The voxels are grey values, no label is there, or the surfaces would be too large for the file.
     """
-    verts, faces, meshes, cut, count, many = [], [], [], [], 0, 0
+    verts, faces, meshes, cut, count, many, work = [], [], [], [], 0, 0, 0
+    if len(layers) > _MOST_LABELS:
+        raise InputError(f"{name} has {len(layers)} layers, of {_MOST_LABELS} at most", "save one label map")
     for number, layer in enumerate(layers):
         labels = _labels_of(name, layer)
         codes = np.zeros(layer.shape, np.uint16, order="F")
-        for z in range(layer.shape[2]):
-            codes[:, :, z] = np.searchsorted(labels, layer[:, :, z])
+        for part in _slabs(layer):
+            codes[part] = np.searchsorted(labels, layer[part])
         for code, box in enumerate(ndimage.find_objects(codes)):
             label = int(labels[code + 1]) if box is not None else 0
             if label == 0:
                 continue
             box = tuple(slice(max(side.start - 1, 0), side.stop + 1) for side in box)
             voxels = math.prod(side.stop - side.start for side in box)
+            work += voxels
+            if work > _MOST_WORK:
+                hint = "save fewer labels, or cut the image to what you need"
+                raise InputError(f"{name}: the {len(labels) - 1} labels are scattered over the whole image", hint)
             check_memory(name, size, CODE_BYTES * codes.size + _BOX_BYTES * voxels)
             inside = codes[box] == code + 1
             crossed = sum(int(np.count_nonzero(np.diff(inside, axis=axis))) for axis in range(3))
@@ -100,8 +108,8 @@ def _labels_of(name: str, voxels: NDArray[Any]) -> NDArray[Any]:
     """0 and all numbers that are there, sorted; `InputError` if they are grey values."""
     found: set[Any] = {0}
     pairs = changes = 0
-    for z in range(voxels.shape[2]):
-        part = voxels[:, :, z]
+    for slab in _slabs(voxels):
+        part = voxels[slab]
         if part.dtype.kind == "f" and not (part == np.rint(part)).all():
             raise InputError(f"{name} holds fractions or grey values, not labels", _SEGMENT_FIRST)
         found.update(np.unique(part).tolist())
@@ -124,6 +132,13 @@ def _labels_of(name: str, voxels: NDArray[Any]) -> NDArray[Any]:
     if len(found) == 1:
         raise InputError(f"{name} holds no label: all its voxels are 0", _SEGMENT_FIRST)
     return np.array(sorted(found), voxels.dtype.newbyteorder("="))
+
+
+def _slabs(voxels: NDArray[Any]) -> Iterator[tuple[slice, slice, slice]]:
+    """Some slices at a time."""
+    step = max(1, _SLAB // (voxels.shape[0] * voxels.shape[1]))
+    for low in range(0, voxels.shape[2], step):
+        yield slice(None), slice(None), slice(low, low + step)
 
 
 def _reaches(codes: NDArray[np.uint16], code: int) -> bool:
