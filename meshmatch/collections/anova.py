@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, frozen
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Ints32, frozen
 from meshmatch.collections.covariates import DesignTerm
 from meshmatch.collections.permutation import PlaceTests, orders, permuted, tested, whitened
 from meshmatch.errors import InputError
@@ -111,6 +111,8 @@ def analyse(
     rest = S - basis.directions.shape[1]
     if rest < 1:
         raise InputError(f"{S} shapes leave nothing to test a model of {S - rest} coefficients by", "leave out terms")
+    if not basis.within.any():
+        raise InputError("the blocks leave nothing to exchange", "a term of the model has to differ within a block")
     order, exact = orders(groups, permutations, seed)
     squares = np.square(basis.directions.T @ points).sum(axis=1)
     total = float(np.square(points - points.mean(axis=0)).sum())
@@ -149,7 +151,7 @@ def analyse(
 
 
 def _test(
-    values: Float[Floats, "S N D"], basis: _Basis, term: int, rest: int, order: Int[Ints, "P S"], white: bool = False
+    values: Float[Floats, "S N D"], basis: _Basis, term: int, rest: int, order: Int[Ints32, "P S"], white: bool = False
 ) -> PlaceTests:
     """F of a term for each permutation of the residuals that the terms before it leave."""
     before = basis.directions[:, basis.term < term]

@@ -20,6 +20,7 @@ Columns: TypeAlias = Mapping[str, Sequence[Any]]
 """Values of the shapes by the names of columns; with a column ``name`` in any order, else in that of the shapes."""
 NAMES = "name"
 SIZE = "size"
+_LARGEST = 1e30  # numbers, whose products have squares
 _SOME = 5  # names in a message
 _NONE = ("none", "null")  # missing among numbers; a category such as "no treatment" among words
 
@@ -35,10 +36,8 @@ class Covariates:
         """The cells of a column; `InputError` where there is none of that name."""
         if name not in self.cells:
             close = get_close_matches(name, self.cells, n=1)
-            known = ", ".join(self.cells)
-            raise InputError(
-                f"there is no column called {name}", f"did you mean {close[0]}?" if close else f"there are: {known}"
-            )
+            known = f"there are: {some(list(self.cells))}" if len(self.cells) > 1 else "give a table that has it"
+            raise InputError(f"there is no column called {name}", f"did you mean {close[0]}?" if close else known)
         return self.cells[name]
 
     def missing(self, name: str) -> Bool[Bools, " S"]:
@@ -169,14 +168,15 @@ def _coded(factor: Factor, known: Covariates) -> tuple[Floats, tuple[str, ...], 
     cells = known.column(factor.column)
     if factor.function != "factor" and _are_numbers(cells):
         values = np.array([number(cell) for cell in cells])
-        if not np.isfinite(values).all():
-            raise InputError(f"{factor.column} is not finite for {known.names[int(np.argmin(np.isfinite(values)))]}")
+        fine = np.abs(values) < _LARGEST
+        if not fine.all():
+            raise InputError(f"{factor.column} is not finite, or huge, for {known.names[int(np.argmin(fine))]}")
         if factor.function == "log":
             if not (values > 0).all():
                 name = known.names[int(np.argmin(values))]
                 raise InputError(f"{factor} needs numbers above 0, and {name} has {values.min():g}")
             values = np.log(values)
-        if not np.ptp(values) > 1e-12 * np.abs(values).max():
+        if not np.ptp(values) > max(1e-12 * np.abs(values).max(), 1 / _LARGEST):
             raise InputError(f"{factor} is the same for all shapes in the model", "leave it out")
         return values[:, None], (str(factor),), f"a number, {values.min():.4g} to {values.max():.4g}"
     if factor.function == "log":

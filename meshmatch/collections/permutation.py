@@ -14,9 +14,11 @@ from math import factorial
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints, Ints32
+from meshmatch.errors import OptionError
 
 _CHUNK = 2_000_000  # numbers at a time
+_LARGEST = 200_000_000  # numbers of all permutations
 HAIR = 1e-9
 """Statistics of one labelling that rounding tells apart."""
 _FLAT = 1e-12  # of the largest scatter at a vertex: directions of less have none
@@ -36,23 +38,26 @@ class PlaceTests:
     largest: Float[Floats, " P"]
 
 
-def orders(groups: Int[Ints, " S"], most: int, seed: int) -> tuple[Int[Ints, "P S"], bool]:
+def orders(groups: Int[Ints, " S"], most: int, seed: int) -> tuple[Int[Ints32, "P S"], bool]:
     """Orders of S shapes that leave each in its group, the given one first; and whether these are all there are.
 
-    All of them where there are at most ``most``, else that many random ones and the given one.
+    All of them where there are at most ``most``, else that many random ones and the given one; `OptionError` for too many.
     """
     count = 1
     for size in np.bincount(groups).tolist():
         count *= factorial(size) if size < 20 and count <= most else most + 1
     place = np.argsort(groups, kind="stable")
-    if count <= most:
+    if count <= most and count * len(groups) <= _LARGEST:
         members = np.split(place, np.flatnonzero(np.diff(groups[place])) + 1)
-        found = np.empty((count, len(groups)), np.int64)
+        found = np.empty((count, len(groups)), np.int32)
         for row, each in enumerate(product(*(permutations(some.tolist()) for some in members))):
             found[row, place] = [k for some in each for k in some]
         return found, True
     random = np.random.default_rng(seed)
-    found = np.empty((most + 1, len(groups)), np.int64)
+    if most * len(groups) > _LARGEST:
+        hint = f"at most {_LARGEST // len(groups):,}"
+        raise OptionError(f"{most:,} permutations of {len(groups)} shapes are too many", hint)
+    found = np.empty((most + 1, len(groups)), np.int32)
     found[0] = np.arange(len(groups))
     step = max(1, _CHUNK // len(groups))
     for low in range(1, most + 1, step):
@@ -61,7 +66,7 @@ def orders(groups: Int[Ints, " S"], most: int, seed: int) -> tuple[Int[Ints, "P 
     return found, False
 
 
-def permuted(basis: Float[Floats, "S R"], order: Int[Ints, "P S"]) -> Iterator[Float[Floats, "B R S"]]:
+def permuted(basis: Float[Floats, "S R"], order: Int[Ints32, "P S"]) -> Iterator[Float[Floats, "B R S"]]:
     """A basis in each order of the shapes, some at a time; as the orders are all, or random, so are their inverses."""
     step = max(1, _CHUNK // max(1, basis.size))
     for low in range(0, len(order), step):

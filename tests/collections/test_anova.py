@@ -221,3 +221,16 @@ def test_what_cannot_be_explained() -> None:
         atlas.anova("form ~ age", ages, kind="welch")  # type: ignore[arg-type]
     with pytest.raises(OptionError, match="permutation"):
         atlas.anova("form ~ age", ages, permutations=0)
+    with pytest.raises(OptionError, match="too many"):
+        orders(np.zeros(40, np.int64), 10**9, 0)
+
+
+def test_blocks_that_exchange_nothing_are_refused() -> None:
+    given = ellipsoids(6)
+    atlas = Atlas.of(given.points, given.faces)
+    table = {"x": list("aabbaa"), "id": list("aabbcc"), "own": list("abcdef")}
+    for formula, blocks in (("form ~ x", "id"), ("form ~ id", "id"), ("form ~ x", "own")):
+        with pytest.raises(InputError, match="nothing to exchange"):
+            atlas.anova(formula, table, blocks=blocks)
+    with pytest.raises(InputError, match="no column called subject"):
+        atlas.anova("form ~ x", table, blocks="subject")
