@@ -64,6 +64,11 @@ class TrainOptions(Options):
         help="Training settings: the ones that measured best, or the paper's (with --implicit DIF-Net's, "
         "for either --field).",
     )
+    recipe: Path | None = optional(
+        "FILE",
+        "Train as another model was: the card.json in its folder, or a part of one. Other options change single "
+        "settings of it; minutes, threads and device are not taken from it.",
+    )
     field: Literal["mls", "rbf", "pointwise"] | None = Option(
         None,
         help="Representation of the deformation: moving least squares (mls, the default) or radial basis functions "
@@ -121,6 +126,9 @@ class TrainOptions(Options):
     poses: Path | None = optional("FILE", "Poses to mix with the sampled ones: .npz, .json or .csv (docs/formats.md).")
     pose_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies that stand in a pose of --poses.")
     bf16: bool | None = Option(None, "--bf16/--no-bf16", help="bfloat16 arithmetic; default: the preset's choice.")
+    device: Literal["auto", "cpu", "cuda", "mps"] = Option(
+        "auto", help="Where the network is trained. auto: a GPU of CUDA if there is one, else the CPU."
+    )
     workers: int | None = Option(None, min=0, help="Processes that generate batches; default: the preset's.")
     threads: Threads = 1
     seed: Seed = 0
@@ -161,7 +169,7 @@ def train(
     def report(now: "StepReport") -> None:
         reports.append(now)
         if len(reports) == 1 or now.validation is not None or now.step == now.steps:
-            console.say(f"{now.words} ({now.seconds:.0f} s)")
+            console.say(f"{now.words} ({now.seconds:.0f} s{_left(reports)})")
 
     with console.progress() as progress:
         learn(resume=not how.fresh, progress=progress, report=report)
@@ -171,20 +179,39 @@ def train(
         _summary(console, output, steps, how.picture, json)
 
 
+def _left(reports: "list[StepReport]") -> str:
+    """Words for the time that the steps which are left will take, by those between the reports."""
+    first, now = reports[0], reports[-1]
+    if now.step in (first.step, now.steps):
+        return ""
+    minutes = (now.seconds - first.seconds) / (now.step - first.step) * (now.steps - now.step) / 60
+    return f", about {minutes:.0f} min left" if minutes >= 1 else ", less than a minute left"
+
+
 def _by_template(output: Path, how: TrainOptions, console: Console) -> tuple[int, Callable[..., Any]]:
     """The steps of a training that deforms a template of vertices, and what runs it."""
+    from meshmatch.models.inference import training_device
     from meshmatch.training import train as training
     from meshmatch.training.recipes import going_on, recipe_for, small_data
 
     settings = (
-        "field", "volume", "arap", "blend", "rate", "points", "steps", "minutes", "bf16", "workers", "threads", "seed",
+        "field", "volume", "arap", "blend", "rate", "points", "steps", "minutes", "bf16", "workers", "threads", "device",
+        "seed",
     )  # fmt: skip
     fitted, start = _fits(how, console)
     if fitted is None:
         recipe = recipe_for(how.shapes, how.preset, how.unsupervised, how.kind)
     else:
         recipe = small_data() if start is None else going_on(start)
-    recipe = recipe.changed(**{name: getattr(how, name) for name in settings})
+    changes = {name: getattr(how, name) for name in settings}
+    if how.recipe is not None:
+        from meshmatch.training.recipe_files import read_recipe
+
+        how.refuse(("preset",), "--recipe")
+        recipe = read_recipe(how.recipe, recipe)
+        changes = {name: value for name, value in changes.items() if name in (*how.given, "threads", "device")}
+    recipe = recipe.changed(**changes)
+    training_device(wanted=recipe.train.device)  # before shapes are made
     facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, start or how.start)
     shapes, kind = fitted or how.shapes, _generated(how)
     return recipe.train.steps, partial(training.train, output, shapes=shapes, kind=kind, recipe=recipe, facts=facts)

@@ -65,11 +65,19 @@ def in_torch(network: Network, K: int, device: str = "cpu") -> Deformer:
         raise OptionError(problem, "use cpu; cuda needs a GPU and a torch that was built for it") from error
 
 
-def training_device(rank: int = 0) -> torch.device:
-    """Where networks are trained: the GPU of this rank among the machine's, or the CPU where there is none."""
+def training_device(rank: int = 0, wanted: str = "auto") -> torch.device:
+    """Where networks are trained: the GPU of this rank among the machine's, or the CPU where there is none; or what is
+    wanted, "cpu", "cuda" or "mps" (`OptionError` if it is not there).
+    """
     import torch
 
-    return torch.device("cuda", rank) if torch.cuda.is_available() else torch.device("cpu")
+    there = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    if wanted == "auto":
+        wanted = "cuda" if there["cuda"] else "cpu"
+    if not there.get(wanted, False):
+        have = ", ".join(name for name in there if there[name])
+        raise OptionError(f"there is no device {wanted!r} to train on", f"this machine and its torch have: {have}")
+    return torch.device("cuda", rank) if wanted == "cuda" else torch.device(wanted)
 
 
 class NodeNetwork:

@@ -34,7 +34,8 @@ class TrainConfig:
 
     ``steps`` fixes the schedule: warm-up, a constant rate, then a cosine to zero over the last ``decay`` share.
     ``minutes`` only stops the run (with a checkpoint to go on from). ``align_steps``: so many steps of the aligner alone
-    come first. `OptionError` if a number cannot be.
+    come first. ``device``: "auto" (a GPU of CUDA if there is one), "cpu", "cuda" or "mps". `OptionError` if a number cannot
+    be.
     """
 
     steps: int = 20_000
@@ -54,6 +55,7 @@ class TrainConfig:
     bf16: bool = False
     seed: int = 0
     align_steps: int = 0
+    device: str = "auto"
     loss: Objective = field(default_factory=CorrespondenceLoss)
 
     def __post_init__(self) -> None:
@@ -100,7 +102,7 @@ class Trainer:
         self.config = config
         self.rank = int(os.environ.get("RANK", 0))
         self.world = int(os.environ.get("WORLD_SIZE", 1))
-        self.device = training_device(int(os.environ.get("LOCAL_RANK", 0)))
+        self.device = training_device(int(os.environ.get("LOCAL_RANK", 0)), config.device)
         if self.world > 1 and not dist.is_initialized():
             dist.init_process_group("gloo" if self.device.type == "cpu" else "nccl")
         self.model = model.to(self.device)

@@ -6,9 +6,11 @@ How a folder is learned is decided by `meshmatch.training.recipes.recipe_for`.
 from __future__ import annotations
 
 import datetime
+import json
 from collections.abc import Callable
+from contextlib import suppress
 from copy import deepcopy
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ import torch
 from torch import Tensor
 
 from meshmatch.arrays import Float, Int, Ints
-from meshmatch.errors import InputError, OptionError, TemplateError
+from meshmatch.errors import InputError, OptionError, OutputError, TemplateError
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import has_nodes, shape_functions
 from meshmatch.generators.bodies import Bodies
@@ -30,7 +32,7 @@ from meshmatch.models.deformer import Deformer
 from meshmatch.models.network import NetworkConfig
 from meshmatch.models.registry import CARD, NO_MODEL, TEMPLATE, WEIGHTS, load_model
 from meshmatch.models.trained import TrainedModel
-from meshmatch.outputs import make_folder
+from meshmatch.outputs import make_folder, replace_on_success
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.prepared_folder import RegisteredShapes, ShapeSamples
@@ -44,9 +46,11 @@ from meshmatch.training.facts import inherited
 from meshmatch.training.lessons import Lessons, check_start, kind_named, lessons, template_of
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.losses import LossPoints, SurfacePoints, held_out_error
+from meshmatch.training.recipe_files import recipe_record
 from meshmatch.training.recipes import Recipe, going_on, recipe_for, small_data
 from meshmatch.training.scans import ScanConfig
 
+METRICS = "metrics.jsonl"
 VALIDATION_SEED = 999_983
 """Of the batch that no training sees and every training is measured on."""
 
@@ -64,8 +68,8 @@ def train(
 ) -> Path:
     """Train a model, or go on training it from the checkpoint in its folder, exactly.
 
-    The folder receives ``checkpoint/last.safetensors`` on the way and, at every stop, ``template.safetensors``,
-    ``weights.safetensors`` and last ``card.json``.
+    The folder receives ``checkpoint/last.safetensors`` and ``metrics.jsonl`` on the way and, at every stop,
+    ``template.safetensors``, ``weights.safetensors`` and last ``card.json``.
 
     Parameters
     ----------
@@ -206,6 +210,8 @@ def train_model(
         for name in ("encoder", "aligner"):  # what reads the batches are copies (see `build_dataset`)
             if (reader := getattr(data, name, None)) is not None:
                 reader.load_state_dict(getattr(trainer.model, name).state_dict())
+    if trainer.rank == 0:
+        report = logged(output / METRICS, trainer, report)
     trainer.run(data, checkpoint, report, lambda model: held_out_error(model, held_out, trainer.points))
     trainer.close()
     if trainer.rank == 0:
@@ -214,12 +220,38 @@ def train_model(
     return output
 
 
+def logged(path: Path, trainer: Trainer, report: Callable[[StepReport], None] | None) -> Callable[[StepReport], None]:
+    """A report that also adds a line to a file: JSON with step, rate, seconds of all runs, terms of the loss, validation.
+
+    Of a file from before, lines of steps that are done again are dropped. `OutputError` if it cannot be written.
+    """
+    kept = []
+    with suppress(OSError, ValueError):
+        lines = path.read_text(encoding="utf-8").splitlines() if trainer.step else []
+        kept = [line for line in lines if json.loads(line)["step"] <= trainer.step]
+    with replace_on_success(path) as temporary:
+        temporary.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+
+    def both(now: StepReport) -> None:
+        record = {"step": now.step, "rate": now.rate, "seconds": round(trainer.seconds, 3), **now.terms}
+        record |= {} if now.validation is None else {"validation": now.validation}
+        try:
+            with path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(record) + "\n")
+        except OSError as error:
+            raise OutputError(f"cannot write {path}: {error.strerror}") from error
+        if report is not None:
+            report(now)
+
+    return both
+
+
 def export(trainer: Trainer, template: Template, output: Path, recipe: Recipe, facts: CardFacts, score: float) -> None:
     """Write the averaged weights as a model folder, with the validation error ``score``; the card comes last."""
     (output / CARD).unlink(missing_ok=True)
     save_template(template, output / TEMPLATE)
     digest = save_weights(trainer.averaged_state(), output / WEIGHTS, storage=recipe.storage)
-    settings: dict[str, Any] = {"train": asdict(recipe.train), "scan": asdict(recipe.scan)}
+    settings = recipe_record(recipe)
     if isinstance(facts.start, TrainedModel):
         begun = facts.start.card
         settings["start"] = {"model": begun.name, "weights_sha256": begun.weights_sha256, "steps": begun.steps}

@@ -75,6 +75,15 @@ def test_defaults(run: Run, stub: Recorder, tmp_path: Path) -> None:
     assert "unfinished: step 2 of 13,000; the same command goes on" in answer.err
 
 
+def test_a_card_is_a_recipe_and_options_change_it(run: Run, stub: Recorder, tmp_path: Path) -> None:
+    card = bundled_folder() / "models" / "hand" / "card.json"
+    assert run("train", "-o", tmp_path / "mine", "--recipe", card, "--steps", 9, "--device", "cpu").status == 0
+    found = stub.called["recipe"]
+    assert (found.train.steps, found.train.shapes, found.network.code, found.train.device) == (9, 16, 384, "cpu")
+    answer = run("train", "-o", tmp_path / "other", "--recipe", card, "--preset", "paper")
+    assert answer.status == 1 and "--preset does not go with --recipe" in answer.err
+
+
 def test_half_of_the_people_are_characters_unless_another_share_is_asked_for(
     run: Run, stub: Recorder, tmp_path: Path
 ) -> None:

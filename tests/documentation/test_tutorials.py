@@ -118,13 +118,13 @@ def test_two_files_become_a_walking_textured_dressed_character(tmp_path: Path, m
     assert Path("character.png").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("page", ["fields"])
+@pytest.mark.parametrize("page", ["fields", "training"])
 def test_the_code_of_a_page_runs(
     page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, remembered_fits: Any
 ) -> None:
     (tmp_path / "templates").symlink_to(ROOT / "templates")
     monkeypatch.chdir(tmp_path)
-    exec(compile(script(page, "python"), f"{page}.md", "exec"), {})
+    exec(compile(script(page, "python"), f"{page}.md", "exec"), {"__name__": "__main__"})
 
 
 @pytest.mark.slow

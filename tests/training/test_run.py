@@ -1,5 +1,6 @@
 """From a folder of registered shapes to a model that loads, and on from there."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -92,6 +93,13 @@ def test_a_folder_becomes_a_model(prepared: Path, tmp_path: Path, chosen: Recipe
     assert card.recipe["scan"]["points"] == 96
     assert card.metrics["validation"]["distance"] > 0
     assert seen[-1].step == 4
+    (line,) = (folder / "metrics.jsonl").read_text().splitlines()
+    assert json.loads(line) == {
+        "step": 4,
+        "rate": seen[-1].rate,
+        "seconds": json.loads(line)["seconds"],
+        **seen[-1].terms,
+    }
     model = load_model(folder)
     assert model.card == card
     points = torch.randn(2, 50, 3, generator=torch.Generator().manual_seed(0)) * 0.2

@@ -1,0 +1,122 @@
+"""Recipes on model cards, and how they are read back.
+
+A file may come from anywhere: it holds plain numbers and words, all of them checked, and names no code that is run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+from meshmatch.errors import InputError, MeshmatchError
+from meshmatch.geometry.kernels import KERNELS
+from meshmatch.models.checkpoint import Storage
+from meshmatch.models.network import NetworkConfig
+from meshmatch.shapes.input_files import read_json
+from meshmatch.training.losses import ChamferLoss, CorrespondenceLoss, Objective
+from meshmatch.training.recipes import Recipe
+
+_LOSSES: dict[str, type[Objective]] = {
+    f"{each.__module__}.{each.__qualname__}": each for each in (CorrespondenceLoss, ChamferLoss)
+}
+_OF_THE_MACHINE = ("minutes", "checkpoint_minutes", "threads", "device")
+_OWN = ("deform", "storage", "template", "characters", "bodies")
+_MOST = {
+    "shapes": 4096,
+    "scans_per_shape": 256,
+    "points": 100_000,
+    "workers": 256,
+    "bodies": 20_000,
+    "correct_points": 100_000,
+}
+_HINT = "give the card.json of a model, or a part of one: network, field.kernel, recipe.train, recipe.scan"
+T = TypeVar("T")
+
+
+def recipe_record(recipe: Recipe) -> dict[str, Any]:
+    """What a card says of a recipe, besides its network and kernel; with the class of the loss by its name."""
+    loss = type(recipe.train.loss)
+    record = {"train": asdict(recipe.train), "scan": asdict(recipe.scan)}
+    return record | {"loss": f"{loss.__module__}.{loss.__qualname__}"} | {name: getattr(recipe, name) for name in _OWN}
+
+
+def read_recipe(path: str | Path, usual: Recipe) -> Recipe:
+    """The recipe of a card, or of a file that has parts of one; what it does not say is as in the usual one.
+
+    What belongs to the machine (minutes, threads, device) is not taken from a file. `InputError` if it is none, names
+    something unknown, or was learned by a loss that is not meshmatch's own.
+    """
+    path = Path(path)
+    try:
+        record = read_json(path)
+        if not isinstance(record, dict):
+            raise InputError("it is not an object")
+        own = _object(record.get("recipe", {}), "recipe")
+        train = _object(own.get("train", {}), "recipe.train")
+        loss = _loss(record, own, usual)
+        loss = _filled(loss, _object(train.get("loss", {}), "recipe.train.loss"), "recipe.train.loss")
+        steps = {name: value for name, value in train.items() if name not in ("loss", *_OF_THE_MACHINE)}
+        more = {name: own[name] for name in _OWN if name in own}
+        if unknown := sorted(own.keys() - {"train", "scan", "loss", "start", *_OWN}):
+            raise InputError(f"recipe.{unknown[0]} is unknown")
+        network = _object(record.get("network", {}), "network")
+        kernel = _object(record.get("field", {}), "field").get("kernel", usual.kernel)
+        found = _filled(usual, more, "recipe")
+        if kernel not in tuple(KERNELS) or found.storage not in get_args(Storage):
+            raise InputError("its kernel or storage is unknown")
+        return replace(
+            found,
+            network=NetworkConfig.from_dict(asdict(usual.network) | network),
+            train=replace(_filled(usual.train, steps, "recipe.train"), loss=loss),
+            scan=_filled(usual.scan, _object(own.get("scan", {}), "recipe.scan"), "recipe.scan"),
+            kernel=kernel,
+        )
+    except MeshmatchError as error:
+        raise InputError(f"{path.name} is no recipe: {error.message}", error.hint or _HINT) from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path.name} is no recipe: {str(error).splitlines()[0]}", _HINT) from error
+
+
+def _loss(record: Mapping[str, Any], own: Mapping[str, Any], usual: Recipe) -> Objective:
+    """A loss of the class that the file names; older cards say only whether shapes corresponded."""
+    if "loss" in own:
+        if own["loss"] not in tuple(_LOSSES):
+            hint = "its author has the class; put it into a recipe in Python (docs/training.md)"
+            raise InputError(f"it was learned by {str(own['loss'])[:80]!r}, a loss of somebody's own", hint)
+        kind = _LOSSES[own["loss"]]
+    elif "correspondence" in record:
+        kind = CorrespondenceLoss if record["correspondence"] is not False else ChamferLoss
+    else:
+        return usual.train.loss
+    return usual.train.loss if type(usual.train.loss) is kind else kind()
+
+
+def _filled(values: T, changes: Mapping[str, Any], where: str) -> T:
+    """A dataclass with some of its numbers and words changed, of the kinds that they have."""
+    known = {each.name: str(each.type) for each in fields(values)}  # type: ignore[arg-type]
+    for name, value in changes.items():
+        if name not in known:
+            raise InputError(f"{where}.{name} is unknown", f"choose from {', '.join(known)}")
+        kind = known[name]
+        number = type(value) is int or (type(value) is float and math.isfinite(value))
+        right = {
+            "bool": type(value) is bool,
+            "int": type(value) is int,
+            "float": number,
+            "float | None": number or value is None,
+        }.get(kind, isinstance(value, str))
+        if not right:
+            raise InputError(f"{where}.{name} must be {kind}, not {str(value)[:40]!r}")
+        if type(value) is not bool and number and not 0 <= value <= _MOST.get(name, 2**53):
+            raise InputError(f"{where}.{name} must lie in 0..{_MOST.get(name, 2**53):,}, not {value}")
+    changed: Any = replace(values, **changes)  # type: ignore[type-var]
+    return changed  # type: ignore[no-any-return]
+
+
+def _object(value: Any, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise InputError(f"{where} must be an object")
+    return value

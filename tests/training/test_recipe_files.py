@@ -1,0 +1,91 @@
+"""Recipes on cards, read back: the same, or refused in a line."""
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from meshmatch.errors import InputError, OptionError
+from meshmatch.models.inference import training_device
+from meshmatch.templates.location import bundled_folder
+from meshmatch.training.losses import CorrespondenceLoss
+from meshmatch.training.recipe_files import read_recipe, recipe_record
+from meshmatch.training.recipes import Recipe, clouds, compact, default, paper, paper_clouds, people, small_data
+
+
+def written(folder: Path, record: object) -> Path:
+    path = folder / "card.json"
+    path.write_text(json.dumps(record))
+    return path
+
+
+@pytest.mark.parametrize("made", [default, people, paper, small_data, clouds, paper_clouds, compact])
+def test_a_recipe_comes_back_from_its_record(made: Any, tmp_path: Path) -> None:
+    recipe = made().changed(steps=77, volume=0.25, seed=9, device="cpu", minutes=3)
+    record = {"recipe": recipe_record(recipe), "network": recipe.network.to_dict(), "field": {"kernel": recipe.kernel}}
+    back = read_recipe(written(tmp_path, record), default())
+    assert back == replace(recipe, train=replace(recipe.train, device="auto", minutes=None))
+
+
+@pytest.mark.parametrize("name", ["human", "quadruped", "hand", "head"])
+def test_the_cards_that_ship_can_be_read(name: str) -> None:
+    path = bundled_folder() / "models" / name / "card.json"
+    card = json.loads(path.read_text())
+    found = read_recipe(path, people())
+    assert asdict(found.train)["loss"] == card["recipe"]["train"]["loss"]
+    assert (found.train.steps, found.train.seed) == (card["recipe"]["train"]["steps"], card["recipe"]["train"]["seed"])
+    assert found.network.to_dict() == card["network"]
+
+
+def test_a_part_changes_a_part(tmp_path: Path) -> None:
+    part = {"recipe": {"train": {"steps": 5, "loss": {"arap": 1}}}}
+    usual = people()
+    wanted = replace(usual, train=replace(usual.train, steps=5, loss=replace(usual.train.loss, arap=1)))
+    assert read_recipe(written(tmp_path, part), usual) == wanted
+
+
+@dataclass(frozen=True)
+class Mine(CorrespondenceLoss):
+    more: float = 1.0
+
+
+def test_a_loss_of_ones_own_is_named_and_never_loaded(tmp_path: Path) -> None:
+    recipe: Recipe = replace(people(), train=replace(people().train, loss=Mine()))
+    record = recipe_record(recipe)
+    assert record["loss"].endswith("test_recipe_files.Mine") and record["train"]["loss"]["more"] == 1.0
+    with pytest.raises(InputError, match="a loss of somebody's own") as caught:
+        read_recipe(written(tmp_path, {"recipe": record}), people())
+    assert "Python" in caught.value.hint
+
+
+@pytest.mark.parametrize(("record", "words"), [
+    ([], "not an object"), ({"recipe": 3}, "recipe must be an object"),
+    ({"recipe": {"train": {"stps": 1}}}, "train.stps"),
+    ({"recipe": {"train": {"steps": "9"}}}, "steps must be int"), ({"recipe": {"train": {"steps": True}}}, "must be int"),
+    ({"recipe": {"train": {"steps": 0}}}, "steps must be 1 or more"),
+    ({"recipe": {"scan": {"points": 10**9}}}, "0..100,000"),
+    ({"recipe": {"train": {"rate": float("nan")}}}, "rate must be float"), ({"recipe": {"scan": {"noise": -1}}}, "0..9"),
+    ({"recipe": {"loss": ["x"]}}, "somebody's own"), ({"recipe": {"storage": "int2"}}, "storage"),
+    ({"recipe": {"train": {"loss": {"robust": 1}}}}, "robust must be bool"), ({"network": {"code": 10**9}}, "code must be"),
+    ({"network": {"size": 1}}, "unknown network"), ({"field": {"kernel": {}}}, "kernel"), ({"recipe": {"tain": {}}}, "tain"),
+])  # fmt: skip
+def test_what_is_no_recipe_is_told(record: Any, words: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no recipe") as caught:
+        read_recipe(written(tmp_path, record), people())
+    assert words in caught.value.message and caught.value.hint and "\n" not in caught.value.message
+
+
+def test_files_that_are_none(tmp_path: Path) -> None:
+    (tmp_path / "text.json").write_text("{")
+    for name in ("text.json", "gone.json", ""):
+        with pytest.raises(InputError):
+            read_recipe(tmp_path / name, people())
+
+
+def test_a_device_that_is_not_there_is_refused_before_the_work() -> None:
+    assert training_device(wanted="cpu").type == "cpu"
+    with pytest.raises(OptionError, match="no device 'tpu'") as caught:
+        training_device(wanted="tpu")
+    assert "cpu" in caught.value.hint
