@@ -13,6 +13,7 @@ import meshmatch
 from meshmatch import FitConfig, Matcher
 from meshmatch.api.pictures import Page
 from meshmatch.arrays import Floats
+from meshmatch.collections.asymmetry import Asymmetry
 from meshmatch.collections.atlas import Projection
 from meshmatch.collections.groups import Comparison
 from meshmatch.collections.measures import Measures
@@ -85,3 +86,4 @@ assert_type(chairs, meshmatch.ImplicitModel)
 assert_type(meshmatch.fit_implicit(chairs, "a.ply"), meshmatch.ImplicitFit)
 assert_type(meshmatch.__version__, str)
 assert_type(node_field(verts, verts, 1.0, outside="mask"), NodeField)
+assert_type(meshmatch.measure_asymmetry(atlas), Asymmetry)
