@@ -8,6 +8,7 @@ import pytest
 
 from meshmatch.errors import InputError, MeshmatchWarning
 from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.formats.obj_look import companions
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import find_appearance, load_appearance
 from tests.shapes.painted import encoded, write_gltf
@@ -367,3 +368,29 @@ def test_a_mark_ends_a_name_or_begins_a_comment(tmp_path: Path, use: str, mtl: s
 def test_two_byte_order_marks(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_text("\ufeff\ufeff" + BODY, encoding="utf-8")
     assert load_shape(tmp_path / "a.obj").V == 4
+
+
+def test_udim_tiles_are_images_of_their_own(tmp_path: Path) -> None:
+    """The second triangle lies in the tile above and to the right of the first's."""
+    path = write(tmp_path, "newmtl skin\nmap_Kd skin.<UDIM>.png\nnorm n_<udim>.png\n")
+    far = "vt 1.1 1.1\nvt 1.9 1.9\nvt 1.1 1.9\n"
+    path.write_text(HEAD + VERTS + COORDINATES + far + "usemtl skin\nf 1/1 2/2 3/3\nf 1/5 3/6 4/7\n")
+    for tile, value in ((1001, 10), (1012, 200)):
+        (tmp_path / f"skin.{tile}.png").write_bytes(encoded(np.full((2, 2, 4), [value, 0, 0, 255], np.uint8)))
+        (tmp_path / f"n_{tile}.png").write_bytes(encoded(PAINT))
+    look = load_appearance(path, load_shape(path))
+    images = [look.materials[k].image for k in look.material.tolist()]
+    assert [image[0, 0, 0] for image in images if image is not None] == [10, 200]
+    assert look.finish is not None and len(look.finish.layers["normal"].materials) == 2
+    found, missing = companions(path, path.read_bytes())
+    assert {file.name for file in found} == {
+        "a.mtl",
+        *(f"{stem}{k}.png" for stem in ("skin.", "n_") for k in (1001, 1012)),
+    }
+    assert missing == []
+    (tmp_path / "skin.1012.png").unlink()
+    with pytest.raises(InputError, match=r"needs the image skin.1012.png"):
+        load_appearance(path, load_shape(path))
+    path.write_text(path.read_text().replace("vt 1.1 1.1", "vt 31.1 1.1"))
+    with pytest.raises(InputError, match="in no tile"):
+        load_appearance(path, load_shape(path))

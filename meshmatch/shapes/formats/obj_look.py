@@ -30,6 +30,8 @@ _LARGEST_MTL = 10_000_000  # bytes
 _MOST_LIBRARIES = 100  # names in one line
 _COMMENT = re.compile(r"\s#.*")  # or the end of a name, such as Material #25
 _PICTURE = re.compile(r"^[ \t]*(?:map_\w+|bump|disp|decal|refl|norm)[ \t]+(\S[^\n]*)$", re.MULTILINE | re.IGNORECASE)
+_TILE = re.compile("<udim>", re.IGNORECASE)
+_TILES = range(1001, 1101)  # ten in a row, the first at u and v from 0 to 1
 _NUMBER = r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:e[+-]?\d+)?"
 _OPTION = re.compile(
     rf"(?:(-o|-s|-t)((?:\s+{_NUMBER}(?!\S)){{0,3}})|-mm\s+\S+\s+\S+|(-clamp)\s+(\S+)|"
@@ -65,6 +67,21 @@ class _Entry:
     def opacity(self) -> float:
         """In 0..1. What is given as such (d) counts more than its opposite (Tr), which some programs write for it."""
         return float(np.clip(1.0 - self.transparency if self.dissolve is None else self.dissolve, 0.0, 1.0))
+
+    @property
+    def tiled(self) -> bool:
+        """Whether the name of an image stands for those of many tiles."""
+        images = [self.image, self.alpha, *self.maps.values()]
+        return any(image is not None and _TILE.search(image.file) for image in images)
+
+    def of_tile(self, tile: int) -> _Entry:
+        """The material of one tile."""
+
+        def named(image: _Map | None) -> _Map | None:
+            return None if image is None else replace(image, file=_TILE.sub(str(tile), image.file))
+
+        maps = {word: replace(image, file=_TILE.sub(str(tile), image.file)) for word, image in self.maps.items()}
+        return replace(self, image=named(self.image), alpha=named(self.alpha), maps=maps)
 
 
 def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, picture: Pixels | None) -> Appearance:
@@ -166,7 +183,27 @@ def _worn(path: Path, data: bytes, shape: Shape, libraries_too: bool) -> _Worn:
     _, which, kind = np.unique(2 * used + laid, return_index=True, return_inverse=True)
     found = [(meant[names[used[face]]], bool(laid[face])) for face in which.tolist()]
     listed = [(name, entries.get(name, _Entry()), covered) for name, covered in found]
-    return _Worn(corners, laid, kind.reshape(-1).astype(np.int64), listed)
+    return _by_tile(_Worn(corners, laid, kind.reshape(-1).astype(np.int64), listed))
+
+
+def _by_tile(worn: _Worn) -> _Worn:
+    """Materials whose images are named by tile (UDIM) as one for each tile; images repeat, so coordinates may stay there."""
+    tiled = np.array([covered and entry.tiled for _, entry, covered in worn.entries])
+    rows = np.flatnonzero(tiled[worn.kind]) if tiled.any() else worn.kind[:0]
+    if not len(rows):
+        return worn
+    place = np.clip(np.nan_to_num(np.floor(worn.corners[rows].mean(axis=1)), nan=-1.0), -1.0, 10.0).astype(np.int64)
+    if place.min() < 0 or place.max() > 9:
+        name = worn.entries[int(worn.kind[rows[0]])][0]
+        raise InputError(f"faces of the material {name} lie in no tile of its images", "UDIM tiles are 1001 to 1100")
+    tile = np.zeros_like(worn.kind)
+    tile[rows] = _TILES.start + place @ [1, 10]
+    _, which, kind = np.unique(worn.kind * 10_000 + tile, return_index=True, return_inverse=True)
+    entries = []
+    for number, own in zip(worn.kind[which].tolist(), tile[which].tolist(), strict=True):
+        name, entry, covered = worn.entries[number]
+        entries.append((name, entry.of_tile(own) if own else entry, covered))
+    return _Worn(worn.corners, worn.laid, kind.reshape(-1), entries)
 
 
 def read_coordinates(path: Path, data: bytes, shape: Shape) -> Float[Floats, "F 3 2"] | None:
@@ -197,11 +234,11 @@ def companions(path: Path, data: bytes) -> tuple[list[Path], list[str]]:
             except (ValueError, LookupError):
                 name = rest.split()[-1]
             folders = (library.parent, path.parent)
-            image = next((file for folder in folders if (file := beside(folder, name)) is not None), None)
-            if image is None:
+            tiles = [_TILE.sub(str(tile), name) for tile in _TILES] if _TILE.search(name) else [name]
+            images = [file for each in tiles for folder in folders if (file := beside(folder, each)) is not None]
+            found |= dict.fromkeys(images if tiles[1:] else images[:1])
+            if not images:
                 missing[name] = None
-            else:
-                found[image] = None
     return list(found), list(missing)
 
 
