@@ -166,7 +166,7 @@ class FitOptions(Options):
         None,
         metavar="NAME",
         help="Fit only this part: its number or, in a glb or gltf file, the name of its meshes, with * and ? as "
-        "wildcards. May be repeated. `meshmatch info FILE` lists names and numbers.",
+        "wildcards; of a label map a label. May be repeated. `meshmatch info FILE` lists names and numbers.",
     )
     without: list[str] | None = Option(
         None,

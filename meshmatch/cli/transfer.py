@@ -242,6 +242,7 @@ def transfer_landmarks(
     """
     import numpy as np
 
+    from meshmatch.shapes.input_files import stem_of
     from meshmatch.shapes.landmark_files import mesh_space
     from meshmatch.transfer.landmarks import check_landmarks_suffix, load_landmarks, save_landmarks
 
@@ -260,7 +261,7 @@ def transfer_landmarks(
             )
         result = meshmatch.transfer_landmarks(a, b, given, transfer, rule=meshmatch.ConfidenceRule(min_confidence))
         found = result.data
-        save_landmarks(temporary, found, mesh_space(target) or "LPS", output.name)
+        save_landmarks(temporary, found, mesh_space(target) or "LPS", output.name, stem_of(target))
     low = np.flatnonzero(found.confidence < min_confidence)
     for k in low[:10].tolist():
         console.warn(f"landmark {found.names[k]} is uncertain: its confidence is {found.confidence[k]:.2f}")

@@ -397,7 +397,9 @@ class Collection(FitsFolder):
             with self.registered(poor) as shapes:
                 mean = superimpose(shapes.points, shapes.faces)
         about = self._about()["sequence"]
-        fits = Fits(names, self.fit_of, self.places_of, files_of(self.store), self.template, bool(about))
+        fits = Fits(
+            names, self.fit_of, self.places_of, files_of(self.store) if original else {}, self.template, bool(about)
+        )
         return Exported(
             tuple(export(output, fits, how, mean, self.progress)), len(names), fits.template.shape.V, left_out
         )

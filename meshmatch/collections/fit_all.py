@@ -146,9 +146,12 @@ def with_left_out(made: Fitted, store: Store, left_out: Sequence[Record]) -> Fit
 
 
 def files_of(store: Store) -> dict[str, str]:
-    """The file of each shape, by its name, as ``fits.csv`` has them."""
-    with store.reading(TABLE) as path, path.open(encoding="utf-8", newline="") as file:
-        return {str(row.get("name")): str(row.get("file")) for row in csv.DictReader(file)}
+    """The file of each shape, by its name, as ``fits.csv`` has them; `InputError` if it is missing or damaged."""
+    try:
+        with store.reading(TABLE) as path, path.open(encoding="utf-8", newline="") as file:
+            return {str(row.get("name")): str(row.get("file")) for row in csv.DictReader(file)}
+    except (OSError, ValueError, csv.Error) as error:
+        raise InputError(f"{store.location}/{TABLE} cannot be read", "run `meshmatch fit` again") from error
 
 
 def elsewhere_words(elsewhere: Mapping[str, str]) -> list[str]:

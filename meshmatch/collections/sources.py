@@ -17,40 +17,12 @@ from meshmatch.shapes.files import SUFFIXES
 from meshmatch.shapes.input_files import stem_of, suffix_of
 
 _COMPANIONS = {
-    *(
-        ".mtl",
-        ".png",
-        ".jpg",
-        ".jpeg",
-        ".webp",
-        ".bmp",
-        ".tga",
-        ".tif",
-        ".tiff",
-        ".gif",
-        ".exr",
-        ".hdr",
-        ".psd",
-        ".bin",
-    ),
-    *(
-        ".csv",
-        ".tsv",
-        ".xls",
-        ".xlsx",
-        ".ods",
-        ".txt",
-        ".json",
-        ".npz",
-        ".mat",
-        ".xml",
-        ".yaml",
-        ".yml",
-        ".rds",
-        ".rda",
-    ),
-    *(".md", ".rst", ".html", ".pdf", ".svg", ".doc", ".docx", ".odt", ".rtf", ".log", ".ini", ".db", ".mp4", ".mov"),
-    *(".py", ".r", ".rdata", ".ipynb", ".sh", ".fcsv", ".tps", ".pts", ".pp", ".safetensors", ".raw", ".zraw", ".zip"),
+    *(".mtl", ".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff", ".gif", ".exr", ".hdr", ".psd"),
+    *(".mp4", ".mov", ".bin", ".raw", ".zraw", ".zip", ".safetensors"),
+    *(".csv", ".tsv", ".xls", ".xlsx", ".ods", ".json", ".npz", ".mat", ".xml", ".yaml", ".yml", ".rds", ".rda"),
+    *(".fcsv", ".tps", ".pts", ".pp"),
+    *(".txt", ".md", ".rst", ".html", ".pdf", ".svg", ".doc", ".docx", ".odt", ".rtf", ".log", ".ini", ".db"),
+    *(".py", ".r", ".rdata", ".ipynb", ".sh"),
 }  # what lies beside shapes and is none
 _NAMED = 5  # of the files that are not read
 _PATTERN = "*?["

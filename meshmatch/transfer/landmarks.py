@@ -207,11 +207,12 @@ def _on_shape(found: LandmarkFile, shape: Shape) -> tuple[Landmarks, float]:
     return replace(joined(parts, np.argsort(rows)), notes=tuple(notes)), largest
 
 
-def save_landmarks(path: Path, landmarks: Landmarks, space: Space = "LPS", name: str = "") -> None:
+def save_landmarks(path: Path, landmarks: Landmarks, space: Space = "LPS", name: str = "", specimen: str = "") -> None:
     """Write landmarks; `OptionError` if the suffix is not one of `LANDMARK_SUFFIXES`.
 
     `space` is the frame that a file for 3D Slicer (.fcsv, .mrk.json) states; it takes a mesh that states none to be in
-    LPS. `name` is what the file will be called, where `path` is a temporary name: a specimen in a .tps file is called so.
+    LPS. `name` is what the file will be called, where `path` is a temporary name. `specimen` is what a .tps file calls
+    the shape, by default as the file.
     """
     suffix = check_landmarks_suffix(path)
     columns = (landmarks.vertex, landmarks.points, landmarks.face, landmarks.barycentric)
@@ -219,7 +220,7 @@ def save_landmarks(path: Path, landmarks: Landmarks, space: Space = "LPS", name:
     rows = list(zip(landmarks.names, *(column.tolist() for column in columns), sure, strict=True))
     points = zip(landmarks.names, landmarks.points.tolist(), landmarks.confidence.tolist(), strict=True)
     if suffix == ".tps":
-        save_specimens(path, {Path(name or path.name).stem: landmarks.points}, landmarks.names)
+        save_specimens(path, {specimen or Path(name or path.name).stem: landmarks.points}, landmarks.names)
     elif suffix == ".fcsv":
         path.write_text("\n".join(fcsv_lines(points, space)) + "\n", encoding="utf-8")
     elif (name or path.name).lower().endswith(".mrk.json"):

@@ -143,6 +143,12 @@ def test_originals_of_the_verb(fits: Path, run: Run, tmp_path: Path) -> None:
     }.items():
         answer = run("export", fits, "-o", tmp_path / "none", *words)
         assert answer.status == 1 and told in answer.err and not (tmp_path / "none").exists()
+    copy = shutil.copytree(fits, tmp_path / "copy")
+    for damage in (b"name,file\n\xff\n", b"name\n" + b"x" * 200_000, None):
+        (copy / "fits.csv").unlink() if damage is None else (copy / "fits.csv").write_bytes(damage)
+        answer = run("export", copy, "-o", tmp_path / "none", "--original")
+        assert answer.status == 1 and "fits.csv cannot be read" in answer.err, answer.err
+    assert run("export", copy, "-o", tmp_path / "without-a-table").status == 0
     changed = replace(all_climber(fits, "a"), files={"a": str(SAMPLES / "dancer.ply")})
     with pytest.raises(InputError, match=r"dancer\.ply has changed since it was fitted"):
         export(tmp_path / "none", changed, Export(original=True), None)

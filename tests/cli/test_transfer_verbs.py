@@ -202,13 +202,14 @@ def test_the_skin_of_a_glb(run: Run, pair: Path) -> None:
     refused(run("transfer-weights", "other.ply", *words), "no skin weights", pair, before)
 
 
-@pytest.mark.parametrize("out", ["out.csv", "out.json", "out.pp"])
+@pytest.mark.parametrize("out", ["out.csv", "out.json", "out.pp", "out.mrk.json", "out.tps"])
 def test_landmarks_of_a_finer_copy(run: Run, pair: Path, out: str) -> None:
     assert record(run(*call("landmarks --json", out=out)))["landmarks"] == 2
     b = load_shape("b.ply")
     found, furthest = load_landmarks(out, b)
-    assert found.names == ("nose", "chin")
+    assert found.names == (("0", "1") if out == "out.tps" else ("nose", "chin"))
     assert np.allclose(found.points, b.verts[[3, 7]], atol=1e-9) and furthest < 1e-9
+    assert out != "out.tps" or Path(out).read_text().endswith("\nID=b\n")
 
 
 # Low confidence

@@ -31,7 +31,16 @@ from tests.transfer.rigs import played
 ROOT = Path(__file__).resolve().parents[2]
 WRITTEN = {
     "artist": {"before.png", "map.npz", "dressed.glb", "dressed.png", "confidence.png", "check.glb"},
-    "anatomist": {"landmarks.csv", "map.npz", "match.png", "child.csv", "landmarks.png", "registered.ply"},
+    "anatomist": {
+        "landmarks.csv",
+        "map.npz",
+        "match.png",
+        "child.csv",
+        "landmarks.png",
+        "landmarks.tps",
+        "meshes",
+        "tables",
+    },
     "researcher": {"map.npz"},
 }
 
