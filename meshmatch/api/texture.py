@@ -28,7 +28,7 @@ from meshmatch.threads import thread_limit
 from meshmatch.transfer import bake
 from meshmatch.transfer.bake import Baked, BakeOptions
 from meshmatch.transfer.source_layout import check_layout, source_layout
-from meshmatch.transfer.unwrap import Atlas, Keep, atlas_of, check_surface, new_atlas, shared_texels
+from meshmatch.transfer.unwrap import Atlas, Keep, atlas_of, check_surface, new_atlas, shared_texels, too_many_layers
 
 if TYPE_CHECKING:
     from meshmatch.render.compose import Composition
@@ -190,7 +190,7 @@ def transfer_texture(
     report = Progress(progress, mesh.name, "baking")
     with thread_limit(1):
         if atlas is None:
-            atlas = _carried(shape, look, maps, polygons)
+            atlas = _carried(shape, look, maps, polygons, options.size)
         elif atlas.shared:
             atlas = _checked(
                 atlas, bake.contradicted(shape, look, mesh, maps.backward, atlas), mesh, options, uv, polygons
@@ -216,12 +216,15 @@ def _checked(
     return replace(atlas, note=f"{words}, as to mirrored halves; these look alike, and are baked once")
 
 
-def _carried(shape: Shape, look: Appearance, maps: MapPair, polygons: Ints | None) -> Atlas:
+def _carried(shape: Shape, look: Appearance, maps: MapPair, polygons: Ints | None, size: int) -> Atlas:
     """The coordinates of the source on the target; an error where places that look different would share one."""
     coordinates, charts = source_layout(shape, look, maps.target, maps.backward, polygons)
+    name = shape.name or "the source"
+    if layers := too_many_layers(coordinates, size):
+        problem = f"the layout of {name} cannot be carried over: it covers the image {layers:.1f} times"
+        raise OptionError(problem, "leave out --uv source")
     atlas = Atlas(coordinates, False, shared=shared_texels(coordinates))
     differ = bake.contradicted(shape, look, maps.target, maps.backward, atlas) if atlas.shared else 0.0
-    name = shape.name or "the source"
     if differ * atlas.shared > _CONTRADICTED:
         problem = (
             f"the layout of {name} cannot be carried over: of its texels {100 * atlas.shared:.0f} % have several places"

@@ -73,8 +73,8 @@ def transfer_texture(
     textured_files.check_textured(output, _COLORS)
     a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
     painted = b.is_cloud or output.suffix.lower() in _COLORS
-    if painted and uv == "keep":
-        hint = "leave out --uv keep" if b.is_cloud else "end the output in .glb or .obj for a texture"
+    if painted and uv in ("keep", "source"):
+        hint = f"leave out --uv {uv}" if b.is_cloud else "end the output in .glb or .obj for a texture"
         raise OptionError(f"{b.name} gets vertex colors, which need no texture coordinates", hint)
     look = textured_files.load_appearance(source, a, image)
     layers = () if look.finish is None else look.finish.images

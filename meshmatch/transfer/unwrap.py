@@ -103,13 +103,19 @@ def _checked(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str, float]:
     room = flat_areas(uv)
     if room.sum() < _MIN_USED:
         return uv, f"they use only {100 * room.sum():.1f} % of the image", 0.0
-    if room.sum() > _LAYERS or rows_of(uv * size).sum() > MOST_ROWS:
-        return uv, f"they overlap ({room.sum():.1f} times the image)", 0.0
+    if layers := too_many_layers(uv, size):
+        return uv, f"they overlap ({layers:.1f} times the image)", 0.0
     deserved = shape.face_areas / shape.face_areas.sum()
     starved = float(deserved[room < _STARVED * deserved].sum())
     if starved > _MAX_STARVED:
         return uv, f"{100 * starved:.0f} % of the surface has no room in the image", 0.0
     return uv, "", shared_texels(uv, size)
+
+
+def too_many_layers(uv: Float[Floats, "F 3 2"], size: int) -> float:
+    """How often triangles cover an image, if that is too often to be looked at texel by texel; else 0."""
+    layers = float(flat_areas(uv).sum())
+    return layers if layers > _LAYERS or rows_of(uv * size).sum() > MOST_ROWS else 0.0
 
 
 def shared_texels(uv: Float[Floats, "F 3 2"], size: int = 1024) -> float:

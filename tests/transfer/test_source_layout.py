@@ -112,3 +112,9 @@ def test_images_that_lie_over_each_other_cannot_become_one(tmp_path: Path) -> No
     result = meshmatch.transfer_texture(path, shape, VertexMap.identity(shape), uv="source", options=SMALL)
     assert (result.baked.image == [255, 0, 0, 255]).all()
     assert "100.0 % of its texels have several places" in result.atlas.note
+    pile = Shape(np.tile(shape.verts, (8, 1)), np.concatenate([shape.faces + k * shape.V for k in range(8)]), "pile")
+    there = VertexMap.between(shape, pile, np.arange(shape.V))
+    back = VertexMap.between(pile, shape, np.tile(np.arange(shape.V), 8))
+    maps = meshmatch.MapPair(shape, pile, there, opposite=back)
+    with pytest.raises(OptionError, match=r"it covers the image 16.0 times"):
+        meshmatch.transfer_texture(path, pile, maps, uv="source", options=SMALL)
