@@ -12,7 +12,7 @@ import meshmatch
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.formats.gltf import Document, digest
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_rig import read_rig
 from meshmatch.shapes.shape import Shape
@@ -268,6 +268,13 @@ def test_what_is_made_of_a_mesh_takes_its_maps(source: Path) -> None:
     again = load_shape(out)
     assert again.made_of == (load_shape(target).hash,) and again.hash not in again.made_of
     assert made.for_shapes(None, again).target_hash == again.hash
+    for odd in ("x", [], {"made_of": 5}):  # somebody else's
+        editor = Editor(Document(out, out.read_bytes()))
+        editor.json["asset"]["extras"]["meshmatch"] = (
+            odd | {"faces": digest(shape.faces)} if isinstance(odd, dict) else odd
+        )
+        target.with_suffix(".glb").write_bytes(editor.to_bytes())
+        assert load_shape(target.with_suffix(".glb")).made_of == ()
     editor = Editor(Document(out, out.read_bytes()))
     part = editor.json["meshes"][0]["primitives"][0]
     part["indices"] = editor.add_indices(shape.faces[::-1], shape.V)

@@ -166,9 +166,10 @@ class Document:
         """Hashes of the meshes that this one says it was made of, vertex by vertex, unless its faces are others since."""
         extras = self.json["asset"].get("extras")
         said = extras.get(ORIGINS) if isinstance(extras, dict) else None
-        if not isinstance(said, dict) or said.get("faces") != digest(faces):
+        made_of = said.get("made_of") if isinstance(said, dict) else None
+        if not isinstance(said, dict) or not isinstance(made_of, list) or said.get("faces") != digest(faces):
             return ()
-        return tuple(str(each) for each in said["made_of"][:MOST_ORIGINS])
+        return tuple(str(each) for each in made_of[:MOST_ORIGINS])
 
     def _names(self, number: int) -> tuple[str, ...]:
         """What a node and its mesh are called."""
