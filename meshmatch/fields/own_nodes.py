@@ -16,6 +16,7 @@ from meshmatch.fields.local_fits import LocalFits, alike, namespace, plain, sums
 from meshmatch.fields.shape_functions import check_kernel, checked_radii, tell_amplification
 from meshmatch.geometry.kernels import Kernel, poorly_supported, support_pairs
 from meshmatch.geometry.trees import cKDTree
+from meshmatch.shapes.shape import LARGEST
 
 Outside = Literal["error", "mask", "nearest"]
 _NEAREST = 4  # nodes that carry a point out of reach
@@ -211,9 +212,12 @@ class NodeField:
         """(..., P, C, D) the sums over nodes of values (N, D) times vectors (..., K, C)."""
         given: Any = vectors if is_tensor(vectors) else as_numbers(vectors, "vectors", finite=True)
         shape, B = tuple(given.shape), self._fields
-        if len(shape) not in (2, 3) or shape[-2] != self.K or not (len(shape) == 2 or B in (1, len(given))):
+        dense = not is_tensor(given) or str(given.layout) == "torch.strided"
+        fits = len(shape) in (2, 3) and 0 not in shape and shape[-2] == self.K
+        if not (dense and fits and (len(shape) == 2 or B in (1, len(given)))):
             batch = "B" if self.points.ndim == 2 else B
-            raise InputError(f"vectors must be ({self.K}, C) or ({batch}, {self.K}, C), not {shape}")
+            layout = "" if dense else f" in the layout {given.layout}"
+            raise InputError(f"vectors must be ({self.K}, C) or ({batch}, {self.K}, C), not {shape}{layout}")
         kind = _precision([self.points, vectors], given if is_tensor(given) else values)
         if is_tensor(given) and not is_tensor(values):
             values = alike(values, given.double() if given.device.type != "mps" else given)
@@ -385,6 +389,8 @@ def _positions(values: Any, what: str, like: Any) -> Any:
         raise InputError(
             f"{what} must be an array of (N, 3) or (B, N, 3), not {found.shape}", "one position in each row"
         )
+    if not abs(found).max() < LARGEST:
+        raise InputError(f"{what} are too far away", "measure them in another unit")
     return _as(values if is_tensor(values) else np.array(found), like)
 
 
@@ -404,7 +410,8 @@ def _precision(arrays: Sequence[Any], like: Any) -> Any:
 
     kind = torch.float32
     for each in arrays:
-        other = each.dtype if is_tensor(each) else torch.from_numpy(np.zeros(0, np.asarray(each).dtype)).dtype
+        small = not is_tensor(each) and np.asarray(each).dtype in (np.float16, np.float32)
+        other = each.dtype if is_tensor(each) else torch.float32 if small else torch.float64
         kind = torch.promote_types(kind, other)
     return kind
 

@@ -76,16 +76,19 @@ def laplacian_basis(shape: ShapeLike, K: int = 100) -> LaplacianBasis:
     """
     found = as_shape(shape)
     name = found.name or "the shape"
-    if not isinstance(K, int) or not 1 <= K <= found.V - 2:
+    if not isinstance(K, int | np.integer) or isinstance(K, bool) or not 1 <= K <= found.V - 2:
         raise InputError(f"{name} with {found.V} vertices has no {K} eigenfunctions", f"ask for 1 to {found.V - 2}")
     if not found.valid.all():
         raise InputError(f"{name} has vertices without a position", "export it again without them")
     unit = float(found.diagonal) or 1.0  # lengths that are far from 1 would shift the spectrum
     verts = found.verts / unit
-    if found.is_cloud:
-        stiffness, mass = robust_laplacian.point_cloud_laplacian(verts)
-    else:
-        stiffness, mass = robust_laplacian.mesh_laplacian(verts, found.faces)
+    try:
+        if found.is_cloud:
+            stiffness, mass = robust_laplacian.point_cloud_laplacian(verts)
+        else:
+            stiffness, mass = robust_laplacian.mesh_laplacian(verts, found.faces)
+    except RuntimeError as error:
+        raise InputError(f"{name} is no surface: its points or triangles span no area") from error
     areas = np.asarray(mass.diagonal(), np.float64)
     floor = 1e-9 * areas.mean()
     if not (np.isfinite(areas).all() and floor > 0):

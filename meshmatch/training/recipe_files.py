@@ -24,7 +24,7 @@ _LOSSES: dict[str, type[Objective]] = {
 }
 _OF_THE_MACHINE = ("minutes", "checkpoint_minutes", "threads", "device")
 _OWN = ("deform", "storage", "template", "characters", "bodies")
-_MOST = {
+_MOST: dict[str, float] = {
     "shapes": 4096,
     "scans_per_shape": 256,
     "points": 100_000,
@@ -32,6 +32,9 @@ _MOST = {
     "bodies": 20_000,
     "correct_points": 100_000,
 }
+_MOST |= dict.fromkeys(("holes", "outliers", "partial", "outside", "strays", "characters", "average"), 1)
+_MOST |= {"momentum": 0.9999999}
+_LEAST = {"points": 64}
 _HINT = "give the card.json of a model, or a part of one: network, field.kernel, recipe.train, recipe.scan"
 T = TypeVar("T")
 
@@ -67,6 +70,8 @@ def read_recipe(path: str | Path, usual: Recipe) -> Recipe:
         found = _filled(usual, more, "recipe")
         if kernel not in tuple(KERNELS) or found.storage not in get_args(Storage):
             raise InputError("its kernel or storage is unknown")
+        if Path(found.template).name != found.template:
+            raise InputError("recipe.template must be the name of a bundled template")
         return replace(
             found,
             network=NetworkConfig.from_dict(asdict(usual.network) | network),
@@ -110,8 +115,9 @@ def _filled(values: T, changes: Mapping[str, Any], where: str) -> T:
         }.get(kind, isinstance(value, str))
         if not right:
             raise InputError(f"{where}.{name} must be {kind}, not {str(value)[:40]!r}")
-        if type(value) is not bool and number and not 0 <= value <= _MOST.get(name, 2**53):
-            raise InputError(f"{where}.{name} must lie in 0..{_MOST.get(name, 2**53):,}, not {value}")
+        least, most = _LEAST.get(name, 0), _MOST.get(name, 2**53)
+        if type(value) is not bool and number and not least <= value <= most:
+            raise InputError(f"{where}.{name} must lie in {least}..{most:,}, not {value}")
     changed: Any = replace(values, **changes)  # type: ignore[type-var]
     return changed  # type: ignore[no-any-return]
 

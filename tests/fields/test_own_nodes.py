@@ -102,7 +102,7 @@ def test_batches_are_what_each_is_alone() -> None:
     (np.float32, np.float32, np.float32), (np.float64, np.float32, np.float64),
     (torch.float32, torch.float32, torch.float32), (torch.float32, torch.float64, torch.float64),
     (torch.float16, torch.bfloat16, torch.float32), (np.float64, torch.float32, torch.float64),
-    (torch.float32, np.float32, torch.float32),
+    (torch.float32, np.float32, torch.float32), (torch.float32, np.longdouble, torch.float64),
 ])  # fmt: skip
 def test_results_have_the_kind_and_precision_of_both(points: Any, vectors: Any, result: Any) -> None:
     def cast(array: np.ndarray, kind: Any) -> Any:
@@ -143,6 +143,7 @@ def test_badly_placed_nodes_are_told() -> None:
     ({"nodes": np.zeros((2, 3, 4))}, InputError), ({"nodes": [[1, 2], [3]]}, InputError), ({"radius": -1.0}, InputError),
     ({"radius": np.ones(3)}, InputError), ({"radius": torch.tensor(torch.nan)}, InputError), ({"radius": None}, InputError),
     ({"points": np.zeros((2, 4, 3)), "nodes": np.stack([NODES] * 3)}, InputError),
+    ({"points": POINTS * 1e200}, InputError), ({"points": np.zeros((0, 5, 3))}, InputError),
     ({"kernel": "gaussian"}, OptionError), ({"kernel": ["smooth"]}, MeshmatchError), ({"outside": "drop"}, OptionError),
 ])  # fmt: skip
 def test_what_no_field_can_be_made_of_is_refused(changes: Any, error: type[MeshmatchError]) -> None:
@@ -153,7 +154,9 @@ def test_what_no_field_can_be_made_of_is_refused(changes: Any, error: type[Meshm
 
 def test_vectors_must_be_one_for_each_node() -> None:
     field = node_field(np.stack([POINTS, POINTS]), NODES, 0.8)
-    for wrong in (VECTORS[:-1], VECTORS[0], np.stack([VECTORS] * 3), VECTORS * np.nan, "words", torch.zeros(3, 150, 3)):
+    lists: list[Any] = [VECTORS[:-1], VECTORS[0], np.stack([VECTORS] * 3), VECTORS * np.nan, "words", VECTORS[:, :0]]
+    tensors = [torch.zeros(3, 150, 3), torch.zeros(150, 3).to_sparse(), torch.zeros(0, 150, 3)]
+    for wrong in (*lists, *tensors):
         with pytest.raises(InputError, match="vectors"):
             field.displacement(wrong)
     for of in (field.moved, field.deformation_gradient):

@@ -65,11 +65,13 @@ def test_a_loss_of_ones_own_is_named_and_never_loaded(tmp_path: Path) -> None:
     ({"recipe": {"train": {"stps": 1}}}, "train.stps"),
     ({"recipe": {"train": {"steps": "9"}}}, "steps must be int"), ({"recipe": {"train": {"steps": True}}}, "must be int"),
     ({"recipe": {"train": {"steps": 0}}}, "steps must be 1 or more"),
-    ({"recipe": {"scan": {"points": 10**9}}}, "0..100,000"),
+    ({"recipe": {"scan": {"points": 10**9}}}, "64..100,000"),
     ({"recipe": {"train": {"rate": float("nan")}}}, "rate must be float"), ({"recipe": {"scan": {"noise": -1}}}, "0..9"),
     ({"recipe": {"loss": ["x"]}}, "somebody's own"), ({"recipe": {"storage": "int2"}}, "storage"),
     ({"recipe": {"train": {"loss": {"robust": 1}}}}, "robust must be bool"), ({"network": {"code": 10**9}}, "code must be"),
     ({"network": {"size": 1}}, "unknown network"), ({"field": {"kernel": {}}}, "kernel"), ({"recipe": {"tain": {}}}, "tain"),
+    ({"recipe": {"scan": {"points": 1}}}, "64..100,000"), ({"recipe": {"train": {"momentum": 7}}}, "momentum"),
+    ({"recipe": {"template": "../other"}}, "bundled template"),
 ])  # fmt: skip
 def test_what_is_no_recipe_is_told(record: Any, words: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no recipe") as caught:
