@@ -25,7 +25,7 @@ from meshmatch.api.inputs import as_model
 from meshmatch.arrays import Ints
 from meshmatch.errors import MeshmatchError
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.methods import Method, OurMethod
+from meshmatch.experiments.bench.methods import DirectMethod, Method, OurMethod
 from meshmatch.experiments.bench.scores import SetScores, evaluate_set
 from meshmatch.experiments.bench.sets import ALL_SETS, SET_NAMES, BenchSet, Pair, load_set
 from meshmatch.fitting.fit_config import Refine
@@ -33,6 +33,7 @@ from meshmatch.maps.evaluate import LOST_CM, SKIN_M2
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.geodesics import GEODESIC
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import make_folder
 from meshmatch.render.charts import draw_curves
 from meshmatch.shapes.shape import Shape
@@ -189,12 +190,14 @@ def main(
     curve: Annotated[Path | None, Option(help="draw the cumulative curves into this file")] = None,
 ) -> runner.Report:
     benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
-    weights = as_model(model).card.weights_sha256  # a wrong name would cost every pair
+    weights = model if model == NO_MODEL else as_model(model).card.weights_sha256  # a wrong name would cost every pair
     if output is not None:
         asked = {"weights": weights, "refine": refine, "seed": seed, "threads": threads}
         runner.once(output / "asked.json", asked, lambda: runner.circumstances(threads, jobs))
     fits, made = (None, None) if output is None else (output / "fits", output / "maps")
-    method = OurMethod(model, refine, seed, threads=threads, kept=fits)
+    method: Method = OurMethod(model, refine, seed, threads=threads, kept=fits)
+    if model == NO_MODEL:
+        method = DirectMethod(seed, threads)
     runs: list[SetRun] = []
     for bench in benches:
         pairs = runner.spread(bench.pairs, limit_pairs)

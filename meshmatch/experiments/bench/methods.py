@@ -30,6 +30,7 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.footpoints import Surface
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.normalise import align, sqrt_area_frame
@@ -85,6 +86,21 @@ class OurMethod:
     def map(self, source: Shape, source_fit: Fit, target: Shape, target_fit: Fit) -> VertexMap:
         """Build the map from two fits."""
         return self._matcher().map(source_fit, target_fit, agree=self.refine in ON_NODES)
+
+
+@dataclass(frozen=True)
+class DirectMethod:
+    """This project without a model: nothing is known of one shape alone."""
+
+    seed: int = 0
+    threads: int = 1
+
+    def fit(self, shape: Shape) -> None:
+        """Nothing."""
+
+    def map(self, source: Shape, source_fit: None, target: Shape, target_fit: None) -> VertexMap:
+        """The map of two shapes that are registered to each other."""
+        return Matcher(NO_MODEL, FitConfig(seed=self.seed), self.threads).match(source, target).map
 
 
 def in_frame(shape: Shape, frame: Frame) -> Shape:
