@@ -201,6 +201,12 @@ def row_of(name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def _by_ways(found: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+    """Pairs that were decided one way, and those that were decided both ways."""
+    parts = [[each for each in found if each["both_ways"] is ways] for ways in (False, True)]
+    return [part for part in parts if part]
+
+
 @runner.command
 def main(
     classes: Annotated[str, Option(help="names, with commas between them; or all")] = "all",
@@ -227,5 +233,5 @@ def main(
     return runner.Report(
         {"rows": [*rows, total], "pairs": everything},
         [runner.table("Keypoints, x100 of sqrt(area)", [*rows, total], _COLUMNS)],
-        notes=[str(fitted_calibration(everything))] if fit else [],
+        notes=[str(fitted_calibration(some)) for some in _by_ways(everything)] if fit else [],
     )
