@@ -192,9 +192,11 @@ class _Search:
         return fitted(self.source, self.target, self.guess, report)
 
     def both_ways(self, there: list[Tried], report: Progress) -> list[_BothWays]:
-        """Fits of the source to the target, and of the target to the source, each continued the other way; best first."""
+        """The best fits of the source to the target, and of the target to the source, each continued the other way; best
+        first."""
+        count = self.source.config.returned
         reverse = _Search(self.target, self.source, self.guess and self.guess[::-1])
-        back = reverse.one_way(report.between(0.0, 0.7))
+        there, back = there[:count], reverse.one_way(report.between(0.0, 0.7))[:count]
         report = report.named("fits both ways")
         ways = zip(there, self._returned(there, report.between(0.7, 0.85)), strict=True)
         ways_back = zip(reverse._returned(back, report.between(0.85, 1.0)), back, strict=True)

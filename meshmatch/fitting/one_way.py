@@ -64,7 +64,8 @@ class DirectConfig:
     coarse_nodes, fine_nodes : nodes of both meshes
     first, second, third, last : least squares of all proposals, of the better ones, of the best on the fine mesh, of which
         the energies decide, and of the one that is taken, which may stretch more
-    better, best : how many proposals are fitted a second, and a third time
+    better, best, returned : how many proposals are fitted a second, and a third time, and how many of each direction are
+        continued in the other one
     unlike : share of vertices by which these differ at least
     both_ways : when the target is fitted to the source as well; "in doubt" is where the one way is not good
     from_source : whether the source is to be the template, and not the one that fits the other better
@@ -84,6 +85,7 @@ class DirectConfig:
     last: NodeRefineConfig = field(default_factory=lambda: _pairs(6, (1e-4, 3e-5), (0.03, 0.02), 4000))
     better: int = 16
     best: int = 6
+    returned: int = 3
     unlike: float = 0.03
     both_ways: Literal["no", "in doubt", "always"] = "in doubt"
     from_source: bool = False
