@@ -110,10 +110,11 @@ class Level:
         return cls(mesh, *nodes.system(mesh.shape, mesh.graph, seed), terms)
 
     def features(
-        self, samples: OrientedPoints, vectors: Float[Floats, "K 3"], pairs: Pairs | None = None
+        self, onto: ThinMesh, samples: OrientedPoints, vectors: Float[Floats, "K 3"], pairs: Pairs | None = None
     ) -> DirectFeatures:
         """Of node vectors; how far known pairs are missed counts as a residual."""
         found = DirectFeatures.of(self.system, samples, vectors, pairs)
+        found = replace(found, likeness=self.mesh.likeness(onto, self.system.surface(vectors)))
         for term in self.known:
             at, goal = term.landmarks
             off = np.linalg.norm(self.system.moved(vectors)[at] - goal, axis=1).mean()
@@ -189,9 +190,12 @@ class Side:
         return Level.of(self.thin, self.config.coarse_nodes, self.known, self.config.seed)
 
     @cached_property
+    def fine_mesh(self) -> ThinMesh:
+        return ThinMesh.of(self.shape, self.config.fine)
+
+    @cached_property
     def fine(self) -> Level:
-        mesh = ThinMesh.of(self.shape, self.config.fine)
-        return Level.of(mesh, self.config.fine_nodes, self.known, self.config.seed)
+        return Level.of(self.fine_mesh, self.config.fine_nodes, self.known, self.config.seed)
 
     @cached_property
     def intrinsic(self) -> Intrinsic:
@@ -214,7 +218,9 @@ def finished(
 
     def fit(proposal: Proposal, goals: Float[Floats, "V 3"]) -> Tried:
         vectors = fine.refined(samples, fine.onto(goals, _ONTO_AGAIN, fine.rigid), config.third)
-        return Tried(proposal, vectors, fine.system.moved(vectors), fine.features(samples, vectors, near))
+        return Tried(
+            proposal, vectors, fine.system.moved(vectors), fine.features(onto.fine_mesh, samples, vectors, near)
+        )
 
     report(0.0)
     found = parallel_map(fit, [proposal for proposal, _ in begun], [goals for _, goals in begun])
@@ -229,7 +235,7 @@ def fitted(own: Side, onto: Side, guess: KnownPairs | None, report: Progress) ->
     if guess is not None:
         proposals.append(Proposal("guess", carried(rested, *guess)))
     trying = report.named(f"fits of {len(proposals)} guesses").between(0.4, 0.8)
-    tried = _screened(own.coarse, proposals, onto.samples, config, trying)
+    tried = _screened(own.coarse, onto, proposals, config, trying)
     goals = [(each.proposal, verts + carried(verts, rested, each.moved - rested)) for each in tried]
     report = report.named("fits of the best guesses").between(0.8, 1.0)
     return sorted(finished(own, onto, goals, report), key=lambda each: each.energy)
@@ -244,17 +250,17 @@ def _proposals(source: Side, target: Side, report: Progress) -> list[Proposal]:
 
 
 def _screened(
-    level: Level, proposals: list[Proposal], samples: OrientedPoints, config: DirectConfig, report: Progress
+    level: Level, onto: Side, proposals: list[Proposal], config: DirectConfig, report: Progress
 ) -> list[Tried]:
     """Proposals fitted on few nodes: all for a few steps, then those that look better; the best, no two alike."""
-    done = 0
+    done, samples = 0, onto.samples
 
     def fit(
         proposal: Proposal, some: OrientedPoints, vectors: Floats, how: NodeRefineConfig, pairs: Pairs | None = None
     ) -> Tried:
         nonlocal done
         vectors = level.refined(some, vectors, how)
-        features = level.features(some, vectors, pairs)
+        features = level.features(onto.thin, some, vectors, pairs)
         done += 1
         report(min(done / (len(proposals) + config.better), 1.0))
         return Tried(proposal, vectors, level.system.moved(vectors), features)

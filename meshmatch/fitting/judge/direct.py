@@ -1,7 +1,7 @@
 """What speaks for and against a fit of one shape to another, made without a model.
 
 A wrong fit comes as near as a right one, if it is stretched enough. So fits are compared by an energy: how far the surfaces
-stay apart, how much had to be stretched, and how much was torn.
+stay apart, how much had to be stretched, how much was torn, and how far noses, eyes and other relief come to lie elsewhere.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.oriented import OrientedPoints
 
 # Weights of the energy beside the residual. Chosen on 30 pairs of 15 kinds of shapes.
-_STRETCH, _TORN = 0.03, 0.2
+_STRETCH, _TORN, _UNLIKE = 0.03, 0.2, 0.02
 _GOOD, _FAIR = 0.9, 0.5
 # Another fit whose energy is so little higher is as good; so many are told.
 _TIE, _TOLD = 0.0015, 9
@@ -35,11 +35,13 @@ class DirectFeatures:
     residual : mean distance both ways, normals included (units of sqrt(area))
     stretch : root mean square over the shape of the norm of the logarithms of its stretches
     discontinuous : share (0..1) of neighbours on the target that belong far apart on the source
+    likeness : correlation (0..1) of what stands out, or is sunk, on both shapes; 1 where it was not asked
     """
 
     residual: float
     stretch: float
     discontinuous: float = 0.0
+    likeness: float = 1.0
 
     @classmethod
     def of(
@@ -58,7 +60,8 @@ class DirectFeatures:
     @property
     def energy(self) -> float:
         """Low for right fits."""
-        return self.residual + _STRETCH * self.stretch + _TORN * self.discontinuous
+        unlike = 1.0 - self.likeness
+        return self.residual + _STRETCH * self.stretch + _TORN * self.discontinuous + _UNLIKE * unlike
 
 
 def judge_direct(

@@ -11,11 +11,12 @@ from itertools import product
 
 import numpy as np
 import robust_laplacian
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, identity
 from scipy.sparse.csgraph import connected_components, dijkstra
-from scipy.sparse.linalg import eigsh
+from scipy.sparse.linalg import eigsh, splu
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.geometry.oriented import OrientedPoints, feature_tree, with_normals
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import edge_lengths, edges_of, vertex_areas, vertex_normals
 from meshmatch.shapes.sampling import farthest_points, triangulate_cloud
@@ -23,6 +24,9 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import low_mesh
 
 _FUNCTIONS = 50  # eigenfunctions
+_SMOOTHED = 0.02, 0.08  # lengths over which a surface is smoothed, in units of sqrt(area)
+_NORMAL_WEIGHT = 0.1  # of unit normals beside positions
+_TINY = 1e-12  # area of vertices whose triangles have none
 _LANDMARKS = 300  # vertices, evenly spread, that stand for all
 _PROFILE = 12  # distances at which the area around an extremity is asked
 # Of the diameter along the surface: an extremity is a maximum of the mean distance that stands out by so much from the
@@ -70,6 +74,36 @@ class ThinMesh:
         """Share of the surface around each vertex."""
         areas = vertex_areas(self.verts, self.faces)
         return np.asarray(areas / areas.sum())
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of positions and weighted normals."""
+        return feature_tree(with_normals(self.verts, self.normals, _NORMAL_WEIGHT))
+
+    @cached_property
+    def relief(self) -> Float[Floats, "V R"]:
+        """How far vertices stand out of the surface smoothed over two lengths, noses and navels: as ranks by area, from -1/2
+        to 1/2."""
+        stiffness, mass = robust_laplacian.mesh_laplacian(self.verts, self.faces)
+        ranks = []
+        for length in _SMOOTHED:
+            smooth = splu(csc_matrix(mass + length**2 * stiffness + _TINY * identity(len(self.verts)))).solve(
+                mass @ self.verts
+            )
+            out = ((self.verts - smooth) * self.normals).sum(1)
+            order = np.argsort(out, kind="stable")
+            rank = np.empty(len(out))
+            rank[order] = np.cumsum(self.areas[order]) - 0.5
+            ranks.append(rank)
+        return np.stack(ranks, 1)
+
+    def likeness(self, other: ThinMesh, moved: OrientedPoints) -> float:
+        """Correlation (0..1) of its relief with that of another mesh, where its vertices are moved to on it."""
+        nearest = other.tree.query(with_normals(moved.points, moved.normals, _NORMAL_WEIGHT))[1]
+        own, theirs = self.relief, other.relief[nearest]
+        own, theirs = own - self.areas @ own, theirs - self.areas @ theirs
+        spreads = np.sqrt((self.areas @ own**2) * (self.areas @ theirs**2))
+        return float(np.abs((self.areas @ (own * theirs)) / np.maximum(spreads, 1e-12)).mean())
 
     @cached_property
     def graph(self) -> csr_matrix:
