@@ -25,6 +25,7 @@ from meshmatch.templates.make import low_mesh
 
 _FUNCTIONS = 50  # eigenfunctions
 _SMOOTHED = 0.02, 0.08  # lengths over which a surface is smoothed, in units of sqrt(area)
+_FLAT = 0.001  # heights that differ by less are the same: so a plane has no relief
 _NORMAL_WEIGHT = 0.1  # of unit normals beside positions
 _TINY = 1e-12  # area of vertices whose triangles have none
 _LANDMARKS = 300  # vertices, evenly spread, that stand for all
@@ -86,15 +87,15 @@ class ThinMesh:
         to 1/2."""
         stiffness, mass = robust_laplacian.mesh_laplacian(self.verts, self.faces)
         ranks = []
-        for length in _SMOOTHED:
+        shortest = np.sqrt(2 * vertex_areas(self.verts, self.faces).sum() / len(self.faces))  # about an edge
+        for length in np.maximum(_SMOOTHED, shortest):
             smooth = splu(csc_matrix(mass + length**2 * stiffness + _TINY * identity(len(self.verts)))).solve(
                 mass @ self.verts
             )
             out = ((self.verts - smooth) * self.normals).sum(1)
-            order = np.argsort(out, kind="stable")
-            rank = np.empty(len(out))
-            rank[order] = np.cumsum(self.areas[order]) - 0.5
-            ranks.append(rank)
+            height, level = np.unique(np.round(out / _FLAT), return_inverse=True)
+            share = np.bincount(level, self.areas, len(height))
+            ranks.append((np.cumsum(share) - share / 2 - 0.5)[level])
         return np.stack(ranks, 1)
 
     def likeness(self, other: ThinMesh, moved: OrientedPoints) -> float:
