@@ -90,7 +90,7 @@ TARGETS: list[Damage] = [
     lambda document: document.update(images=[3]),
     lambda document: document["bufferViews"][3].update(buffer=7),
     lambda document: document["scenes"][0].update(nodes={"0": 1}),
-    lambda document: document["nodes"][4].update(weights=[float("nan")]),
+    lambda document: next(node for node in document["nodes"] if "mesh" in node).update(weights=[float("nan")]),
 ]
 
 

@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
-from scipy.sparse import csr_array
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.errors import InputError, warn
@@ -62,6 +60,8 @@ def label_surfaces(
     InputError
         The voxels are grey values, no label is there, or the surfaces would be too large for the file.
     """
+    from scipy import ndimage  # not needed to read other files, which load it late
+
     verts, faces, meshes, cut, count, many, work = [], [], [], [], 0, 0, 0
     if len(layers) > _MOST_LABELS:
         raise InputError(f"{name} has {len(layers)} layers, of {_MOST_LABELS} at most", "save one label map")
@@ -182,6 +182,8 @@ def _net(inside: Bool[Bools, "X Y Z"]) -> tuple[Float[Floats, "V 3"], Int[Ints, 
 
 def _relaxed(verts: Float[Floats, "V 3"], quads: Int[Ints, "N 4"], cells: Int[Ints, "V 3"]) -> Float[Floats, "V 3"]:
     """Each vertex towards the mean of its neighbours and away again, within its cell."""
+    from scipy.sparse import csr_array
+
     sides = np.concatenate([quads[:, [k, (k + 1) % 4]] for k in range(4)])
     pairs = np.concatenate([sides, sides[:, ::-1]])
     beside = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(verts), len(verts)))
