@@ -68,7 +68,7 @@ class DirectConfig:
         continued in the other one
     unlike : share of vertices by which these differ at least
     both_ways : when the target is fitted to the source as well; "in doubt" is where the one way is not good
-    from_source : whether the source is to be the template, and not the one that fits the other better
+    from_source : whether the source is to be the template both ways too, and not the one that fits the other better
     seed : of all random numbers
     """
 

@@ -46,9 +46,7 @@ from meshmatch.templates.template import Template
 
 _ALIGNED_BY = 2400  # samples
 # Where the template roughly belongs is all that is asked of a search.
-_ROUGHLY = DirectConfig(
-    coarse=1200, fine=2400, samples=3000, few=1200, fewer=700, better=8, best=3, both_ways="no", from_source=True
-)
+_ROUGHLY = DirectConfig(coarse=1200, fine=2400, samples=3000, few=1200, fewer=700, better=8, best=3, both_ways="no")
 _ONTO = Schedule(steps=6, prior=(1e-2, 1e-3), scale=(1.0, 1.0), damping=1e-6)
 # Set by hand, on femurs, hearts, ants and four-legged animals: a shape to which the template comes so near, and stretches so
 # little (0.6 for hearts, 0.8 and more for ants in other poses), stands as the template does;
