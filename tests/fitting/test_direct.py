@@ -186,6 +186,9 @@ def test_relief_is_alike_where_a_bump_lies_on_a_bump() -> None:
         moved = OrientedPoints(turn.apply(with_nose.verts), turn.apply(with_nose.normals))
         likeness[degrees] = with_nose.likeness(with_nose, moved)
     assert likeness[0] == pytest.approx(1) and likeness[90] < 0.6
+    inside_out = ThinMesh(with_nose.kept, with_nose.verts, with_nose.faces[:, ::-1])
+    assert with_nose.likeness(inside_out, OrientedPoints(with_nose.verts, -with_nose.normals)) == pytest.approx(1)
+    assert np.allclose(with_nose.areas @ with_nose.relief, 0)
     flat = trimesh.creation.box((1, 1, 0)).subdivide().subdivide().subdivide()
     tilted = Rotation.from_rotvec([0.3, 0.2, 0.1]).apply(np.asarray(flat.vertices))
     upper = np.asarray(flat.faces)[np.asarray(flat.face_normals)[:, 2] > 0]

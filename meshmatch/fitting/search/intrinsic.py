@@ -101,8 +101,8 @@ class ThinMesh:
     def likeness(self, other: ThinMesh, moved: OrientedPoints) -> float:
         """Correlation (0..1) of its relief with that of another mesh, where its vertices are moved to on it."""
         nearest = other.tree.query(with_normals(moved.points, moved.normals, _NORMAL_WEIGHT))[1]
-        own, theirs = self.relief, other.relief[nearest]
-        own, theirs = own - self.areas @ own, theirs - self.areas @ theirs
+        own, theirs = self.relief, other.relief[nearest]  # of its own the mean is 0
+        theirs = theirs - self.areas @ theirs
         spreads = np.sqrt((self.areas @ own**2) * (self.areas @ theirs**2))
         return float(np.abs((self.areas @ (own * theirs)) / np.maximum(spreads, 1e-12)).mean())
 
