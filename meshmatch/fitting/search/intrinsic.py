@@ -89,9 +89,8 @@ class ThinMesh:
         ranks = []
         shortest = np.sqrt(2 * vertex_areas(self.verts, self.faces).sum() / len(self.faces))  # about an edge
         for length in np.maximum(_SMOOTHED, shortest):
-            smooth = splu(csc_matrix(mass + length**2 * stiffness + _TINY * identity(len(self.verts)))).solve(
-                mass @ self.verts
-            )
+            system = csc_matrix(mass + length**2 * stiffness + _TINY * identity(len(self.verts)))
+            smooth = splu(system).solve(mass @ self.verts)
             out = ((self.verts - smooth) * self.normals).sum(1)
             height, level = np.unique(np.round(out / _FLAT), return_inverse=True)
             share = np.bincount(level, self.areas, len(height))
