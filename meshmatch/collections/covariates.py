@@ -170,11 +170,13 @@ def _coded(factor: Factor, known: Covariates) -> tuple[Floats, tuple[str, ...], 
         values = np.array([number(cell) for cell in cells])
         fine = np.abs(values) < _LARGEST
         if not fine.all():
-            raise InputError(f"{factor.column} is not finite, or huge, for {known.names[int(np.argmin(fine))]}")
+            name = known.names[int(np.argmin(fine))]
+            raise InputError(f"{factor.column} is not finite, or huge, for {name}", "leave the cell empty")
         if factor.function == "log":
             if not (values > 0).all():
                 name = known.names[int(np.argmin(values))]
-                raise InputError(f"{factor} needs numbers above 0, and {name} has {values.min():g}")
+                message = f"{factor} needs numbers above 0, and {name} has {values.min():g}"
+                raise InputError(message, f"use {factor.column} itself, or leave the cell empty")
             values = np.log(values)
         if not np.ptp(values) > max(1e-12 * np.abs(values).max(), 1 / _LARGEST):
             raise InputError(f"{factor} is the same for all shapes in the model", "leave it out")

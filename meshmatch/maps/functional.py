@@ -19,6 +19,8 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import ShapeLike, as_shape
 
+_LOOK = "meshmatch info FILE says what is in it"
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LaplacianBasis(Brief, Pickled):
@@ -88,11 +90,11 @@ def laplacian_basis(shape: ShapeLike, K: int = 100) -> LaplacianBasis:
         else:
             stiffness, mass = robust_laplacian.mesh_laplacian(verts, found.faces)
     except RuntimeError as error:
-        raise InputError(f"{name} is no surface: its points or triangles span no area") from error
+        raise InputError(f"{name} is no surface: its points or triangles span no area", _LOOK) from error
     areas = np.asarray(mass.diagonal(), np.float64)
     floor = 1e-9 * areas.mean()
     if not (np.isfinite(areas).all() and floor > 0):
-        raise InputError(f"{name} has no surface area")
+        raise InputError(f"{name} has no surface area", _LOOK)
     areas = np.maximum(areas, floor)  # vertices that no face uses
     start = np.random.default_rng(0).standard_normal(found.V)
     values, vectors = eigsh(csr_matrix(stiffness), K, csr_matrix((areas, (range(found.V),) * 2)), sigma=-1e-8, v0=start)

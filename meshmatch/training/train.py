@@ -239,7 +239,8 @@ def logged(path: Path, trainer: Trainer, report: Callable[[StepReport], None] | 
             with path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(record) + "\n")
         except OSError as error:
-            raise OutputError(f"cannot write {path}: {error.strerror}") from error
+            hint = "the same command goes on from the last checkpoint"
+            raise OutputError(f"cannot write {path}: {error.strerror}", hint) from error
         if report is not None:
             report(now)
 
