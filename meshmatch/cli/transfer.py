@@ -202,10 +202,6 @@ def _landmark_table(table: Path, given: Mapping[str, Any], source: str, written:
     path = given["source"]
     own, _ = load_landmarks(given["landmarks"], meshmatch.load_shape(path), mesh_space(path))
     specimens = {source: own.points} | {name: landmark_positions(file) for name, file in written.items()}
-    for name, points in specimens.items():
-        if len(points) != len(own.names):
-            problem = f"{written[name]} has {len(points)} landmarks, {given['landmarks']} has {len(own.names)}"
-            raise InputError(problem, "remove it, and give the same command")
     with replace_on_success(table) as temporary:
         save_specimens(temporary, specimens, own.names)
     return f"wrote {table}: {len(own.names)} landmarks of {len(specimens)} specimens, {source} among them"

@@ -256,9 +256,14 @@ def landmark_positions(path: Path) -> Float[Floats, "L 3"]:
 
 def save_specimens(path: Path, specimens: Mapping[str, Float[Floats, "L 3"]], names: Sequence[str]) -> None:
     """Write one table of the same landmarks of several specimens, for R and other programs; `OptionError` if it has another
-    suffix than .csv (specimen,landmark,x,y,z), .tps, .txt (Morphologika), .npz (points (S, L, 3), specimens, landmarks).
+    suffix than .csv (specimen,landmark,x,y,z), .tps, .txt (Morphologika), .npz (points (S, L, 3), specimens, landmarks);
+    `InputError` if a specimen has more or fewer landmarks.
     """
     suffix = check_table_suffix(path)
+    for specimen, points in specimens.items():
+        if len(points) != len(names):
+            problem = f"{specimen} has {len(points)} landmarks, and there are {len(names)}"
+            raise InputError(problem, "remove its file of landmarks, and give the same command")
     if suffix == ".npz":
         points = np.stack(list(specimens.values()))
         tables.write_npz(path, {"points": points, "specimens": list(specimens), "landmarks": list(names)})
