@@ -99,7 +99,7 @@ def _factors(points: Floats, normals: Floats, verts: Floats, faces: Ints) -> Flo
     total = (c * p - 2 * b * q + a * r) / np.maximum(square, 1e-300)  # squared singular values, added up
     product = np.sqrt(squared_lengths(image) / np.maximum(square, 1e-300))
     difference = np.sqrt(np.maximum(total**2 - 4 * product**2, 0.0))
-    large = np.sqrt((total + difference) / 2)
+    large = np.sqrt(np.maximum(total + difference, 0.0) / 2)
     return np.asarray(np.maximum(large, large / np.maximum(product, 1e-12)))
 
 

@@ -26,6 +26,7 @@ from meshmatch.shapes.shape import Shape
 # All set by hand on bodies of SCAPE, FAUST and SHREC'19.
 _RINGS = (1, 2, 2, 3)  # of triangles around a fold that move, round by round; more rounds gain little
 _STRETCH, _SLACK = 3.0, 0.02  # an edge whose image is longer, in units of sqrt(area), is where the map tears
+_THINNEST = 1e-3  # height over length: what is thinner has no area that its image could keep, and spoils the equations
 _STIFFEST = 50.0  # a sliver's sides count no more
 _MOST = 0.2  # a map that folds more of the surface is wrong as a whole
 _LARGEST = 200_000  # vertices; triangles of larger meshes are smaller than the fits are exact
@@ -50,8 +51,10 @@ class _Images:
         self.map, self.source, self.workers = found, source, workers
         self.same = same_rows(source.verts)
         faces = self.same[source.faces[source.valid_faces]]
-        self.faces = faces[(faces != faces[:, [1, 2, 0]]).all(axis=1)]
         self.verts, self.points = source.verts / length_of(source), found.points(target) / length_of(target)
+        sides = self.verts[faces] - self.verts[faces[:, [1, 2, 0]]]
+        longest = squared_lengths(sides.reshape(-1, 3)).reshape(-1, 3).max(axis=1)
+        self.faces = faces[2 * triangle_areas(self.verts, faces) > _THINNEST * longest]
         self.normals = normals_at(found, target)
         self.side = 1.0 if facing(self.points, self.normals, self.verts, self.faces) >= 0 else -1.0
         self.normals *= self.side

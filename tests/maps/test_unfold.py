@@ -135,3 +135,19 @@ def test_folds_of_known_maps() -> None:
     assert Folds.of(into, Shape(flat.verts[:3], flat.faces[:1]), small).crushed == 1.0 and share > 0.4
     turned = VertexMap.between(flat, flat, np.array([0, 1, 2, 1]))  # the second triangle lies on the first
     assert Folds.of(turned, flat, flat).flipped == pytest.approx(0.5)
+
+
+def test_triangles_without_height_do_not_keep_folds_shut() -> None:
+    """As decimation leaves them on flat ground: a vertex in the middle of a side, and a triangle between it and the side."""
+    target, plain = ball(3, 0.0), ball(3)
+    some = plain.faces[::3]
+    a, b, c = some.T
+    middle = plain.V + np.arange(len(some))
+    rng = np.random.default_rng(0)
+    verts = np.concatenate([plain.verts, plain.verts[some[:, :2]].mean(1) + 1e-9 * rng.standard_normal((len(some), 3))])
+    pieces = [np.stack(each, 1) for each in ((a, middle, c), (middle, b, c), (a, b, middle))]
+    source = Shape(verts, np.concatenate([np.delete(plain.faces, np.s_[::3], axis=0), *pieces]))
+    found = folded(source, target)
+    before, after = (Folds.of(each, source, target) for each in (found, unfolded(found, source, target)))
+    assert before.flipped > 0.002
+    assert after.flipped < 0.5 * before.flipped
