@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fitting.fit_config import NodeRefineConfig, Schedule
 from meshmatch.fitting.judge.direct import DirectFeatures
 from meshmatch.fitting.search.discontinuities import Pairs, neighbours
@@ -30,7 +30,7 @@ from meshmatch.fitting.solve.priors import Prior, RotatedReference, ViscousGradi
 from meshmatch.fitting.solve.surface_nodes import SurfaceNodes
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.solve.terms import GoalTerm, LandmarkTerm, PairTerm, Term
-from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.progress import Progress
@@ -131,8 +131,16 @@ class Level:
         problem = Problem(system=self.system, terms=[GoalTerm(goals), *self.known], schedule=schedule)
         return minimise(problem, prior, np.zeros((self.system.K, 3)))
 
+    def limbs_onto(self, at: Int[Ints, " N"], goals: Float[Floats, "N 3"]) -> Float[Floats, "K 3"]:
+        """Node vectors that bring some vertices to their goals, from the rigid motion that does it best."""
+        start = self.system.vectors_to(kabsch(self.mesh.verts[at], goals).to_world(self.mesh.verts))
+        terms = [LandmarkTerm((at, goals), 1 / len(at)), *self.known]
+        return minimise(Problem(system=self.system, terms=terms, schedule=_LIMBS_ONTO), self.rigid, start)
+
     def begun(self, proposal: Proposal) -> Float[Floats, "K 3"]:
         """Near a proposal: as rigid as possible, or with limbs that may be longer or shorter than its own."""
+        if proposal.at is not None:
+            return self.limbs_onto(proposal.at, proposal.points)
         if proposal.kind in ("rigid", "affine"):
             return self.onto(proposal.points, _ONTO, self.rigid)
         return self.onto(proposal.points, _ONTO_STRETCHED, self.viscous)
@@ -153,6 +161,7 @@ class Level:
 
 _ONTO = Schedule(steps=6, prior=(3e-2, 1e-3), scale=(1.0, 0.15), damping=1e-6)
 _ONTO_STRETCHED = Schedule(steps=6, prior=(3e-2, 1e-3), scale=(1.0, 0.3), damping=1e-6)
+_LIMBS_ONTO = Schedule(steps=8, prior=(3e-2, 3e-3), damping=1e-6)
 _ONTO_AGAIN = Schedule(steps=4, prior=(1e-3, 3e-4), scale=(1.0, 0.15), damping=1e-6)
 
 

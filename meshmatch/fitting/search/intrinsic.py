@@ -34,6 +34,7 @@ _PROFILE = 12  # distances at which the area around an extremity is asked
 # way to a higher one, and lies so far from the others. At most so many are told apart.
 _PERSISTENCE, _APART, _MOST = 0.04, 0.08, 14
 _SHARES = (0.15, 0.3, 0.5, 0.7)  # of the way to an extremity: where ways are compared
+_RINGS, _RING = (0.25, 0.5, 0.75), 0.03  # shares of the way where there are rings, and half of their width
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +204,25 @@ class Intrinsic:
             low, high = apart[off].min(), apart[off].max()
             spread += np.where(off, (apart - low) / max(high - low, 1e-9), 0) / len(_SHARES)
         return spread
+
+    @cached_property
+    def rings(self) -> list[list[Int[Ints, " N"]]]:
+        """Of each limb, vertices around it: at some shares of the way from the middle, and at its end."""
+        ends, near, found = self.extremities, self.distances[int(self.eccentricity.argmin())], []
+        for end, detour in zip(ends, near + self.distances[ends] - near[ends][:, None], strict=True):
+            before, ring = self.distances[end], []
+            for share in _RINGS:
+                at = int((np.abs(near - share * near[end]) + 2 * detour).argmin())
+                close = _RING + 0.6 * min(before[at], 0.25)  # so that it is not the body beside the limb
+                ring.append(np.flatnonzero((np.abs(before - before[at]) < _RING) & (self.distances[at] < close)))
+            found.append([*ring, np.flatnonzero(before < _RING)])
+        return found
+
+    @cached_property
+    def skeleton(self) -> Float[Floats, "T R 3"]:
+        """The middle of each of the `rings`."""
+        verts = self.mesh.verts
+        return np.array([[verts[ring].mean(0) for ring in limb] for limb in self.rings]).reshape(-1, len(_RINGS) + 1, 3)
 
     @cached_property
     def tour(self) -> list[int]:

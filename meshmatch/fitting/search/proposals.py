@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations, product, zip_longest
+from itertools import combinations, product
 from typing import Literal
 
 import numpy as np
@@ -27,16 +27,18 @@ Kind = Literal["rigid", "affine", "spectral", "extremities", "guess"]
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """Where the vertices of the source's thin mesh (V,) may belong.
+    """Where vertices of the source's thin mesh (V,) may belong.
 
     Attributes
     ----------
     kind : what it was made by
-    points : (V, 3) positions, in the frame of the target
+    points : (N, 3) positions, in the frame of the target
+    at : (N,) which vertices belong there; all of them where it is None
     """
 
     kind: Kind
-    points: Float[Floats, "V 3"]
+    points: Float[Floats, "N 3"]
+    at: Int[Ints, " N"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,12 +57,14 @@ class ProposalSettings:
     compared : how many of these are refined to ``functions``, from ``first_functions``
     functions, first_functions, more : eigenfunctions of a map in the end and after the first steps, and how many are added
         in each step
-    maps : maps of each kind that are kept
+    maps : spectral maps that are kept
+    limbs : assignments of extremities that are kept
     beam, assignments : partial assignments of extremities that are kept, and complete ones, of each search
     turns : assignments that keep the order around the shape that are kept, of each search
     skipped : cost of an extremity without counterpart
     same : share of vertices by which two maps differ at least, where two vertices ``apart`` differ
-    facing : how much the share of triangles that keep their orientation counts, against the error of distances
+    bent, left : how much it costs, beside the error of distances, that no turn takes limbs to limbs, and the share of the
+        length of limbs that has no counterpart
     """
 
     rigid: int = 10
@@ -76,13 +80,15 @@ class ProposalSettings:
     functions: int = 40
     more: int = 5
     maps: int = 16
+    limbs: int = 14
     beam: int = 400
     assignments: int = 50
     turns: int = 8
     skipped: float = 0.12
     same: float = 0.02
     apart: float = 0.1
-    facing: float = 0.1
+    bent: float = 0.15
+    left: float = 0.05
 
 
 SETTINGS = ProposalSettings()
@@ -235,25 +241,16 @@ def _facing(source: Intrinsic, target: Intrinsic, vertex: Int[Ints, " V"]) -> fl
 
 
 def extremity_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
-    """Maps that send extremities to extremities, chosen by how these lie to each other, by a beam search.
+    """Where limbs go if extremities are sent to extremities, chosen by how these lie to each other, by a beam search.
 
-    What is compared is how far they lie apart, how far the ways from the middle to two of them are one, and in what order
-    these ways run: lengths of limbs may differ.
+    What is compared is how far they lie apart, how far the ways from the middle to two of them are one, in what order these
+    ways run, and whether a turn in space takes limbs to limbs. Lengths of limbs may differ.
     """
     if min(len(source.extremities), len(target.extremities)) < 2:
         return []
     judge = Assignments(source, target)
-    orders = judge.candidates()
-    by_cost = sorted(dict.fromkeys(each for order in orders for each in order), key=judge.cost)
-    mixed = [each for turn in zip_longest(by_cost, *orders) for each in turn if each is not None]
-    kept = _distinct(target, [judge.judged[each][2] for each in dict.fromkeys(mixed) if judge.judged[each][1] > 0])
-    maps = []
-    for vertex in kept:
-        smooth = _smoothed(source, target, vertex)
-        for each in (smooth, vertex):
-            error = _distance_error(source, target, source.landmarks, each[source.landmarks])
-            maps.append((error - SETTINGS.facing * _facing(source, target, each), each))
-    return _kept("extremities", source, target, maps)
+    found = dict.fromkeys(each for ways in judge.candidates() for each in ways)
+    return [judge.limbs(each) for each in sorted(found, key=judge.cost)[: SETTINGS.limbs]]
 
 
 Assignment = tuple[int, ...]
@@ -276,8 +273,13 @@ class Assignments:
         of_lengths = 0.5 * _changes(*apart) + 2.0 * _changes(*shared)
         of_order = [0.2 * _changes(of(source.spread), of(target.spread)) for of in (np.asarray, _ranks)]
         self._costs = [(single, of_lengths), *((0.2 * single, each) for each in of_order)]
-        self._along = np.column_stack([along, source.eccentricity]), np.column_stack([along_to, target.eccentricity])
-        self.judged: dict[Assignment, tuple[float, float, Ints]] = {}
+        some = source.landmarks[::2]
+        self._along = (
+            np.column_stack([along, source.eccentricity])[some],
+            np.column_stack([along_to, target.eccentricity]),
+        )
+        self._apart = source.distances[np.ix_(some, some)]
+        self._shares = reach / reach.sum(), reach_to / reach_to.sum()
 
     def candidates(self) -> list[list[Assignment]]:
         """The best assignments of beam searches, and of those that keep the order around the shape, one list by each way
@@ -332,18 +334,33 @@ class Assignments:
         return [each for each in found if sum(j >= 0 for j in each) >= 2]
 
     def cost(self, assignment: Assignment) -> float:
-        """How far the map of an assignment is from an isometry that keeps the orientation."""
-        if assignment not in self.judged:
-            pairs = [(i, j) for i, j in enumerate(assignment) if j >= 0]
-            own, theirs = ([each[k] for each in pairs] + [count] for k, count in enumerate(self._counts))
-            vertex = _nearest(self._along[0][:, own], self._along[1][:, theirs])
-            some = self._source.landmarks[::2]
-            error = _distance_error(self._source, self._target, some, vertex[some])
-            facing = _facing(self._source, self._target, vertex)
-            left = min(self._counts) - len(pairs)
-            cost = error - SETTINGS.facing * facing + 0.2 * SETTINGS.skipped * left
-            self.judged[assignment] = cost, facing, vertex
-        return self.judged[assignment][0]
+        """How far an assignment is from an isometry that bends limbs, but little."""
+        own, theirs = _pairs(assignment)
+        vertex = _nearest(self._along[0][:, [*own, -1]], self._along[1][:, [*theirs, -1]])
+        error = np.abs(self._apart - self._target.distances[np.ix_(vertex, vertex)]).mean()
+        joints, goals = self._joints(own, theirs)
+        bent = np.sqrt(np.square(kabsch(joints, goals).to_world(joints) - goals).sum(1).mean())
+        left = 2 - self._shares[0][own].sum() - self._shares[1][theirs].sum()
+        return float(error + SETTINGS.bent * bent + SETTINGS.left * left)
+
+    def limbs(self, assignment: Assignment) -> Proposal:
+        """Where an assignment takes the limbs of the source: their rings to those of the target, turned as all of it is."""
+        own, theirs = _pairs(assignment)
+        joints, goals = self._joints(own, theirs)
+        turn, verts = kabsch(joints, goals).rotation, self._source.mesh.verts
+        rings = [ring for limb in own for ring in self._source.rings[limb]]
+        points = [goal + (verts[ring] - joint) @ turn.T for ring, joint, goal in zip(rings, joints, goals, strict=True)]
+        return Proposal("extremities", np.concatenate(points), np.concatenate(rings))
+
+    def _joints(self, own: list[int], theirs: list[int]) -> tuple[Float[Floats, "N 3"], Float[Floats, "N 3"]]:
+        """The middles of all rings of some limbs of the source, and of the target."""
+        return self._source.skeleton[own].reshape(-1, 3), self._target.skeleton[theirs].reshape(-1, 3)
+
+
+def _pairs(assignment: Assignment) -> tuple[list[int], list[int]]:
+    """Extremities of the source that have a counterpart, and these."""
+    own = [number for number, other in enumerate(assignment) if other >= 0]
+    return own, [assignment[number] for number in own]
 
 
 def _changes(own: Float[Floats, "T T"], theirs: Float[Floats, "U U"]) -> Float[Floats, "T T U U"]:
@@ -356,15 +373,6 @@ def _ranks(table: Float[Floats, "T T"]) -> Float[Floats, "T T"]:
     ranks = np.zeros(table.shape)
     ranks[above] = np.argsort(np.argsort(table[above], kind="stable"), kind="stable") / max(len(above[0]) - 1, 1)
     return ranks + ranks.T
-
-
-def _smoothed(source: Intrinsic, target: Intrinsic, vertex: Int[Ints, " V"]) -> Int[Ints, " V"]:
-    """The map after ZoomOut from a few functions."""
-    at, last = source.landmarks, min(30, source.functions.shape[1], target.functions.shape[1])
-    own, size = source.functions[at], min(8, last)
-    C = np.asarray(np.linalg.lstsq(own[:, :size], target.functions[vertex[at], :size], rcond=None)[0].T, np.float64)
-    C, _ = _zoomed(C, own, target.functions[target.landmarks], last, 6)
-    return _nearest(source.functions[:, :last] @ C.T, target.functions[:, :last])
 
 
 def _kept(kind: Kind, source: Intrinsic, target: Intrinsic, maps: list[tuple[float, Ints]]) -> list[Proposal]:
