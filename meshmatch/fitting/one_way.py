@@ -126,11 +126,6 @@ class Level:
         """As rigid as possible, about the shape as it is."""
         return RotatedReference(np.tile(np.eye(3), (len(self.system.gradient_points), 1, 1)))
 
-    def onto(self, goals: Float[Floats, "V 3"], schedule: Schedule, prior: Prior) -> Float[Floats, "K 3"]:
-        """Node vectors that bring each vertex near a goal of its own."""
-        problem = Problem(system=self.system, terms=[GoalTerm(goals), *self.known], schedule=schedule)
-        return minimise(problem, prior, np.zeros((self.system.K, 3)))
-
     def limbs_onto(self, at: Int[Ints, " N"], goals: Float[Floats, "N 3"]) -> Float[Floats, "K 3"]:
         """Node vectors that bring some vertices to their goals, from the rigid motion that does it best."""
         start = self.system.vectors_to(kabsch(self.mesh.verts[at], goals).to_world(self.mesh.verts))
@@ -138,12 +133,14 @@ class Level:
         return minimise(Problem(system=self.system, terms=terms, schedule=_LIMBS_ONTO), self.rigid, start)
 
     def begun(self, proposal: Proposal) -> Float[Floats, "K 3"]:
-        """Near a proposal: as rigid as possible, or with limbs that may be longer or shorter than its own."""
+        """Near a proposal; limbs may be longer or shorter than its own."""
         if proposal.at is not None:
             return self.limbs_onto(proposal.at, proposal.points)
         if proposal.kind in ("rigid", "affine"):
-            return self.onto(proposal.points, _ONTO, self.rigid)
-        return self.onto(proposal.points, _ONTO_STRETCHED, self.viscous)
+            return self.system.vectors_to(proposal.points)
+        terms: list[Term] = [GoalTerm(proposal.points), *self.known]
+        problem = Problem(system=self.system, terms=terms, schedule=_ONTO)
+        return minimise(problem, self.viscous, np.zeros((self.system.K, 3)))
 
     def refined(
         self,
@@ -159,10 +156,8 @@ class Level:
         return minimise(problem, prior or self.rigid, vectors)
 
 
-_ONTO = Schedule(steps=6, prior=(3e-2, 1e-3), scale=(1.0, 0.15), damping=1e-6)
-_ONTO_STRETCHED = Schedule(steps=6, prior=(3e-2, 1e-3), scale=(1.0, 0.3), damping=1e-6)
+_ONTO = Schedule(steps=6, prior=(3e-2, 1e-3), scale=(1.0, 0.3), damping=1e-6)
 _LIMBS_ONTO = Schedule(steps=8, prior=(3e-2, 3e-3), damping=1e-6)
-_ONTO_AGAIN = Schedule(steps=4, prior=(1e-3, 3e-4), scale=(1.0, 0.15), damping=1e-6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +221,7 @@ def finished(
     fine, samples, near, config = own.fine, onto.samples, onto.neighbours, own.config
 
     def fit(proposal: Proposal, goals: Float[Floats, "V 3"]) -> Tried:
-        vectors = fine.refined(samples, fine.onto(goals, _ONTO_AGAIN, fine.rigid), config.third)
+        vectors = fine.refined(samples, fine.system.vectors_to(goals), config.third)
         return Tried(
             proposal, vectors, fine.system.moved(vectors), fine.features(onto.fine_mesh, samples, vectors, near)
         )
