@@ -32,7 +32,7 @@ _PEOPLE = "human"
 _NEXT, _TOGETHER = ("quadruped",), 2  # asked after people, before the others; how many models at a time
 _MOST_READ = 40  # files of a folder whose kind is found out
 _NAME_IT = "name the model (--model NAME, in Python model=NAME) if that is wrong"
-_LEAVE_OUT = "exclude what does not belong to it with --without (`meshmatch info` lists parts)"
+_LEAVE_OUT = "exclude what does not belong to it with --without (`meshmatch info` lists parts), or try --try-harder"
 
 
 @dataclass(frozen=True)

@@ -83,6 +83,8 @@ def fit(
     chosen = f" (model {made.model})" if how.model == AUTO else ""
     console.say(f"wrote {len(made.records) - counts[FAILED]} fits to {output}{chosen}: {told}")
     console.say(*elsewhere_words(made.elsewhere))
+    if counts["poor"] and not how.try_harder:
+        console.say("the same command with --try-harder searches for longer where a fit is poor")
     if made.agreed:
         console.say(f"{made.agreed} fits agreed on how the template stretches")
     if json:

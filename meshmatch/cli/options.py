@@ -197,6 +197,12 @@ class FitOptions(Options):
         help="Whether to try the mirror image of each shape too, as for left hands with a model of right hands. "
         "Default: as the model card says.",
     )
+    try_harder: bool = Option(
+        False,
+        "--try-harder",
+        help="Where a fit is poor, search up to twenty times as long: as a part in more orientations, and for parts of the "
+        "file that may be the shape.",
+    )
     seed: Seed = 0
     device: str = Option(
         "cpu", metavar="NAME", help="Where the network is evaluated: cpu, or cuda (needs meshmatch[train])."
@@ -239,7 +245,10 @@ class FitOptions(Options):
         from meshmatch.fitting.fit_config import FitConfig
 
         partial: Literal["auto", "yes", "no"] = "auto" if self.partial is None else "yes" if self.partial else "no"
-        plain = FitConfig(refine=self.refine, seed=self.seed, partial=partial, mirror=self.mirror, device=self.device)
+        plain = FitConfig(
+            refine=self.refine, seed=self.seed, partial=partial, mirror=self.mirror, try_harder=self.try_harder,
+            device=self.device,
+        )  # fmt: skip
         return tuple(replace(plain, up=up, front=front) for up, front in self.axes)
 
     def record(self, fit: meshmatch.Fit | meshmatch.ImplicitFit) -> dict[str, Any]:

@@ -33,7 +33,7 @@ class MapOptions(PairOptions):
 
     for_matching: ClassVar[tuple[str, ...]] = (
         *("up", "front", "source_up", "source_front", "target_up", "target_front"),
-        *("partial", "mirror", "only", "without", "known_pairs"),
+        *("partial", "mirror", "try_harder", "only", "without", "known_pairs"),
     )
     map: Path | None = Option(
         None,

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 Json = dict[str, Any]
 """One JSON object; paths become strings."""
-_HINT = "is it the model's category? try --up and --front, or leave out --strict to see the result"
+_HINT = "is it the model's category? try --up and --front, or --try-harder, or leave out --strict to see the result"
 _MOST_PARTS = 1000  # of which --json tells the numbers
 _QUIET = 10.0  # seconds without a word, where nobody watches a bar
 

@@ -153,9 +153,11 @@ class Setting:
         return None if found.verdict == "poor" else found
 
     def choices(self) -> dict[str, Any]:
-        """How shapes are read and fitted, as JSON has it."""
+        """How shapes are read and fitted, as JSON has it. How long poor fits are searched for may change later."""
+        fit = asdict(self.config)
+        del fit["try_harder"]
         chosen: dict[str, Any] = {"model": self.model, "only": self.only, "without": self.without}
-        chosen |= {"sequence": self.sequence, "fit": asdict(self.config)}
+        chosen |= {"sequence": self.sequence, "fit": fit}
         return dict(json.loads(json.dumps(chosen)))
 
     def digest(self) -> str:

@@ -51,8 +51,9 @@ def fit_alone(task: FitTask) -> Record:
     file, began = f"{task.folder}/{source.name}{SUFFIX}", time.monotonic()
     try:
         digest = digest_of(source.digest(), setting.digest(), "" if task.last is None else task.last.digest)
-        known = _known(setting.store, file, digest)
-        if known is not None:
+        harder = digest_of(digest, "try_harder")
+        known = _known(setting.store, file, (digest, harder))
+        if known is not None and (known.verdict != "poor" or known.digest == harder or not setting.config.try_harder):
             return known
         last = None if task.last is None else setting.read(task.folder, task.last.name).fit
         fit = setting.fit(source.load(setting.only, setting.without), last)
@@ -76,7 +77,7 @@ def fit_alone(task: FitTask) -> Record:
             front=fit.front,
             vertices=fit.repaired.original.V,
             seconds=round(time.monotonic() - began, 3),
-            digest=digest,
+            digest=harder if setting.config.try_harder else digest,
             notes=fit.repaired.notes[0] if fit.left_out else "; ".join(fit.notes) if fit.model == NO_MODEL else "",
             kind=other,
         )
@@ -88,8 +89,8 @@ def fit_alone(task: FitTask) -> Record:
     return record
 
 
-def _known(store: Store, file: str, digest: str) -> Record | None:
-    """What is known of a fit that was made before, from the same file and in the same way."""
+def _known(store: Store, file: str, digests: Sequence[str]) -> Record | None:
+    """What is known of a fit that was made before, from the same file and in one of some ways."""
     if not store.exists(file):
         return None
     try:
@@ -97,7 +98,7 @@ def _known(store: Store, file: str, digest: str) -> Record | None:
             record = Record(**load_words(path)[1]["record"])
     except (InputError, KeyError, TypeError):
         return None
-    return record if record.digest == digest else None
+    return record if record.digest in digests else None
 
 
 @dataclass(frozen=True)

@@ -146,6 +146,9 @@ class FitConfig:
     mirror
         Whether the shape may be the mirror image of what the model knows, such as the other hand: "auto" fits both and
         keeps the better, "no" never; by default as the model's card says.
+    try_harder
+        Where a fit is poor, search for longer, up to twenty times: for a part from more orientations, and for separate
+        parts of the file that are the shape and that the network alone does not recognise.
     samples
         Points drawn on the surface.
     coarse_samples
@@ -191,6 +194,7 @@ class FitConfig:
     front: str | None = None
     partial: Partial = "auto"
     mirror: Mirroring | None = None
+    try_harder: bool = False
     samples: int = 8000
     coarse_samples: int = 2048
     copies: int = 48

@@ -32,6 +32,7 @@ _HINT = "one target vertex for each source vertex, both counted from 0"
 # All of these were set by hand.
 _EMPTY = 0.06  # a fit of the whole that leaves this share of the template without surface may be one of a part
 _OPEN = 0.3  # so may a bad one of a mesh with a boundary of so many sqrt(area)
+_CUT = 1.0  # a bad fit that leaves nothing bare needs a boundary of so many: characters built of parts have up to 0.5
 _AGAINST = 0.06  # a boundary so near to another part (units of sqrt(area)) is not that of a cut
 _CLOSER = 0.85  # a part is believed if its residual is that much smaller
 _MISSING = 0.03  # and if it lacks that much of the surface
@@ -102,17 +103,21 @@ def _as_part_if_closer(whole: Registration) -> tuple[Registration, bool]:
     """A fit of the whole, or one as a part if that may be and is better; and which it is."""
     if not _may_be_part(whole):
         return whole, False
-    part = _best_part(whole.task.on_visible_samples)
+    config = whole.task.config
+    thorough = config.try_harder or config.partial == "yes" or _leaves_bare(whole)
+    part = _best_part(whole.task.on_visible_samples, thorough)
+    if part is None:
+        return whole, False
     # A part explains the shape better than the whole, and lacks some of it.
     closer = part.candidate.cost < _CLOSER * whole.candidate.residual
     partial = closer and part.candidate.share < 1 - _MISSING
     return (part, True) if partial else (whole, False)
 
 
-def _best_part(task: FitTask) -> Registration:
-    """The best fit of a part; where that is poor, also from more orientations."""
+def _best_part(task: FitTask, thorough: bool) -> Registration | None:
+    """The best fit of a part, if one is near; in a ``thorough`` search, where that is poor, also from more orientations."""
     found = fit_part(task)
-    if found is not None and judge_registration(found, partial=True).verdict != "poor":
+    if not thorough or (found is not None and judge_registration(found, partial=True).verdict != "poor"):
         return found
     return min([each for each in (found, fit_part(task, wide=True)) if each is not None], key=_cost)
 
@@ -142,7 +147,14 @@ def _may_be_part(whole: Registration) -> bool:
         return False
     # the residual of a cloud says how sparse and noisy it is
     if not task.shape.is_cloud and whole.candidate.residual > LIMITS.search_parts:
-        return True
+        least = _OPEN if task.config.try_harder or asked == "yes" else _CUT
+        if boundary_length(task.shape) >= least * np.sqrt(task.shape.area):
+            return True
+    return _leaves_bare(whole)
+
+
+def _leaves_bare(whole: Registration) -> bool:
+    """Whether a fit of the whole leaves so much of the template without surface that the shape may be a part."""
     return uncovered_share(whole.local, whole.surface.points) > _EMPTY
 
 

@@ -102,8 +102,10 @@ def test_nothing_is_made_of_what_nobody_knows(reads: Reads, monkeypatch: pytest.
     for fit, found in (("fair", 0.6, False), False), (("fair", 0.8, True), False), (("fair", 0.8, False), True):
         made = SimpleNamespace(verdict=fit[0], trust=fit[1], partial=fit[2])
         monkeypatch.setattr(apart, "classify", lambda *_, made=made: (made.verdict != "poor", made))
-        alone = find_alone(loaders(), together("room.ply", table, floor(BODY)), CONFIG)
+        scene = together("room.ply", table, floor(BODY))
+        alone = find_alone(loaders(), scene, FitConfig(try_harder=True))
         assert (alone is not None) is found
+        assert find_alone(loaders(), scene, CONFIG) is None  # such a fit takes long
 
 
 def test_a_model_that_knows_some_parts_spares_the_others(reads: Reads) -> None:
@@ -135,6 +137,9 @@ def test_only_a_poor_fit_of_the_whole_gives_way_to_a_better_one(
     assert fit.repaired is not None and fit.repaired.original.V == scene.V
     assert fit.verdict == (whole if kept == "whole" else alone)
     assert (asked == []) is (whole == "fair")
+    hard = Matcher("human").fit(scene, FitConfig(try_harder=True))
+    hinted = [any("--try-harder" in note for note in each.notes) for each in (fit, hard)]
+    assert hinted == [fit.verdict == "poor", False]
 
 
 def test_parts_far_apart_are_tried_before_they_are_refused(reads: Reads, monkeypatch: pytest.MonkeyPatch) -> None:

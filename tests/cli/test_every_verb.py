@@ -36,6 +36,7 @@ SHARED: list[tuple[tuple[str, ...], dict[str, Any], dict[str, Any]]] = [
     *((("--up", axis), {"up": axis.lower()}, {"up": axis.lower()}) for axis in ("x", "-z", "Y")),
     (("--front", "-y"), {"front": "-y"}, {"front": "-y"}),
     *((("--mirror", word), {"mirror": word}, {"mirror": word}) for word in ("auto", "no")),
+    (("--try-harder",), {"try_harder": True}, {"try_harder": True}),
     (("--seed", "7"), {"seed": 7}, {"seed": 7}),
     (("--device", "cuda"), {"device": "cuda"}, {"device": "cuda"}),
     (("--partial",), {"partial": "yes"}, {"partial": "yes"}),
@@ -110,7 +111,7 @@ WRONG: list[tuple[str, str, tuple[str, ...]]] = [
     ("--map m.xyz", "is not a format for maps", ("match", "register", "wrap")),
     *(
         (f"--map ab.npz {words}", f"{words.split()[0]} does not go with --map", ("match", "register", "wrap"))
-        for words in ("--partial", "--source-up y", "--target-front x", "--mirror no", "--only 1")
+        for words in ("--partial", "--source-up y", "--target-front x", "--mirror no", "--only 1", "--try-harder")
     ),
 ]
 

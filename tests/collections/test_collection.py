@@ -472,3 +472,23 @@ def test_each_shape_of_a_mixed_folder_gets_the_model_of_its_kind(tmp_path: Path)
     before = {path: path.read_bytes() for path in (tmp_path / "fits").rglob("*.safetensors")}
     assert [record.verdict for record in collection.fit(tmp_path / "shapes").records] == ["good"] * 3
     assert before == {path: path.read_bytes() for path in (tmp_path / "fits").rglob("*.safetensors")}
+
+
+def test_only_poor_fits_are_made_again_where_the_search_may_take_longer(
+    shapes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+    fit = Fitter.fit
+
+    def poor_dancer(self: Fitter, shape: Shape) -> meshmatch.Fit:
+        made.append(shape.name)
+        found = fit(self, shape)
+        return replace(found, verdict="poor") if shape.name == "dancer" else found
+
+    monkeypatch.setattr(Fitter, "fit", poor_dancer)
+    collection = meshmatch.Collection(tmp_path / "fits", workers=1)
+    two = [shapes / "climber.ply", shapes / "dancer.ply"]
+    for harder, expected in ((False, ["climber", "dancer"]), (True, ["dancer"]), (True, []), (False, [])):
+        made.clear()
+        collection.fit(two, model="human", config=replace(QUICK, try_harder=harder), agree=False)
+        assert made == expected

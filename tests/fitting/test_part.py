@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -141,6 +142,23 @@ def test_what_is_said_to_be_a_part_is_tried_as_a_whole_with_little_effort(
     assert part or np.array_equal(found.points, usual.points)
 
 
+@pytest.mark.parametrize(
+    ("border", "bare", "harder", "tried"),
+    [(0.5, 0.0, False, False), (0.5, 0.0, True, True), (0.5, 0.1, False, True), (1.2, 0.0, False, True)],
+)
+def test_a_character_of_open_parts_is_tried_as_a_part_of_a_body_only_in_a_long_search(
+    monkeypatch: pytest.MonkeyPatch, dancer: Shape, border: float, bare: float, harder: bool, tried: bool
+) -> None:
+    """Unless the fit of the whole leaves template bare, or the border is longer than such parts have."""
+    monkeypatch.setattr(fitter, "boundary_length", lambda shape: border * np.sqrt(shape.area))
+    monkeypatch.setattr(fitter, "uncovered_share", lambda *_: bare)
+    task = SimpleNamespace(config=FitConfig(try_harder=harder), shape=dancer)
+    whole = SimpleNamespace(
+        task=task, candidate=SimpleNamespace(residual=0.05), local=None, surface=SimpleNamespace(points=0)
+    )
+    assert fitter._may_be_part(whole) is tried  # type: ignore[arg-type]
+
+
 @pytest.mark.slow
 def test_a_whole_stays_a_whole_where_parts_are_tried() -> None:
     climber = load_shape(bundled_folder() / "samples" / "climber.ply")
@@ -174,7 +192,8 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
             lambda found, partial, verdict=verdict: Judgement(verdict, (), FitFeatures(residual=0.02)),
         )
         asked.clear()
-        best = fitter._best_part(task)
+        best = fitter._best_part(task, thorough=True)
+        assert best is not None
         found[verdict] = best.candidate.cost
         assert asked == ({(48, 2, False)} if verdict == "fair" else {(48, 2, False), (96, 4, True)})
     assert found["poor"] <= found["fair"]
@@ -183,7 +202,11 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
     monkeypatch.setattr(candidates, "SETTINGS", replace(patient, lost=0.0))
     assert fitter.fit_part(task) is None
     wide = fitter.fit_part(task, wide=True)
-    assert wide is not None and fitter._best_part(task).candidate.cost == wide.candidate.cost
+    best = fitter._best_part(task, thorough=True)
+    assert wide is not None and best is not None and best.candidate.cost == wide.candidate.cost
+    asked.clear()
+    assert fitter._best_part(task, thorough=False) is None
+    assert asked == {(48, 2, False)}
 
 
 def test_frames_of_a_part_are_tried_along_the_body(dancer: Shape) -> None:
