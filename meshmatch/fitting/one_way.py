@@ -40,6 +40,7 @@ from meshmatch.threads import parallel_map
 
 KnownPairs = tuple[Float[Floats, "N 3"], Float[Floats, "N 3"]]
 """Positions on the source and on the target that belong together."""
+BothWays = Literal["no", "in doubt", "always"]
 _KNOWN_WEIGHT = 0.05  # of each known pair; all other pairs together have about 1
 _NEAR = 3  # vertices of the coarse mesh by which one of the fine mesh moves
 
@@ -87,7 +88,7 @@ class DirectConfig:
     best: int = 6
     returned: int = 3
     unlike: float = 0.03
-    both_ways: Literal["no", "in doubt", "always"] = "in doubt"
+    both_ways: BothWays = "in doubt"
     from_source: bool = False
     seed: int = 0
 

@@ -35,7 +35,7 @@ from meshmatch.experiments import runner
 from meshmatch.fitting.direct import match_either_side
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.calibration import DirectCalibration
-from meshmatch.fitting.one_way import DirectConfig
+from meshmatch.fitting.one_way import BothWays, DirectConfig
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.shapes.files import load_shape
 from meshmatch.templates.make import edge_graph
@@ -140,13 +140,13 @@ def error_of(folder: Path, pair: tuple[str, str], vertices: Int[Ints, " N"]) -> 
     return min(float(100 * known[each, vertices].mean()) for each in symmetries(folder, *pair))
 
 
-def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[str, Any]:
-    """Error, verdict and cost of one pair."""
+def measure(folder: Path, pair: tuple[str, str], model: str, seed: int, ways: BothWays = "in doubt") -> dict[str, Any]:
+    """Error, verdict and cost of one pair; ``ways`` of matches without a model."""
     source, target = (load_shape(folder / f"{name}.ply") for name in pair)
     began, evidence = time.process_time(), {}
     if model == NO_MODEL:
         clean = usable(source), usable(target)
-        found = match_either_side(clean[0].shape, clean[1].shape, DirectConfig(seed=seed))
+        found = match_either_side(clean[0].shape, clean[1].shape, DirectConfig(seed=seed, both_ways=ways))
         fits = replace(found.source, repaired=clean[0]), replace(found.target, repaired=clean[1])
         mapped = map_of_fits(fits, fits, 1)
         evidence = {"energy": found.energy, "leads": found.leads, "both_ways": found.both_ways}
@@ -165,7 +165,7 @@ def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[
     }
 
 
-def fitted_calibration(found: Sequence[dict[str, Any]], most: float = 0.008, ridge: float = 0.002) -> DirectCalibration:
+def fitted_calibration(found: Sequence[dict[str, Any]], most: float = 0.008, ridge: float = 0.01) -> DirectCalibration:
     """By logistic regression, with a little ridge, of maps without a model that are right and wrong."""
     right = np.array([each["error"] < OFF for each in found])
     values = np.array([[-each["energy"], min([most, *each["leads"]])] for each in found])
@@ -201,12 +201,6 @@ def row_of(name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _by_ways(found: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
-    """Pairs that were decided one way, and those that were decided both ways."""
-    parts = [[each for each in found if each["both_ways"] is ways] for ways in (False, True)]
-    return [part for part in parts if part]
-
-
 @runner.command
 def main(
     classes: Annotated[str, Option(help="names, with commas between them; or all")] = "all",
@@ -215,16 +209,17 @@ def main(
     seed: runner.Seed = 0,
     data: runner.Data = runner.DATA,
     work: runner.Work = None,
-    fit: Annotated[bool, Option("--fit", help="also find the weights of the verdict")] = False,
+    ways: Annotated[BothWays, Option("--both-ways", help="when the target is fitted to the source, too")] = "in doubt",
+    fit: Annotated[bool, Option("--fit", help="also find the weights of verdicts, one way or both")] = False,
 ) -> runner.Report:
     names = CLASSES if classes == "all" else runner.names_of(classes, (*CLASSES, *TURNING), "class")
     rows, everything = [], []
     for name in names:
         folder = folder_of(name, data)
         pairs = runner.spread(list(permutations(shapes_of(folder), 2)), limit_pairs)
-        asked = {"model": model, "seed": seed}
+        asked = {"model": model, "seed": seed} | ({} if ways == "in doubt" else {"ways": ways})
         found = [
-            runner.at_work(work, f"{name}-{'-'.join(pair)}", asked, partial(measure, folder, pair, model, seed))
+            runner.at_work(work, f"{name}-{'-'.join(pair)}", asked, partial(measure, folder, pair, model, seed, ways))
             for pair in runner.track(pairs, name)
         ]
         rows.append(row_of(name, found))
@@ -233,5 +228,5 @@ def main(
     return runner.Report(
         {"rows": [*rows, total], "pairs": everything},
         [runner.table("Keypoints, x100 of sqrt(area)", [*rows, total], _COLUMNS)],
-        notes=[str(fitted_calibration(some)) for some in _by_ways(everything)] if fit else [],
+        notes=[str(fitted_calibration(everything))] if fit else [],
     )
