@@ -12,6 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.fitting.judge.calibration import CALIBRATION
@@ -22,7 +24,7 @@ from meshmatch.fitting.solve.agreement import log_stretch
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.geometry.triangles import edge_lengths, edges_of
+from meshmatch.geometry.triangles import edge_lengths, edges_of, vertex_areas
 from meshmatch.shapes.sampling import Samples, sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -42,10 +44,11 @@ _FLIPPED_IF_UNSIGNED = 0.015  # normals of a cloud have no side: taken for a usu
 # Features that decide alone, and how much each adds to the logit of a wrong fit. Set by hand, between what right and
 # wrong fits of `experiments.bench.campaign` have: knees that bend forward by so many degrees (16 at most where right, 31
 # to 74 of bodies taken back to front), pieces of a part beside the template (2 and 4 % of its surface), and a border of
-# what a part shows that is not cut (7 % where right and fair, 57 to 91 % of limbs taken for more).
+# what a part shows that is not cut (1 % where right and fair, 41 to 82 % of limbs taken for more).
 _ALONE = 8.0
-_FORWARD, _ASTRAY, _UNCUT = 27.0, 0.03, 0.5
+_FORWARD, _ASTRAY, _UNCUT = 27.0, 0.03, 0.3
 _ASIDE = 0.022  # mean distance from the template (units of sqrt(area), 3 cm on a person) of a piece that is beside it
+_ISLAND = 0.05  # what is hidden in pieces of less than this share of it, in ears and between fingers, was not cut off
 _CUT = 0.12  # a border further from an edge of the shape than this (units of sqrt(area)) is not that of a cut
 
 
@@ -189,11 +192,15 @@ def uncut_share(
     system: NodeSystem, local: OrientedPoints, vectors: Float[Floats, "K 3"], edges: Float[Floats, "N 3"]
 ) -> float:
     """Share (0..1) by length of the border of what samples show of the template that is far from all open ``edges`` of the
-    shape (their middles, core frame): there the template goes on, and nothing was cut off.
+    shape (their middles, core frame): there the template goes on, and nothing was cut off. Small hidden pieces have none.
     """
     shown, faces = visible_vertices(system, local, vectors), system.faces
     sides = edges_of(faces).vertices
-    border = sides[shown[sides[:, 0]] != shown[sides[:, 1]]]
+    inside = sides[~shown[sides].any(1)]
+    piece = connected_components(coo_matrix((np.ones(len(inside)), inside.T), (len(shown),) * 2), directed=False)[1]
+    area = np.where(shown, 0.0, vertex_areas(system.verts, faces))
+    hidden = (np.bincount(piece, area) > _ISLAND * area.sum())[piece] & ~shown
+    border = sides[hidden[sides].any(1) & shown[sides].any(1)]
     if not len(border) or not len(edges):
         return 0.0
     length = edge_lengths(system.verts, border)

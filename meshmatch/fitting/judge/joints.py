@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.fitting.solve.priors import signed_svd
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.templates.template import Template
@@ -14,15 +14,21 @@ _KNEES = (("left thigh", "left shin"), ("right thigh", "right shin"))
 _DOWN, _FRONT = np.array([0.0, -1.0, 0.0]), 2
 
 
-def knees_forward(system: NodeSystem, vectors: Float[Floats, "K 3"], template: Template) -> float:
-    """How far (degrees) the knee bends forward that does so most; 0 where none does, or the template has no knees."""
+def knees_forward(
+    system: NodeSystem, vectors: Float[Floats, "K 3"], template: Template, shown: Bool[Bools, " V"] | None = None
+) -> float:
+    """How far (degrees) the knee bends forward that does so most; 0 where none does, or the template has no knees. Where
+    only some vertices are ``shown``, knees whose thigh or shin mostly is not say nothing.
+    """
     names, labels = template.label_names or (), np.asarray(template.labels)[system.gradient_points]
+    seen = np.ones(len(labels), bool) if shown is None else shown[system.gradient_points]
     gradient, most = system.deformation_gradient(vectors), 0.0
     for above, below in _KNEES:
         if above not in names or below not in names:
             continue
-        parts = [gradient[labels == names.index(name)] for name in (above, below)]
-        if all(map(len, parts)):
+        own = [labels == names.index(name) for name in (above, below)]
+        parts = [gradient[each] for each in own]
+        if all(len(part) and seen[each].mean() > 0.5 for part, each in zip(parts, own, strict=True)):
             left, _, right = signed_svd(np.stack([part.mean(0) for part in parts]))
             thigh, shin = left @ right  # the rotations nearest to both
             direction = thigh.T @ shin @ _DOWN

@@ -20,6 +20,7 @@ from meshmatch.fitting.judge.joints import knees_forward
 from meshmatch.fitting.judge.reasons import Reason, ReasonCode, Verdict
 from meshmatch.fitting.search.predictor import reads_alike
 from meshmatch.fitting.search.task import Registration, without_interior
+from meshmatch.fitting.search.visibility import visible_vertices
 from meshmatch.fitting.solve.regularity import Regularity
 
 _SKIN = 1.9  # square metres of an adult's skin
@@ -101,7 +102,8 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
         spread_at=spread_at if predicted else None,
         connected=connected_parts(task.shape, found.local),
     )
-    features = replace(features, forward=knees_forward(task.system, vectors, task.model.template))
+    shown = visible_vertices(task.system, found.local, vectors) if partial else None
+    features = replace(features, forward=knees_forward(task.system, vectors, task.model.template, shown))
     if partial and not task.shape.is_cloud:
         edges = found.core_frame.apply(task.shape.verts[task.shape.edges.open].mean(1))
         features = replace(features, uncut=uncut_share(task.system, found.local, vectors, edges))
