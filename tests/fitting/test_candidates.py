@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from meshmatch.api.inputs import as_model
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.search import candidates, frames, refinement
 from meshmatch.fitting.search.candidates import candidates_of_whole
@@ -24,7 +25,9 @@ from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
+from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.location import bundled_folder
 from tests.fitting.eggs import egg_model, scan_of
 
 STILL = RigidPose.identity()
@@ -55,11 +58,25 @@ def test_a_shape_that_the_network_misses_is_tried_with_its_core_further_down(
 
     monkeypatch.setattr(Predictor, "fit_all", fit_all)
     candidates_of_whole(task)
-    assert sum(map(len, asked[:-1])) == tried * len(tried_frames)
-    assert len(asked[-1]) == careful
+    assert sum(map(len, asked[:-2])) == tried * len(tried_frames)
+    assert len(asked[-2]) == careful
     if tried > 1:
         down = asked[1][0].center - tried_frames[0].center
         assert np.allclose(down / np.linalg.norm(down), -tried_frames[0].rotation[:, 1])
+
+
+@pytest.mark.parametrize(("front", "right"), [(None, True), ("z", False)])
+def test_a_body_taken_back_to_front_is_turned_about(
+    monkeypatch: pytest.MonkeyPatch, front: str | None, right: bool
+) -> None:
+    """All frames that are tried have its back to the front; where the user says so, it is left."""
+    model, config = as_model("human"), FitConfig(careful=1)
+    task = FitTask.of(model, config, load_shape(bundled_folder() / "samples" / "climber.ply"))
+    true = candidates_of_whole(task)[1][0].pose
+    turned = RigidPose(true.rotation * [-1.0, 1.0, -1.0], true.center)
+    monkeypatch.setattr(candidates, "frames_to_try", lambda *_: [turned])
+    found = candidates_of_whole(replace(task, config=replace(config, front=front)))[1][0].pose
+    assert (found.rotation[:, 2] @ true.rotation[:, 2] > 0.9) == right
 
 
 @pytest.mark.parametrize(("upright", "careful"), [(False, 3), (True, 4)])
@@ -81,7 +98,7 @@ def test_how_a_file_stands_is_tried_however_badly_it_begins(
 
     monkeypatch.setattr(Predictor, "fit_all", fit_all)
     _, found = candidates_of_whole(task)
-    assert [len(poses) for poses in asked] == [5 + upright, careful]
+    assert [len(poses) for poses in asked] == [5 + upright, careful, 1]
     assert [each.pose.rotation is odd for each in found] == [True] * 3 + [False] * upright
     assert candidates.of_file(task, found) == found[3:]  # it will be refined, too
 

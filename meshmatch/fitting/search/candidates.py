@@ -26,6 +26,7 @@ from meshmatch.fitting.search.predictor import (
     Predictor,
     best_first,
     one_way_residual,
+    ranking_residual,
     scaled_to_area,
     two_way_residual,
 )
@@ -37,11 +38,13 @@ from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.progress import Progress
+from meshmatch.shapes.normalise import ALIGNS
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map
 
 STAGE = "fitting as a part"
+_ABOUT = np.array([-1.0, 1.0, -1.0])  # of the columns of a rotation: half a turn about its own y axis
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,12 +63,14 @@ class CandidateSettings:
     unusual_residual : a shape that the network's own fits miss by more may be built like nobody that the aligner knows: with
         a large head the core lies further down its own up axis
     lower_cores : by how much the core is then tried further down
+    about_margin : residual, as a multiple of the best one, up to which this is refined the other way round as well
     shares : shares of the surface that a part may show
     min_share : the smallest share that a shape is taken to show
     lost : residual from which on the candidates of a narrow search are not worth refining: of parts of people that are found
         it is 0.020 to 0.030
     wide_shares : shares for which a wide search tries all frames
-    ranking_samples : samples by which frames are ranked
+    wide_kept : one in so many of these, the best, is tried for the other shares
+    ranking_samples, ranking_samples_if_wide : samples by which frames are ranked
     careful, careful_if_wide : candidates of each share that are fitted with care, in a narrow and in a wide search
     completed : candidates that are completed and fitted again: so many once, of these so many twice, and so many three times
     varied : candidates of which variants are sought
@@ -82,11 +87,14 @@ class CandidateSettings:
     scale_margin: float = 1.1
     unusual_residual: float = 0.05
     lower_cores: tuple[float, ...] = (0.1, 0.2)
+    about_margin: float = 1.1
     shares: tuple[float, ...] = (1.0, 0.8, 0.62, 0.48, 0.36)
     min_share: float = 0.2
     lost: float = 0.034
     wide_shares: tuple[float, ...] = (0.62,)
+    wide_kept: int = 8
     ranking_samples: int = 768
+    ranking_samples_if_wide: int = 512
     careful: int = 5
     careful_if_wide: int = 5
     completed: tuple[int, ...] = (10, 5, 3)
@@ -123,9 +131,23 @@ def candidates_of_whole(task: FitTask) -> tuple[FitTask, list[Candidate]]:
         task, candidates = _rescaled(task, candidates)
     chosen = candidates[:careful]
     chosen += [each for each in of_file(task, candidates) if each not in chosen]
-    best = task.predictor.fit_all([(task.samples, each.pose) for each in chosen])
+    best = best_first(task.predictor.fit_all([(task.samples, each.pose) for each in chosen]))
+    best += _about_face(task, best[0])
     orientation(1.0)
     return task, best_first(best)
+
+
+def _about_face(task: FitTask, best: Candidate) -> list[Candidate]:
+    """The best candidate turned about by its own up axis, where that fits about as well, and nobody says where the front is.
+
+    The turned votes are ranked by single predictions, which are wrong where a vote is far from the core frame: people who
+    make a bridge were taken to stand on all fours.
+    """
+    if task.config.front is not None or task.model.card.frame["orientation"] in ALIGNS:
+        return []
+    predictor = replace(task.predictor, rng=np.random.default_rng(task.config.seed))  # others draw what they would
+    turned = predictor.fit_all([(task.samples, RigidPose(best.pose.rotation * _ABOUT, best.pose.center))])
+    return [each for each in turned if each.residual < SETTINGS.about_margin * best.residual]
 
 
 def of_file(task: FitTask, candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -242,10 +264,10 @@ def _careful(task: FitTask, wide: bool, progress: Progress) -> list[Candidate]:
         frames, others = frames_of_part(task.model, samples, task.config, wide, task.shape.upright)
         tried = list(range(len(others)))
         if wide and number >= len(SETTINGS.wide_shares):
-            tried = sorted(best, key=lambda frame: best[frame])[: len(others) // 4]
-        thin = samples.first(SETTINGS.ranking_samples)
+            tried = sorted(best, key=lambda frame: best[frame])[: len(others) // SETTINGS.wide_kept]
+        thin = samples.first(SETTINGS.ranking_samples_if_wide if wide else SETTINGS.ranking_samples)
         starts = [(thin, pose) for pose in [*(others[k] for k in tried), *frames]]
-        rough = task.predictor.fit_all(starts, 1, 1, one_way_residual)
+        rough = task.predictor.fit_all(starts, 1, 1, ranking_residual if wide else one_way_residual)
         for k, candidate in zip(tried, rough, strict=False):
             best[k] = min(candidate.residual, best.get(k, np.inf))
         rough.sort(key=lambda candidate: candidate.residual)

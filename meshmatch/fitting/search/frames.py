@@ -94,18 +94,19 @@ def frames_of_part(
 ) -> tuple[list[RigidPose], list[RigidPose]]:
     """Core frames to try for a part, whose middle is not that of the whole, and which a vote seldom knows.
 
-    Those of `frames_to_try`; and, the same for any samples, all turns about the user's axes, or, if the search is to be
-    ``wide``, about the axes of the file, each with several places of the core along the body.
+    Those of `frames_to_try`; and, the same for any samples, all turns about the user's axes, each with several places of
+    the core along the body. Where nobody says how a shape stands, a ``wide`` search has all turns about the axes of the
+    file instead of both.
     """
-    frames = frames_to_try(model, samples, config, upright)
     if model.card.frame["orientation"] in ALIGNS:
-        return frames, []
+        return frames_to_try(model, samples, config, upright), []
     up, front = _axes(config)
-    if up is not None or front is not None:
+    given, turned = up is not None or front is not None, []
+    if given:
         turned = forced_frames(up, front)
-    else:
-        axes = np.concatenate([np.eye(3), -np.eye(3)]) if wide else np.empty((0, 3))
-        turned = [pose for axis in axes for pose in forced_frames(axis, None, 8)]
+    elif wide:
+        turned = [pose for axis in np.concatenate([np.eye(3), -np.eye(3)]) for pose in forced_frames(axis, None, 8)]
+    frames = [] if wide and not given else frames_to_try(model, samples, config, upright)
     spread = [RigidPose(pose.rotation, pose.center + away * pose.rotation[:, 1]) for pose in turned for away in _ALONG]
     return frames, spread
 
