@@ -28,8 +28,8 @@ Scheduler = Annotated[
 ]
 
 
-# The residual is in % of sqrt(area).
-_ROW = "{:<28} {:<7} {:>6} {:>9} {:>4} {:>6} {:>11} {:>8}"
+# The residual is in % of sqrt(area), the distance of the surfaces in the unit of the files.
+_ROW = "{:<28} {:<7} {:>6} {:>9} {:>9} {:>4} {:>6} {:>11} {:>8}"
 
 
 @grouped
@@ -59,8 +59,8 @@ def fit(
     Each shape is reported when it is finished; one that cannot be fitted does not stop the others. Without --model, shapes
     of another kind than the first are fitted by the model of theirs, in FITS/KIND. Run the command
     again to continue after an interruption or to add shapes. With --model none the template is built from the shapes
-    themselves, which must be complete, in any pose and orientation; mirror images are found. FITS/fits.csv lists the
-    result of every shape.
+    themselves, in any pose and orientation; mirror images and cut shapes are found. FITS/fits.csv lists the result of every
+    shape.
     """
     from meshmatch.collections.fit_all import elsewhere_words
     from meshmatch.collections.setting import FAILED
@@ -85,6 +85,10 @@ def fit(
     console.say(*elsewhere_words(made.elsewhere))
     if counts["poor"] and not how.try_harder:
         console.say("the same command with --try-harder searches for longer where a fit is poor")
+    near = [each for each in made.records if each.verdict in ("good", "fair") and each.distance >= 0]
+    if near and made.model == NO_MODEL:
+        mean, most = sum(each.distance for each in near) / len(near), max(each.furthest for each in near)
+        console.say(f"surfaces lie {mean:.2g} apart on average, {most:.2g} at most, in the unit of the files")
     if made.agreed:
         console.say(f"{made.agreed} fits agreed on how the template stretches")
     if json:
@@ -99,10 +103,12 @@ def _table(console: Console) -> Callable[["Record"], None]:
 
     def tell(record: "Record") -> None:
         if not next(lines):
-            console.say(_ROW.format("shape", "verdict", "trust", "residual", "up", "front", "vertices", "seconds"))
-        measured: tuple[str, ...] = (f"{record.trust:.2f}", f"{100 * record.residual:.1f} %", record.up, record.front)
-        measured += (f"{record.vertices:,}", f"{record.seconds:.1f}")
-        console.say(_ROW.format(record.name, record.verdict, *(measured if record.fitted else [""] * 6)).rstrip())
+            console.say(
+                _ROW.format("shape", "verdict", "trust", "residual", "distance", "up", "front", "vertices", "seconds")
+            )
+        measured: tuple[str, ...] = (f"{record.trust:.2f}", f"{100 * record.residual:.1f} %", f"{record.distance:.2g}")
+        measured += (record.up, record.front, f"{record.vertices:,}", f"{record.seconds:.1f}")
+        console.say(_ROW.format(record.name, record.verdict, *(measured if record.fitted else [""] * 7)).rstrip())
         if not record.fitted or record.verdict == "poor":
             console.warn(f"{record.name}: {'' if record.fitted else 'not fitted: '}{record.reasons}")
         if record.notes:

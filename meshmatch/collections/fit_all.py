@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 from meshmatch.arrays import Floats
+from meshmatch.collections.compare import FAIR, Usual, on_the_other_side
 from meshmatch.collections.setting import AGREEING, ALONE, FAILED, FIRST, Record, Setting, Source, digest_of
 from meshmatch.collections.settle import on_the_mean, save_text, settled
 from meshmatch.collections.sources import natural
@@ -37,8 +39,20 @@ from meshmatch.progress import ProgressCallback
 
 TABLE = "fits.csv"
 COLUMNS = (
-    *("name", "file", "verdict", "trust", "reasons", "residual", "inverted", "volume"),
-    *("up", "front", "vertices", "seconds", "notes", "kind"),
+    *(
+        "name",
+        "file",
+        "verdict",
+        "trust",
+        "reasons",
+        "residual",
+        "distance",
+        "furthest",
+        "stretch",
+        "inverted",
+        "volume",
+    ),
+    *("mirrored", "up", "front", "vertices", "seconds", "notes", "kind"),
 )
 _MOST_NAMED = 10  # in one line
 _GROUP = 4  # fits that one task of the agreement takes a step with: fixed, for sums must not depend on the workers
@@ -73,25 +87,37 @@ def fit_all(
 ) -> Fitted:
     """Fit all shapes of a collection; see `Collection.fit`."""
     report = progress or (lambda stage, name, share: None)
+    others: set[str] = set()
+    cut: dict[str, float] = {}
     if setting.model == NO_MODEL:
         first = _Run(setting, sources, crew, report).fit_alone(None, FIRST)
-        setting = on_the_mean(setting, [record.name for record in first if record.verdict not in ("poor", FAILED)])
+        usual, others = Usual.of(first), on_the_other_side(first)
+        cut = {} if usual is None else {each.name: usual.scale for each in first if usual.stands_out(each)}
+        setting = on_the_mean(
+            setting, [each.name for each in first if _believed(each, usual) and each.name not in others]
+        )
     run = _Run(setting, sources, crew, report)
-    records = run.fit_alone(tell)
+    records = run.fit_alone(tell if setting.learned else None, others=others, cut=cut)
     fitted = [number for number, record in enumerate(records) if record.fitted]
     if not fitted:
         _write_table(setting.store, records)
         raise InputError(f"none of {len(records)} shapes could be fitted: {records[0].name}: {records[0].reasons}")
-    agreeing = [number for number in fitted if records[number].verdict != "poor"]
+    usual = None if setting.learned else Usual.of(records)
+    agreeing = [number for number in fitted if _believed(records[number], usual)]
     parts = [f"{records[number].name} {records[number].digest} {records[number].verdict}" for number in fitted]
     how = AgreeConfig.for_collection(setting.trained) if setting.agrees else None
-    everybody = digest_of(*parts, str(how))  # fits that agreed in another way agree again
+    everybody = digest_of(
+        *parts, str(how), *([str(usual)] if usual else [])
+    )  # fits that agreed in another way agree again
     groups = run.groups(agreeing, everybody) if agree and setting.agrees and len(agreeing) > 1 else []
-    tasks = run.last_tasks({number: records[number] for number in fitted}, groups)
+    tasks = run.last_tasks({number: records[number] for number in fitted}, groups, usual)
     if groups and not all(is_finished(setting.store, task) for task in tasks.values()):
         run.agree(groups, len(agreeing))
     for number, done in run.finish(tasks):
         records[number] = _finished(records[number], done)
+    if tell is not None and not setting.learned:  # what is thought of one depends on all
+        for record in records:
+            tell(record)
     setting.store.remove(AGREEING)
     _write_table(setting.store, records)
     return Fitted(tuple(records), len(agreeing) if groups else 0, setting.model)
@@ -181,9 +207,16 @@ class _Run:
             self.report(stage, self.setting.store.location, (done + 1) / len(items))
             yield number, result
 
-    def fit_alone(self, tell: Callable[[Record], None] | None, folder: str = ALONE) -> list[Record]:
+    def fit_alone(
+        self,
+        tell: Callable[[Record], None] | None,
+        folder: str = ALONE,
+        others: Set[str] = frozenset(),
+        cut: Mapping[str, float] = MappingProxyType({}),
+    ) -> list[Record]:
         """Fit every shape on its own; the frames of a sequence one after the other, of several sequences beside each
-        other.
+        other. ``others`` are names of shapes to be fitted as mirror images of what was thought, ``cut`` of those that may be
+        parts, and the sqrt(area) of the whole.
         """
         found: dict[int, Record] = {}
         chains = self._chains()
@@ -191,7 +224,11 @@ class _Run:
             numbers = [chain[turn] for chain in chains if turn < len(chain)]
             before = [self._last(chain[:turn], found) for chain in chains if turn < len(chain)]
             places = zip(numbers, before, strict=True)
-            tasks = [FitTask(self.setting, self.sources[number], last, folder) for number, last in places]
+            tasks = []
+            for number, last in places:
+                source = self.sources[number]
+                how = source.name in others, cut.get(source.name)
+                tasks.append(FitTask(self.setting, source, last, folder, *how))
             for at, result in self._each(fit_alone, tasks, "fitting" if folder == ALONE else "choosing the template"):
                 source = self.sources[numbers[at]]
                 if isinstance(result, Died):
@@ -220,15 +257,18 @@ class _Run:
         parts = [tuple(names[first : first + _GROUP]) for first in range(0, len(names), _GROUP)]
         return [Group(number, part, agreement) for number, part in enumerate(parts)]
 
-    def last_tasks(self, records: Mapping[int, Record], groups: Sequence[Group]) -> dict[int, FinishTask]:
+    def last_tasks(
+        self, records: Mapping[int, Record], groups: Sequence[Group], usual: Usual | None
+    ) -> dict[int, FinishTask]:
         """What finishes each fit; a digest of all that agree tells whether that was done before."""
         steps = AgreeConfig.for_collection(self.setting.trained).schedule.steps if groups else 0
         group_of = {name: group for group in groups for name in group.names}
         found = {}
         for number, record in records.items():
             own = group_of.get(record.name)
-            agreed_with = "nobody" if own is None else own.agreement
-            found[number] = FinishTask(self.setting, self.sources[number], record.digest, agreed_with, own, steps)
+            agreed_with = ("nobody" if own is None else own.agreement) + ("" if usual is None else f" {usual}")
+            task = FinishTask(self.setting, self.sources[number], record.digest, agreed_with, own, steps, usual)
+            found[number] = task
         return found
 
     def agree(self, groups: Sequence[Group], count: int) -> None:
@@ -269,12 +309,15 @@ def _finished(alone: Record, done: Finished) -> Record:
     """The record of a fit alone, with what became of it when it agreed with others."""
     if done.trouble:
         return replace(alone, verdict=FAILED, reasons=done.trouble)
-    known = replace(alone, **regularity_words(done.regularity))
-    return (
-        known
-        if done.verdict == alone.verdict
-        else replace(known, verdict=done.verdict, reasons="; ".join(done.reasons))
-    )
+    known, trust = replace(alone, **regularity_words(done.regularity)), round(done.trust, 4)
+    if (done.verdict, trust) == (alone.verdict, alone.trust):
+        return known
+    return replace(known, verdict=done.verdict, trust=trust, reasons="; ".join(done.reasons))
+
+
+def _believed(record: Record, usual: Usual | None) -> bool:
+    """Whether a fit is not poor, alone and among the others."""
+    return record.verdict not in ("poor", FAILED) and (usual is None or usual.trust(record) >= FAIR)
 
 
 def _write_table(store: Store, records: Sequence[Record]) -> None:

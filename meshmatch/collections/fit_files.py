@@ -66,6 +66,7 @@ def save_fit(
     about: Words = {name: getattr(fit, name) for name in _FIT_WORDS}
     about |= {"reasons": [[reason.code, str(reason)] for reason in fit.reasons], "scale": fit.frame.scale}
     about |= {"left_out": list(fit.left_out)} if fit.left_out else {}
+    about |= {"side": fit.side} if fit.side else {}
     if fit.regularity is not None:
         about["regularity"] = asdict(fit.regularity)
     if places is not None:
@@ -127,6 +128,7 @@ def load_fit(path: str | Path, template: Template) -> StoredFit:
             seconds=0.0,
             left_out=_numbers(about.get("left_out", [])),
             regularity=regularity_of(about),
+            side=float(about.get("side", 0.0)),
             **{name: about[name] for name in _FIT_WORDS},
         )
         if not (1 / LARGEST < fit.frame.scale < LARGEST and (np.abs(fit.frame.center) < LARGEST).all()):

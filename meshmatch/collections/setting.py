@@ -16,6 +16,7 @@ from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fitter import may_show_part
 from meshmatch.fitting.without_model import fit_without_model
 from meshmatch.maps.places import Places
 from meshmatch.models.registry import NO_MODEL
@@ -79,8 +80,15 @@ class Record:
     trust: float = 0.0
     reasons: str = ""
     residual: float = float("nan")  # units of sqrt(area)
+    distance: float = float("nan")  # of the surfaces, on average and at most, unit of the file
+    furthest: float = float("nan")
     inverted: float = float("nan")  # share of the template, and mean change of volume, see `Regularity`
     volume: float = float("nan")
+    stretch: float = float("nan")  # of the template, see `FitFeatures`
+    likely: float = 0.0  # trust of the fit alone, however little is known of what corresponds
+    mirrored: int = 0  # 1 where it was fitted as a mirror image
+    side: float = 0.0  # see `Fit.side`
+    scale: float = 0.0  # of the fit: sqrt(area) of a whole shape, unit of the file
     up: str = ""
     front: str = ""
     vertices: int = 0
@@ -124,6 +132,11 @@ class Setting:
         return found
 
     @property
+    def learned(self) -> bool:
+        """Whether a model learned what corresponds; else fits are compared with each other."""
+        return self.model != NO_MODEL and self.trained.card.correspondence
+
+    @property
     def agrees(self) -> bool:
         """Whether fits made so can agree: they have nodes, which a trained model moves."""
         return self.model != NO_MODEL and self.config.for_model(self.trained).moves_nodes
@@ -133,12 +146,15 @@ class Setting:
         with self.store.reading(f"{folder}/{name}{SUFFIX}") as path:
             return load_fit(path, self.template)
 
-    def fit(self, shape: Shape, last: Fit | None = None) -> Fit:
-        """Fit one shape; a frame of a sequence from the last one's fit."""
+    def fit(self, shape: Shape, last: Fit | None = None, other_side: bool = False, whole: float | None = None) -> Fit:
+        """Fit one shape; a frame of a sequence from the last one's fit. Without a model perhaps as the other side than the
+        first template's fit took it for, or as a part of shapes of that sqrt(area), if it has an edge.
+        """
         if self.model == NO_MODEL:
             part, begun, mirror = validated(shape), self._begun(shape.name), self.config.mirror != "no"
+            whole = whole if may_show_part(part.shape, self.config) else None
             with thread_limit(1):
-                found = fit_without_model(self.template, part.shape, start=begun, mirror=mirror)
+                found = fit_without_model(self.template, part.shape, start=begun, mirror=mirror, other_side=other_side)
             return replace(found, repaired=part)
         matcher = Matcher(self.trained, self.config, 1)
         return matcher.fit(shape) if last is None else matcher.follow(shape, last)
@@ -162,8 +178,8 @@ class Setting:
 
     def digest(self) -> str:
         """Of all that decides how a shape is fitted."""
-        searched = "searched" if self.model == NO_MODEL else ""
-        return digest_of(self.template_hash, json.dumps(self.choices(), sort_keys=True) + searched)
+        compared = "" if self.learned else "compared"
+        return digest_of(self.template_hash, json.dumps(self.choices(), sort_keys=True) + compared)
 
 
 def template_at(store: Store, file: str = TEMPLATE) -> Template:

@@ -6,6 +6,7 @@ anybody, with the same result bit for bit.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -17,6 +18,7 @@ import numpy as np
 from meshmatch.api.inputs import validated
 from meshmatch.api.kinds import other_kind
 from meshmatch.arrays import Float, Floats
+from meshmatch.collections.compare import Usual
 from meshmatch.collections.fit_files import StoredFit, load_words, regularity_of, save_fit
 from meshmatch.collections.setting import AGREEING, ALONE, FITS, SUFFIX, Record, Setting, Source, digest_of
 from meshmatch.collections.stores import Store
@@ -25,7 +27,7 @@ from meshmatch.fitting.agree import member_of, with_vectors
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree_step, log_stretch
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.system import node_system
-from meshmatch.maps.places import Places
+from meshmatch.maps.places import Places, surface_distance
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.input_files import read_npy
@@ -40,6 +42,8 @@ class FitTask:
     source: Source
     last: Record | None = None  # of the frame before, in a sequence
     folder: str = ALONE
+    other_side: bool = False
+    whole: float | None = None  # see `Setting.fit`
 
 
 def fit_alone(task: FitTask) -> Record:
@@ -50,13 +54,15 @@ def fit_alone(task: FitTask) -> Record:
     source, setting = task.source, task.setting
     file, began = f"{task.folder}/{source.name}{SUFFIX}", time.monotonic()
     try:
-        digest = digest_of(source.digest(), setting.digest(), "" if task.last is None else task.last.digest)
+        begins = "" if task.last is None else task.last.digest
+        begins += ("other side" if task.other_side else "") + (f"part of {task.whole}" if task.whole else "")
+        digest = digest_of(source.digest(), setting.digest(), begins)
         harder = digest_of(digest, "try_harder")
         known = _known(setting.store, file, (digest, harder))
         if known is not None and (known.verdict != "poor" or known.digest == harder or not setting.config.try_harder):
             return known
         last = None if task.last is None else setting.read(task.folder, task.last.name).fit
-        fit = setting.fit(source.load(setting.only, setting.without), last)
+        fit = setting.fit(source.load(setting.only, setting.without), last, task.other_side, task.whole)
         assert fit.repaired is not None
         reasons, other, samples = "; ".join(fit.reasons), "", None
         if fit.verdict == "poor" and setting.model != NO_MODEL:
@@ -65,6 +71,7 @@ def fit_alone(task: FitTask) -> Record:
         if setting.agrees:
             how = AgreeConfig.for_collection(setting.trained)
             samples = member_of(node_system(setting.trained), fit.repaired.shape, fit, setting.config, how).samples
+        distance, furthest = surface_distance(fit.repaired.shape, fit)
         record = Record(
             name=source.name,
             file=source.path,
@@ -72,9 +79,16 @@ def fit_alone(task: FitTask) -> Record:
             trust=round(fit.trust, 4),
             reasons=reasons,
             residual=float(fit.residual),
+            distance=distance,
+            furthest=furthest,
             **regularity_words(fit.regularity),
-            up=fit.up,
-            front=fit.front,
+            stretch=math.nan if fit.signs is None else fit.signs.stretch,
+            likely=fit.trust if fit.signs is None or setting.model == NO_MODEL else fit.signs.p_correct,
+            mirrored=int(fit.frame.mirrored),
+            side=fit.side,
+            scale=fit.frame.scale,
+            up="" if setting.model == NO_MODEL else fit.up,
+            front="" if setting.model == NO_MODEL else fit.front,
             vertices=fit.repaired.original.V,
             seconds=round(time.monotonic() - began, 3),
             digest=harder if setting.config.try_harder else digest,
@@ -196,6 +210,7 @@ class FinishTask:
     agreed_with: str  # a digest of all that took part
     group: Group | None = None
     step: int = 0
+    usual: Usual | None = None
 
     @property
     def file(self) -> str:
@@ -220,6 +235,7 @@ class Finished:
     trouble: str = ""
     verdict: str = ""
     reasons: tuple[str, ...] = ()
+    trust: float = 0.0
     regularity: Regularity | None = None
 
 
@@ -231,7 +247,7 @@ def finish(task: FinishTask) -> Finished:
         with task.setting.store.reading(task.file) as path:
             about = load_words(path)[0]
             reasons = tuple(str(sentence) for _, sentence in about["reasons"])
-            return Finished("", about["verdict"], reasons, regularity_of(about))
+            return Finished("", about["verdict"], reasons, about["trust"], regularity_of(about))
     except MeshmatchError as error:
         return Finished(error.message)
 
@@ -241,6 +257,8 @@ def _finish(task: FinishTask) -> None:
     alone = setting.read(ALONE, name)
     part = validated(leave_out(task.source.load(setting.only, setting.without), alone.fit.left_out))
     before = replace(alone.fit, repaired=part, verts=part.shape.verts)
+    if task.usual is not None:
+        before = task.usual.judged(before, Record(**alone.words["record"]))
     fit = before
     if task.group is not None:
         vectors = load_array(setting.store, task.group.file(task.step))[task.group.names.index(name)]

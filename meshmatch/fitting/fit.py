@@ -77,6 +77,9 @@ class Fit(Pickled):
     regularity
         Share of template vertices where the deformation folds (det F <= 0), and mean change of volume, of these node
         vectors; None if it was read from a file that does not say.
+    side
+        Logarithm of how many times as much energy the other side has, the mirror image or the shape as it is; 0 where it
+        was not tried.
 
     Examples
     --------
@@ -107,6 +110,7 @@ class Fit(Pickled):
     signs: FitFeatures | None = None
     left_out: tuple[int, ...] = ()
     regularity: Regularity | None = None
+    side: float = 0.0
 
     def __repr__(self) -> str:
         name = f"{self.repaired.original.name!r}, " if self.repaired else ""

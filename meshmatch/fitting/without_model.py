@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -27,6 +28,7 @@ from meshmatch.fitting.judge.features import compute_features
 from meshmatch.fitting.judge.reasons import Reason
 from meshmatch.fitting.judge.verdict import judge
 from meshmatch.fitting.one_way import DirectConfig
+from meshmatch.fitting.search.predictor import one_way_residual
 from meshmatch.fitting.search.task import take_samples
 from meshmatch.fitting.solve.blend import FieldPath
 from meshmatch.fitting.solve.driver import Problem, minimise
@@ -37,7 +39,7 @@ from meshmatch.fitting.solve.viscous import ViscousConfig, viscous_vectors
 from meshmatch.geometry.frames import Frame, RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.registry import NO_MODEL
-from meshmatch.shapes.normalise import Align, align
+from meshmatch.shapes.normalise import Align, align, sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, low_mesh, make_template
@@ -56,6 +58,8 @@ _NEAR, _STRETCH = 0.045, 0.7
 # 0.66 of mirrored femurs, 0.97 of ants, 0.88 of eggs that were turned wrongly.
 _SEARCHED, _TURNED = 0.9, MIRRORED_SHARE
 _SHRUNK = 0.93  # area of a mean of shapes that are posed, against theirs: 0.997 of femurs, 0.87 of ants
+_PART = 0.85  # so much of a whole's energy a part must have; 0.3 of a cut femur
+_TURNS = 2  # of a part, and of its mirror image, that are tried
 _LOST = 0.5  # trust of a search whose result is not believed
 
 
@@ -122,27 +126,37 @@ class _Fitted:
 class _Task:
     """One shape, and the template that is fitted to it."""
 
-    def __init__(self, template: Template, shape: Shape, config: ViscousConfig) -> None:
-        self.template, self.shape, self.config = template, shape, config
+    def __init__(self, template: Template, shape: Shape, config: ViscousConfig, size: float | None = None) -> None:
+        """``size`` is that of the whole of which the shape is a part: the unit of its core frame, in that of its file."""
+        self.template, self.shape, self.config, self.partial = template, shape, config, size is not None
         self.system = viscous_system(template)
-        self._own, self._samples = take_samples(shape, config.samples, np.random.default_rng(config.seed + 1))
+        whole = None if size is None else replace(sqrt_area_frame(shape), scale=size)
+        rng = np.random.default_rng(config.seed + 1)
+        self._own, self._samples = take_samples(shape, config.samples, rng, whole)
         self._resting = sample_surface(template.shape, _ALIGNED_BY, np.random.default_rng(config.seed))
 
     def fitted(self, begin: _Begin) -> _Fitted:
         points = begin.frame.apply(self._own.undo(self._samples.points))
         normals = self._samples.normals @ self._own.rotation @ begin.frame.rotation.T
         samples = replace(self._samples, points=points, normals=normals).facing(self.system.surface(begin.vectors))
-        vectors = viscous_vectors(self.system, samples, self.config, begin.vectors)
-        return _Fitted(begin, samples, vectors, DirectFeatures.of(self.system, samples, vectors))
+        vectors = viscous_vectors(self.system, samples, self.config, begin.vectors, self.partial)
+        features = DirectFeatures.of(self.system, samples, vectors)
+        if self.partial:
+            features = replace(features, residual=one_way_residual(self.system, samples, vectors))
+        return _Fitted(begin, samples, vectors, features)
 
     def turned(self, side: Frame | None, how: Align = "rigid") -> _Begin:
         """The template as it rests, on the shape, or on its mirror image, turned in any way, or near its file's axes."""
+        return self.turns(side, how)[0]
+
+    def turns(self, side: Frame | None, how: Align = "rigid", keep: int = 1) -> list[_Begin]:
+        """The same in several ways, the best one first."""
         outer = self._own if side is None else self._own.compose(side)
         normals = self._samples.normals if side is None else self._samples.normals @ side.rotation.T
         points = self._samples.points if side is None else side.apply(self._samples.points)
         samples = replace(self._samples, points=points, normals=normals).first(_ALIGNED_BY)
-        pose = align(samples, self._resting, how)[0].pose
-        return _Begin(outer.compose(pose.frame), np.zeros((self.system.K, 3)))
+        frames = [outer.compose(found.pose.frame) for found in align(samples, self._resting, how, keep)]
+        return [_Begin(frame, np.zeros((self.system.K, 3))) for frame in frames]
 
     def searched(self, side: Frame | None) -> list[_Begin]:
         """Where the template belongs on the shape, or on its mirror image, in another pose; none of what is no surface."""
@@ -170,16 +184,25 @@ class _Task:
         pose: RigidPose = align(replace(samples, points=points, normals=normals), self._resting, "near")[0].pose
         return _Begin(start.frame.compose(pose.frame), np.zeros((self.system.K, 3)))
 
-    def best(self, sides: Sequence[Frame | None]) -> _Fitted:
-        """The best fit of the shape; or of its mirror image, if that fits clearly better."""
+    def best(self, sides: Sequence[Frame | None]) -> tuple[_Fitted, float]:
+        """The best fit of the shape; or of its mirror image, if that fits clearly better. And its `Fit.side`."""
         found = [self.fitted(self.turned(side)) for side in sides]
-        found[0] = _clearly_better(found[0], self.fitted(self.turned(None, "near")), _TURNED)
+        if sides[0] is None:
+            found[0] = _clearly_better(found[0], self.fitted(self.turned(None, "near")), _TURNED)
         if not any(each.alike for each in found):
             for number, side in enumerate(sides):
                 for begin in self.searched(side):
                     found[number] = _clearly_better(self.fitted(begin), found[number], _SEARCHED)
-        plain, *other = found
-        return _clearly_better(other[0], plain, _TURNED) if other else plain
+        if len(found) == 1:
+            return found[0], 0.0
+        plain, other = found
+        best = _clearly_better(other, plain, _TURNED)
+        return best, float(np.log((plain if best is other else other).energy / best.energy))
+
+    def best_part(self, sides: Sequence[Frame | None]) -> _Fitted:
+        """The best fit of a part, of either side."""
+        begins = [begin for side in sides for begin in self.turns(side, keep=_TURNS)]
+        return min((self.fitted(begin) for begin in begins), key=attrgetter("energy"))
 
     def best_from(self, start: Fit) -> _Fitted:
         """The best fit from where another template of the same vertices was fitted."""
@@ -188,7 +211,7 @@ class _Task:
             return found
         ambiguous = tuple(reason for reason in start.reasons if reason.code == "ambiguous")
         vectors = self.onto(np.arange(len(start.points)), start.points)
-        moved = self.fitted(_Begin(start.frame, vectors, 1.0, ambiguous))
+        moved = self.fitted(_Begin(start.frame, vectors, start.trust, ambiguous))
         return _clearly_better(moved, found, _SEARCHED)
 
 
@@ -198,20 +221,36 @@ def _clearly_better(one: _Fitted, other: _Fitted, factor: float) -> _Fitted:
 
 
 def fit_without_model(
-    template: Template, shape: Shape, config: ViscousConfig | None = None, start: Fit | None = None, mirror: bool = True
+    template: Template,
+    shape: Shape,
+    config: ViscousConfig | None = None,
+    start: Fit | None = None,
+    mirror: bool = True,
+    other_side: bool = False,
+    whole: float | None = None,
 ) -> Fit:
     """Fit a template to a repaired shape; a mesh, or a cloud. Such a fit is fair at best, for nothing was learned of what
     corresponds.
 
     ``start`` is a fit of another template of the same vertices to this shape, from which this one begins. With ``mirror``
-    the shape may be the mirror image of what the template shows.
+    the shape may be the mirror image of what the template shows; with ``other_side`` it is the one that ``start`` is not.
+    Where ``whole`` is given, the sqrt(area) of a whole shape in the unit of the file, it may also be cut.
     """
     config, began = config or ViscousConfig(), time.monotonic()
     task = _Task(template, shape, config)
-    sides = (None, MIRROR) if mirror else (None,)
-    found = task.best(sides) if start is None else task.best_from(start)
+    if start is None:
+        found, lead = task.best((None, MIRROR) if mirror else (None,))
+    elif other_side:
+        found, lead = task.best((None if start.frame.mirrored else MIRROR,))[0], -start.side
+    else:
+        found, lead = task.best_from(start), start.side
+    partial = False
+    if whole is not None:
+        part = _Task(template, shape, config, whole).best_part((None, MIRROR) if mirror else (None,))
+        partial = part.energy < _PART * found.energy
+        found = part if partial else found
     system, frame, residual = task.system, found.begin.frame, found.features.residual
-    judged = judge(compute_features(system, found.vectors, found.samples, residual, template.labels))
+    judged = judge(compute_features(system, found.vectors, found.samples, residual, template.labels, partial))
     unsure = Reason("unsupervised", "fitted without a trained model: surfaces that lie close need not correspond")
     notes = ("taken for the mirror image of the template",) if frame.mirrored else ()
     fit = judged_fit(
@@ -226,9 +265,14 @@ def fit_without_model(
         seed=config.seed,
         model=NO_MODEL,
         notes=notes,
+        side=lead,
+        partial=partial,
     )
-    fit = cap_verdict(fit, [*(reason for reason in found.begin.doubts if reason.code == "ambiguous"), unsure])
+    # The trust is that of the fit itself: a collection compares it with others.
+    trust = min(fit.trust, found.begin.trust)
+    doubts = (reason for reason in found.begin.doubts if reason.code == "ambiguous")
+    fit = replace(cap_verdict(fit, [*doubts, unsure]), trust=trust)
     if found.begin.trust >= _LOST:
         return fit
-    lost = Reason("unsupervised", "no pose of the template is clearly right for this shape")
-    return replace(fit, verdict="poor", reasons=(lost, *fit.reasons), trust=min(fit.trust, found.begin.trust))
+    lost = Reason("doubt", "no pose of the template is clearly right for this shape")
+    return replace(fit, verdict="poor", reasons=(lost, *fit.reasons))

@@ -164,6 +164,21 @@ class Places:
         return cKDTree(np.concatenate(columns, 1)[self._points])
 
 
+def surface_distance(shape: Shape, fit: Fit) -> tuple[float, float]:
+    """How far a shape and its fitted template lie apart, on average over both surfaces and at most, in the unit of its file.
+
+    Of a part, and of a cloud, only from there to the template.
+    """
+    ways = [(closest_footpoints(shape, fit).distance, shape.vertex_areas)]
+    if not (fit.partial or shape.is_cloud):
+        points, normals = in_core_frame(shape, fit)
+        facing = vertex_normals(fit.points, fit.faces)
+        back = Surface(points, shape.faces, normals).query(fit.points, facing).distance
+        ways.append((back, vertex_areas(fit.points, fit.faces)))
+    mean = np.mean([np.average(distance, weights=weights) for distance, weights in ways])
+    return fit.frame.scale * float(mean), fit.frame.scale * float(max(distance.max() for distance, _ in ways))
+
+
 def heights(shape: Shape, fit: Fit, foot: Footpoints) -> Float[Floats, " V"]:
     """How far the vertices of a shape lie above their footpoints on the fitted template, at most `_HIGH` either way."""
     above = in_core_frame(shape, fit)[0] - foot.values(fit.faces, fit.points)

@@ -52,13 +52,16 @@ def test_what_is_said(fits: Path, run: Run) -> None:
         "verdict",
         "trust",
         "residual",
+        "distance",
         "up",
         "front",
         "vertices",
         "seconds",
     ]
     assert answer.err.count("verdict") == 1
-    assert re.search(r"^dancer +good +[01]\.\d\d +\d\.\d % +\+y +\+z +4,002 +\d+\.\d$", answer.err, re.MULTILINE)
+    assert re.search(
+        r"^dancer +good +[01]\.\d\d +\d\.\d % +0\.\d+ +\+y +\+z +4,002 +\d+\.\d$", answer.err, re.MULTILINE
+    )
     assert re.search("^empty +failed$", answer.err, re.MULTILINE)
     assert "warning: empty: not fitted: empty.obj is empty (0 bytes)" in answer.err
     assert f"wrote 2 fits to {fits} (model human): 2 good, 1 failed" in answer.err

@@ -1,5 +1,8 @@
 """The tutorials run from end to end, as they stand, and their pictures show something."""
 
+import csv
+import importlib
+import importlib.util
 import os
 import re
 import shlex
@@ -15,6 +18,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from meshmatch.cli import main
+from meshmatch.collections import settle
+from meshmatch.experiments.makers import bones
+from meshmatch.fitting import without_model
+from meshmatch.fitting.fit_config import Schedule
+from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.maps.files import load_map
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.dressed_files import save_textured
@@ -23,6 +31,7 @@ from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_rig import Clip, Rig, Track
 from meshmatch.shapes.formats.gltf_rigged import Binding, rigged
+from meshmatch.shapes.landmark_files import read_landmark_file
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance
 from tests.shapes.painted import quarters
@@ -31,16 +40,7 @@ from tests.transfer.rigs import played
 ROOT = Path(__file__).resolve().parents[2]
 WRITTEN = {
     "artist": {"before.png", "map.npz", "dressed.glb", "dressed.png", "confidence.png", "check.glb"},
-    "anatomist": {
-        "landmarks.csv",
-        "map.npz",
-        "match.png",
-        "child.csv",
-        "landmarks.png",
-        "landmarks.tps",
-        "meshes",
-        "tables",
-    },
+    "anatomist": {"fits"},
     "researcher": {"map.npz"},
 }
 
@@ -125,6 +125,66 @@ def test_two_files_become_a_walking_textured_dressed_character(tmp_path: Path, m
     away = cKDTree(skin.verts).query(jacket)[0] / np.sqrt(skin.area)
     assert len(jacket) > 50 and away.max() < 0.1
     assert Path("character.png").stat().st_size > 1000
+
+
+@pytest.fixture
+def small_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fits without a model on few nodes, of few samples: enough for small bones."""
+    schedule = Schedule(steps=10, prior=(1e-3, 1e-6), scale=(0.1, 0.02), damping=1e-6)
+    small = ViscousConfig(nodes=150, radius=0.18, faces=1200, samples=1500, back_points=800, schedule=schedule)
+    for module in (settle, without_model):
+        monkeypatch.setattr(module, "ViscousConfig", lambda: small)
+    monkeypatch.setattr(without_model, "_ALIGNED_BY", 300)
+
+
+@pytest.mark.filterwarnings("ignore::meshmatch.errors.MeshmatchWarning")
+def test_a_folder_of_bones_becomes_landmarks_statistics_and_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_fits: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In at most ten commands. Bones are drawn with their truth."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("meshmatch.render.picture.HEIGHT", 120)
+    page = (ROOT / "docs" / "anatomist.md").read_text(encoding="utf-8")
+    block = re.search(r"^```text\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    assert block is not None
+    first, *commands = block[1].splitlines()
+    assert len(commands) < 10
+    few = first.replace("--count 20", "--count 5").replace("--vertices 3000", "--vertices 400")
+    assert bones.main(shlex.split(few)[3:]) == 0 and few != first
+    quick = {"fit": ["--jobs", "1"], "atlas": ["--no-measures", "--permutations", "99"]}
+    for command in commands:
+        words = shlex.split(command)[1:]
+        assert main([*words, *quick.get(words[0], [])]) == 0, command
+    assert "surfaces lie 0." in capsys.readouterr().err
+    with open("fits/fits.csv", encoding="utf-8", newline="") as file:
+        fits = {row["name"]: row for row in csv.DictReader(file)}
+    with open("bones/table.csv", encoding="utf-8", newline="") as file:
+        known = {row["name"]: row for row in csv.DictReader(file)}
+    for name, row in fits.items():
+        assert row["verdict"] in ("good", "fair") and float(row["distance"]) < 0.5
+        assert (row["mirrored"] == "1") == (known[name]["side"] == "left")
+        if name == "bone-01":  # from which the landmarks are
+            continue
+        found, truth = (
+            np.array([place.where for place in read_landmark_file(Path(folder, name + suffix), name, "LPS").places])
+            for folder, suffix in (("landmarks", ".mrk.json"), ("bones/landmarks", ".csv"))
+        )
+        assert np.linalg.norm(found - truth, axis=1).mean() < 6.0  # of 100
+    terms = Path("atlas/anova.csv").read_text(encoding="utf-8")
+    assert "log(size)" in terms and "group" in terms
+    assert {"mean.png", "landmarks.tps"} <= {path.name for path in tmp_path.iterdir()}
+    tables = [path.name for path in Path("tables").iterdir()]
+    assert {"coords.csv", "metadata.csv"} == set(tables)
+    if importlib.util.find_spec("vtkmodules") is None:
+        return
+    vtk = importlib.import_module("vtkmodules.vtkIOXML")
+    for path, array in (("meshes/bone-01.vtp", None), ("originals/bone-02.vtp", "distance_to_mean")):
+        reader = vtk.vtkXMLPolyDataReader()
+        reader.SetFileName(path)
+        reader.Update()
+        read = reader.GetOutput()
+        assert read.GetNumberOfPolys() > 300
+        assert array is None or read.GetPointData().GetArray(array).GetNumberOfTuples() == read.GetNumberOfPoints()
 
 
 @pytest.mark.parametrize("page", ["fields", "training"])

@@ -22,20 +22,21 @@ ReasonCode = Literal[
     "side",
     "unsupervised",
     "ambiguous",
+    "outlier",
 ]
 """Template and shape stay apart; some of the shape is not reached; template lies where the shape has no surface;
 neighbours belong far apart; the template is stretched or compressed; it is folded, or inside out, in places; pieces of a
 part lie beside it; a part ends where the shape has no edge; a knee bends forward; the shape faces the other way; the network
 predicts other points for tilted and mirrored copies of the shape; no feature alone, but all together; it was taken for a
 part; its mirror image fits as well; the model was learned without
-correspondence, or there was none; other fits are equally good."""
+correspondence, or there was none; other fits are equally good; it stands out of its collection."""
 
 
 class Reason(str):
     """Why a verdict is not good: a string with a sentence to print, and a ``code`` to branch on.
 
     The codes are "residual", "unreached", "empty", "torn", "crushed", "folded", "pieces", "uncut", "bent", "facing",
-    "unsure", "doubt", "part", "side", "unsupervised" and "ambiguous".
+    "unsure", "doubt", "part", "side", "unsupervised", "ambiguous" and "outlier".
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol, TypeAlias
 
 import numpy as np
 from scipy.sparse import csc_matrix
@@ -29,6 +29,9 @@ Quadratic = tuple[Float[Floats, "V 6"], Float[Floats, "V 3"]]
 """Upper triangles (V, 6) of H_p and right-hand sides H_p s_p (V, 3) of template vertices p, see `NodeSystem.solve`."""
 
 
+OneSided: TypeAlias = Literal[False, True, "strictly"]
+
+
 class Term(Protocol):
     """Something that pulls at template vertices."""
 
@@ -41,12 +44,12 @@ class PairTerm:
     """Pairs of template vertices and samples, whose weights sum to about one and follow those of the samples.
 
     Where pairs are ``one_sided``, the samples show a part of the shape: template vertices without a partner are left to
-    the prior.
+    the prior. Where they are "strictly" so, only samples look for partners, and nothing is drawn to the edge of a cut.
     """
 
     samples: OrientedPoints  # core frame
     config: Pairing
-    one_sided: bool = False
+    one_sided: OneSided = False
 
     def quadratic(self, system: NodeSystem, vectors: Float[Floats, "K 3"], scale: float) -> Quadratic:
         surface, shared = system.surface(vectors), self.config.shared
@@ -88,7 +91,7 @@ class LandmarkTerm:
 
 
 def terms_of(
-    samples: OrientedPoints, config: Pairing, landmarks: Landmarks | None = None, one_sided: bool = False
+    samples: OrientedPoints, config: Pairing, landmarks: Landmarks | None = None, one_sided: OneSided = False
 ) -> list[Term]:
     """What pulls the template onto samples in the core frame, and to landmarks where there are any."""
     pairs = PairTerm(samples, config, one_sided)
@@ -96,7 +99,12 @@ def terms_of(
 
 
 def _nearest_pairs(
-    system: NodeSystem, samples: OrientedPoints, surface: OrientedPoints, scale: float, config: Pairing, one_sided: bool
+    system: NodeSystem,
+    samples: OrientedPoints,
+    surface: OrientedPoints,
+    scale: float,
+    config: Pairing,
+    one_sided: OneSided,
 ) -> Quadratic:
     """Pairs of what is nearest and faces the same way, in both directions, each with half of the weight."""
     moved, normals = surface.points, surface.normals
@@ -106,7 +114,9 @@ def _nearest_pairs(
     area = vertex_areas(moved, system.faces)
     forward = area / area.sum() * robust_weight(moved - partner, scale)
     forward *= _row_sums(normals * partner_normal) > config.normal_cosine
-    if one_sided:
+    if one_sided == "strictly":
+        forward *= 0.0
+    elif one_sided:
         forward *= np.linalg.norm(moved - partner, axis=1) < 3 * scale
 
     some = samples.thinned(config.back_points)

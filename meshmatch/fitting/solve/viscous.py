@@ -37,9 +37,19 @@ class ViscousConfig(Pairing):
 
 
 def viscous_vectors(
-    system: NodeSystem, samples: OrientedPoints, config: ViscousConfig, start: Float[Floats, "K 3"] | None = None
+    system: NodeSystem,
+    samples: OrientedPoints,
+    config: ViscousConfig,
+    start: Float[Floats, "K 3"] | None = None,
+    partial: bool = False,
 ) -> Float[Floats, "K 3"]:
-    """Node vectors that move the template onto the shape of the samples, from ``start``, or from where it rests."""
+    """Node vectors that move the template onto the shape of the samples, which may be a part of it, from ``start``, or from
+    where it rests.
+    """
     prior = ViscousGradient.over(system.verts[system.gradient_points], config.near)
-    problem = Problem(system=system, terms=terms_of(samples, config), schedule=config.schedule)
+    problem = Problem(
+        system=system,
+        terms=terms_of(samples, config, one_sided="strictly" if partial else False),
+        schedule=config.schedule,
+    )
     return minimise(problem, prior, np.zeros((system.K, 3)) if start is None else start)

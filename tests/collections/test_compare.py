@@ -1,0 +1,65 @@
+"""Fits are judged by what is usual in their collection; and sides, by what all of them show."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from meshmatch.collections.compare import Usual, on_the_other_side
+from meshmatch.collections.setting import Record
+from meshmatch.fitting.judge.reasons import Reason
+from tests.conftest import icosphere, some_fit
+
+UNSURE = Reason("unsupervised", "nothing was learned")
+
+
+def records(stretches: list[float], sides: list[float] | None = None) -> list[Record]:
+    leads = sides or [0.0] * len(stretches)
+    return [
+        Record(f"s{k}", "", "fair", residual=0.01, stretch=stretch, likely=0.99, side=side)
+        for k, (stretch, side) in enumerate(zip(stretches, leads, strict=True))
+    ]
+
+
+def test_what_is_stretched_as_the_others_is_good_and_what_stands_out_is_poor() -> None:
+    some = records([0.2, 0.22, 0.18, 0.21, 0.19, 0.5, 1.2])
+    usual = Usual.of(some)
+    assert usual is not None and usual.stretch == pytest.approx(0.21)
+    assert [usual.stands_out(each) for each in some] == [False] * 5 + [True] * 2
+    ball = icosphere(1)
+    fit = replace(some_fit(ball.verts, ball.faces), verdict="fair", reasons=(UNSURE,))
+    judged = [usual.judged(fit, each) for each in some]
+    assert [each.verdict for each in judged] == ["good"] * 5 + ["fair", "poor"]
+    assert [reason.code for each in judged for reason in each.reasons] == ["outlier"] * 2
+    assert "1.6-fold, 1.2-fold is usual" in judged[5].reasons[0]
+    trust = [each.trust for each in judged]
+    assert trust[0] > 0.9 > trust[5] > 0.5 > trust[6] > 0
+
+
+def test_more_of_a_residual_counts_and_what_a_fit_says_of_itself_stays() -> None:
+    some = records([0.2] * 6)
+    usual = Usual.of(some)
+    assert usual is not None
+    ball = icosphere(1)
+    fit = replace(some_fit(ball.verts, ball.faces), verdict="fair", reasons=(UNSURE,))
+    far = usual.judged(fit, replace(some[0], residual=0.03))
+    assert far.verdict == "poor" and "3.0 % of sqrt(area) apart" in far.reasons[0]
+    torn = replace(fit, reasons=(Reason("ambiguous", "two are as good"), UNSURE))
+    assert [reason.code for reason in usual.judged(torn, some[0]).reasons] == ["ambiguous"]
+    assert usual.judged(torn, some[0]).verdict == "fair"
+    assert usual.judged(replace(fit, verdict="poor"), some[0]).verdict == "poor"
+    assert usual.judged(fit, replace(some[0], likely=0.3)).verdict == "poor"
+
+
+def test_of_few_and_of_fits_that_do_not_say_nothing_is_usual() -> None:
+    assert Usual.of(records([0.2] * 4)) is None
+    assert Usual.of(records([np.nan] * 9)) is None
+
+
+def test_sides_are_taken_where_nearly_all_have_a_clear_one() -> None:
+    stretches = [0.2] * 6
+    clear = records(stretches, [0.3, 0.12, -0.1, 0.4, 0.25, -0.2])
+    assert on_the_other_side(clear) == {"s2", "s5"}
+    symmetric = records(stretches, [0.01, 0.02, -0.03, 0.01, -0.12, 0.09])
+    assert on_the_other_side(symmetric) == set()
+    assert on_the_other_side(clear[:3]) == set()
