@@ -17,7 +17,7 @@ from meshmatch.errors import InputError, MeshmatchError, ModelError, OptionError
 from meshmatch.fitting.classify import classify
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fitter import may_show_part
+from meshmatch.fitting.fitter import boundary_length, may_show_part
 from meshmatch.fitting.judge.category import FAMILIAR, KNOWN, SURE, category_residual, category_samples
 from meshmatch.models.card import ModelCard
 from meshmatch.models.registry import list_models
@@ -69,9 +69,10 @@ def category_residuals(
 ) -> Float[Floats, "M S"]:
     """`category_residual` of repaired shapes by models; infinite where a model cannot see a shape, or was not asked.
 
-    One shape decides first, if possible a whole one. The model of people, and the user's own, are asked about it, and the
-    others where none of these is ``sure``: two at a time, animals first, until one is. Models of its kind are then asked
-    about the other shapes, and the rest where they do not know them: but not about a part of something whose kind is known.
+    One shape decides first, if possible a whole one, or that with the shortest boundary. The model of people, and the
+    user's own, are asked about it, and the others where none of these is ``sure``: two at a time, animals first, until one
+    is. Models of its kind are then asked about the other shapes, and the rest where they do not know them: but not about a
+    part of something whose kind is known.
     """
     samples = parallel_map(category_samples, shapes, [config.seed for config in configs])
 
@@ -91,7 +92,11 @@ def category_residuals(
             found[place] = value
 
     parts = [_is_part(shape, config) for shape, config in zip(shapes, configs, strict=True)]
-    first, *others = sorted(range(len(shapes)), key=lambda number: shapes[number].is_cloud or parts[number])
+    lacking = [
+        np.inf if shape.is_cloud else part * boundary_length(shape) / np.sqrt(shape.area)
+        for shape, part in zip(shapes, parts, strict=True)
+    ]
+    first, *others = np.argsort(lacking, kind="stable").tolist()
     for rows in _order(models):
         ask(rows, [first])
         if found[:, first].min() <= sure:

@@ -208,6 +208,10 @@ def test_a_whole_shape_decides_before_a_part(monkeypatch: pytest.MonkeyPatch) ->
     half = ball("half 6 6 6", opened=True)
     for shapes in ([half, ball("man 3 7 7")], [ball("man 3 7 7"), half]):
         assert asked(monkeypatch, shapes, "yes") == ["human half", "human man", "own man"]
+    # of two with a boundary the one that lacks less
+    holed = Shape(half.verts, ball("").faces[trimesh.creation.icosphere(3).triangles_center[:, 2] > -0.7], "man 3 7 7")
+    for shapes in ([half, holed], [holed, half]):
+        assert asked(monkeypatch, shapes, "yes") == ["human half", "human man", "own man"]
     # a cloud may be of another kind
     found = asked(monkeypatch, [cloud("rough 6 6 6"), ball("man 3 7 7")])
     assert found == ["human man", "human rough", "own man", "own rough", "quadruped rough"]

@@ -71,7 +71,8 @@ class CandidateSettings:
     wide_shares : shares for which a wide search tries all frames
     wide_kept : one in so many of these, the best, is tried for the other shares
     ranking_samples, ranking_samples_if_wide : samples by which frames are ranked
-    careful, careful_if_wide : candidates of each share that are fitted with care, in a narrow and in a wide search
+    careful : candidates of each share that are fitted with care
+    worth_if_wide : multiple of the best residual up to which they are worth it in a wide search
     completed : candidates that are completed and fitted again: so many once, of these so many twice, and so many three times
     varied : candidates of which variants are sought
     coarse_samples : samples by which variants are compared, and visible vertices found
@@ -96,7 +97,7 @@ class CandidateSettings:
     ranking_samples: int = 768
     ranking_samples_if_wide: int = 512
     careful: int = 5
-    careful_if_wide: int = 5
+    worth_if_wide: float = 1.3
     completed: tuple[int, ...] = (10, 5, 3)
     varied: int = 1
     coarse_samples: int = 2048
@@ -271,8 +272,8 @@ def _careful(task: FitTask, wide: bool, progress: Progress) -> list[Candidate]:
         for k, candidate in zip(tried, rough, strict=False):
             best[k] = min(candidate.residual, best.get(k, np.inf))
         rough.sort(key=lambda candidate: candidate.residual)
-        count = SETTINGS.careful_if_wide if wide else SETTINGS.careful
-        careful = [(samples, each.pose) for each in rough[:count]]
+        limit = SETTINGS.worth_if_wide * rough[0].residual if wide else np.inf
+        careful = [(samples, each.pose) for each in rough[: SETTINGS.careful] if each.residual <= limit]
         found += [replace(fit, share=share) for fit in task.predictor.fit_all(careful, measure=one_way_residual)]
         progress((number + 1) / len(order))
     return found
