@@ -50,7 +50,7 @@ OWNERS = {
     "pymeshlab": {"shapes"},
     "rich": {"experiments", "cli"},
     "robust_laplacian": {"templates", "fitting", "maps"},
-    "safetensors": {"collections", "templates", "generators", "models", "training"},
+    "safetensors": {"maps", "templates", "generators", "models", "training"},
     "scipy": {
         *(
             "fields",
@@ -71,6 +71,7 @@ OWNERS = {
         "experiments",
     },
     "skimage": {"implicit", "experiments"},
+    "tensorboard": {"training"},
     "threadpoolctl": {"threads"},
     "torch": {"arrays", "generators", "fields", "models", "training", "fitting", "implicit", "experiments"},
     "trimesh": {"shapes", "fitting", "experiments"},
@@ -90,6 +91,7 @@ EXTRAS = (
     "train",
     "implicit",
     "cluster",
+    "tensorboard",
     "bench",
     "plots",
 )  # what the package imports only where it is installed

@@ -132,6 +132,14 @@ class TrainOptions(Options):
     workers: int | None = Option(None, min=0, help="Processes that generate batches; default: the preset's.")
     threads: Threads = 1
     seed: Seed = 0
+    validate: Path | None = optional(
+        "FOLDER",
+        "Measure on the registered shapes of another folder that `meshmatch prepare` wrote with the same template. "
+        "Default: on more of what is learned.",
+    )
+    tensorboard: bool = Option(
+        False, "--tensorboard", help="Also write curves for TensorBoard (needs the extra `tensorboard`)."
+    )
     picture: Path | None = optional("FILE", "Plot the losses of this run: .png, .svg or .pdf.")
     fresh: bool = Option(False, "--fresh", help="Start again instead of continuing from the folder's checkpoint.")
 
@@ -214,7 +222,8 @@ def _by_template(output: Path, how: TrainOptions, console: Console) -> tuple[int
     training_device(wanted=recipe.train.device)  # before shapes are made
     facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, start or how.start)
     shapes, kind = fitted or how.shapes, _generated(how)
-    return recipe.train.steps, partial(training.train, output, shapes=shapes, kind=kind, recipe=recipe, facts=facts)
+    learn = partial(training.train, output, shapes=shapes, kind=kind, recipe=recipe, facts=facts)
+    return recipe.train.steps, partial(learn, validation=how.validate, tensorboard=how.tensorboard)
 
 
 def _implicit(output: Path, how: TrainOptions, console: Console) -> tuple[int, Callable[..., Any]]:

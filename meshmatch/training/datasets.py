@@ -119,7 +119,8 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
         # The roughly right frame in which the encoder works: x_core = S R^T (x - t) + shift.
         if self.scan.upright:
             t = points.mean(1)
-            turn, shift = scans.yaw_rotations(B, generator), torch.zeros(B, 1, 3)
+            turn = scans.yaw_rotations(B, generator) if self.scan.yaw else torch.eye(3).expand(B, 3, 3)
+            shift = torch.zeros(B, 1, 3)
         else:
             turn = small_rotations(B, generator) @ R.transpose(1, 2)
             shift = 0.03 * torch.randn(B, 1, 3, generator=generator)

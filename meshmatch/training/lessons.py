@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from meshmatch.errors import OptionError
+from meshmatch.errors import InputError, OptionError
 from meshmatch.generators.bodies import Bodies
 from meshmatch.generators.characters import people_source
 from meshmatch.generators.generator import Source, shipped_template
@@ -100,6 +100,25 @@ def check_start(start: TrainedModel, template: Template | None, recipe: Recipe) 
     if other := [name for name, equal in same.items() if not equal]:
         hint = f"fit your shapes with it (`meshmatch fit ... --model {start.card.name}`), and train on the fits"
         raise OptionError(f"model {start.card.name} has another {' and another '.join(other)}", hint)
+
+
+def measured_on(shapes: str | Path | RegisteredShapes | None, learned: Lessons) -> Lessons:
+    """The same lessons, measured on other registered shapes if there are some.
+
+    `InputError` for a folder that is not prepared, or for another template; `OptionError` where learning needs no
+    correspondence, and is measured without.
+    """
+    if shapes is None:
+        return learned
+    if isinstance(learned.source, ShapeSamples):
+        raise OptionError("learning without correspondence is not measured on registered shapes", "leave them out")
+    if isinstance(shapes, RegisteredShapes):
+        verts = np.asarray(shapes.verts, np.float32)
+        if shapes.template.hash != learned.template.hash:
+            raise InputError(f"{shapes.name}: these are fits of another template", "fit them with the same model")
+    else:
+        verts = read_registered(shapes, learned.template)
+    return replace(learned, unseen=registered_source(torch.from_numpy(verts)))
 
 
 def kind_named(name: str) -> Kind | Bodies:

@@ -7,7 +7,8 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -252,6 +253,16 @@ class Trainer:
         """Part from the other processes, if there are any; nothing more can be trained."""
         if self.world > 1 and dist.is_initialized():
             dist.destroy_process_group()
+
+    @contextmanager
+    def averaged(self) -> Iterator[None]:
+        """The model with the averaged weights, within the block."""
+        before = {n: t.detach().clone() for n, t in self.model.state_dict().items()}
+        self.model.load_state_dict(self.averaged_state())
+        try:
+            yield
+        finally:
+            self.model.load_state_dict(before)
 
     def averaged_state(self) -> dict[str, Tensor]:
         """State dict of the model with the averaged weights, on the CPU."""

@@ -115,7 +115,7 @@ def paper() -> Recipe:
     1,000 shapes, which are drawn once. The template has its 300 nodes, each with a radius of a fifth of the diameter.
     """
     train = TrainConfig(steps=75_000, shapes=16, scans_per_shape=1, **_PLAIN_ADAM)
-    clean = dict.fromkeys(("noise", "holes", "outliers", "partial", "density", "bumps", "scale"), 0.0)
+    clean: dict[str, Any] = dict.fromkeys(("noise", "holes", "outliers", "partial", "density", "bumps", "scale"), 0.0)
     scan = ScanConfig(3000, upright=True, sphere=True, **clean)
     return Recipe(PAPER, train, scan, "cubic", template="human-T-300", bodies=1000)
 

@@ -19,7 +19,8 @@ class ScanConfig:
 
     ``holes``, ``outliers``, ``partial`` are shares of the scans: with holes; with up to 10 % outliers; seen
     from one side or cut by a plane. ``upright``: scans stand in the category's own axes, centred, turned about
-    the vertical only (the paper); otherwise roughly in the core frame, where an aligner puts them.
+    the vertical only (the paper), without ``yaw`` not at all; otherwise roughly in the core frame, where an aligner puts
+    them.
     ``outside`` is the share of scans that show only what is seen from outside, not what lies inside clothes or between
     parts; ``strays`` that of scans with something else in them: a thing that is held, a base, a sheet.
     ``sphere``: shapes are scaled to the template's radius around its centroid (the paper) instead of to area 1.
@@ -36,6 +37,7 @@ class ScanConfig:
     outside: float = 0.0
     strays: float = 0.0
     upright: bool = False
+    yaw: bool = True
     sphere: bool = False
 
 

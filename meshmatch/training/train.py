@@ -6,9 +6,7 @@ How a folder is learned is decided by `meshmatch.training.recipes.recipe_for`.
 from __future__ import annotations
 
 import datetime
-import json
 from collections.abc import Callable
-from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +17,7 @@ import torch
 from torch import Tensor
 
 from meshmatch.arrays import Float, Int, Ints
-from meshmatch.errors import InputError, OptionError, OutputError, TemplateError
+from meshmatch.errors import InputError, OptionError, TemplateError
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import has_nodes, shape_functions
 from meshmatch.generators.bodies import Bodies
@@ -32,7 +30,7 @@ from meshmatch.models.deformer import Deformer
 from meshmatch.models.network import NetworkConfig
 from meshmatch.models.registry import CARD, NO_MODEL, TEMPLATE, WEIGHTS, load_model
 from meshmatch.models.trained import TrainedModel
-from meshmatch.outputs import make_folder, replace_on_success
+from meshmatch.outputs import make_folder
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.prepared_folder import RegisteredShapes, ShapeSamples
@@ -43,14 +41,16 @@ from meshmatch.training.alone import alone
 from meshmatch.training.datasets import BatchDataset, CloudDataset, build_lattice
 from meshmatch.training.facts import CardFacts as CardFacts
 from meshmatch.training.facts import inherited
-from meshmatch.training.lessons import Lessons, check_start, kind_named, lessons, template_of
+from meshmatch.training.lessons import Lessons, check_start, kind_named, lessons, measured_on, template_of
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.losses import LossPoints, SurfacePoints, held_out_error
 from meshmatch.training.recipe_files import recipe_record
 from meshmatch.training.recipes import Recipe, going_on, recipe_for, small_data
+from meshmatch.training.records import CURVES, METRICS, Metrics, Report, check_curves, curves, in_turn
 from meshmatch.training.scans import ScanConfig
 
-METRICS = "metrics.jsonl"
+BEST = "best"
+"""The folder of the model with the lowest validation error so far."""
 VALIDATION_SEED = 999_983
 """Of the batch that no training sees and every training is measured on."""
 
@@ -63,13 +63,16 @@ def train(
     recipe: Recipe | None = None,
     facts: CardFacts | None = None,
     resume: bool = True,
+    validation: str | Path | RegisteredShapes | None = None,
+    tensorboard: bool = False,
     progress: ProgressCallback | None = None,
     report: Callable[[StepReport], None] | None = None,
 ) -> Path:
     """Train a model, or go on training it from the checkpoint in its folder, exactly.
 
     The folder receives ``checkpoint/last.safetensors`` and ``metrics.jsonl`` on the way and, at every stop,
-    ``template.safetensors``, ``weights.safetensors`` and last ``card.json``.
+    ``template.safetensors``, ``weights.safetensors`` and last ``card.json``; and in ``best`` the same of the model with the
+    lowest validation error, which is measured every 500 steps.
 
     Parameters
     ----------
@@ -87,6 +90,11 @@ def train(
         What the card says of the model: name, category, licence.
     resume
         Go on from a checkpoint if there is one.
+    validation
+        Registered shapes to measure on, which the training does not see: a folder that `prepare` made with the same
+        template, or fits as for ``shapes``. By default more of what is learned.
+    tensorboard
+        Also write curves for TensorBoard (the extra ``tensorboard``), into the folder ``tensorboard``.
     progress
         As in `match`.
     report
@@ -100,9 +108,9 @@ def train(
     Raises
     ------
     InputError
-        The folder is not prepared or has too few shapes.
+        A folder is not prepared, or has too few shapes.
     OptionError
-        Choices do not go together, or the extra ``train`` is not installed.
+        Choices do not go together, or the extra ``train`` or ``tensorboard`` is not installed.
     ModelError
         The name cannot be one, or the checkpoint is of another training.
     TemplateError
@@ -134,26 +142,33 @@ def train(
     if start is not None:
         check_start(start, template_of(shapes, kind, recipe, start), recipe)  # shapes may take minutes to make
 
-    def both(now: StepReport) -> None:
+    if tensorboard:
+        check_curves()
+
+    def told(now: StepReport) -> None:
         if progress is not None:
             progress(now.words, "training", now.step / now.steps)
-        if report is not None:
-            report(now)
 
     making = Progress(progress, "shapes").stage("making shapes (once)")
-    return _learn(output, facts, recipe, resume, both, lambda: lessons(shapes, kind, recipe, making))
+
+    def make() -> Lessons:
+        return measured_on(validation, lessons(shapes, kind, recipe, making))
+
+    return _learn(output, facts, recipe, resume, in_turn(told, report), tensorboard, make)
 
 
 @alone
 def _learn(
-    output: str | Path, facts: CardFacts, recipe: Recipe, resume: bool, report: Callable[[StepReport], None],
+    output: str | Path, facts: CardFacts, recipe: Recipe, resume: bool, report: Report, tensorboard: bool,
     make: Callable[[], Lessons],
 ) -> Path:  # fmt: skip
     """What `train` does once its folder is its own."""
     learned = make()
     facts = replace(facts, category=facts.category or learned.category or facts.name, data=facts.data or learned.data)
     facts = replace(facts, frame=facts.frame or learned.frame, mirror=facts.mirror or learned.mirror)
-    return train_model(learned.template, learned.source, output, recipe, facts, resume, report, learned.unseen)
+    return train_model(
+        learned.template, learned.source, output, recipe, facts, resume, report, learned.unseen, tensorboard
+    )
 
 
 def train_model(
@@ -165,6 +180,7 @@ def train_model(
     resume: bool = True,
     report: Callable[[StepReport], None] | None = None,
     unseen: Source | None = None,
+    tensorboard: bool = False,
 ) -> Path:
     """`train` on shapes with the template's vertices, validated on ``unseen`` ones or on more of the same, or on samples
     without correspondence; returns the folder.
@@ -210,41 +226,29 @@ def train_model(
         for name in ("encoder", "aligner"):  # what reads the batches are copies (see `build_dataset`)
             if (reader := getattr(data, name, None)) is not None:
                 reader.load_state_dict(getattr(trainer.model, name).state_dict())
+
+    def error(_: Deformer) -> float:
+        """Of the averaged weights, which the model will have."""
+        with trainer.averaged():
+            return held_out_error(trainer.model, held_out, trainer.points)
+
+    def keep(score: float | None) -> None:
+        if score is not None and metrics.is_best(score):
+            make_folder(output / BEST)
+            export(trainer, template, output / BEST, recipe, facts, score)
+
     if trainer.rank == 0:
-        report = logged(output / METRICS, trainer, report)
-    trainer.run(data, checkpoint, report, lambda model: held_out_error(model, held_out, trainer.points))
+        metrics = Metrics(output / METRICS, trainer)
+        drawn = curves(output / CURVES, trainer.step) if tensorboard else None
+        report = in_turn(metrics, drawn, report, lambda now: keep(now.validation))
+    trainer.run(data, checkpoint, report, error)
     trainer.close()
     if trainer.rank == 0:
-        trainer.model.load_state_dict(trainer.averaged_state())
-        export(trainer, template, output, recipe, facts, held_out_error(trainer.model, held_out, trainer.points))
+        score = error(trainer.model)
+        if (output / BEST).is_dir():
+            keep(score)
+        export(trainer, template, output, recipe, facts, score)
     return output
-
-
-def logged(path: Path, trainer: Trainer, report: Callable[[StepReport], None] | None) -> Callable[[StepReport], None]:
-    """A report that also adds a line to a file: JSON with step, rate, seconds of all runs, terms of the loss, validation.
-
-    Of a file from before, lines of steps that are done again are dropped. `OutputError` if it cannot be written.
-    """
-    kept = []
-    with suppress(OSError, ValueError):
-        lines = path.read_text(encoding="utf-8").splitlines() if trainer.step else []
-        kept = [line for line in lines if json.loads(line)["step"] <= trainer.step]
-    with replace_on_success(path) as temporary:
-        temporary.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
-
-    def both(now: StepReport) -> None:
-        record = {"step": now.step, "rate": now.rate, "seconds": round(trainer.seconds, 3), **now.terms}
-        record |= {} if now.validation is None else {"validation": now.validation}
-        try:
-            with path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(record) + "\n")
-        except OSError as error:
-            hint = "the same command goes on from the last checkpoint"
-            raise OutputError(f"cannot write {path}: {error.strerror}", hint) from error
-        if report is not None:
-            report(now)
-
-    return both
 
 
 def export(trainer: Trainer, template: Template, output: Path, recipe: Recipe, facts: CardFacts, score: float) -> None:

@@ -117,6 +117,12 @@ def test_upright_scans_turn_about_the_vertical_alone(egg: Template) -> None:
         assert torch.allclose(points.mean(0), torch.zeros(3), atol=1e-5)
 
 
+def test_upright_scans_without_yaw_stand_as_the_template(egg: Template) -> None:
+    (targets, *_) = still(egg, replace(UPRIGHT, yaw=False))[0].targets
+    rest = egg.shape.verts[loss_vertices(egg, 1000)]
+    assert np.allclose(kabsch(rest, targets.double().numpy()).rotation, np.eye(3), atol=1e-4)
+
+
 def test_several_scans_of_one_shape_differ(egg: Template, network: Deformer) -> None:
     batch = small_data(egg, network)[0]
     assert not torch.equal(batch.points[0], batch.points[1])

@@ -1,8 +1,11 @@
 """From a folder of registered shapes to a model that loads, and on from there."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,9 +32,10 @@ from meshmatch.templates.prepared_folder import RegisteredShapes, read_registere
 from meshmatch.templates.template import Template, read_template
 from meshmatch.training.datasets import registered_source
 from meshmatch.training.lessons import template_of
-from meshmatch.training.loop import StepReport, TrainConfig
+from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.losses import CorrespondenceLoss
 from meshmatch.training.recipes import Recipe, default, going_on, paper, people, recipe_for
+from meshmatch.training.records import curves
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.train import CardFacts, train, train_model
 from tests.generators.stick import stick_figure
@@ -105,6 +109,63 @@ def test_a_folder_becomes_a_model(prepared: Path, tmp_path: Path, chosen: Recipe
     points = torch.randn(2, 50, 3, generator=torch.Generator().manual_seed(0)) * 0.2
     assert model.network(points).shape == (2, model.template.K, 3)
     assert not model.network.training
+
+
+def test_the_best_model_so_far_is_kept_beside_the_last(prepared: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    scores = iter([0.3, 0.2, 0.25, 0.5])  # of three validations on the way, and at the end
+    monkeypatch.setattr("meshmatch.training.train.held_out_error", lambda *_: next(scores))
+    run = Trainer.run
+    monkeypatch.setattr(Trainer, "run", lambda *args: run(*args, every=1))  # validated every ten steps
+    folder = trained(prepared, tmp_path / "model", SMALL.changed(steps=30))
+    best, last = load_model(folder / "best").card, load_model(folder).card
+    assert (best.steps, last.steps) == (20, 30)
+    assert [each.metrics["validation"]["distance"] for each in (best, last)] == [0.2, 0.5]
+    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert [row["validation"] for row in rows if "validation" in row] == [0.3, 0.2, 0.25]
+
+
+def test_another_folder_can_be_measured_on(prepared: Path, tmp_path: Path) -> None:
+    usual = trained(prepared, tmp_path / "usual")
+    template = read_template(prepared / "template.safetensors")
+    flat = RegisteredShapes(template, read_registered(prepared, template)[:1] * [1, 0.5, 1], "flat", "none")
+    there = trained(prepared, tmp_path / "there", validation=flat)
+    card, other = load_model(usual).card, load_model(there).card
+    assert card.weights_sha256 == other.weights_sha256 and card.metrics != other.metrics
+    assert (
+        load_model(trained(prepared, tmp_path / "same", validation=prepared)).card.weights_sha256 == card.weights_sha256
+    )
+    other_template = replace(flat, template=replace(template, core=template.core[:-1]))
+    for wrong, error in ((tmp_path / "usual", "not a prepared folder"), (other_template, "another template")):
+        with pytest.raises(InputError, match=error):
+            trained(prepared, tmp_path / "wrong", validation=wrong)
+
+
+def test_tensorboard_is_asked_for_before_shapes_are_made(prepared: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
+    with pytest.raises(OptionError, match="needs tensorboard") as caught:
+        trained(prepared, tmp_path / "model", tensorboard=True)
+    assert "meshmatch[tensorboard]" in caught.value.hint and not (tmp_path / "model").exists()
+
+
+def test_curves_have_the_numbers_of_the_reports(tmp_path: Path, monkeypatch: Any) -> None:
+    drawn: list[tuple[str, float, int]] = []
+
+    class Writer:
+        def __init__(self, folder: Path, purge_step: int) -> None:
+            assert (folder, purge_step) == (tmp_path, 51)
+
+        def add_scalar(self, name: str, value: float, step: int) -> None:
+            drawn.append((name, value, step))
+
+        def flush(self) -> None:
+            pass
+
+    monkeypatch.setitem(sys.modules, "tensorboard", ModuleType("tensorboard"))
+    board = ModuleType("torch.utils.tensorboard")
+    board.SummaryWriter = Writer  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", board)
+    curves(tmp_path, 50)(StepReport(100, 200, 1e-3, 1.0, {"total": 2.0}, 0.5))
+    assert drawn == [("rate", 1e-3, 100), ("loss/total", 2.0, 100), ("validation", 0.5, 100)]
 
 
 def test_batches_are_drawn_on_the_cpu_wherever_the_model_is() -> None:

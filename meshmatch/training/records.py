@@ -1,0 +1,88 @@
+"""What a training writes about itself while it runs: a line in metrics.jsonl for each report, and curves for TensorBoard."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from meshmatch.errors import OutputError, needs
+from meshmatch.outputs import replace_on_success
+from meshmatch.training.loop import StepReport, Trainer
+
+METRICS = "metrics.jsonl"
+CURVES = "tensorboard"
+Report = Callable[[StepReport], None]
+
+
+class Metrics:
+    """Reports as lines of JSON: step, rate, seconds of all runs, terms of the loss, validation.
+
+    Of a file from before, lines of steps that are done again are dropped. ``best`` is the lowest validation error in it.
+    `OutputError` if it cannot be written.
+    """
+
+    def __init__(self, path: Path, trainer: Trainer) -> None:
+        self.path, self.trainer, kept = path, trainer, []
+        known = []
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            for line in path.read_text(encoding="utf-8").splitlines() if trainer.step else []:
+                row = json.loads(line)
+                if row["step"] <= trainer.step:
+                    kept.append(line)
+                    known += [float(row["validation"])] if "validation" in row else []
+        self.best = min(known, default=float("inf"))
+        with replace_on_success(path) as temporary:
+            temporary.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+
+    def __call__(self, now: StepReport) -> None:
+        record = {"step": now.step, "rate": now.rate, "seconds": round(self.trainer.seconds, 3), **now.terms}
+        record |= {} if now.validation is None else {"validation": now.validation}
+        try:
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(record) + "\n")
+        except OSError as error:
+            hint = "the same command goes on from the last checkpoint"
+            raise OutputError(f"cannot write {self.path}: {error.strerror}", hint) from error
+
+    def is_best(self, score: float) -> bool:
+        """Whether an error is the lowest so far, and remember it."""
+        lower = score < self.best
+        self.best = min(score, self.best)
+        return lower
+
+
+def curves(folder: Path, step: int) -> Report:
+    """A report that draws its numbers as TensorBoard's curves, from a step on; `OptionError` if that is not installed."""
+    check_curves()
+    from torch.utils.tensorboard import SummaryWriter
+
+    writer: Any = SummaryWriter(folder, purge_step=step + 1)
+
+    def draw(now: StepReport) -> None:
+        numbers = {"rate": now.rate} | {f"loss/{name}": value for name, value in now.terms.items()}
+        numbers |= {} if now.validation is None else {"validation": now.validation}
+        for name, value in numbers.items():
+            writer.add_scalar(name, value, now.step)
+        writer.flush()
+
+    return draw
+
+
+def check_curves() -> None:
+    """`OptionError` if TensorBoard is not installed."""
+    with needs("tensorboard", "tensorboard"):
+        import tensorboard  # noqa: F401
+
+
+def in_turn(*reports: Report | None) -> Report:
+    """A report that makes several, in this order."""
+
+    def each(now: StepReport) -> None:
+        for report in reports:
+            if report is not None:
+                report(now)
+
+    return each
