@@ -9,7 +9,7 @@ from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, overload
 
 import numpy as np
 
@@ -27,17 +27,18 @@ from meshmatch.api.inputs import (
     validated,
 )
 from meshmatch.api.results import MatchResult, map_of_fits, shape_of
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter, check_landmarks, fits_with_landmarks
 from meshmatch.maps.build import judged_by_pairs
+from meshmatch.maps.places import PlacedFit
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
-from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes
+from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes, check_list
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map, thread_limit, worker_slot
@@ -142,8 +143,32 @@ class Matcher:
         """
         return self.fit_all([shape], config)[0]
 
-    def fit_all(self, shapes: Sequence[ShapeLike], config: FitConfig | Sequence[FitConfig] | None = None) -> list[Fit]:
-        """Fit the template to several shapes, some at once; where one fails, the others stop.
+    @overload
+    def fit_all(
+        self,
+        shapes: Sequence[ShapeLike],
+        config: FitConfig | Sequence[FitConfig] | None = None,
+        *,
+        errors: Literal["raise"] = "raise",
+    ) -> list[Fit]: ...
+
+    @overload
+    def fit_all(
+        self,
+        shapes: Sequence[ShapeLike],
+        config: FitConfig | Sequence[FitConfig] | None = None,
+        *,
+        errors: Literal["return"],
+    ) -> list[Fit | MeshmatchError]: ...
+
+    def fit_all(
+        self,
+        shapes: Sequence[ShapeLike],
+        config: FitConfig | Sequence[FitConfig] | None = None,
+        *,
+        errors: Literal["raise", "return"] = "raise",
+    ) -> list[Fit] | list[Fit | MeshmatchError]:
+        """Fit the template to several shapes, some at once.
 
         Parameters
         ----------
@@ -151,6 +176,10 @@ class Matcher:
             Each as in `match`.
         config
             One for all shapes, or one for each.
+        errors
+            Where a shape cannot be read or fitted, "raise" stops all others; with "return" its error takes the place of
+            its fit. Files are then read one by one, when it is their turn, and ``progress`` is also told how many shapes
+            are done (stage "shapes"). For thousands of files, from which a stopped run is to go on, see `Collection`.
 
         Returns
         -------
@@ -162,11 +191,15 @@ class Matcher:
         MeshmatchError
             As for `fit`.
         """
+        if errors not in ("raise", "return"):
+            raise OptionError(f"errors cannot be {errors!r}", "choose raise or return")
+        if errors == "return":
+            check_list(shapes)
+            return self._fit_each(shapes, configs_for(config or self.config, len(shapes)))
         clean = [usable(shape) for shape in as_shapes(shapes)]
-        configs = configs_for(config or self.config, len(clean))
-        clean, kinds, begun = self._choose(clean, configs)
-        fits = self._fit_all(clean, configs, begun)
-        return [replace(fit, notes=(*kind, *fit.notes)) for kind, fit in zip(kinds, fits, strict=True)]
+        # one fit alone may have all threads that were asked for; several have one each
+        inner = self._asked_threads if len(clean) == 1 else 1
+        return self._fit_chosen(clean, configs_for(config or self.config, len(clean)), self.threads, inner)
 
     def follow(self, shape: ShapeLike, last: Fit) -> Fit:
         """Fit the next frame of a sequence, starting from the fit of the last one; from nothing where tracking is lost.
@@ -230,7 +263,7 @@ class Matcher:
         agree
             Refine both fits together first, so that the template stretches alike, as `match` does: a more accurate map,
             and a confidence that knows where the fits disagreed. Without it the fits are only composed, in a tenth of
-            the time.
+            the time; so are fits of a `Collection`, which have agreed already, and know the shapes' vertices no more.
 
         Returns
         -------
@@ -247,6 +280,7 @@ class Matcher:
                 if not isinstance(fit, Fit):
                     hint = "fit each shape with Matcher.fit; or call match with the shapes themselves"
                     raise OptionError(f"a map is made from fits, not from {type(fit).__name__}", hint)
+            agree = agree and not any(isinstance(fit, PlacedFit) for fit in (source, target))
             fits = self._agreed((source, target)) if agree else (source, target)
             return map_of_fits(fits, (source, target), self.threads)
 
@@ -288,7 +322,7 @@ class Matcher:
             check_landmarks(self.model)
             pairs = landmark_vertices(clean, landmarks, configs)  # before the long work
         with thread_limit(1):
-            fits = self._fit_all(clean, configs, begun)
+            fits = self._fit_all(clean, configs, begun, self.threads)
             known = None
             if landmarks is not None:
                 clean = [shape_of(fit) for fit in fits]
@@ -345,8 +379,51 @@ class Matcher:
 
         return fit_of_parts(self.model, clean, config, progress) or (whole, clean)
 
-    def _fit_all(self, clean: Sequence[Repaired], configs: Sequence[FitConfig], begun: Sequence[_Begun]) -> list[Fit]:
-        stop, slots = threading.Event(), threading.Semaphore(self.threads)
+    def _fit_each(self, shapes: Sequence[ShapeLike], configs: Sequence[FitConfig]) -> list[Fit | MeshmatchError]:
+        """What becomes of each shape: a fit or an error."""
+        done, counting, stop = 0, threading.Lock(), threading.Event()
+
+        def one(number: int) -> Fit | MeshmatchError:
+            nonlocal done
+            found: Fit | MeshmatchError
+            try:
+                clean = usable(as_shape(shapes[number], f"shape {number + 1}"))
+                found = self._fit_chosen([clean], [configs[number]], 1, stop=stop)[0]
+            except MeshmatchError as error:
+                found = error
+            with counting:
+                done += 1
+                if self.progress is not None:
+                    self.progress("shapes", f"{done} of {len(shapes)}", done / len(shapes))
+            return found
+
+        with thread_limit(1):
+            return parallel_map(one, range(len(shapes)), threads=self.threads, stop=stop)
+
+    def _fit_chosen(
+        self,
+        clean: Sequence[Repaired],
+        configs: Sequence[FitConfig],
+        threads: int,
+        inner: int = 1,
+        stop: threading.Event | None = None,
+    ) -> list[Fit]:
+        """Fits by the model that the shapes choose, with what is to be said of the choice."""
+        clean, kinds, begun = self._choose(clean, configs)
+        fits = self._fit_all(clean, configs, begun, threads, inner, stop)
+        return [replace(fit, notes=(*kind, *fit.notes)) for kind, fit in zip(kinds, fits, strict=True)]
+
+    def _fit_all(
+        self,
+        clean: Sequence[Repaired],
+        configs: Sequence[FitConfig],
+        begun: Sequence[_Begun],
+        threads: int,
+        inner: int = 1,
+        stop: threading.Event | None = None,
+    ) -> list[Fit]:
+        """Fits by so many threads, each with ``inner`` of the numerical libraries, until ``stop`` is set."""
+        stop, slots = stop or threading.Event(), threading.Semaphore(threads)
         names = [part.shape.name for part in clean]
         labels = [f"{name} ({number + 1})" if names.count(name) > 1 else name for number, name in enumerate(names)]
 
@@ -363,10 +440,8 @@ class Matcher:
                 best = (found, here) if begun[number].tried else self._best(found, here, config, report)
             return self._finished(*best, configs[number])
 
-        # one fit alone may have all threads that were asked for; several have one each
-        inner = self._asked_threads if len(clean) == 1 else 1
         with thread_limit(inner):  # after an error, or Ctrl-C, the other fits end at their next report
-            return parallel_map(one, range(len(clean)), threads=self.threads, stop=stop)
+            return parallel_map(one, range(len(clean)), threads=threads, stop=stop)
 
     def _finished(self, fit: Fit, clean: Repaired, config: FitConfig) -> Fit:
         """The fit with its shape, and with what its user should know."""

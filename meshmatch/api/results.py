@@ -19,7 +19,7 @@ from meshmatch.maps.build import build_map
 from meshmatch.maps.evaluate import Evaluation, evaluate_map
 from meshmatch.maps.files import load_map
 from meshmatch.maps.mapped_mesh import invert_map
-from meshmatch.maps.places import Places
+from meshmatch.maps.places import PlacedFit, Places
 from meshmatch.maps.unfold import unfolded
 from meshmatch.maps.vertex_map import VertexMap, check_map
 from meshmatch.progress import ProgressCallback
@@ -233,19 +233,23 @@ def map_of_fits(
         assert first.owner and first.source and second.source
         return first.owner.match(first, second, first.source, second.source)
 
-    def placed(fit: Fit | ImplicitFit, own: Fit | ImplicitFit) -> tuple[Places, Shape]:
+    def placed(fit: Fit | ImplicitFit, own: Fit | ImplicitFit) -> tuple[Places, Shape | None]:
         assert isinstance(fit, Fit) and isinstance(own, Fit)
+        if isinstance(fit, PlacedFit):
+            return fit.places, None
         part = shape_of(fit)
         return Places.of(part, fit, own, threads), part.original
 
     (here, source), (there, target) = placed(first, before[0]), placed(second, before[1])
-    return unfolded(build_map(here, there, threads), source, target, threads)
+    found = build_map(here, there, threads)
+    return found if source is None or target is None else unfolded(found, source, target, threads)
 
 
 def shape_of(fit: Fit) -> Repaired:
     """The repaired shape that a fit is of."""
     if fit.repaired is None:
-        raise OptionError("this fit does not know its shape", "make it with meshmatch.register or Matcher.fit")
+        hint = "make it with meshmatch.register or Matcher.fit, or read it with meshmatch.load_fit"
+        raise OptionError("this fit does not know its shape", hint)
     return fit.repaired
 
 

@@ -191,9 +191,10 @@ class Collection(FitsFolder):
         Returns
         -------
         Fit
-            Without the shape itself: its ``verts`` are empty.
+            It knows where the vertices of the shape belong, but not the shape: its ``verts`` are empty. `Matcher.map` takes
+            it, also together with fits of other shapes by the same model.
         """
-        return self._read(name)[0]
+        return self._read(name)
 
     def places_of(self, name: str) -> Places:
         """Where the vertices of a shape belong on the template.
@@ -208,7 +209,7 @@ class Collection(FitsFolder):
         Places
             A point of the template for every vertex.
         """
-        return self._read(name)[1]
+        return self._read(name).places
 
     def map(self, source: str, target: str) -> VertexMap:
         """The map between two shapes: nothing is fitted, only looked up.

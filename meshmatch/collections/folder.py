@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any, Self
 
 from meshmatch.collections.fit_all import TABLE
-from meshmatch.collections.fit_files import load_words
 from meshmatch.collections.setting import FITS, SUFFIX, finished_fit
 from meshmatch.collections.settle import read_about
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError
-from meshmatch.fitting.fit import Fit
-from meshmatch.maps.places import Places
+from meshmatch.maps.fit_files import load_words
+from meshmatch.maps.places import PlacedFit
 
 
 class FitsFolder:
@@ -64,7 +63,7 @@ class FitsFolder:
             raise InputError(f"{self.store.location} is not a folder of fits", hint)
         return about
 
-    def _read(self, name: str) -> tuple[Fit, Places]:
+    def _read(self, name: str) -> PlacedFit:
         if not self.store.exists(f"{FITS}/{name}{SUFFIX}"):
             close = get_close_matches(name, self._fitted, n=1)
             hint = f"did you mean {close[0]}?" if close else "names are those of the fitted files, without the suffix"

@@ -67,7 +67,7 @@ def map_some(task: MapTask) -> int:
     """Write maps to one shape; how many there are. Those that are as new as the fits are kept."""
     for source in task.sources:
         if not _is_new(task, source):
-            places, target = (finished_fit(task.fits, name)[1] for name in (source, task.target))
+            places, target = (finished_fit(task.fits, name).places for name in (source, task.target))
             found = build_map(places, target)
             with task.output.writing(task.file(source)) as path:
                 save_map(path, found)

@@ -11,14 +11,14 @@ from typing import Any
 
 from meshmatch.api.inputs import as_model, validated
 from meshmatch.api.matcher import Matcher
-from meshmatch.collections.fit_files import StoredFit, load_fit
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import may_show_part
 from meshmatch.fitting.without_model import fit_without_model
-from meshmatch.maps.places import Places
+from meshmatch.maps.fit_files import StoredFit, read_fit
+from meshmatch.maps.places import PlacedFit
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
@@ -144,7 +144,7 @@ class Setting:
     def read(self, folder: str, name: str) -> StoredFit:
         """A fit of the collection."""
         with self.store.reading(f"{folder}/{name}{SUFFIX}") as path:
-            return load_fit(path, self.template)
+            return read_fit(path, self.template)
 
     def fit(self, shape: Shape, last: Fit | None = None, other_side: bool = False, whole: float | None = None) -> Fit:
         """Fit one shape; a frame of a sequence from the last one's fit. Without a model perhaps as the other side than the
@@ -165,7 +165,7 @@ class Setting:
         if self.template_file == FIRST_TEMPLATE or not self.store.exists(file):
             return None
         with self.store.reading(file) as path:
-            found = load_fit(path, template_at(self.store, FIRST_TEMPLATE)).fit
+            found = read_fit(path, template_at(self.store, FIRST_TEMPLATE)).fit
         return None if found.verdict == "poor" else found
 
     def choices(self) -> dict[str, Any]:
@@ -193,18 +193,18 @@ def _template(store: Store, file: str, changed: int) -> Template:
         return load_template(path)
 
 
-def finished_fit(store: Store, name: str) -> tuple[Fit, Places]:
-    """A finished fit, and where the shape's vertices belong; some are kept in memory. Errors as `load_fit`."""
+def finished_fit(store: Store, name: str) -> PlacedFit:
+    """A finished fit; some are kept in memory. Errors as `read_fit`."""
     return _finished(store, name, store.changed(f"{FITS}/{name}{SUFFIX}"))
 
 
 @lru_cache(maxsize=64)
-def _finished(store: Store, name: str, changed: int) -> tuple[Fit, Places]:
+def _finished(store: Store, name: str, changed: int) -> PlacedFit:
     with store.reading(f"{FITS}/{name}{SUFFIX}") as path:
-        found = load_fit(path, template_at(store))
-    if found.places is None:
+        found = read_fit(path, template_at(store)).fit
+    if not isinstance(found, PlacedFit):
         raise InputError(f"the fit of {name} is not finished", "run `meshmatch fit` to its end")
-    return found.fit, found.places
+    return found
 
 
 def forget() -> None:

@@ -19,7 +19,6 @@ from meshmatch.api.inputs import validated
 from meshmatch.api.kinds import other_kind
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.compare import Usual
-from meshmatch.collections.fit_files import StoredFit, load_words, regularity_of, save_fit
 from meshmatch.collections.setting import AGREEING, ALONE, FITS, SUFFIX, Record, Setting, Source, digest_of
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError
@@ -27,7 +26,8 @@ from meshmatch.fitting.agree import member_of, with_vectors
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree_step, log_stretch
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.system import node_system
-from meshmatch.maps.places import Places, surface_distance
+from meshmatch.maps.fit_files import StoredFit, load_words, regularity_of, write_fit
+from meshmatch.maps.places import PlacedFit, Places, surface_distance
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.input_files import read_npy
@@ -97,7 +97,7 @@ def fit_alone(task: FitTask) -> Record:
         )
         words = {"record": asdict(record), "roughness": fit.repaired.shape.roughness}
         with setting.store.writing(file) as path:
-            save_fit(path, fit, samples=samples, words=words)
+            write_fit(path, fit, samples=samples, words=words)
     except MeshmatchError as error:
         return Record(source.name, source.path, reasons=str(error.message))
     return record
@@ -267,7 +267,7 @@ def _finish(task: FinishTask) -> None:
     places = Places.of(part, fit, before if task.group is not None else None)
     words = {"digest": task.digest, "agreed_with": task.agreed_with}
     with setting.store.writing(task.file) as path:
-        save_fit(path, fit, places, words=words)
+        write_fit(path, PlacedFit.of(fit, places), words=words)
 
 
 def regularity_words(regularity: Regularity | None) -> dict[str, Any]:

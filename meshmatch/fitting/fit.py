@@ -112,14 +112,18 @@ class Fit(Pickled):
     regularity: Regularity | None = None
     side: float = 0.0
 
+    @property
+    def shape_name(self) -> str:
+        """Name of the fitted shape; empty where it is not known."""
+        return self.repaired.original.name if self.repaired else ""
+
     def __repr__(self) -> str:
-        name = f"{self.repaired.original.name!r}, " if self.repaired else ""
+        name = f"{self.shape_name!r}, " if self.shape_name else ""
         part = ", part" if self.partial else ""
         way = f"up {self.up}, front {self.front}"
         return f"Fit({name}model {self.model!r}, {self.verdict}, trust {self.trust:.2f}, {way}{part})"
 
     def _repr_html_(self) -> str:
-        name = self.repaired.original.name if self.repaired else "a shape"
         rows = {
             "model": self.model + (", fitted to a part" if self.partial else ""),
             "verdict": "; ".join([self.verdict, *self.reasons]),
@@ -127,7 +131,7 @@ class Fit(Pickled):
             "axes": f"up {self.up}, front {self.front}",
             "notes": "; ".join(self.notes),
         }
-        return table_html(f"Fit: {name}", rows)
+        return table_html(f"Fit: {self.shape_name or 'a shape'}", rows)
 
     @cached_property
     def vertex_distance(self) -> Floats:

@@ -11,7 +11,7 @@ template within reach, with Gaussian weights; its place is the expectation, and 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -162,6 +162,29 @@ class Places:
         """Of a cloud. The expected squared distance is that of the means, plus the variance of this shape's point."""
         columns = [self.resting] if self.spread is None else [self.resting, self.spread[:, None]]
         return cKDTree(np.concatenate(columns, 1)[self._points])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class PlacedFit(Fit):
+    """A fit that was read from a folder of fits: it does not know its shape, but where the shape's vertices belong.
+
+    Attributes
+    ----------
+    places
+        Where they belong on the template.
+    """
+
+    places: Places
+
+    @classmethod
+    def of(cls, fit: Fit, places: Places) -> PlacedFit:
+        """A fit with the places of its shape's vertices, in place of the shape."""
+        known = {field.name: getattr(fit, field.name) for field in fields(Fit)}
+        return cls(**known | {"verts": np.empty((0, 3)), "repaired": None, "places": places})
+
+    @property
+    def shape_name(self) -> str:
+        return self.places.name
 
 
 def surface_distance(shape: Shape, fit: Fit) -> tuple[float, float]:

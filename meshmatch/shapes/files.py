@@ -307,12 +307,17 @@ def as_shape(source: ShapeLike, name: str = "") -> Shape:
 
 def as_shapes(sources: Sequence[ShapeLike]) -> list[Shape]:
     """The shapes that are meant, see `as_shape`; `InputError` also for a single shape instead of a list."""
+    check_list(sources)
+    return [as_shape(source) for source in sources]
+
+
+def check_list(sources: object) -> None:
+    """Refuse a single shape, or something else, in place of a list (`InputError`)."""
     single = isinstance(sources, str | os.PathLike | Shape | HasVertices | HasPoints)
     if single or not isinstance(sources, Iterable):
         raise InputError(f"expected a list of shapes, not {type(sources).__name__}", "write [shape]")
     if isinstance(sources, tuple) and len(sources) == 2 and _array(sources[1]).dtype.kind in "iu":
         raise InputError("expected a list of shapes, not one mesh", "write [(vertices, faces)]")
-    return [as_shape(source) for source in sources]
 
 
 def _array(values: Any) -> NDArray[Any]:

@@ -12,8 +12,10 @@ import meshmatch
 from meshmatch.api.matcher import Matcher
 from meshmatch.api.results import MatchResult
 from meshmatch.errors import MeshmatchError, OptionError
+from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.shapes.shape import Shape
+from tests.conftest import some_fit
 
 SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
 pytestmark = pytest.mark.usefixtures("remembered_fits")
@@ -89,6 +91,31 @@ def test_a_failed_fit_stops_the_other(
         matcher.fit_all([Shape(sphere.verts, sphere.faces, name) for name in order])
     assert fits["ended"] == ["good"]
     assert fits["reports"] < 900
+
+
+def test_errors_take_the_place_of_fits(
+    matcher: Matcher, monkeypatch: pytest.MonkeyPatch, sphere: Shape, tmp_path: Path
+) -> None:
+    def fit(self: Any, shape: Shape, landmarks: Any = None) -> Fit:
+        if shape.name == "bad":
+            raise OptionError("bad")
+        return some_fit(shape.verts, shape.faces)
+
+    monkeypatch.setattr(Fitter, "fit", fit)
+    told: list[tuple[str, str, float]] = []
+    matcher.progress = lambda *about: told.append(about)
+    (tmp_path / "cut.ply").write_bytes(b"ply")
+    shapes = [Shape(sphere.verts, sphere.faces, name) for name in ("one", "bad", "two")]
+    found = matcher.fit_all([*shapes, tmp_path / "cut.ply", tmp_path / "none.ply", 3], errors="return")  # type: ignore[list-item]
+    matcher.progress = None
+    assert [type(each).__name__ for each in found] == ["Fit", "OptionError", "Fit", *["InputError"] * 3]
+    assert isinstance(found[2], Fit) and found[2].repaired is not None and found[2].repaired.shape.name == "two"
+    shares = [share for stage, _, share in told if stage == "shapes"]
+    assert shares == pytest.approx(np.arange(1, 7) / 6)
+    assert matcher.fit_all([], errors="return") == []
+    for wrong in (lambda: matcher.fit_all("a.ply", errors="return"), lambda: matcher.fit_all(shapes, errors="ignore")):  # type: ignore[call-overload]
+        with pytest.raises(MeshmatchError):
+            wrong()
 
 
 def test_an_interrupt_stops_all_fits(

@@ -1,24 +1,30 @@
 """Models, matchers and results in other processes."""
 
 import copy
+import json
 import multiprocessing
 import os
 import pickle
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 
+from meshmatch.api.fits import load_fit, save_fit
 from meshmatch.api.matcher import Matcher
-from meshmatch.api.results import MatchResult
+from meshmatch.api.results import MatchResult, shape_of
 from meshmatch.collections.collection import Collection
-from meshmatch.errors import ModelError
+from meshmatch.errors import InputError, MeshmatchError, ModelError, OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.maps.fit_files import load_words
+from meshmatch.maps.places import PlacedFit, Places
 from meshmatch.models.registry import load_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
@@ -104,6 +110,52 @@ def test_results_come_back_bit_for_bit_and_read_only(matcher: Matcher, result: M
     )
     assert fits[0].reasons == result.source_fit.reasons
     assert [reason.code for reason in fits[0].reasons] == [reason.code for reason in result.source_fit.reasons]
+
+
+def test_fits_come_back_from_files(matcher: Matcher, folder: Path, result: MatchResult, tmp_path: Path) -> None:
+    fits = result.before_agreement
+    assert isinstance(fits[0], Fit) and isinstance(fits[1], Fit)
+    left_out = replace(fits[0], left_out=(2,), notes=("about it",))
+    for name, fit in (("a", left_out), ("b", fits[1])):
+        save_fit(tmp_path / f"{name}.safetensors", fit)
+    back = [load_fit(tmp_path / f"{name}.safetensors", folder) for name in "ab"]
+    found = matcher.map(back[0], back[1])
+    for name in ("index", "face", "barycentric", "confidence", "source_hash", "target_hash"):
+        assert np.array_equal(getattr(found, name), getattr(result.map, name)), name
+    assert back[0].left_out == (2,) and back[0].notes == ("about it",) and back[0].trust == fits[0].trust
+    assert "egg 1" in repr(back[0])
+    placed = PlacedFit.of(fits[1], Places.of(shape_of(fits[1]), fits[1]))
+    composed = matcher.map(back[0], fits[1], agree=False)
+    assert np.mean(matcher.map(back[0], placed).index == composed.index) > 0.9  # it is not laid out anew
+    pool_map = again(matcher).map(again(back[0]), again(back[1]))
+    assert np.array_equal(pool_map.index, found.index)
+
+
+def test_files_of_fits_are_refused_in_words(folder: Path, result: MatchResult, tmp_path: Path) -> None:
+    fit, path = result.source_fit, tmp_path / "a.safetensors"
+    assert isinstance(fit, Fit)
+    calls: list[tuple[type[MeshmatchError], str, Callable[[], object]]] = [
+        (OptionError, "not a format for fits", lambda: save_fit(tmp_path / "a.npz", fit)),
+        (OptionError, "without a model cannot be saved", lambda: save_fit(path, replace(fit, model="none"))),
+        (InputError, "does not know its shape", lambda: save_fit(path, replace(fit, repaired=None))),
+        (InputError, "MatchResult is not a fit", lambda: save_fit(path, result)),  # type: ignore[arg-type]
+        (InputError, "not a fit's file|no such file", lambda: load_fit(path)),
+    ]
+    for error, words, call in calls:
+        with pytest.raises(error, match=words) as caught:
+            call()
+        assert not path.exists() and caught.value.hint
+    save_fit(path, fit)
+    with pytest.raises(ModelError, match="a fit of a model 'egg'"):
+        load_fit(path)
+    with pytest.raises(InputError, match="of another template"):
+        load_fit(path, "human")
+    arrays, words = load_file(path), load_words(path)
+    header = {"fit": json.dumps({"schema": 1, "fit": words[0], "more": words[1]})}
+    for name, bad in {"shape_verts": np.full((9, 3), np.nan), "shape_faces": np.full((4, 3), 10**6)}.items():
+        save_file(arrays | {name: bad}, path, header)
+        with pytest.raises(InputError):
+            load_fit(path, folder)
 
 
 def test_what_a_shape_derives_stays_behind(cube: Shape) -> None:

@@ -13,11 +13,11 @@ import pytest
 
 from meshmatch.collections.collection import Collection
 from meshmatch.collections.export import Export, Fits, export
-from meshmatch.collections.fit_files import load_fit, save_fit
 from meshmatch.collections.superimpose import Superimposed
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.maps.files import load_map
+from meshmatch.maps.fit_files import read_fit, write_fit
 from meshmatch.maps.mapped_mesh import MappedMesh
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
@@ -215,8 +215,8 @@ def test_shapes_of_another_kind_are_left_out(fits: Path, run: Run, tmp_path: Pat
         shutil.copy(file, mixed / "human" / "fits")
         for animal in ("cow", "fox"):
             shutil.copy(file, file.with_name(f"{animal}.safetensors"))
-        kept = load_fit(file, template)
-        save_fit(file, replace(kept.fit, verdict="poor", model="quadruped"), kept.places, words=kept.words)
+        kept = read_fit(file, template)
+        write_fit(file, replace(kept.fit, verdict="poor", model="quadruped"), words=kept.words)
     (mixed / "bird").mkdir()
     (mixed / "bird" / "fits.csv").touch()  # of shapes that could not be fitted
     said = f"warning: climber, dancer: of another kind, see {mixed / 'human'}"

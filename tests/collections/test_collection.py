@@ -4,7 +4,7 @@ import csv
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +15,15 @@ from scipy.spatial.transform import Rotation
 
 import meshmatch
 from meshmatch.cli import main
-from meshmatch.collections.fit_files import load_fit, load_words, save_fit
 from meshmatch.collections.setting import Record
 from meshmatch.errors import InputError, MeshmatchError, MeshmatchWarning, OptionError, OutputError
 from meshmatch.experiments.hostile.learned import write_eggs
+from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.solve.agreement import agree_step
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.locks import locked
+from meshmatch.maps.fit_files import load_words, read_fit, write_fit
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
@@ -235,11 +236,11 @@ def test_damaged_fits_are_refused(made: tuple[Path, tuple[Record, ...]], tmp_pat
     for data in (b"", whole[:1000], whole[:-1], whole.replace(b'"schema', b'"schemo', 1), b"\xff" * 100):
         broken.write_bytes(data)
         with pytest.raises(InputError):
-            load_fit(broken, template)
+            read_fit(broken, template)
     for words in ("[" * 100_000, "[1]", '{"schema": 1, "fit": [], "more": 3}'):
         save_file({"a": np.zeros(3)}, broken, {"fit": words})
         with pytest.raises(InputError):
-            load_fit(broken, template)
+            read_fit(broken, template)
     about = tmp_path / "about"
     about.mkdir()
     for text in ("[" * 100_000, "{}", "\x00", '{"schema": 2}'):
@@ -253,23 +254,23 @@ def test_damaged_fits_are_refused(made: tuple[Path, tuple[Record, ...]], tmp_pat
     text = json.dumps(header | {"__metadata__": {"fit": json.dumps(about_fit)}}).encode()
     broken.write_bytes(len(text).to_bytes(8, "little") + text + whole[size:])
     with pytest.raises(InputError, match="too large"):
-        load_fit(broken, template)
+        read_fit(broken, template)
     del about_fit["fit"]["verdict"]
     text = json.dumps(header | {"__metadata__": {"fit": json.dumps(about_fit)}}).encode()
     broken.write_bytes(len(text).to_bytes(8, "little") + text + whole[size:])
     with pytest.raises(InputError, match="not a fit's file"):
         load_words(broken)
     broken.write_bytes(whole)
-    fit = load_fit(broken, template).fit
+    fit = read_fit(broken, template).fit
     for wrong in (
         replace(fit, verdict="fine"),
         replace(fit, seed="0"),
         replace(fit, frame=replace(fit.frame, scale=1e70)),
         replace(fit, points=1e200 * fit.points),
     ):
-        save_fit(broken, wrong)
+        write_fit(broken, wrong)
         with pytest.raises(InputError, match=r"invalid|cannot be"):
-            load_fit(broken, template)
+            read_fit(broken, template)
     numbers = whole.replace(b'\\"schema\\": 1', b'\\"schema\\": 9')
     assert numbers != whole
     broken.write_bytes(numbers)
@@ -278,14 +279,25 @@ def test_damaged_fits_are_refused(made: tuple[Path, tuple[Record, ...]], tmp_pat
     broken.write_bytes(whole)
     other = meshmatch.load_model("quadruped").template
     with pytest.raises(InputError, match="another template"):
-        load_fit(broken, other)
+        read_fit(broken, other)
+
+
+def test_a_matcher_maps_fits_of_a_collection(made: tuple[Path, tuple[Record, ...]]) -> None:
+    collection, matcher = meshmatch.Collection(made[0]), meshmatch.Matcher("human")
+    climber, dancer = collection.fit_of("climber"), meshmatch.load_fit(made[0] / "fits" / "dancer.safetensors")
+    found, known = matcher.map(climber, dancer), collection.map("climber", "dancer")
+    for name in ("index", "barycentric", "confidence", "source_hash", "verdict"):
+        assert np.array_equal(getattr(found, name), getattr(known, name)), name
+    assert repr(climber).startswith("Fit('climber', model 'human'")
 
 
 def test_maps_of_unfinished_fits_are_refused(made: tuple[Path, tuple[Record, ...]], tmp_path: Path) -> None:
     folder = tmp_path / "fits"
     shutil.copytree(made[0], folder)
     collection = meshmatch.Collection(folder)
-    save_fit(folder / "fits" / "turned.safetensors", collection.fit_of("turned"))
+    finished = collection.fit_of("turned")
+    alone = Fit(**{field.name: getattr(finished, field.name) for field in fields(Fit)})
+    write_fit(folder / "fits" / "turned.safetensors", alone)
     for read in (
         lambda: collection.save_maps(tmp_path / "maps"),
         lambda: meshmatch.Collection(folder).fit_of("turned"),
@@ -347,8 +359,8 @@ def test_poor_fits_are_left_out_of_an_atlas(
     folder = tmp_path / "fits"
     shutil.copytree(made[0], folder)
     collection = meshmatch.Collection(folder)
-    found = load_fit(folder / "fits" / "turned.safetensors", collection.template)
-    save_fit(folder / "fits" / "turned.safetensors", replace(found.fit, verdict="poor"), found.places)
+    found = read_fit(folder / "fits" / "turned.safetensors", collection.template)
+    write_fit(folder / "fits" / "turned.safetensors", replace(found.fit, verdict="poor"))
     with pytest.raises(InputError, match="holds 2 fits and 1 poor ones"):
         collection.atlas()
     with collection.registered(poor=True) as shapes:

@@ -92,7 +92,7 @@ def test_a_run_goes_on_where_it_was_stopped(
         return some_fit(body.places, people.template.shape.faces, signs=FitFeatures(residual=0.02))
 
     monkeypatch.setattr(campaign, "People", lambda *_: people)
-    monkeypatch.setattr(campaign, "save_fit", lambda *_: None)
+    monkeypatch.setattr(campaign, "write_fit", lambda *_: None)
     monkeypatch.setattr(Matcher, "fit", fit)
     words = ["--output", str(tmp_path), "--seed", "5", "--seeds", "1", "--bodies"]
     assert campaign.main([*words, "2"]) == 0 and campaign.main([*words, "3"]) == 0

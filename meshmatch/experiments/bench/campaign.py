@@ -27,7 +27,6 @@ from typer import Option
 
 from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
-from meshmatch.collections.fit_files import save_fit
 from meshmatch.errors import MeshmatchError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.verdict_cases import LIMBS, direction, faces_kept
@@ -43,6 +42,7 @@ from meshmatch.generators.rig import forward_kinematics, penetration, skin
 from meshmatch.generators.rotations import DEGREE, rotation_from_vector
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.evaluate import CM_PER_UNIT
+from meshmatch.maps.fit_files import write_fit
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.shape import Shape
@@ -257,7 +257,7 @@ def main(
         try:
             fit = matcher.fit(body.shape)
             row |= measured(body, fit, template)
-            save_fit(output / "fits" / f"{people.seed}-{number}.safetensors", fit)
+            write_fit(output / "fits" / f"{people.seed}-{number}.safetensors", fit)
         except MeshmatchError as error:
             row |= {"verdict": REFUSED, "reasons": [error.message]}
         row["seconds"] = time.process_time() - began

@@ -20,7 +20,6 @@ import numpy as np
 from meshmatch.api.inputs import as_model, validated
 from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.collections.fit_files import load_fit, save_fit
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import ON_NODES, FitConfig, LatentRefineConfig, Partial, Refine
@@ -28,6 +27,7 @@ from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import interpolate
+from meshmatch.maps.fit_files import read_fit, write_fit
 from meshmatch.maps.footpoints import Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import NO_MODEL
@@ -75,12 +75,12 @@ class OurMethod:
         """Fit the model's template to the shape; `MeshmatchError` of a kept fit of another template, or a damaged one."""
         path = None if self.kept is None else self.kept / f"{shape.hash}.safetensors"
         if path is not None and path.is_file():
-            known, clean = load_fit(path, as_model(self.model).template), validated(shape)
+            known, clean = read_fit(path, as_model(self.model).template), validated(shape)
             return replace(known.fit, verts=clean.shape.verts, repaired=clean, seconds=float(known.words["seconds"]))
         fit = self._matcher().fit(shape)
         if path is not None:
             make_folder(path.parent)
-            save_fit(path, fit, words={"seconds": fit.seconds})
+            write_fit(path, fit, words={"seconds": fit.seconds})
         return fit
 
     def map(self, source: Shape, source_fit: Fit, target: Shape, target_fit: Fit) -> VertexMap:

@@ -14,7 +14,6 @@ import torch
 from meshmatch.cli.info import info
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.collection import Collection
-from meshmatch.collections.fit_files import load_fit
 from meshmatch.collections.map_all import load_pairs as load_names
 from meshmatch.collections.registered import Registered, read_group
 from meshmatch.errors import MeshmatchError, visible
@@ -23,6 +22,7 @@ from meshmatch.generators.pose_files import load_poses
 from meshmatch.implicit.model import load_implicit
 from meshmatch.implicit.samples import samples_of
 from meshmatch.maps.files import load_map
+from meshmatch.maps.fit_files import read_fit
 from meshmatch.models.card import IMPLICIT, read_card, read_implicit_card
 from meshmatch.models.checkpoint import load_weights as load_network
 from meshmatch.models.registry import TEMPLATE, verify_model
@@ -122,7 +122,7 @@ def _write_again(path: Path) -> None:
 def _map_all(path: Path) -> None:
     fits = path.parents[1]
     if path.parent.name == "alone":
-        load_fit(path, load_template(fits / TEMPLATE))
+        read_fit(path, load_template(fits / TEMPLATE))
     Collection(fits, 1).save_maps(fits / "maps")
 
 

@@ -1,8 +1,8 @@
 """Fits as files: safetensors with the arrays, and a JSON header for the words.
 
-A fit is kept in two states. Alone, it has the samples of its shape with it, for it has yet to agree with others. Finished,
-it knows where the vertices of its shape belong on the template (`Places`), which is all that maps ask. Neither holds the
-template, which a collection keeps once, nor anything that differs from run to run.
+A collection keeps a fit in two states. Alone, it has the samples of its shape with it, for it has yet to agree with others.
+Finished, it knows where the vertices of its shape belong on the template (`Places`), which is all that maps ask. A user's
+fit has the shape itself. None holds the template, nor anything that differs from run to run.
 """
 
 from __future__ import annotations
@@ -22,14 +22,16 @@ from meshmatch.fitting.judge.reasons import Reason
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.maps.places import Places
+from meshmatch.maps.places import PlacedFit, Places
 from meshmatch.maps.vertex_map import VERDICTS
 from meshmatch.models.tensor_file import read_header
-from meshmatch.shapes.shape import LARGEST
+from meshmatch.shapes.shape import LARGEST, Shape
 from meshmatch.templates.template import Template, save_arrays
 
 SCHEMA = 1
-_HINT = "fit the shape again: remove the file, and run `meshmatch fit` as before"
+_HINT = "fit the shape again; in a folder of fits, remove the file, and run `meshmatch fit` as before"
+_SHAPE = "shape_"  # begins the names of a shape's arrays
+_SHAPE_ARRAYS = ("verts", "faces", "colors", "invalid", "weights", "skinned")
 _FIT_WORDS = {
     **dict.fromkeys(("template_hash", "verdict", "up", "front", "model"), str),
     **{"residual": float, "trust": float, "seed": int, "partial": bool},
@@ -42,25 +44,27 @@ Words = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class StoredFit:
-    """A fit that was read from a file: it does not know its shape, but where the shape's vertices belong.
+    """A fit that was read from a file, a `PlacedFit` if it was finished.
 
     ``verts`` of the fit are none, and its ``seconds`` 0. ``words`` are what else the file says.
     """
 
     fit: Fit
-    places: Places | None  # of a finished fit
     samples: OrientedPoints | None  # of a fit alone, in the fit's core frame
+    shape: Shape | None  # as its file had it, of a user's fit
     words: Words
 
 
-def save_fit(
+def write_fit(
     path: str | Path,
     fit: Fit,
-    places: Places | None = None,
     samples: OrientedPoints | None = None,
+    shape: Shape | None = None,
     words: Words | None = None,
 ) -> None:
-    """Write a fit with the places or the samples of its shape; ``words`` are what else is worth knowing (JSON)."""
+    """Write a fit, with the places of a finished one, the samples of its shape, or the shape as its file had it; ``words``
+    are what else is worth knowing (JSON).
+    """
     arrays: dict[str, np.ndarray] = {"points": fit.points, "vectors": fit.vectors}
     arrays |= {"rotation": fit.frame.rotation, "center": fit.frame.center}
     about: Words = {name: getattr(fit, name) for name in _FIT_WORDS}
@@ -69,7 +73,8 @@ def save_fit(
     about |= {"side": fit.side} if fit.side else {}
     if fit.regularity is not None:
         about["regularity"] = asdict(fit.regularity)
-    if places is not None:
+    if isinstance(fit, PlacedFit):
+        places = fit.places
         arrays |= {name: getattr(places, name) for name in _PLACES}
         arrays |= {name: kept for name in _OPTIONAL if (kept := getattr(places, name)) is not None}
         about |= {"shape": places.name, "shape_hash": places.hash}
@@ -78,12 +83,15 @@ def save_fit(
         if samples.weights is not None:
             arrays["sample_weights"] = samples.weights
         about["signed"] = samples.signed
+    if shape is not None:
+        arrays |= {_SHAPE + name: kept for name in _SHAPE_ARRAYS if (kept := getattr(shape, name)) is not None}
+        about |= {"shape": shape.name, "upright": shape.upright, "made_of": shape.made_of, "notes": fit.notes}
     header = {"schema": SCHEMA, "fit": about, "more": words or {}}
     save_arrays(path, arrays, {"fit": json.dumps(header, sort_keys=True)})
 
 
 def load_words(path: str | Path) -> tuple[Words, Words]:
-    """What a fit's file says in words: of the fit, and what else; the arrays are not read. Errors as `load_fit`."""
+    """What a fit's file says in words: of the fit, and what else; the arrays are not read. Errors as `read_fit`."""
     path = Path(path)
     try:
         read_header(path)
@@ -106,7 +114,7 @@ def load_words(path: str | Path) -> tuple[Words, Words]:
         raise InputError(f"{path.name} is not a fit's file", _HINT) from error
 
 
-def load_fit(path: str | Path, template: Template) -> StoredFit:
+def read_fit(path: str | Path, template: Template) -> StoredFit:
     """Read a fit of this template; `InputError` if the file is missing, damaged, of another schema or template."""
     path = Path(path)
     about, more = load_words(path)
@@ -115,7 +123,7 @@ def load_fit(path: str | Path, template: Template) -> StoredFit:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no dictionary)
         if about["template_hash"] != template.hash:
             wrong = f"{path.name} is a fit of another template ({about['template_hash']}, not {template.hash})"
-            raise InputError(wrong, "a collection holds fits of one model")
+            raise InputError(wrong, "use the model that made it")
         V = template.shape.V
         fit = Fit(
             frame=Frame(float(about["scale"]), arrays["rotation"], arrays["center"]),
@@ -129,11 +137,14 @@ def load_fit(path: str | Path, template: Template) -> StoredFit:
             left_out=_numbers(about.get("left_out", [])),
             regularity=regularity_of(about),
             side=float(about.get("side", 0.0)),
+            notes=tuple(map(str, about.get("notes", ()))),
             **{name: about[name] for name in _FIT_WORDS},
         )
         if not (1 / LARGEST < fit.frame.scale < LARGEST and (np.abs(fit.frame.center) < LARGEST).all()):
             raise ValueError("its frame cannot be")
-        return StoredFit(fit, _places(arrays, about, fit), _samples(arrays, about), more)
+        places = _places(arrays, about, fit)
+        fit = fit if places is None else PlacedFit.of(fit, places)
+        return StoredFit(fit, _samples(arrays, about), _shape(arrays, about), more)
     except (SafetensorError, KeyError, TypeError, ValueError, OverflowError, OSError) as error:
         raise InputError(f"{path.name} is damaged: {error}", _HINT) from error
 
@@ -186,6 +197,16 @@ def _samples(arrays: dict[str, np.ndarray], about: Words) -> OrientedPoints | No
     points, normals = (_checked(arrays, f"sample_{name}", np.float64, (P, 3)) for name in ("points", "normals"))
     weights = _checked(arrays, "sample_weights", np.float64, (P,)) if "sample_weights" in arrays else None
     return OrientedPoints(points, normals, bool(about["signed"]), weights)
+
+
+def _shape(arrays: dict[str, np.ndarray], about: Words) -> Shape | None:
+    if _SHAPE + "verts" not in arrays:
+        return None
+    known: Words = {name: arrays[_SHAPE + name] for name in _SHAPE_ARRAYS if _SHAPE + name in arrays}
+    if not (np.abs(known["verts"]) < LARGEST).all():
+        raise ValueError("its shape has vertices that cannot be")
+    made_of = tuple(map(str, about["made_of"]))
+    return Shape(name=str(about["shape"]), upright=about["upright"] is True, made_of=made_of, **known)
 
 
 def _checked(arrays: dict[str, np.ndarray], name: str, kind: Any, shape: tuple[int, ...]) -> Any:

@@ -1,0 +1,95 @@
+"""Fits as files of their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from meshmatch.api.inputs import as_model, usable
+from meshmatch.errors import InputError, ModelError, OptionError
+from meshmatch.fitting.fit import Fit
+from meshmatch.maps.fit_files import load_words, read_fit, write_fit
+from meshmatch.maps.places import PlacedFit
+from meshmatch.models.registry import NO_MODEL, list_models
+from meshmatch.models.trained import TrainedModel
+from meshmatch.shapes.tables import check_suffix
+
+_SUFFIX = ".safetensors"
+
+
+def save_fit(path: str | Path, fit: Fit) -> None:
+    """Write a fit with its shape, whole or not at all, as folders of fits have them. Its model is named, not contained.
+
+    Parameters
+    ----------
+    path
+        A file with the suffix .safetensors.
+    fit
+        Of a model.
+
+    Raises
+    ------
+    OptionError
+        Another suffix, or a fit that was made without a model: it is of the other shape, which the file would not hold.
+    InputError
+        It is no fit, or does not know its shape.
+    OutputError
+        The file cannot be written.
+
+    Examples
+    --------
+    >>> meshmatch.save_fit("climber.safetensors", meshmatch.register("templates/samples/climber.ply"))
+    >>> meshmatch.load_fit("climber.safetensors").verdict
+    """
+    if not isinstance(fit, Fit):
+        raise InputError(f"{type(fit).__name__} is not a fit", "register and Matcher.fit make one")
+    check_suffix(path, (_SUFFIX,), "fits")
+    if fit.model == NO_MODEL:
+        raise OptionError("a fit without a model cannot be saved: it is of the other shape", "save the map: save_map")
+    if fit.repaired is None and not isinstance(fit, PlacedFit):
+        raise InputError("this fit does not know its shape", "make it with meshmatch.register or Matcher.fit")
+    write_fit(path, fit, shape=None if fit.repaired is None else fit.repaired.original)
+
+
+def load_fit(path: str | Path, model: str | Path | TrainedModel | None = None) -> Fit:
+    """Read a fit, for `Matcher` to map or follow as if it had just been made.
+
+    Parameters
+    ----------
+    path
+        What `save_fit` wrote; or a file in ``fits`` of a `Collection`, whose fit does not know its shape.
+    model
+        The model of the fit, by default the installed one that the file names.
+
+    Returns
+    -------
+    Fit
+        Its ``seconds`` are 0, and it has no ``signs``.
+
+    Raises
+    ------
+    InputError
+        The file is missing or damaged, or its fit is of another template.
+    ModelError
+        The file's model is not installed.
+
+    Examples
+    --------
+    >>> meshmatch.save_fit("climber.safetensors", meshmatch.register("templates/samples/climber.ply"))
+    >>> climber = meshmatch.load_fit("climber.safetensors")
+    >>> meshmatch.Matcher("human").map(climber, meshmatch.register("templates/samples/dancer.ply"))
+    """
+    path = Path(path)
+    if model is None:
+        model = str(load_words(path)[0]["model"])
+        if model == NO_MODEL:
+            raise InputError(f"{path.name} is a fit without a model", "open its folder: meshmatch.Collection(folder)")
+        if model not in {entry.name for entry in list_models()}:
+            raise ModelError(
+                f"{path.name} is a fit of a model {model[:80]!r}", "pass that model: load_fit(path, model)"
+            )
+    read = read_fit(path, as_model(model).template)
+    if read.shape is None:
+        return read.fit
+    clean = replace(usable(read.shape), left_out=read.fit.left_out)
+    return replace(read.fit, verts=clean.shape.verts, repaired=clean)
