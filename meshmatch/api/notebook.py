@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -53,9 +54,10 @@ def carried_html(
     kind: str, found: VertexMap, draw: Callable[[], Composition] | None, more: Mapping[str, str] | None = None
 ) -> str:
     """What was made by a map: the map's verdict, and a picture of the result."""
+    confidence = float(found.confidence.mean())
     rows = {
         "verdict": "; ".join([found.verdict, *found.reasons]),
         "vertices": f"{found.source_vertices:,} of {found.source or 'the source'}",
-        "confidence": f"{float(found.confidence.mean()):.2f} on average",
+        "confidence": "unknown" if math.isnan(confidence) else f"{confidence:.2f} on average",
     }
     return result_html(f"{kind}: {found.source} → {found.target}", rows | dict(more or {}), draw)

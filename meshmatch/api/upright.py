@@ -15,7 +15,7 @@ from meshmatch.transfer.carry_rig import turn_of, upright
 def trust(source: Shape, maps: MapPair) -> Float[Floats, " V"]:
     """How much each vertex of the source counts: by its area, and the confidence of the map."""
     share = source.vertex_areas / max(source.area, 1e-300) * source.V
-    return np.where(source.valid, (share + 1e-3) * (maps.forward.confidence + 1e-3), 0.0)
+    return np.where(source.valid, (share + 1e-3) * (maps.forward.assumed_confidence + 1e-3), 0.0)
 
 
 def turn_upright(maps: MapPair, along_y: bool) -> Float[Floats, "3 3"]:

@@ -199,7 +199,8 @@ def _transfer(verb: Verb, name: str, rest: dict[str, Any], made: str) -> tuple[_
     except MeshmatchError as error:
         words = error.message + (f" ({error.hint})" if error.hint else "")
         return _Row(name, file, output, _FAILED, error=words), {"verdict": _FAILED, "error": words}
-    confidence, seconds = f"{record['confidence_mean']:.2f}", f"{time.monotonic() - began:.1f}"
+    known = record["confidence_mean"]
+    confidence, seconds = "" if known is None else f"{known:.2f}", f"{time.monotonic() - began:.1f}"
     return _Row(name, file, output, record["verdict"], confidence, seconds, made=made), record
 
 

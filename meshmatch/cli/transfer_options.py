@@ -153,7 +153,7 @@ class Transfer:
         """For --json: what was done, and by which map."""
         record: Json = {"output": self.output} | own | words.map_record(maps.forward, self.names)
         record["map"] = self.options.map
-        record["confidence_mean"] = confidence
+        record["confidence_mean"] = words.known_number(confidence)
         if maps.match is not None:
             record |= self.options.record(maps.match.source_fit) | {
                 "notes": list(maps.match.notes),

@@ -112,6 +112,11 @@ def _terminal() -> rich.console.Console:
     return Terminal(stderr=True)  # made anew: it then follows a stderr that was redirected since
 
 
+def known_number(value: float) -> float | None:
+    """A number as JSON has it: null for nan."""
+    return None if math.isnan(value) else float(value)
+
+
 def print_json(record: Json) -> None:
     """One JSON object on one line of stdout."""
     line = json.dumps(record, ensure_ascii=False, default=str)

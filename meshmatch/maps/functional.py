@@ -128,7 +128,7 @@ def map_from_functional(
     Returns
     -------
     VertexMap
-        From source to target, vertex to vertex. Its confidence is not known.
+        From source to target, vertex to vertex. Its confidence is not known (nan).
 
     Raises
     ------

@@ -63,7 +63,7 @@ class MappedMesh:
 
     def __init__(self, source_to_target: VertexMap, source: Shape, target: Shape) -> None:
         self.points = source_to_target.points(target)
-        self.confidence = source_to_target.confidence.astype(np.float64)
+        self.confidence = source_to_target.assumed_confidence.astype(np.float64)
         self.unit = length_of(target)
         self.normals = normals_at(source_to_target, target)
         kept = np.flatnonzero(~discontinuous_faces(source_to_target, source, target) & source.valid_faces)
@@ -209,7 +209,8 @@ def length_of(shape: Shape) -> float:
 
 def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, workers: int = 1) -> VertexMap:
     """A map from target to source, from one from source to target; `InputError` as `VertexMap.for_shapes`. Its
-    confidence falls with the distance to the image: it is low where nothing of the source was mapped to.
+    confidence falls with the distance to the image: it is low where nothing of the source was mapped to, and that is
+    all it says where the confidence of the map is not known.
     """
     checked = source_to_target.for_shapes(source, target)
     identical = bool((checked.index == np.arange(source.V)).all() and (checked.face < 0).all())
@@ -220,7 +221,7 @@ def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, worker
     found = image.query(target.verts, normals, workers)
     several, vertex = _meeting_vertices(checked, source, target.V)
     weights = np.tile([1.0, 0.0, 0.0], (len(several), 1))
-    confidence = checked.confidence[vertex].astype(np.float64)
+    confidence = checked.assumed_confidence[vertex].astype(np.float64)
     met = MappedFootpoints(vertex, np.full(len(several), -1), weights, found.distance[several], confidence)
     found = found.updated(several, met)
     if not target.is_cloud:
@@ -244,8 +245,8 @@ def _meeting_vertices(found: VertexMap, source: Shape, V: int) -> tuple[Int[Ints
     highest = np.zeros(V)
     rows = np.flatnonzero(found.on_vertex)
     at = found.index[rows]
-    np.maximum.at(highest, at, found.confidence[rows])
-    trusted = (found.confidence[rows] >= _MEETING * highest[at]) & source.valid[rows]
+    np.maximum.at(highest, at, found.assumed_confidence[rows])
+    trusted = (found.assumed_confidence[rows] >= _MEETING * highest[at]) & source.valid[rows]
     rows, at = rows[trusted], at[trusted]
     count = np.bincount(at, minlength=V)
     sums = np.stack([np.bincount(at, source.verts[rows, k], V) for k in range(3)], axis=1)

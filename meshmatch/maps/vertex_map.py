@@ -47,7 +47,7 @@ class VertexMap(Pickled):
     barycentric
         (V_source, 3) weights of that face's corners: not negative, rows sum to 1, (1, 0, 0) where the face is -1.
     confidence
-        (V_source,) float32 from 0 (a guess) to 1 (certain, and where nothing is known about it).
+        (V_source,) float32 from 0 (a guess) to 1 (certain); all nan if it is not known, as in a map from elsewhere.
     verdict
         "good", "fair" or "poor", of the map as a whole; "unknown" if a file does not say.
     reasons
@@ -118,7 +118,7 @@ class VertexMap(Pickled):
         size = len(vertex)
         faces = np.full(size, -1) if self.face is None else _whole_numbers(self.face, f"{label}: face")
         weights = np.array(np.eye(1, 3).repeat(size, 0) if self.barycentric is None else self.barycentric, np.float64)
-        given = np.ones(size) if self.confidence is None else np.array(self.confidence, np.float64)
+        given = np.full(size, np.nan) if self.confidence is None else np.array(self.confidence, np.float64)
         trust = np.clip(given, -1, 2).astype(np.float32)  # a short float holds no 1e300, which is refused below
         arrays: dict[str, NDArray[Any]] = {"index": vertex, "face": faces, "barycentric": weights, "confidence": trust}
         for name, array in arrays.items():
@@ -129,8 +129,8 @@ class VertexMap(Pickled):
             raise InputError(f"{label}: face {int(faces.min())} does not exist")
         if not (weights >= -1e-9).all() or not np.allclose(weights.sum(axis=1), 1.0, atol=1e-6):
             raise InputError(f"{label}: barycentric weights must be 0 or more and sum to 1")
-        if not ((trust >= 0) & (trust <= 1)).all():
-            raise InputError(f"{label}: confidence must lie in 0..1")
+        if not (((trust >= 0) & (trust <= 1)).all() or np.isnan(trust).all()):
+            raise InputError(f"{label}: confidence must lie in 0..1; leave it out where it is not known")
         return arrays
 
     @classmethod
@@ -175,7 +175,12 @@ class VertexMap(Pickled):
         VertexMap
             Every vertex to itself, with confidence 1.
         """
-        return cls.between(shape, shape, np.arange(shape.V), verdict="good")
+        return cls.between(shape, shape, np.arange(shape.V), confidence=np.ones(shape.V), verdict="good")
+
+    @property
+    def assumed_confidence(self) -> Float[Floats32, " V_source"]:
+        """(V_source,) the confidence, or 1 where it is not known: a transfer follows the map that it is given."""
+        return np.nan_to_num(self.confidence, nan=1.0)
 
     def for_shapes(self, source: Shape | None, target: Shape | None, label: str = "the map") -> VertexMap:
         """This map, checked to be one from `source` to `target`, with names, counts and hashes filled in.
@@ -373,8 +378,8 @@ class VertexMap(Pickled):
     def compose(self, other: VertexMap) -> VertexMap:
         """This map, then `other`: from this source to the other's target.
 
-        The point of a vertex is where `other` puts the vertex ``index[i]``; the confidence is the lower of the two, the
-        verdict the worse.
+        The point of a vertex is where `other` puts the vertex ``index[i]``; the confidence is the lower of the two, unknown
+        if one of them is; the verdict is the worse.
 
         Parameters
         ----------

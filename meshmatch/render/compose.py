@@ -105,12 +105,15 @@ def matched_colors(
     colors: Float[Floats, "V 3"], forward: VertexMap, back: VertexMap, source: Shape
 ) -> Float[Floats, "V_target 3"]:
     """Colors of the target from those of the source's vertices; grey where nothing was matched nearby."""
-    matched = back.confidence > _MATCHED * forward.confidence[back.index]
+    matched = back.assumed_confidence > _MATCHED * forward.assumed_confidence[back.index]
     return np.where(matched[:, None], pull_values(back, colors), UNKNOWN)
 
 
 def compose_confidence(source: Shape, target: Shape, vertex_map: VertexMap, look: Look = Look()) -> Composition:
-    """Source and target colored by the confidence of the map: low is dark."""
+    """Source and target colored by the confidence of the map: low is dark. `OptionError` if it is not known."""
+    if np.isnan(vertex_map.confidence).any():
+        hint = "maps that `meshmatch match` wrote as .npz, .mat, .json or .csv have it"
+        raise OptionError("the confidence of this map is not known", hint)
     scale = Scale(0.0, 1.0, "confidence of the map", reverse=True)
     maps = vertex_map, invert_map(vertex_map, source, target)
     panels = _painted((source, target), [scale.colors(each.confidence) for each in maps])

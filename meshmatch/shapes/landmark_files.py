@@ -8,6 +8,7 @@ puts it on a shape.
 from __future__ import annotations
 
 import csv
+import math
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -429,7 +430,11 @@ def fcsv_lines(points: Iterable[tuple[str, Sequence[float], float]], space: Spac
     yield f"# columns = {_FCSV_COLUMNS}"
     for k, (name, (x, y, z), confidence) in enumerate(points, 1):
         label = '"' + name.replace('"', '""') + '"' if set(name) & set('",') else name
-        yield f"{k},{x!r},{y!r},{z!r},0.0,0.0,0.0,1.0,1,1,0,{label},confidence {confidence:.3g},"
+        yield f"{k},{x!r},{y!r},{z!r},0.0,0.0,0.0,1.0,1,1,0,{label},{_description(confidence)},"
+
+
+def _description(confidence: float) -> str:
+    return "" if math.isnan(confidence) else f"confidence {confidence:.3g}"
 
 
 def markups_record(points: Iterable[tuple[str, Sequence[float], float]], space: Space) -> dict[str, Any]:
@@ -438,7 +443,7 @@ def markups_record(points: Iterable[tuple[str, Sequence[float], float]], space: 
         {
             "id": str(k),
             "label": name,
-            "description": f"confidence {confidence:.3g}",
+            "description": _description(confidence),
             "position": list(position),
             "positionStatus": "defined",
         }

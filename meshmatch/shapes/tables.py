@@ -461,8 +461,11 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
 
 
 def short_floats(values: np.ndarray) -> list[Any]:
-    """float32 numbers as the floats with the fewest digits that read back as the same float32."""
-    return list(values.astype(np.float32).astype(np.str_).astype(np.float64).tolist())
+    """float32 numbers as the floats with the fewest digits that read back as the same float32; None for nan."""
+    floats = values.astype(np.float32).astype(np.str_).astype(np.float64)
+    found = floats.astype(object)
+    found[np.isnan(floats)] = None
+    return list(found.tolist())
 
 
 def load_pairs(path: str | Path) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:

@@ -52,7 +52,7 @@ def carry_moves(
     matrix = backward.sparse()
     found = np.stack([(matrix @ np.einsum("vij,vj->vi", frames, move)).astype(np.float32) for move in moves])
     graph = vertex_graph(target)
-    known = target.valid & (backward.confidence >= _SURE)
+    known = target.valid & (backward.assumed_confidence >= _SURE)
     facing = unit(backward.apply(np.einsum("vij,vj->vi", turns, source.vertex_normals)))
     known &= dot(facing, target.vertex_normals) > _FACING
     part = _parts(graph)

@@ -86,7 +86,7 @@ class _Body:
         self.size, self.name = length_of(source), source.name or "the source"
         turns, scale = local_frames(forward, source, target)
         self.jacobians = turns * scale[:, None, None]
-        self.trust = forward.confidence + 1e-3
+        self.trust = forward.assumed_confidence + 1e-3
         edges = source.edges.vertices
         self.step = float(np.median(edge_lengths(source.verts, edges)))
         self.usable = np.flatnonzero(source.valid & (np.bincount(edges.ravel(), minlength=source.V) > 0))

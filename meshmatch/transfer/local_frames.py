@@ -39,7 +39,7 @@ def local_frames(
     here, there = (place[edges[:, 1]] - place[edges[:, 0]] for place in (source.verts, image))
     length, now = edge_lengths(source.verts, edges), edge_lengths(image, edges)
     torn = is_discontinuous(now / length_of(target), length / length_of(source)) | (length == 0)
-    trust = np.where(torn, 0.0, forward.confidence[edges].min(axis=1)) + 1e-6
+    trust = np.where(torn, 0.0, forward.assumed_confidence[edges].min(axis=1)) + 1e-6
     weight = trust / np.maximum(length, 1e-12 * length_of(source))
     products = weight[:, None, None] * there[:, :, None] * here[:, None, :]
     sums = np.zeros((source.V, 11))  # products, and lengths now and before

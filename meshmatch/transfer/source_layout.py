@@ -89,7 +89,7 @@ def _images(walker: SurfaceWalker, target: Shape, back: VertexMap) -> tuple[Floa
     torn = np.flatnonzero(locator.discontinuous)
     if len(torn):
         faces = target.faces[torn]
-        sure = back.confidence[faces].argmax(axis=1)
+        sure = back.assumed_confidence[faces].argmax(axis=1)
         vertex = faces[np.arange(len(torn)), sure]
         away = target.verts[faces] - target.verts[vertex][:, None]
         at[torn] = image[vertex][:, None] + np.einsum("fij,fkj->fki", locator.jacobian[vertex], away)

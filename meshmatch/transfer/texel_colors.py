@@ -190,7 +190,7 @@ class TexelLocator:
 
     def __init__(self, walker: SurfaceWalker, target: Shape, back: VertexMap, corners: Floats) -> None:
         self.walker = walker
-        self._confidence = back.confidence.astype(np.float32)
+        self._confidence = back.assumed_confidence.astype(np.float32)
         self._image, start = images_of(walker, back)
         self.faces, self.verts = target.faces, target.verts
         self._corners = list(np.ascontiguousarray(target.faces.T))

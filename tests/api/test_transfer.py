@@ -45,7 +45,7 @@ def test_two_poses_of_a_mesh_need_no_match(pair: tuple[Shape, Shape, VertexMap])
     maps = meshmatch.find_maps(sphere, other)
     for found in (maps.forward, maps.backward):
         np.testing.assert_array_equal(found.index, true.index)
-        assert (found.verdict, found.confidence.min()) == ("unknown", 1.0)
+        assert found.verdict == "unknown" and np.isnan(found.confidence).all()
     values = np.arange(float(sphere.V))
     np.testing.assert_array_equal(meshmatch.transfer_values(sphere, other, values).data, values)
     assert not have_same_faces(sphere, Shape(other.verts, np.roll(other.faces, 1, axis=1)))

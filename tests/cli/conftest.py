@@ -86,7 +86,9 @@ def fake_fit(shape: Shape, verdict: str = "good", reasons: tuple[str, ...] = (),
 
 def nearest_map(source: Shape, target: Shape, **about: Any) -> VertexMap:
     """Some map: vertex i goes to vertex i, round and round."""
-    return VertexMap.between(source, target, np.arange(source.V) % target.V, **about)
+    return VertexMap.between(
+        source, target, np.arange(source.V) % target.V, **{"confidence": np.ones(source.V)} | about
+    )
 
 
 class FakeMatching:

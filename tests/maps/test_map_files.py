@@ -30,7 +30,7 @@ def same(a: VertexMap, b: VertexMap, names: tuple[str, ...]) -> None:
         assert type(one) is type(other), name
         if isinstance(one, np.ndarray):
             assert one.dtype == other.dtype, name
-            assert np.array_equal(one, other), name
+            assert np.array_equal(one, other, equal_nan=name == "confidence"), name
         else:
             assert one == other, name
 
@@ -117,7 +117,7 @@ def test_maps_of_other_programs(tmp_path: Path) -> None:
         ("a.csv", b"x,y\n1,2\n", "target_vertex"),
         ("a.csv", b"source_vertex,target_vertex\n1,2\n0,3\n", "in order"),
         ("a.csv", b"source_vertex,target_vertex\n0,2\n1\n", "line 3 has 1 cell, the first 2"),
-        ("a.csv", b"source_vertex,target_vertex,confidence\n0,2,nan\n", "0..1"),
+        ("a.csv", b"source_vertex,target_vertex,confidence\n0,2,nan\n1,2,0.5\n", "0..1"),
     ],
 )
 def test_damaged_files(tmp_path: Path, name: str, content: bytes, message: str) -> None:
@@ -183,6 +183,16 @@ def test_a_signalling_nan_prints_no_warning(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.full(4, 0x7D01, np.uint16).view(np.float16))
     with pytest.raises(InputError, match="whole numbers"):
         load_map(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".txt", ".csv", ".npz", ".mat", ".json"])
+def test_confidence_that_is_not_known_stays_so(tmp_path: Path, suffix: str) -> None:
+    made = VertexMap("a", "b", np.array([2, 0, 1]))
+    path = tmp_path / f"map{suffix}"
+    save_map(path, made)
+    assert np.isnan(load_map(path).confidence).all() and np.isnan(made.compose(made).confidence).all()
+    if suffix == ".json":
+        assert json.loads(path.read_text())["confidence"] == [None] * 3
 
 
 def test_a_truncated_npy_and_a_pickle(tmp_path: Path) -> None:

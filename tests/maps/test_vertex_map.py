@@ -47,7 +47,7 @@ def test_a_bare_list_is_a_map_with_unknowns() -> None:
     assert m.face.tolist() == [-1] * 3
     assert m.barycentric.tolist() == [[1, 0, 0]] * 3
     assert m.confidence.dtype == np.float32
-    assert m.confidence.tolist() == [1] * 3
+    assert np.isnan(m.confidence).all() and m.assumed_confidence.tolist() == [1] * 3
     assert m.verdict == "unknown"
 
 

@@ -104,7 +104,7 @@ def measure(
         answers[left] = found.index[at]
         truth = TruthDistances(bench.shape(target), bench.landmarks(target), cache)
         errors = truth.errors([answers])[0][left]
-        return {"errors": errors, "confidence": found.confidence[at], "partial": fit.partial}
+        return {"errors": errors, "confidence": found.assumed_confidence[at], "partial": fit.partial}
 
     pairs = runner.spread(bench.pairs, limit)
     results = [

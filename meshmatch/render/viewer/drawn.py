@@ -151,7 +151,7 @@ def relative_size(source: Shape, target: Shape, there: VertexMap) -> float:
     points = there.points(target)
     own = np.linalg.norm(source.verts[pairs[:, 0]] - source.verts[pairs[:, 1]], axis=1)
     image = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
-    sure = there.confidence[pairs].min(axis=1) * (image <= np.quantile(image, 0.95))
+    sure = there.assumed_confidence[pairs].min(axis=1) * (image <= np.quantile(image, 0.95))
     lengths = float(sure @ own), float(sure @ image)
     return lengths[1] / lengths[0] if min(lengths) > 0 else 1.0
 

@@ -67,7 +67,7 @@ def write_page(
             "position": scaled(box.place(part.verts), np.uint16),
             "normal": scaled(part.normals @ box.rotation.T, np.int8),
             "color": scaled(tints[k][rows], np.uint8),
-            "confidence": scaled(maps[k].confidence[rows], np.uint8),
+            "confidence": scaled(maps[k].assumed_confidence[rows], np.uint8),
             "match": small_integers(maps[k].index[rows]),
             "face": small_integers(part.faces),
             "place": scaled(cubes[1 - k].place(maps[k].points(shapes[1 - k])[rows]), np.uint16),
@@ -80,12 +80,12 @@ def write_page(
             own |= {f"{name}.{key}": array for key, array in shown_arrays.items()}
         arrays |= {f"{side}.{name}": array for name, array in own.items()}
     words |= {"look": None, "own": False} if looks is None else looks.words
-    # Files of indices alone are read as confident everywhere: that says nothing.
-    known = there.verdict != "unknown" or bool((there.confidence < 1).any())
+    # Files of indices alone were once read as confident everywhere: that says nothing.
+    known = not np.isnan(there.confidence).any() and (there.verdict != "unknown" or bool((there.confidence < 1).any()))
     words |= {
         "verdict": there.verdict,
         "reasons": [plain_text(reason) for reason in there.reasons],
-        "confidence": [round(float(found.confidence.mean()), 4) for found in maps] if known else None,
+        "confidence": [round(float(found.assumed_confidence.mean()), 4) for found in maps] if known else None,
         "ramp": Scale(0.0, 1.0, reverse=True).colors(np.linspace(0, 1, 9)).round(4).tolist(),
     }
     size = write_html(Path(path), "viewer", SCRIPTS, words, arrays, f"{shown[0]} → {shown[1]}")
