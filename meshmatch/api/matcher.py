@@ -195,6 +195,7 @@ class Matcher:
             raise OptionError(f"errors cannot be {errors!r}", "choose raise or return")
         if errors == "return":
             check_list(shapes)
+            shapes = list(shapes)
             return self._fit_each(shapes, configs_for(config or self.config, len(shapes)))
         clean = [usable(shape) for shape in as_shapes(shapes)]
         # one fit alone may have all threads that were asked for; several have one each

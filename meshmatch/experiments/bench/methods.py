@@ -66,9 +66,11 @@ class OurMethod:
     threads: int = 1
     kept: Path | None = None
     latent: LatentRefineConfig = field(default_factory=LatentRefineConfig)  # of the search over codes
+    quick: bool = False
 
     def _matcher(self) -> Matcher:
-        config = FitConfig(refine=self.refine, seed=self.seed, partial=self.partial, latent=self.latent)
+        made = FitConfig.quick if self.quick else FitConfig
+        config = made(refine=self.refine, seed=self.seed, partial=self.partial, latent=self.latent)
         return Matcher(self.model, config, self.threads)
 
     def fit(self, shape: Shape) -> Fit:
