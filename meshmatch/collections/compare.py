@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from meshmatch.collections.setting import Record
+from meshmatch.collections.setting import FAILED, Record
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.judge.reasons import Reason, Verdict
 
@@ -54,8 +54,12 @@ class Usual:
         return float(record.likely / (1 + np.exp(_STRETCH * stretch + _RESIDUAL * residual - _OFFSET)))
 
     def stands_out(self, record: Record) -> bool:
-        """Whether the template had to stretch so much that the shape may lack some of it."""
+        """Whether the template had to stretch much more than usual."""
         return record.fitted and record.stretch > _STANDS_OUT * self.stretch
+
+    def may_lack(self, record: Record) -> bool:
+        """Whether a shape may lack some of what the template shows."""
+        return self.stands_out(record) or record.verdict == "poor"
 
     def _times(self, record: Record) -> tuple[float, float]:
         return record.stretch / self.stretch, record.residual / self.residual
@@ -86,7 +90,7 @@ def on_the_other_side(records: Sequence[Record]) -> set[str]:
     """Names of shapes that were fitted as they are, for their mirror images are not much better; but all the others show
     that shapes of this kind have sides.
     """
-    leads = np.array([each.side for each in records if each.fitted])
+    leads = np.array([each.side for each in records if each.verdict not in ("poor", FAILED)])
     if len(leads) < _FEWEST or (np.abs(leads) > _CLEAR).mean() < _MOST:
         return set()
     return {each.name for each in records if each.side < 0}

@@ -92,7 +92,7 @@ def fit_all(
     if setting.model == NO_MODEL:
         first = _Run(setting, sources, crew, report).fit_alone(None, FIRST)
         usual, others = Usual.of(first), on_the_other_side(first)
-        cut = {} if usual is None else {each.name: usual.scale for each in first if usual.stands_out(each)}
+        cut = {} if usual is None else {each.name: usual.scale for each in first if usual.may_lack(each)}
         setting = on_the_mean(
             setting, [each.name for each in first if _believed(each, usual) and each.name not in others]
         )

@@ -154,7 +154,9 @@ class Setting:
             part, begun, mirror = validated(shape), self._begun(shape.name), self.config.mirror != "no"
             whole = whole if may_show_part(part.shape, self.config) else None
             with thread_limit(1):
-                found = fit_without_model(self.template, part.shape, start=begun, mirror=mirror, other_side=other_side)
+                found = fit_without_model(
+                    self.template, part.shape, start=begun, mirror=mirror, other_side=other_side, whole=whole
+                )
             return replace(found, repaired=part)
         matcher = Matcher(self.trained, self.config, 1)
         return matcher.fit(shape) if last is None else matcher.follow(shape, last)

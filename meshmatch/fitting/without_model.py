@@ -26,7 +26,7 @@ from meshmatch.fitting.fitter import cap_verdict
 from meshmatch.fitting.judge.direct import DirectFeatures
 from meshmatch.fitting.judge.features import compute_features
 from meshmatch.fitting.judge.reasons import Reason
-from meshmatch.fitting.judge.verdict import judge
+from meshmatch.fitting.judge.verdict import Judgement, judge
 from meshmatch.fitting.one_way import DirectConfig
 from meshmatch.fitting.search.predictor import one_way_residual
 from meshmatch.fitting.search.task import take_samples
@@ -244,13 +244,19 @@ def fit_without_model(
         found, lead = task.best((None if start.frame.mirrored else MIRROR,))[0], -start.side
     else:
         found, lead = task.best_from(start), start.side
-    partial = False
+    system, partial = task.system, False
+
+    def judged_as(found: _Fitted) -> Judgement:
+        residual = found.features.residual
+        return judge(compute_features(system, found.vectors, found.samples, residual, template.labels, partial=partial))
+
+    judged = judged_as(found)
     if whole is not None:
         part = _Task(template, shape, config, whole).best_part((None, MIRROR) if mirror else (None,))
-        partial = part.energy < _PART * found.energy
-        found = part if partial else found
-    system, frame, residual = task.system, found.begin.frame, found.features.residual
-    judged = judge(compute_features(system, found.vectors, found.samples, residual, template.labels, partial))
+        if part.energy < (1.0 if judged.verdict == "poor" else _PART) * found.energy:
+            found, partial = part, True
+            judged = judged_as(found)
+    frame, residual = found.begin.frame, found.features.residual
     unsure = Reason("unsupervised", "fitted without a trained model: surfaces that lie close need not correspond")
     notes = ("taken for the mirror image of the template",) if frame.mirrored else ()
     fit = judged_fit(

@@ -1,13 +1,20 @@
 """Fits are judged by what is usual in their collection; and sides, by what all of them show."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from meshmatch.collections import setting
 from meshmatch.collections.compare import Usual, on_the_other_side
 from meshmatch.collections.setting import Record
+from meshmatch.collections.stores import Store
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.reasons import Reason
+from meshmatch.models.registry import NO_MODEL
+from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere, some_fit
 
 UNSURE = Reason("unsupervised", "nothing was learned")
@@ -49,6 +56,22 @@ def test_more_of_a_residual_counts_and_what_a_fit_says_of_itself_stays() -> None
     assert usual.judged(torn, some[0]).verdict == "fair"
     assert usual.judged(replace(fit, verdict="poor"), some[0]).verdict == "poor"
     assert usual.judged(fit, replace(some[0], likely=0.3)).verdict == "poor"
+
+
+def test_only_a_shape_with_an_edge_may_be_a_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ball, asked = icosphere(2), []
+
+    def fitted(*_: object, whole: float | None, **__: object) -> Fit:
+        asked.append(whole)
+        return some_fit(ball.verts, ball.faces)
+
+    monkeypatch.setattr(setting, "fit_without_model", fitted)
+    monkeypatch.setattr(setting.Setting, "template", None)
+    monkeypatch.setattr(setting.Setting, "_begun", lambda *_: None)
+    how = setting.Setting(Store.of(tmp_path), NO_MODEL, FitConfig())
+    for shape in (ball, Shape(ball.verts, ball.faces[ball.verts[ball.faces, 2].min(axis=1) > -0.3])):
+        how.fit(shape, whole=3.0)
+    assert asked == [None, 3.0]
 
 
 def test_of_few_and_of_fits_that_do_not_say_nothing_is_usual() -> None:
