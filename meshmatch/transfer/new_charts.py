@@ -15,6 +15,7 @@ import numpy as np
 import xatlas
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.transfer.merged_charts import merged_charts
 from meshmatch.transfer.whole_polygons import whole_polygons
 
 # Charts are packed on a grid of at most this size, at several densities; the best result is taken.
@@ -85,7 +86,8 @@ def _made(
     if not np.array_equal(origin[faces], corners):
         raise RuntimeError("faces were lost")
     charts = uv * (np.array([maker.width, maker.height]) / maker.texels_per_unit)
-    charts, faces = whole_polygons(verts, corners, charts, faces.astype(np.int64), polygons)
+    charts, faces = merged_charts(verts, corners, charts, faces.astype(np.int64))
+    charts, faces = whole_polygons(verts, corners, charts, faces, polygons)
     grid = min(size, _GRID)
     return _packed(charts, faces, grid, padding * grid / size, atlases), faces
 
