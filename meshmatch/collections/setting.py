@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -96,6 +96,16 @@ class Record:
     digest: str = ""
     notes: str = ""  # which parts were left out, if any
     kind: str = ""  # that it is of, if that is another one than the model's
+
+    @classmethod
+    def of(cls, words: Mapping[str, Any]) -> Record:
+        """As it was kept beside a fit; `TypeError` for other words, and values of other types."""
+        record = cls(**words)
+        for each in fields(cls):
+            kind = str if each.default is MISSING else type(each.default)
+            if not isinstance(getattr(record, each.name), (float, int) if kind is float else kind):
+                raise TypeError(each.name)
+        return record
 
     @property
     def fitted(self) -> bool:

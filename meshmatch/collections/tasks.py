@@ -109,7 +109,7 @@ def _known(store: Store, file: str, digests: Sequence[str]) -> Record | None:
         return None
     try:
         with store.reading(file) as path:
-            record = Record(**load_words(path)[1]["record"])
+            record = Record.of(load_words(path)[1]["record"])
     except (InputError, KeyError, TypeError):
         return None
     return record if record.digest in digests else None
@@ -258,7 +258,7 @@ def _finish(task: FinishTask) -> None:
     part = validated(leave_out(task.source.load(setting.only, setting.without), alone.fit.left_out))
     before = replace(alone.fit, repaired=part, verts=part.shape.verts)
     if task.usual is not None:
-        before = task.usual.judged(before, Record(**alone.words["record"]))
+        before = task.usual.judged(before, Record.of(alone.words["record"]))
     fit = before
     if task.group is not None:
         vectors = load_array(setting.store, task.group.file(task.step))[task.group.names.index(name)]

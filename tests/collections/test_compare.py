@@ -1,6 +1,6 @@
 """Fits are judged by what is usual in their collection; and sides, by what all of them show."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -86,3 +86,11 @@ def test_sides_are_taken_where_nearly_all_have_a_clear_one() -> None:
     symmetric = records(stretches, [0.01, 0.02, -0.03, 0.01, -0.12, 0.09])
     assert on_the_other_side(symmetric) == set()
     assert on_the_other_side(clear[:3]) == set()
+
+
+def test_a_record_of_other_types_is_not_read() -> None:
+    kept = asdict(records([1.0])[0])
+    assert Record.of({**kept, "stretch": 2}).stretch == 2
+    for words in ({**kept, "stretch": "much"}, {**kept, "name": 3}, {**kept, "mirrored": None}, {**kept, "other": 1}):
+        with pytest.raises(TypeError):
+            Record.of(words)
