@@ -157,7 +157,7 @@ def test_known_points_and_preset_reach_the_training(
 ) -> None:
     called = {}
 
-    def stub(template, samples, output, recipe, facts, resume, report, unseen):
+    def stub(template, samples, output, recipe, facts, resume, report, *of_validation):
         called.update(vars(facts), known=samples.landmarks.shape, output=output, recipe=recipe, resume=resume)
         report(StepReport(1, 1, 1e-3, 1.0, {"total": 0.5}))
         card = read_card(bundled_folder() / "models" / "human" / "card.json")
