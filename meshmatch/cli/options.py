@@ -200,7 +200,7 @@ class FitOptions(Options):
     try_harder: bool = Option(
         False,
         "--try-harder",
-        help="Where a fit is poor, search up to twenty times as long: as a part in more orientations, and for parts of the "
+        help="Where a fit is poor, search for longer: as a part in more orientations, and for parts of the "
         "file that may be the shape.",
     )
     seed: Seed = 0
