@@ -85,3 +85,19 @@ def test_the_calibration_of_direct_maps_tells_right_from_wrong() -> None:
     told = [fitted.logit(each["energy"], each["leads"]) > 0 for each in found]
     assert np.mean([a == (each["error"] < 10) for a, each in zip(told, found, strict=True)]) > 0.85
     assert fitted.logit(0.03, [0.004, 0.5]) == fitted.logit(0.03, [0.5, 0.004]) < fitted.logit(0.03, [])
+
+
+def test_verdicts_are_counted_by_weights_of_other_classes() -> None:
+    rng = np.random.default_rng(1)
+    pairs = [
+        {
+            "error": 3.0 if right else 30.0,
+            "energy": rng.normal(0.03 if right else 0.06, 0.004),
+            "leads": (rng.uniform(0.002, 0.01),),
+        }
+        for right in [True] * 30 + [False] * 20
+    ]
+    odd = [{"error": 30.0, "energy": 0.02, "leads": (0.02,)}]  # looks right, and is wrong
+    counts = any_shapes.held_out({"a": pairs[::2], "b": pairs[1::2], "odd": odd})
+    assert (counts["pairs"], counts["right"]) == (51, 30)
+    assert counts["good"] > counts["good_over"] == 1 and counts["right_not_poor"] >= 28

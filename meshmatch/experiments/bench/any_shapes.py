@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import date
 from functools import cache, partial
@@ -35,6 +35,7 @@ from meshmatch.experiments import runner
 from meshmatch.fitting.direct import match_either_side
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.calibration import DirectCalibration
+from meshmatch.fitting.judge.direct import judge_direct
 from meshmatch.fitting.one_way import BothWays, DirectConfig
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.shapes.files import load_shape
@@ -57,6 +58,8 @@ _COLUMNS |= {
     "error": "worst_error:.1f",
     "CPU s": "cpu:.1f",
 }
+_HELD_OUT = {"maps": "maps", "pairs": "pairs:d", "under 10": "right:d", "good": "good:d", "good over 10": "good_over:d"}
+_HELD_OUT |= {"under 10, good or fair": "right_not_poor:d"}
 
 
 def folder_of(name: str, data: Path) -> Path:
@@ -165,6 +168,13 @@ def measure(folder: Path, pair: tuple[str, str], model: str, seed: int, ways: Bo
     }
 
 
+_Found = Mapping[str, Sequence[dict[str, Any]]]  # pairs of each class
+
+
+def _all(found: _Found) -> list[dict[str, Any]]:
+    return [row for some in found.values() for row in some]
+
+
 def fitted_calibration(found: Sequence[dict[str, Any]], most: float = 0.008, ridge: float = 0.01) -> DirectCalibration:
     """By logistic regression, with a little ridge, of maps without a model that are right and wrong."""
     right = np.array([each["error"] < OFF for each in found])
@@ -180,6 +190,23 @@ def fitted_calibration(found: Sequence[dict[str, Any]], most: float = 0.008, rid
     data = f"{len(found)} pairs of experiments.bench.any_shapes, of which {int(right.sum())} are right"
     today = date.today().isoformat()
     return DirectCalibration(offset=float(offset), energy=energy, lead=lead, most=most, data=data, date=today)
+
+
+def held_out(found: _Found) -> dict[str, Any]:
+    """How verdicts of each class come out by the weights that the other classes give."""
+    counts = {"pairs": 0, "right": 0, "good": 0, "good_over": 0, "right_not_poor": 0}
+    for name, own in found.items():
+        others = [row for other, some in found.items() if other != name for row in some]
+        calibration = fitted_calibration(others)
+        for row in own:
+            verdict = judge_direct(row["energy"], row["leads"], calibration)[0]
+            right = row["error"] < OFF
+            counts["pairs"] += 1
+            counts["right"] += right
+            counts["good"] += verdict == "good"
+            counts["good_over"] += verdict == "good" and not right
+            counts["right_not_poor"] += verdict != "poor" and right
+    return counts
 
 
 def row_of(name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -209,24 +236,41 @@ def main(
     seed: runner.Seed = 0,
     data: runner.Data = runner.DATA,
     work: runner.Work = None,
-    ways: Annotated[BothWays, Option("--both-ways", help="when the target is fitted to the source, too")] = "in doubt",
-    fit: Annotated[bool, Option("--fit", help="also find the weights of verdicts, one way or both")] = False,
+    fit: Annotated[bool, Option("--fit", help="also find the weights of verdicts")] = False,
 ) -> runner.Report:
     names = CLASSES if classes == "all" else runner.names_of(classes, (*CLASSES, *TURNING), "class")
-    rows, everything = [], []
+    found: dict[str, list[dict[str, Any]]] = {}
+    one_way: dict[str, list[dict[str, Any]]] = {}
+    asked = {"model": model, "seed": seed}
     for name in names:
         folder = folder_of(name, data)
         pairs = runner.spread(list(permutations(shapes_of(folder), 2)), limit_pairs)
-        asked = {"model": model, "seed": seed} | ({} if ways == "in doubt" else {"ways": ways})
-        found = [
-            runner.at_work(work, f"{name}-{'-'.join(pair)}", asked, partial(measure, folder, pair, model, seed, ways))
-            for pair in runner.track(pairs, name)
-        ]
-        rows.append(row_of(name, found))
-        everything += found
-    total = row_of("all", everything)
-    return runner.Report(
-        {"rows": [*rows, total], "pairs": everything},
-        [runner.table("Keypoints, x100 of sqrt(area)", [*rows, total], _COLUMNS)],
-        notes=[str(fitted_calibration(everything))] if fit else [],
+        found[name], one_way[name] = [], []
+        for pair in runner.track(pairs, name):
+            called = f"{name}-{'-'.join(pair)}"
+            row = runner.at_work(work, called, asked, partial(measure, folder, pair, model, seed))
+            found[name].append(row)
+            if fit and row["both_ways"]:
+                call = partial(measure, folder, pair, model, seed, "no")
+                row = runner.at_work(work, f"{called}-one-way", asked | {"ways": "no"}, call)
+            one_way[name].append(row)
+    everything = _all(found)
+    rows = [*(row_of(name, some) for name, some in found.items()), row_of("all", everything)]
+    report = runner.Report(
+        {"rows": rows, "pairs": everything}, [runner.table("Keypoints, x100 of sqrt(area)", rows, _COLUMNS)]
+    )
+    return _with_calibrations(report, found, one_way) if fit else report
+
+
+def _with_calibrations(report: runner.Report, found: _Found, one_way: _Found) -> runner.Report:
+    """The weights of both verdicts, and how they do on classes that did not give them."""
+    doubtful = {name: [row for row in some if row["both_ways"]] for name, some in found.items()}
+    fits = {"one way": one_way, "both ways, where one way leaves doubt": doubtful}
+    rows = [{"maps": which, **held_out(each)} for which, each in fits.items()]
+    table = runner.table("Verdicts by weights that other classes gave", rows, _HELD_OUT)
+    return replace(
+        report,
+        record={**report.record, "held out": rows},
+        tables=[*report.tables, table],
+        notes=[f"{which}: {fitted_calibration(_all(each))}" for which, each in fits.items()],
     )
