@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import boundary_length, may_show_part
 from meshmatch.fitting.judge.category import FAMILIAR, KNOWN, SURE, category_residual, category_samples
+from meshmatch.maps.evaluate import CM, X100, ErrorUnit
 from meshmatch.models.card import ModelCard
 from meshmatch.models.registry import list_models
 from meshmatch.models.trained import TrainedModel
@@ -27,6 +29,8 @@ from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map
+
+UnitName = Literal["auto", "cm", "file", "x100"]
 
 _PEOPLE = "human"
 _NEXT, _TOGETHER = ("quadruped",), 2  # asked after people, before the others; how many models at a time
@@ -300,6 +304,27 @@ def kinds_of(
         if progress is not None:
             progress("looking for known kinds", "shapes", (number + 1) / len(read))
     return found
+
+
+def is_person(shape: Shape) -> bool:
+    """Whether the model of people is sure of a shape, without asking others; False if it is not installed."""
+    people = [model for model in installed_models() if model.built_in and model.card.category == _PEOPLE]
+    try:
+        return bool(people) and category_residuals(people[:1], [repair(shape).shape], [FitConfig()])[0, 0] <= SURE
+    except InputError:  # of no use to any model
+        return False
+
+
+def error_unit(name: UnitName, target: Shape) -> ErrorUnit:
+    """What errors on a target are told in; ``"auto"``: centimetres on a person, else the unit of its file.
+
+    `OptionError` if there is no such unit.
+    """
+    if name not in get_args(UnitName):
+        raise OptionError(f"invalid unit {name!r}", f"choose one of {', '.join(get_args(UnitName))}")
+    if name == "x100":
+        return X100
+    return CM if name == "cm" or (name == "auto" and is_person(target)) else ErrorUnit.of_file(target)
 
 
 def kind_notes(kinds: Mapping[str, str | None], folder: Path) -> list[str]:

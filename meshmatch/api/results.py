@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from meshmatch.api.kinds import UnitName, error_unit
 from meshmatch.arrays import Brief, Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.build import build_map
-from meshmatch.maps.evaluate import Evaluation, evaluate_map
+from meshmatch.maps.evaluate import CM, Evaluation, evaluate_map
 from meshmatch.maps.files import load_map
 from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.places import PlacedFit, Places
@@ -330,13 +331,14 @@ def evaluate(
     truth: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
     *,
     backward: VertexMap | str | Path | None = None,
+    unit: UnitName = "auto",
     seed: int = 0,
     progress: ProgressCallback | None = None,
 ) -> Evaluation:
     """Measure a map: its coverage, distortion and Dirichlet energy, and its errors where the truth is known.
 
-    Errors are geodesic distances on the target, divided by the square root of its area; or in centimetres with the
-    target scaled to 1.9 square metres, the skin area of a person.
+    Errors are geodesic distances on the target, divided by the square root of its area; they are told in the unit of its
+    file, or for a person in centimetres, with the target scaled to 1.9 square metres of skin.
 
     Parameters
     ----------
@@ -351,6 +353,9 @@ def evaluate(
         ((N,), (N,)).
     backward
         A map from target to source, or its file, for ``bijectivity``; for instance ``result.backward()`` of a match.
+    unit
+        What errors are told in: "cm" (a person's), "file" (the unit of the target's file), "x100" (hundredths of
+        sqrt(area)), or "auto": "cm" if the model ``human`` recognises the target, else "file".
     seed
         Of the random pairs of points between which distortion is measured.
     progress
@@ -364,7 +369,7 @@ def evaluate(
     Raises
     ------
     MeshmatchError
-        The map or the truth belongs to other shapes, or is something else.
+        The map or the truth belongs to other shapes, or is something else; or there is no such unit.
 
     Examples
     --------
@@ -383,4 +388,7 @@ def evaluate(
     known = truth if isinstance(truth, tuple) and len(truth) == 2 else (None, truth)
     rng = np.random.default_rng(seed)
     with thread_limit(1):
-        return evaluate_map(vertex_map, source, target, *known, backward=backward, rng=rng, progress=progress)
+        told = CM if truth is None else error_unit(unit, target)
+        return evaluate_map(
+            vertex_map, source, target, *known, backward=backward, unit=told, rng=rng, progress=progress
+        )

@@ -175,20 +175,24 @@ def evaluate(
     backward: Path | None = optional(
         "MAP", "The map from TARGET to SOURCE, to measure how far both together lead astray."
     ),
-    threshold: float = Option(15.0, min=0.0, metavar="CM", help="Report the share of errors above this many cm."),
+    threshold: float | None = Option(
+        None,
+        min=0.0,
+        metavar="LENGTH",
+        help="Report the share of errors above this, in --unit; by default 15 cm, or 10 % of the square root of the area.",
+    ),
     curve: Path | None = optional("FILE", "Plot the cumulative error curve: .png, .svg or .pdf (needs ground truth)."),
     picture: Path | None = optional("PNG", "Draw both shapes, errors as a color map (needs ground truth)."),
-    unit: options.ErrorUnit = Option(
-        "cm", help="Unit of curve and picture: cm on a person (1.9 m2 of skin), or percent of the target's sqrt(area)."
-    ),
+    unit: options.ErrorUnit = "auto",
     seed: options.Seed = 0,
     json: options.Json = False,
 ) -> None:
     """Measure how good a map is.
 
     Reports coverage and, between meshes, distortion, Dirichlet energy and folds. With --truth or --points also geodesic
-    errors on TARGET: in percent of the square root of its area, and in centimetres with TARGET scaled to 1.9 square
-    metres, the skin area of a person. With --backward also how far from itself a vertex arrives by both maps.
+    errors on TARGET: in percent of the square root of its area, and in the unit of its file, or of a person in
+    centimetres with TARGET scaled to 1.9 square metres of skin. With --backward also how far from itself a vertex arrives
+    by both maps.
     """
     told = options.check_truth(truth, points)
     for what, file in (("curve", curve), ("picture", picture)):
@@ -209,17 +213,17 @@ def evaluate(
     known = options.load_truth(truth, points, shapes[0])
     console = Console()
     with console.progress() as report:
-        result = meshmatch.evaluate(found, *shapes, known, backward=back, seed=seed, progress=report)
+        result = meshmatch.evaluate(found, *shapes, known, backward=back, unit=unit, seed=seed, progress=report)
     if known is not None and result.errors is not None:
         if curve is not None:
             from meshmatch.render.charts import draw_curves
 
-            limit = 20.0 if unit == "cm" else 25.0
-            draw_curves({found.source or source.stem: result.errors}, curve, limit, unit=unit)
+            limit = 20.0 if result.unit.name == "cm" else 2.5 * result.unit.lost
+            draw_curves({found.source or source.stem: result.errors}, curve, limit, unit=result.unit)
         if picture is not None:
             from meshmatch.render.compose import compose_errors
 
-            compose_errors(*shapes, found, known, result.errors, unit).render(picture)
+            compose_errors(*shapes, found, known, result.errors, result.unit).render(picture)
     console.say(*(f"note: {reason}" for reason in found.reasons))
     if json:
         print_json(dict(result.as_dict(threshold)))
@@ -227,13 +231,16 @@ def evaluate(
         print_rows(_rows(result, threshold))
 
 
-def _rows(result: "Evaluation", threshold: float) -> list[tuple[str, str, str]]:
-    rows = []
+def _rows(result: "Evaluation", threshold: float | None) -> list[tuple[str, str, str]]:
+    rows, unit = [], result.unit
     if (errors := result.errors) is not None:
+        digits, limit = ".2f" if unit.name == "cm" else ".3g", unit.lost if threshold is None else threshold
         rows = [
-            ("mean error", f"{errors.mean_cm:.2f} cm", f"{100 * errors.mean:.2f} x 0.01 sqrt(area)"),
-            ("median error", f"{errors.median_cm:.2f} cm", f"{100 * errors.median:.2f} x 0.01 sqrt(area)"),
-            (f"over {threshold:g} cm", f"{100 * errors.share_over(threshold):.2f} %", ""),
+            (f"{name} error", f"{unit.factor * value:{digits}} {unit.symbol}", f"{100 * value:.2f} x 0.01 sqrt(area)")
+            for name, value in {"mean": errors.mean, "median": errors.median}.items()
+        ]
+        rows += [
+            (f"over {limit:.3g}", f"{100 * result.share_over(threshold):.2f} %", "of the points"),
             ("points", f"{errors.values.size}", f"geodesic: {result.geodesic}"),
         ]
     rows += [

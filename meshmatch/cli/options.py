@@ -35,7 +35,13 @@ Seed = Annotated[int, Option(min=0, help="Random seed. The same seed gives the s
 Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout.")]
 Threads = Annotated[int, Option(min=1, help="Number of threads.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Print only warnings and errors.")]
-ErrorUnit = Literal["cm", "x100"]
+ErrorUnit = Annotated[
+    Literal["auto", "cm", "file", "x100"],
+    Option(
+        help="Unit of errors: cm on a person (1.9 m2 of skin), file (unit of TARGET's file), x100 (percent of the square "
+        "root of TARGET's area), or auto: cm if TARGET is a person, else file."
+    ),
+]
 Truth = Annotated[
     Path | None,
     Option(

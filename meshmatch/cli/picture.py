@@ -34,9 +34,7 @@ class PictureOptions:
     confidence: bool = Option(False, "--confidence", help="With --map: show its confidence as a color map.")
     truth: options.Truth = None
     points: options.Points = None
-    unit: options.ErrorUnit = Option(
-        "cm", help="Unit of errors: cm on a person (1.9 m2 of skin), or percent of the target's sqrt(area)."
-    )
+    unit: options.ErrorUnit = "auto"
     values: list[Path] | None = options.optional(
         "FILE",
         "A number per vertex, shown as a color map (.npy or .csv), or three, shown as a color. Once for each shape.",
@@ -233,11 +231,12 @@ def _compose_map(shown: PictureOptions, file: Path, shapes: "list[meshmatch.Shap
     known = options.load_truth(shown.truth, shown.points, source)
     if known is None:
         return compose_match(source, target, found, look=look)
+    from meshmatch.api.kinds import error_unit
     from meshmatch.maps.evaluate import map_errors
     from meshmatch.maps.geodesics import GeodesicDistances
 
     errors = map_errors(found.index, *known, GeodesicDistances(target))
-    return compose_errors(source, target, found, known, errors, shown.unit, shown.range, look)
+    return compose_errors(source, target, found, known, errors, error_unit(shown.unit, target), shown.range, look)
 
 
 def _compose_fit(

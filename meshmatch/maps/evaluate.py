@@ -23,6 +23,53 @@ CM_PER_UNIT = 100.0 * float(np.sqrt(SKIN_M2))
 """Centimetres in one sqrt(area) of a person with 1.9 m2 of skin."""
 LOST_CM = 15.0
 """An error above this is a point on the wrong limb; a pair whose mean lies above it is a left-right flip."""
+_LOST = 0.1  # the same of other shapes, in units of sqrt(area)
+
+
+@dataclass(frozen=True)
+class ErrorUnit:
+    """What errors are told in.
+
+    Attributes
+    ----------
+    name
+        "cm" (the target scaled to 1.9 m2 of skin), "file" (unit of the target's file) or "x100" (hundredths of sqrt(area)).
+    factor
+        How many are one sqrt(area) of the target.
+    symbol
+        What stands after a number.
+    words
+        What stands at an axis.
+    lost
+        A larger error is a point in a wrong place.
+    """
+
+    name: str
+    factor: float
+    symbol: str
+    words: str
+    lost: float
+
+    @classmethod
+    def of_file(cls, target: Shape) -> ErrorUnit:
+        """The unit of the target's file.
+
+        Parameters
+        ----------
+        target
+            What errors were measured on.
+
+        Returns
+        -------
+        ErrorUnit
+            ``factor`` is the square root of the target's area.
+        """
+        size = float(np.sqrt(target.area))
+        return cls("file", size, "(unit of the file)", "unit of the file", _LOST * size)
+
+
+CM = ErrorUnit("cm", CM_PER_UNIT, "cm", "cm, target scaled to 1.9 m² of skin", LOST_CM)
+X100 = ErrorUnit("x100", 100.0, "x 0.01 sqrt(area)", "hundredths of sqrt(area)", 100 * _LOST)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -210,6 +257,8 @@ class Evaluation:
         or more); None unless both are meshes.
     errors
         Distances from the truth; None where it is not known.
+    unit
+        What errors are told in.
     geodesic
         How distances along a surface are measured.
     dirichlet
@@ -230,6 +279,7 @@ class Evaluation:
     distortion: float | None = None
     folds: Folds | None = None
     errors: Errors | None = None
+    unit: ErrorUnit = CM
     geodesic: str = GEODESIC
     dirichlet: float | None = None
     bijectivity: float | None = None
@@ -238,18 +288,19 @@ class Evaluation:
         rows = {name: f"{value:.4g}" for name, value in self.as_dict().items() if isinstance(value, float | int)}
         return table_html("Evaluation", rows)
 
-    def as_dict(self, threshold_cm: float = LOST_CM) -> Mapping[str, Any]:
+    def as_dict(self, threshold: float | None = None) -> Mapping[str, Any]:
         """Plain numbers, for a line of JSON.
 
         Parameters
         ----------
-        threshold_cm
-            From which error on a point counts in ``share_over_threshold``.
+        threshold
+            What an error must exceed to count in ``share_over_threshold``, in ``unit``; its ``lost`` by default.
 
         Returns
         -------
         dict
-            Lengths ending in "x100" are in sqrt(area) x 100, those in "cm" are for a target of 1.9 m2.
+            ``mean``, ``median`` and ``threshold`` of errors are in ``unit``; lengths ending in "x100" in sqrt(area) x 100,
+            those in "cm" for a target of 1.9 m2.
         """
         record: dict[str, Any] = {
             "coverage_vertices": self.coverage.vertices,
@@ -262,15 +313,36 @@ class Evaluation:
         if self.errors is not None:
             record |= {
                 "points": int(self.errors.values.size),
+                "unit": self.unit.name,
+                "mean": self.unit.factor * self.errors.mean,
+                "median": self.unit.factor * self.errors.median,
                 "mean_x100": 100 * self.errors.mean,
                 "median_x100": 100 * self.errors.median,
                 "mean_cm": self.errors.mean_cm,
                 "median_cm": self.errors.median_cm,
-                "threshold_cm": threshold_cm,
-                "share_over_threshold": self.errors.share_over(threshold_cm),
+                "threshold": self.unit.lost if threshold is None else threshold,
+                "share_over_threshold": self.share_over(threshold),
                 "geodesic": self.geodesic,
             }
         return record
+
+    def share_over(self, threshold: float | None = None) -> float:
+        """Share of the points with a large error.
+
+        Parameters
+        ----------
+        threshold
+            What an error must exceed, in ``unit``; its ``lost`` by default.
+
+        Returns
+        -------
+        float
+            From 0 to 1; nan where the truth is not known.
+        """
+        if self.errors is None:
+            return float("nan")
+        limit = (self.unit.lost if threshold is None else threshold) / self.unit.factor
+        return float((self.errors.values > limit).mean())
 
 
 def evaluate_map(
@@ -281,15 +353,16 @@ def evaluate_map(
     target_points: ArrayLike | None = None,
     *,
     backward: VertexMap | None = None,
+    unit: ErrorUnit = CM,
     rng: np.random.Generator | None = None,
     progress: ProgressCallback | None = None,
 ) -> Evaluation:
     """Coverage, distortion, Dirichlet energy and folds (if both shapes are meshes), bijectivity where the map back is given
     and, where the truth is given as in `map_errors`, errors.
 
-    With `target_points` alone, entry i belongs to vertex i of the source. `rng` chooses the points of `distortion`;
-    ``default_rng(0)`` if none is given. `InputError` if the map does not belong to these shapes, or the truth to them;
-    or if the truth is given and the target is a cloud.
+    With `target_points` alone, entry i belongs to vertex i of the source. `unit` is what errors are told in; `rng`,
+    ``default_rng(0)`` if none is given, chooses the points of `distortion`. `InputError` if the map does not belong to
+    these shapes, or the truth to them; or if the truth is given and the target is a cloud.
     """
     vertex_map = vertex_map.for_shapes(source, target)
     over = errors = stretched = folds = energy = astray = None
@@ -306,4 +379,4 @@ def evaluate_map(
     if backward is not None and not source.is_cloud:
         astray = round_trip(vertex_map, backward, GeodesicDistances(source))
     measured: dict[str, Any] = {"dirichlet": energy, "bijectivity": astray}
-    return Evaluation(coverage(vertex_map.index, target), stretched, folds, errors, **measured)
+    return Evaluation(coverage(vertex_map.index, target), stretched, folds, errors, unit, **measured)

@@ -11,13 +11,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from meshmatch.arrays import Floats
 from meshmatch.errors import OptionError
-from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
+from meshmatch.maps.evaluate import CM, Errors, ErrorUnit
 from meshmatch.outputs import replace_on_success
 from meshmatch.render.scales import short
 
@@ -38,11 +38,6 @@ _METADATA: dict[str, dict[str, None]] = {
 _MOST_TERMS, _MOST_BARS, _MOST_GROUPS = 12, 20, 14
 _MARKERS = "os^Dv"  # one for each round through the colors
 _STYLE = Path(__file__).with_name("charts.mplstyle")
-# What the error axis counts: units in one sqrt(area), the unit's name, the words under the axis.
-_UNITS = {
-    "cm": (CM_PER_UNIT, "cm", "geodesic error (cm, target scaled to 1.9 m² of skin)"),
-    "x100": (100.0, "x 0.01", "geodesic error (0.01 of the square root of the target's area)"),
-}
 
 
 def check_chart(path: str | Path) -> None:
@@ -53,23 +48,21 @@ def check_chart(path: str | Path) -> None:
         raise OptionError("charts need matplotlib", "pip install 'meshmatch[plots]'")
 
 
-def draw_curves(
-    curves: Mapping[str, Errors], path: str | Path, limit: float = 20.0, *, unit: Literal["cm", "x100"] = "cm"
-) -> None:
+def draw_curves(curves: Mapping[str, Errors], path: str | Path, limit: float = 20.0, *, unit: ErrorUnit = CM) -> None:
     """Draw cumulative error curves, at least one: the share of points (vertical) with at most this error, up to ``limit``
-    in ``unit``: centimeters on a target scaled to 1.9 m² (a person's skin), or hundredths of sqrt(area).
+    in ``unit``.
     """
-    if not curves or not limit > 0 or unit not in _UNITS:
-        raise OptionError(f"a curve needs errors, a positive limit and a unit of {', '.join(_UNITS)}")
-    factor, counted, xlabel = _UNITS[unit]
+    if not curves or not limit > 0:
+        raise OptionError("a curve needs errors and a positive limit")
+    factor = unit.factor
     with saved(path, 6.0, 4.0) as figure:
         axes = figure.subplots()
         at = np.linspace(0.0, limit, 801)
         for number, (name, errors) in enumerate(curves.items()):
             mean, median = errors.mean * factor, errors.median * factor
-            label = f"{short(name)}: mean {mean:.2f} {counted}, median {median:.2f} {counted}"
+            label = f"{short(name)}: mean {mean:.3g}, median {median:.3g}"
             axes.plot(at, 100 * errors.curve(at / factor), label=label, **pen(number))
-        axes.set(xlim=(0, limit), ylim=(0, 101), xlabel=xlabel, ylabel="share of points")
+        axes.set(xlim=(0, limit), ylim=(0, 101), xlabel=f"geodesic error ({unit.words})", ylabel="share of points")
         axes.yaxis.set_major_formatter("{x:.0f} %")
         axes.legend(loc="lower right", frameon=True, edgecolor=_GRID, framealpha=0.92)
 

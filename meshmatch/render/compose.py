@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
+from meshmatch.maps.evaluate import CM, Errors, ErrorUnit
 from meshmatch.maps.mapped_mesh import MappedMesh, invert_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.facing import Rotations, same_side, upright
@@ -29,16 +29,10 @@ from meshmatch.templates.template import Template
 from meshmatch.transfer.attributes import pull_values
 from meshmatch.transfer.label_files import Labels
 
-ErrorUnit = Literal["cm", "x100"]
-
 # A target vertex whose confidence is a smaller share of that of its match than this is unmatched.
 _MATCHED = 0.05
 # Known points closer than this (units of sqrt(area)) are interpolated over the surface between them.
 _CLOSE = 0.06
-_ERROR_UNITS = {
-    "cm": (CM_PER_UNIT, "error (cm, on a body with 1.9 m2 of skin)"),
-    "x100": (100.0, "error (hundredths of sqrt(area))"),
-}
 PALE = (0.88, 0.88, 0.89)
 """Color of a shape that only shows points."""
 
@@ -128,17 +122,17 @@ def compose_errors(
     vertex_map: VertexMap,
     known: tuple[Int[Ints, " N"], Int[Ints, " N"]],
     errors: Errors,
-    unit: ErrorUnit = "cm",
+    unit: ErrorUnit = CM,
     limits: tuple[float, float] | None = None,
     look: Look = Look(),
 ) -> Composition:
     """Source and target colored by the errors at ``known`` points, given as vertices of source and target."""
-    factor, title = _ERROR_UNITS[unit]
-    values = np.asarray(errors.values, np.float64) * factor
-    scale = Scale.of(values, title, limits)
+    values = np.asarray(errors.values, np.float64) * unit.factor
+    scale = Scale.of(values, f"error ({unit.words})", limits)
     panels = [_painted_points(shape, at, values, scale) for shape, at in zip((source, target), known, strict=True)]
     gaps = any((np.asarray(panel.colors) == UNKNOWN).all(axis=1).any() for panel in panels)
-    record = {"points": int(values.size), "mean_cm": errors.mean_cm, "mean_x100": 100 * errors.mean}
+    record = {"points": int(values.size), "unit": unit.name, "mean": unit.factor * errors.mean}
+    record |= {"mean_cm": errors.mean_cm, "mean_x100": 100 * errors.mean}
     shown = Composition(tuple(panels), replace(scale, unknown=gaps), "the errors of the map", record)
     return shown.rotated(same_side(source, target, vertex_map, up=look.up, front=look.front))
 

@@ -17,6 +17,7 @@ from meshmatch.shapes.shape import Shape
 from tests.cli.conftest import Answer, Run, refused, well
 
 V = 642
+SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
 
 
 @pytest.fixture
@@ -66,7 +67,7 @@ def test_with_the_map_back_it_says_where_both_lead(evaluate: Callable[[str], Ans
 )
 def test_every_form_of_the_truth_gives_the_same_errors(evaluate: Callable[[str], Answer], truth: str) -> None:
     record = json.loads(evaluate(f"{truth} --json").out)
-    assert (record["points"], record["median_cm"], record["threshold_cm"]) == (V, 0.0, 15.0)
+    assert (record["points"], record["unit"], record["median"], record["median_cm"]) == (V, "file", 0.0, 0.0)
     assert record["mean_cm"] > 1.0  # a tenth of the vertices, thrown across the sphere
     assert 0.05 < record["share_over_threshold"] <= 64 / V
 
@@ -74,7 +75,28 @@ def test_every_form_of_the_truth_gives_the_same_errors(evaluate: Callable[[str],
 @pytest.mark.parametrize(("pairs", "right"), [("0 0\n5 5\n577 577\n", True), ("641 641\n", False)])
 def test_truth_about_good_vertices_alone_is_0(evaluate: Callable[[str], Answer], pairs: str, right: bool) -> None:
     Path("t.txt").write_text(pairs)
-    assert ("mean error    0.00 cm" in evaluate("--truth t.txt").out) == right
+    assert ("mean error    0 (unit of the file)" in evaluate("--truth t.txt").out) == right
+
+
+def test_errors_are_in_the_unit_of_the_file_unless_it_is_a_person(evaluate: Callable[[str], Answer]) -> None:
+    record = json.loads(evaluate("--truth column.txt --json").out)
+    size = float(np.sqrt(load_shape("b.ply").area))
+    assert record["mean"] == pytest.approx(record["mean_x100"] / 100 * size) and record["mean"] > 0
+    assert record["threshold"] == pytest.approx(0.1 * size)
+    assert f"over {0.1 * size:.3g}" in evaluate("--truth column.txt").out
+    asked = json.loads(evaluate("--truth column.txt --unit cm --json").out)
+    assert (asked["unit"], asked["threshold"], asked["mean"]) == ("cm", 15.0, record["mean_cm"])
+
+
+def test_of_a_person_they_are_in_centimetres(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    climber = load_shape(SAMPLES / "climber.ply")
+    index = np.arange(climber.V)
+    index[0] = index[1]
+    save_map("map.npz", VertexMap.between(climber, climber, index))
+    Path("t.txt").write_text("0 0\n5 5\n")
+    answer = run("evaluate", "map.npz", *2 * [str(SAMPLES / "climber.ply")], "--truth", "t.txt")
+    assert "cm" in well(answer).out.splitlines()[0] and "over 15 " in answer.out
 
 
 def test_threshold(evaluate: Callable[[str], Answer]) -> None:
@@ -92,9 +114,9 @@ def test_seed_chooses_the_pairs_of_the_distortion(evaluate: Callable[[str], Answ
 
 
 def test_units_draw_different_curves(evaluate: Callable[[str], Answer]) -> None:
-    for unit in ("cm", "x100"):
+    for unit in ("cm", "x100", "file"):
         evaluate(f"--truth column.txt --curve {unit}.png --unit {unit}")
-    assert Path("cm.png").read_bytes() != Path("x100.png").read_bytes()
+    assert len({Path(f"{unit}.png").read_bytes() for unit in ("cm", "x100", "file")}) == 3
 
 
 @pytest.mark.parametrize(
@@ -128,7 +150,7 @@ def test_a_map_of_other_shapes_is_refused(run: Run, folder: Path, torus: Shape) 
     refused(run("evaluate", "map.npy", "t.ply", "b.ply"), "runs the wrong way", folder, before)
 
 
-@pytest.mark.parametrize(("unit", "title"), [("cm", "cm"), ("x100", "sqrt(area)")])
+@pytest.mark.parametrize(("unit", "title"), [("cm", "cm"), ("x100", "sqrt(area)"), ("file", "unit of the file")])
 def test_the_errors_as_heat_on_both_shapes(
     evaluate: Callable[[str], Answer], monkeypatch: pytest.MonkeyPatch, unit: str, title: str
 ) -> None:
@@ -139,7 +161,7 @@ def test_the_errors_as_heat_on_both_shapes(
         real(panels, path, look)
 
     monkeypatch.setattr(compose, "render_shapes", watched)
-    assert "cm" in evaluate(f"--truth column.txt --picture errors.png --unit {unit}").out
+    assert "mean error" in evaluate(f"--truth column.txt --picture errors.png --unit {unit}").out
     with Image.open("errors.png") as image:
         pixels = np.asarray(image, dtype=int)
     red = (pixels[..., 0] > pixels[..., 2] + 60) & (pixels[..., 1] < 120)

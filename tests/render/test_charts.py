@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from meshmatch.errors import OptionError, OutputError
-from meshmatch.maps.evaluate import Errors
+from meshmatch.maps.evaluate import X100, Errors
 from meshmatch.render import charts
 from meshmatch.render.charts import (
     Dots,
@@ -43,8 +43,8 @@ def test_long_and_strange_names_stay_in_the_picture(tmp_path: Path) -> None:
 
 def test_a_curve_rises_where_the_errors_are(tmp_path: Path) -> None:
     errors = {"good": Errors(np.full(50, 0.01)), "bad": Errors(np.full(50, 0.05))}
-    draw_curves(errors, tmp_path / "cm.png", 10.0, unit="x100")
-    draw_curves(errors, tmp_path / "far.png", 20.0, unit="x100")
+    draw_curves(errors, tmp_path / "cm.png", 10.0, unit=X100)
+    draw_curves(errors, tmp_path / "far.png", 20.0, unit=X100)
     at = []
     for name, number in (("cm.png", 0), ("cm.png", 1), ("far.png", 1)):
         points = spots(tmp_path / name, number, right=1.0)
@@ -53,7 +53,7 @@ def test_a_curve_rises_where_the_errors_are(tmp_path: Path) -> None:
     assert (at[1] - at[0]) / (at[2] - at[0]) == pytest.approx((0.5 - 0.1) / (0.25 - 0.1), rel=0.05)
     draw_curves(errors, tmp_path / "body.png", 10.0)
     assert (tmp_path / "body.png").read_bytes() != (tmp_path / "cm.png").read_bytes()
-    for curves, rest in (({}, {}), (errors, {"limit": 0}), (errors, {"unit": "inch"})):
+    for curves, rest in (({}, {}), (errors, {"limit": 0})):
         with pytest.raises(OptionError, match="a curve needs"):
             draw_curves(curves, tmp_path / "no.png", **rest)
 

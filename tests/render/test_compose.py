@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError, OptionError
-from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
+from meshmatch.maps.evaluate import CM_PER_UNIT, X100, Errors
 from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render import compose
@@ -113,7 +113,7 @@ def test_errors_at_all_vertices_are_painted(sphere: Shape) -> None:
 def test_errors_at_a_few_points_are_balls_where_they_are(sphere: Shape) -> None:
     known = np.array([5, 9, 5]), np.array([100, 200, 300])
     found = VertexMap.identity(sphere)
-    shown = compose_errors(sphere, sphere, found, known, Errors([0.1, 0.3, 0.5]), "x100", (0.0, 40.0))
+    shown = compose_errors(sphere, sphere, found, known, Errors([0.1, 0.3, 0.5]), X100, (0.0, 40.0))
     panels, scale = shown.panels, scale_of(shown)
     assert (scale.low, scale.high) == (0, 40)
     assert "sqrt(area)" in scale.title
