@@ -55,8 +55,10 @@ class Deformer(nn.Module):
         self.register_buffer("nodes", nodes)
         self.register_buffer("anchors", anchors)
         self.register_buffer("anchor_phi", anchor_phi)
-        self.encoder: layers.BasisEncoder | layers.PointEncoder
-        if config.encoder == "basis":
+        self.encoder: layers.Encoder
+        if isinstance(config.encoder, type):
+            self.encoder = config.encoder(basis, config.code)
+        elif config.encoder == "basis":
             self.encoder = layers.BasisEncoder(basis, config.width, config.depth, config.code)
         else:
             self.encoder = layers.PointEncoder(config.code)

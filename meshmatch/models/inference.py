@@ -17,7 +17,6 @@ from scipy.special import erf
 
 from meshmatch.arrays import Float, Floats, Floats32
 from meshmatch.errors import OptionError, needs
-from meshmatch.fields.shape_functions import has_nodes
 from meshmatch.geometry.oriented import nearest, quick_tree
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.checkpoint import load_weights
@@ -33,11 +32,12 @@ _EPSILON = np.float32(1e-5)  # of layer and batch norms, as in torch
 
 
 def load_network(path: str | Path, config: NetworkConfig, K: int) -> Network:
-    """A network for K nodes with the weights of a file, in evaluation mode. A pointwise one needs torch.
+    """A network for K nodes with the weights of a file, in evaluation mode. A pointwise one, and one with somebody's own
+    encoder, needs torch.
 
     `ModelError` if the file is damaged, or holds the weights of another network.
     """
-    if has_nodes(config.field):
+    if not config.in_torch:
         return NodeNetwork(config, load_weights(path, weight_shapes(config, K)))
     with needs("torch", "train"):
         from meshmatch.models.deformer import blank_deformer, with_weights
@@ -55,7 +55,7 @@ def in_torch(network: Network, K: int, device: str = "cpu") -> Deformer:
 
     if isinstance(network, NodeNetwork):
         found = with_weights(network.config, K, network.weights)
-    else:  # pointwise; others may use it on the CPU
+    else:  # in torch already; others may use it on the CPU
         assert isinstance(network, Deformer)
         found = network if device == "cpu" else copy.deepcopy(network)
     try:

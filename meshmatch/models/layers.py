@@ -98,7 +98,23 @@ def _shared_mlp(width: int, norm: Callable[[int], nn.Module]) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Linear(width // 4, 3))
 
 
-class BasisEncoder(nn.Module):
+class Encoder(nn.Module):
+    """What a network asks of its encoder.
+
+    One's own is made with basis points (M, 3), spread where the shapes of the category are, and the length D of a code.
+    Batches are drawn with `features`, by other processes and without a gradient; `forward` is what is trained.
+    """
+
+    def features(self, points: Float[torch.Tensor, "B P 3"]) -> Float[torch.Tensor, "B ..."]:
+        """What is learned from, of point sets in the core frame."""
+        raise NotImplementedError
+
+    def forward(self, features: Float[torch.Tensor, "B ..."]) -> Float[torch.Tensor, "B D"]:
+        """Codes."""
+        raise NotImplementedError
+
+
+class BasisEncoder(Encoder):
     """Offsets from a fixed set of basis points to the nearest input point, then an MLP.
 
     After *Efficient Learning on Point Clouds with Basis Point Sets* (ICCV 2019). The features cost one tree
@@ -121,7 +137,7 @@ class BasisEncoder(nn.Module):
         return result
 
 
-class PointEncoder(nn.Module):
+class PointEncoder(Encoder):
     """The paper's encoder: positional encoding on a hypersphere, shared MLP, max-pool, two linear layers.
 
     The encoding has Gaussian frequencies (Tancik et al., *Fourier Features Let Networks Learn High Frequency Functions in

@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol
 
 from meshmatch.arrays import Float, Floats, Floats32
 from meshmatch.errors import ModelError
-from meshmatch.fields.shape_functions import FIELDS, FieldName
+from meshmatch.fields.shape_functions import FIELDS, FieldName, has_nodes
 
 POINT_SIZES = (128, 128, 256, 512, 1024)  # of the layers of `models.layers.PointEncoder`
 _MAX = {
@@ -24,10 +24,11 @@ class NetworkConfig:
 
     The defaults were chosen on generated bodies (docs/paper.md).
 
-    A pointwise field has a decoder of its own, whatever ``decoder`` says.
+    A pointwise field has a decoder of its own, whatever ``decoder`` says. ``encoder`` may also be a class of one's own
+    (docs/training.md): it is made with basis points (M, 3) and the length of a code, as `models.layers.Encoder` says.
     """
 
-    encoder: Literal["basis", "point"] = "basis"
+    encoder: Literal["basis", "point"] | type = "basis"
     decoder: Literal["flat", "node"] = "flat"
     code: int = 512
     width: int = 768
@@ -41,7 +42,8 @@ class NetworkConfig:
 
     def __post_init__(self) -> None:
         # A card may come from anywhere: bound what building the network allocates.
-        if self.encoder not in ("basis", "point") or self.decoder not in ("flat", "node"):
+        known = isinstance(self.encoder, type) or self.encoder in ("basis", "point")
+        if not known or self.decoder not in ("flat", "node"):
             raise ModelError(f"unknown network: encoder {self.encoder!r}, decoder {self.decoder!r}", "update meshmatch")
         if self.field not in FIELDS:
             raise ModelError(f"unknown field {self.field!r}, only {', '.join(FIELDS)}", "update meshmatch")
@@ -50,16 +52,37 @@ class NetworkConfig:
             if type(value) is not int or not 0 <= value <= limit:
                 raise ModelError(f"network option {name} must be an integer from 0 to {limit}, not {value!r}")
 
+    @property
+    def in_torch(self) -> bool:
+        """Whether only torch can evaluate it: it has no nodes, or somebody's own encoder."""
+        return not has_nodes(self.field) or isinstance(self.encoder, type)
+
     @staticmethod
-    def from_dict(values: dict[str, Any]) -> NetworkConfig:
+    def from_dict(values: dict[str, Any], encoder: type | None = None) -> NetworkConfig:
+        """The config of a card; ``encoder`` is the class that the card names, if it names one."""
         known = NetworkConfig.__dataclass_fields__
         unknown = sorted(set(values) - set(known))
         if unknown:
             raise ModelError(f"unknown network options: {', '.join(unknown)}", "update meshmatch")
+        named = values.get("encoder", "basis")
+        if isinstance(named, str) and "." in named:
+            if encoder is None:
+                hint = "load it in Python: meshmatch.load_model(..., encoder=THE_CLASS)"
+                raise ModelError(f"the model has an encoder of its author's own, {named[:80]!r}", hint)
+            if _name_of(encoder) != named:
+                raise ModelError(f"the model's encoder is {named[:80]!r}, not {_name_of(encoder)!r}")
+            values = values | {"encoder": encoder}
+        elif encoder is not None:
+            raise ModelError(f"the model has meshmatch's own encoder {named!r}", "leave out encoder=")
         return NetworkConfig(**values)
 
     def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
+        own = {"encoder": _name_of(self.encoder)} if isinstance(self.encoder, type) else {}
+        return asdict(self) | own
+
+
+def _name_of(encoder: type) -> str:
+    return f"{encoder.__module__}.{encoder.__qualname__}"
 
 
 PAPER = NetworkConfig(encoder="point", decoder="node", width=1024, align_basis=0, corrections=0)
@@ -92,7 +115,7 @@ class Network(Protocol):
 
 
 def weight_shapes(config: NetworkConfig, K: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of the weights and buffers of a network with K nodes, by name; not for pointwise fields."""
+    """Shapes of the weights and buffers of a network with K nodes, by name; not for those that only torch can evaluate."""
     found: dict[str, tuple[int, ...]] = {"nodes": (K, 3), "anchors": (K, 3), "anchor_phi": (K, K)}
 
     def linear(name: str, inputs: int, outputs: int) -> None:

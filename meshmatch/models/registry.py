@@ -149,13 +149,15 @@ def check_weights(folder: Path, card: ModelCard | ImplicitCard) -> None:
         raise ModelError(problem, "fetch or add the model again")
 
 
-def load_model(name: str | Path = "human") -> TrainedModel:
+def load_model(name: str | Path = "human", encoder: type | None = None) -> TrainedModel:
     """Load a model.
 
     Parameters
     ----------
     name
         Registry name or folder.
+    encoder
+        The class of its encoder, if the model was trained with one of somebody's own: no code is run that a file names.
 
     Returns
     -------
@@ -165,8 +167,8 @@ def load_model(name: str | Path = "human") -> TrainedModel:
     Raises
     ------
     ModelError
-        Unknown name, damaged files, an unknown kernel, weights that are not those of the card's network, or a template
-        that is not the one the model was trained with.
+        Unknown name, damaged files, an unknown kernel, weights that are not those of the card's network, a template
+        that is not the one the model was trained with, or another encoder than the card's.
     TemplateError
         The template's file is damaged.
 
@@ -180,10 +182,11 @@ def load_model(name: str | Path = "human") -> TrainedModel:
 
     folder, card = find_model(name)
     known_as = folder.name if _is_registered(folder) else os.path.abspath(folder)
-    return trained_model(card, folder / TEMPLATE, folder / WEIGHTS, partial(_unpickled, known_as, card))
+    again = partial(_unpickled, known_as, card, encoder)
+    return trained_model(card, folder / TEMPLATE, folder / WEIGHTS, again, encoder)
 
 
-def load_once(name: str | Path) -> TrainedModel:
+def load_once(name: str | Path, encoder: type | None = None) -> TrainedModel:
     """As `load_model`, but once in each process, and again if the model's files have changed since."""
     folder = locate_model(name)
     try:
@@ -191,19 +194,19 @@ def load_once(name: str | Path) -> TrainedModel:
     except OSError:
         changed = 0  # the reader says what is missing
     with _loading:
-        return _loaded(folder.resolve(), changed)
+        return _loaded(folder.resolve(), changed, encoder)
 
 
 @lru_cache(maxsize=8)
-def _loaded(folder: Path, changed: int) -> TrainedModel:
-    return load_model(folder)
+def _loaded(folder: Path, changed: int, encoder: type | None) -> TrainedModel:
+    return load_model(folder, encoder)
 
 
-def _unpickled(name: str, card: ModelCard) -> TrainedModel:
+def _unpickled(name: str, card: ModelCard, encoder: type | None = None) -> TrainedModel:
     """What a pickled model becomes: the model of this name or folder, which must be the same."""
     hint = "add the same model here (`meshmatch models add`), or make the Matcher where it is used"
     try:
-        model = load_once(name)
+        model = load_once(name, encoder)
     except ModelError as error:
         raise ModelError(f"the pickled model {card.name} cannot be loaded here: {error.message}", hint) from error
     if model.card != card:

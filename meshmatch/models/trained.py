@@ -73,7 +73,7 @@ class TrainedModel:
             The model.
         """
         inference: Network = network
-        if has_nodes(network.config.field):
+        if not network.config.in_torch:
             weights = {name: value.numpy(force=True) for name, value in network.state_dict().items()}
             inference = NodeNetwork(network.config, weights)
         made = cls(card, template, inference)
@@ -161,11 +161,16 @@ def torch_network(model: TrainedModel, device: str = "cpu") -> Deformer:
 
 
 def trained_model(
-    card: ModelCard, template_file: Path, weights_file: Path, load_again: Callable[[], TrainedModel] | None = None
+    card: ModelCard,
+    template_file: Path,
+    weights_file: Path,
+    load_again: Callable[[], TrainedModel] | None = None,
+    encoder: type | None = None,
 ) -> TrainedModel:
     """The model of a card, from files that are safe to read; `meshmatch.models.registry.load_model` finds them.
 
-    ``load_again`` is what a pickle of the model holds, a function that survives it.
+    ``load_again`` is what a pickle of the model holds, a function that survives it; ``encoder`` is the class that the card
+    names, if it has one of its author's own.
 
     `ModelError` for a kernel that is not known here, weights that are not those of the card's network, or a template that
     is not the one the model was trained with; `TemplateError` if its file is damaged.
@@ -178,7 +183,7 @@ def trained_model(
     if card.field["kernel"] not in KERNELS:
         problem = f"model {card.name} has the kernel {card.field['kernel']!r}, not {' or '.join(KERNELS)}"
         raise ModelError(problem, "it may need a newer meshmatch: update it")
-    network = load_network(weights_file, NetworkConfig.from_dict(card.network), template.K)
+    network = load_network(weights_file, NetworkConfig.from_dict(card.network, encoder), template.K)
     made = TrainedModel(card, template, network)
     object.__setattr__(made, "load_again", load_again)
     return made

@@ -17,7 +17,7 @@ from meshmatch.arrays import Float, Floats, Int
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.generators.generator import Source
-from meshmatch.models.layers import BasisEncoder, PointEncoder
+from meshmatch.models.layers import BasisEncoder, Encoder
 from meshmatch.progress import Progress
 from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.training import scans
@@ -85,7 +85,7 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
     template_core: Float[Tensor, "C 3"]
     core: Int[Tensor, " C"]
     loss_points: Int[Tensor, " M"]
-    encoder: BasisEncoder | PointEncoder | None
+    encoder: Encoder | None
     aligner: BasisEncoder | None
     scan: ScanConfig
     shapes: int = 32
@@ -228,7 +228,7 @@ class CloudDataset(torch.utils.data.Dataset[CloudBatch]):
     normals: Float[Tensor, "N P 3"]
     landmarks: Float[Tensor, "N L 3"]
     lattice: Lattice | None
-    encoder: BasisEncoder | PointEncoder | None
+    encoder: Encoder | None
     scan: ScanConfig
     shapes: int = 8
     seed: int = 0

@@ -74,7 +74,7 @@ def read_recipe(path: str | Path, usual: Recipe) -> Recipe:
             raise InputError("recipe.template must be the name of a bundled template")
         return replace(
             found,
-            network=NetworkConfig.from_dict(asdict(usual.network) | network),
+            network=NetworkConfig.from_dict(usual.network.to_dict() | network),
             train=replace(_filled(usual.train, steps, "recipe.train"), loss=loss),
             scan=_filled(usual.scan, _object(own.get("scan", {}), "recipe.scan"), "recipe.scan"),
             kernel=kernel,

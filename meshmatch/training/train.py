@@ -301,7 +301,7 @@ def build_deformer(
 ) -> Deformer:
     """An untrained network for a template, its basis points laid where the source's shapes are."""
     basis = align_basis = torch.zeros(1, 3)
-    if network.encoder == "basis" or network.align_basis:
+    if network.encoder != "point" or network.align_basis:
         if isinstance(source, CloudDataset):
             points = replace(source, shapes=64, seed=seed + 1)[0].points
         else:

@@ -1,6 +1,7 @@
 """From a folder of registered shapes to a model that loads, and on from there."""
 
 import json
+import pickle
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from meshmatch.errors import InputError, OptionError, OutputError, TemplateError
+from meshmatch.errors import InputError, ModelError, OptionError, OutputError, TemplateError
 from meshmatch.experiments.makers import human_bodies
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.fitting.fit_config import FitConfig
@@ -23,6 +24,7 @@ from meshmatch.generators.generator import Source
 from meshmatch.generators.kinds import Kind
 from meshmatch.implicit.training import train_implicit
 from meshmatch.locks import locked
+from meshmatch.models.layers import Encoder
 from meshmatch.models.registry import load_model, verify_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
@@ -218,6 +220,50 @@ def test_training_goes_on_from_the_checkpoint_unless_told_not_to(prepared: Path,
     fresh = verify_model(trained(prepared, stopped, other, resume=False))
     assert (fresh.steps, fresh.seed) == (4, 1)
     assert fresh.weights_sha256 != whole.weights_sha256
+
+
+class Pooled(Encoder):
+    """An encoder of a user."""
+
+    def __init__(self, basis: torch.Tensor, outputs: int) -> None:
+        super().__init__()
+        self.reach = torch.nn.Parameter(basis.norm(dim=1).max())
+        self.code = torch.nn.Linear(3, outputs)
+
+    def features(self, points: torch.Tensor) -> torch.Tensor:
+        return 2 * points
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        found: torch.Tensor = self.code((features / self.reach).amax(1))
+        return found
+
+
+def test_an_encoder_of_ones_own_is_trained_kept_and_asked_for(prepared: Path, tmp_path: Path) -> None:
+    own = replace(SMALL, network=replace(NETWORK, encoder=Pooled))
+    folder = trained(prepared, tmp_path / "pooled", own)
+    name = f"{Pooled.__module__}.Pooled"
+    with pytest.raises(ModelError, match=f"an encoder of its author's own, '{name}'") as caught:
+        load_model(folder)
+    assert "encoder=" in caught.value.hint
+    with pytest.raises(ModelError, match="not 'torch"):
+        load_model(folder, encoder=torch.nn.Identity)
+    model = load_model(folder, encoder=Pooled)
+    assert model.card.network["encoder"] == name and isinstance(model.network.encoder, Pooled)
+    eggs = np.asarray(egg_template().shape.verts)
+    found = model.inference.predict([eggs, eggs[::-1]])
+    np.testing.assert_allclose(found[0], found[1], atol=1e-5)  # whatever the order of the points
+    learned = model.network.state_dict()
+    assert not torch.equal(learned["encoder.reach"], small_network(egg_template(), own.network).encoder.reach)
+    again = pickle.loads(pickle.dumps(model))
+    assert again.card == model.card
+    np.testing.assert_array_equal(again.inference.predict([eggs]), found[:1])
+    fit = Fitter(model, FitConfig(samples=300, coarse_samples=60, careful=1, partial="no")).fit(egg_template().shape)
+    assert np.isfinite(fit.points).all()
+    longer = replace(own, train=replace(own.train, steps=6))
+    assert load_model(trained(prepared, folder, longer), encoder=Pooled).card.steps == 6
+    ours = trained(prepared, tmp_path / "ours")
+    with pytest.raises(ModelError, match="meshmatch's own encoder"):
+        load_model(ours, encoder=Pooled)
 
 
 def test_a_training_may_begin_with_a_models_weights(prepared: Path, tmp_path: Path) -> None:
