@@ -34,6 +34,12 @@ class AtlasOptions:
         help="form (or keep): shapes with their sizes, the default; shape (or remove): all scaled to one size.",
     )
     robust: bool = Option(False, "--robust", help="Reduce the influence of outliers among the shapes.")
+    align_by: str = Option(
+        "whole",
+        metavar="PART",
+        help="Superimpose shapes of several parts by one, so that the pose of the others shows: its number (1 is the "
+        "largest), or its name in the template or in the files. each: every connected part alone, without their pose.",
+    )
     poor: bool = Option(False, "--poor", help="Include shapes whose fit is poor.")
     groups: tuple[Path, Path] | None = Option(
         None, metavar="A.txt B.txt", help="Compare two groups: files with the names of their shapes, one per line."
@@ -76,6 +82,8 @@ class AtlasOptions:
         if self.groups is None and self.model is None and not self.symmetry and self.statistic != "normal":
             hint = "add --groups A.txt B.txt, --model or --symmetry"
             raise OptionError("--statistic is for groups, models and symmetry, and there are none", hint)
+        if self.symmetry and self.align_by != "whole":
+            raise OptionError("--symmetry is of whole shapes", "leave out --align-by")
         if self.format != "png":
             from meshmatch.render.charts import check_chart
 
@@ -125,7 +133,7 @@ def atlas(
     with folder_on_success(output) as folder, _shapes(fits, how.poor) as shapes, thread_limit(threads):
         for name, verdict in shapes.left_out.items():
             console.warn(f"{name}: left out, for its fit is {verdict}")
-        made = shapes.atlas(modes=how.modes, scale=how.scale, robust=how.robust)
+        made = shapes.atlas(modes=how.modes, scale=how.scale, robust=how.robust, align_by=how.align_by)
         _warn(console, made, how)
         found = _find(console, made, shapes, how)
         names = write_folder(folder, made, found, rotation=shapes.rotation, title=output.name)
@@ -197,7 +205,9 @@ def _find(console: Console, made: Any, shapes: "Registered", how: AtlasOptions) 
     if how.measures and len(shapes.names) > 3:
         with console.progress() as progress:
             measures = measure_atlas(made, shapes.points, seed=how.seed, progress=progress)
-    return Findings(measures, comparison, names, explained, how.samples, how.seed, how.format, members, asymmetry)
+    return Findings(
+        measures, comparison, names, explained, how.samples, how.seed, how.format, members, asymmetry, how.align_by
+    )  # fmt: skip
 
 
 def _tell(console: Console, about: dict[str, Any]) -> None:

@@ -86,6 +86,8 @@ def measure_asymmetry(
     >>> found = meshmatch.measure_asymmetry(meshmatch.Atlas.load("atlas"))
     >>> print(found.directional.p, found.fluctuating_of)
     """
+    if atlas.groups is not None:
+        raise InputError("symmetry is of whole shapes, and parts were superimposed", "make an atlas of whole shapes")
     names, mean, weights = atlas.names, atlas.mean_shape, atlas.weights
     points = atlas.mean + atlas.offsets(atlas.scores)
     across = _Across(mean, weights, seed)
@@ -138,7 +140,7 @@ def _apart(own: Float[Floats, "V 3"], across: _Across, laid: Superimposed) -> Fl
     image = across.image(own)
     pose = laid.poses(image[None])
     apart = own - pose.apply(image[None])[0]
-    return np.asarray((apart - across.image(apart) @ pose.rotations[0].T) / 2)
+    return np.asarray((apart - across.image(apart) @ pose.rotations[0, 0].T) / 2)
 
 
 class _Across:

@@ -54,7 +54,8 @@ class Atlas(Brief, Pickled):
     scores
         (S, M) of each shape along each mode, in standard deviations.
     sizes
-        (S,) root mean square distance of each shape from its center, before it was scaled, unit of its file.
+        (S,) root mean square distance of each shape from its center (of what was superimposed, from its own centers),
+        before it was scaled, unit of its file.
     faces
         (F, 3) triangles of all shapes.
     weights
@@ -69,6 +70,9 @@ class Atlas(Brief, Pickled):
         Whether the mean and modes resist outliers.
     template
         Hash of the template whose fits the shapes are; empty if not known.
+    groups
+        (V,) vertices of one number from 0 were superimposed together, each group for itself, and those of -1 with group 0,
+        without a say; None where whole shapes were.
 
     Examples
     --------
@@ -89,6 +93,7 @@ class Atlas(Brief, Pickled):
     scale: Scale = "keep"
     robust: bool = False
     template: str = ""
+    groups: Int[Ints, " V"] | None = None
 
     @classmethod
     def of(
@@ -101,6 +106,7 @@ class Atlas(Brief, Pickled):
         scale: Scale = "keep",
         robust: bool = False,
         template: str = "",
+        groups: ArrayLike | None = None,
     ) -> Atlas:
         """The atlas of S shapes with the same vertices and faces.
 
@@ -125,6 +131,9 @@ class Atlas(Brief, Pickled):
             a few outliers hardly change.
         template
             Hash of the template whose fits the shapes are.
+        groups
+            (V,) of shapes of several parts, which vertices are superimposed together: 0 for those of one part and -1 for
+            others, whose pose then shows; or 0, 1, 2, ... for each part alone, so that no pose shows. By default all.
 
         Returns
         -------
@@ -135,7 +144,7 @@ class Atlas(Brief, Pickled):
         ------
         InputError
             Fewer than three shapes, shapes that do not have the same vertices or do not differ, names that are not one
-            for each or not different.
+            for each or not different, groups without surface.
         OptionError
             Another ``scale``, or no modes.
         """
@@ -147,7 +156,7 @@ class Atlas(Brief, Pickled):
         if len(called) != len(points) or len(set(called)) < len(called):
             raise InputError(f"{len(points)} shapes need as many different names", "one for each, in their order")
         faces = np.array(faces, np.int64)
-        laid = superimpose(points, faces, scale, robust)
+        laid = superimpose(points, faces, scale, robust, groups)
         found = components(points, laid, modes, robust)
         mean = laid.consensus + found.center
         sign = outward(found.modes, mean, laid.weights)
@@ -156,19 +165,10 @@ class Atlas(Brief, Pickled):
         for array in (mean, kept, found.deviations, scores, sizes, faces, laid.weights):
             frozen(array)
         return cls(
-            mean=mean,
-            modes=kept,
-            deviations=found.deviations,
-            scores=scores,
-            sizes=sizes,
-            faces=faces,
-            weights=laid.weights,
-            names=called,
-            total=found.total,
-            scale=scale,
-            robust=robust,
-            template=template,
-        )
+            mean=mean, modes=kept, deviations=found.deviations, scores=scores, sizes=sizes, faces=faces,
+            weights=laid.weights, names=called, total=found.total, scale=scale, robust=robust, template=template,
+            groups=None if laid.groups is None else frozen(laid.groups),
+        )  # fmt: skip
 
     @property
     def variances(self) -> Float[Floats, " M"]:
@@ -193,10 +193,8 @@ class Atlas(Brief, Pickled):
     @cached_property
     def laid(self) -> Superimposed:
         """How further shapes are laid over the mean."""
-        size = None
-        if self.scale == "remove":
-            size = float(self.sizes.mean())
-        return Superimposed(self.mean, self.weights, size)
+        size = float(self.sizes.mean()) if self.scale == "remove" else None
+        return Superimposed(self.mean, self.weights, size, self.groups)
 
     def offsets(self, scores: Float[Floats, "N M"]) -> Float[Floats, "N V 3"]:
         """What scores add to the mean.
@@ -475,7 +473,8 @@ class Atlas(Brief, Pickled):
         OutputError
             It cannot be written.
         """
-        save_arrays(path, {each.name: np.asarray(getattr(self, each.name)) for each in fields(self)})
+        arrays = {each.name: getattr(self, each.name) for each in fields(self)}
+        save_arrays(path, {name: np.asarray(array) for name, array in arrays.items() if array is not None})
 
     @classmethod
     def load(cls, path: str | Path) -> Atlas:

@@ -53,6 +53,7 @@ def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
             "total": ("f", ()),
         },
         **{"scale": ("U", ()), "robust": ("b", ()), "template": ("U", ())},
+        **({"groups": ("i", (V,))} if "groups" in given else {}),
     }
     fits = {n: n in given and (given[n].dtype.kind, given[n].shape) == about for n, about in layout.items()}
     numbers = {n: given[n].astype(np.float64) for n in layout if fits[n] and layout[n][0] == "f"}  # any float is read
@@ -65,6 +66,7 @@ def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
             "weights": (weights >= 0).all() and abs(weights.sum() - 1) <= _ROUNDED,
             "faces": F > 0 and faces.min() >= 0 and faces.max() < V,
             "scale": str(given["scale"]) in get_args(Scale),
+            "groups": "groups" not in given or _are_groups(given["groups"]),
         }
         wrong = [name for name, holds in right.items() if not holds]
     if wrong:
@@ -72,3 +74,10 @@ def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {name: frozen(array) for name, array in (given | numbers).items()}
     words = {"names": tuple(map(str, given["names"])), "scale": str(given["scale"]), "template": str(given["template"])}
     return found | words | {"total": float(given["total"]), "robust": bool(given["robust"])}
+
+
+def _are_groups(given: np.ndarray) -> bool:
+    """Whether they count from 0, none left out, and -1."""
+    found = np.unique(given)
+    counted = found[found >= 0]
+    return bool(found[0] >= -1 and len(counted) and counted[-1] == len(counted) - 1)

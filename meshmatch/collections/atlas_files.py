@@ -55,6 +55,7 @@ from meshmatch.collections.explain import Explained
 from meshmatch.collections.groups import Comparison
 from meshmatch.collections.measures import Measures
 from meshmatch.collections.model_files import LEVEL, asymmetry_record, model_record, short, write_asymmetry, write_model
+from meshmatch.collections.named_parts import WHOLE
 from meshmatch.collections.registered import outlying
 from meshmatch.render.facing import facing
 from meshmatch.render.viewer.single_pages import Varying, write_atlas_page
@@ -73,7 +74,7 @@ _BLOCK = 64  # shapes at a time
 @dataclass(frozen=True, eq=False)
 class Findings:
     """What was found out about an atlas beside itself; what was not asked for is None. ``groups`` are names of A and B,
-    ``members`` say which shape is in which; ``charts`` is the format of charts.
+    ``members`` say which shape is in which; ``charts`` is the format of charts, ``align_by`` what was superimposed.
     """
 
     measures: Measures | None = None
@@ -85,6 +86,7 @@ class Findings:
     charts: ChartFormat = "png"
     members: Mapping[str, str] = field(default_factory=dict)
     asymmetry: Asymmetry | None = None
+    align_by: str = WHOLE
 
     def classes(self, atlas: Atlas) -> list[str]:
         """The group of each shape in charts, "" where it has none: as it was compared, or else in the model."""
@@ -159,6 +161,7 @@ def record(atlas: Atlas, findings: Findings) -> dict[str, Any]:
         "vertices": len(atlas.mean),
         "modes": len(atlas.modes),
         "scale": atlas.scale,
+        "align_by": findings.align_by,
         "robust": atlas.robust,
         "deviations": short(atlas.deviations),
         "compactness": short(atlas.compactness),

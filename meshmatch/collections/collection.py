@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from meshmatch.collections.export import Export, Exported, Fits, Place, export
 from meshmatch.collections.fit_all import Fitted, elsewhere_words, files_of, fit_all, fit_other_kinds, with_left_out
 from meshmatch.collections.folder import FitsFolder
 from meshmatch.collections.map_all import Pair, map_all
+from meshmatch.collections.named_parts import WHOLE, Masks, parts_of_template
 from meshmatch.collections.registered import Registered, held
 from meshmatch.collections.setting import Record, Setting, forget, template_at
 from meshmatch.collections.settle import settled
@@ -405,7 +407,15 @@ class Collection(FitsFolder):
             tuple(export(output, fits, how, mean, self.progress)), len(names), fits.template.shape.V, left_out
         )
 
-    def atlas(self, *, modes: int = 100, scale: Scale = "keep", robust: bool = False, poor: bool = False) -> Atlas:
+    def atlas(
+        self,
+        *,
+        modes: int = 100,
+        scale: Scale = "keep",
+        robust: bool = False,
+        poor: bool = False,
+        align_by: str = WHOLE,
+    ) -> Atlas:
         """The mean and the modes of the fitted shapes.
 
         Parameters
@@ -418,6 +428,9 @@ class Collection(FitsFolder):
             As in `Atlas.of`.
         poor
             Whether poor fits count.
+        align_by
+            What is superimposed: "whole" shapes, "each" connected part alone, or one part, whose number (the largest is "1")
+            or name this is: of the template, or of a mesh in the files.
 
         Returns
         -------
@@ -425,7 +438,7 @@ class Collection(FitsFolder):
             Of all fits that count.
         """
         with self.registered(poor) as shapes:
-            return shapes.atlas(modes=modes, scale=scale, robust=robust)
+            return shapes.atlas(modes=modes, scale=scale, robust=robust, align_by=align_by)
 
     @contextmanager
     def registered(self, poor: bool = False) -> Iterator[Registered]:
@@ -459,7 +472,10 @@ class Collection(FitsFolder):
 
         faces = np.asarray(self.template.shape.faces)
         with held(len(names), self.template.shape.V, read) as points:
-            yield Registered(points, faces, names, np.eye(3), left_out, self.template.hash)
+            yield Registered(points, faces, names, np.eye(3), left_out, self.template.hash, partial(self._parts, names))
+
+    def _parts(self, names: Sequence[str]) -> Masks:
+        return parts_of_template(self.template, names, files_of(self.store), self.places_of)
 
     def _check(self, name: str) -> None:
         """`InputError` for a name that has no fit here, or whose fit is of another kind."""

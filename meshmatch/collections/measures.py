@@ -180,7 +180,7 @@ class _Collection:
         shares = np.zeros((1 + len(found.modes), S))
         shares[:, kept] = np.concatenate([found.center[None], found.modes])
         sums = weighted_sums(self._shapes, atlas.laid, shares)
-        laid = Superimposed(atlas.mean + sums[0], atlas.weights, atlas.laid.size)
+        laid = replace(atlas.laid, consensus=atlas.mean + sums[0])
         apart = np.empty((2, len(out), len(counts)))
         for number, row in enumerate(out.tolist()):
             known, real = self._laid(row, laid), self._real(row, laid)

@@ -14,10 +14,12 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.atlas import Atlas
+from meshmatch.collections.named_parts import WHOLE, Masks, groups_of, parts_of_file
 from meshmatch.collections.superimpose import Scale
 from meshmatch.errors import InputError
 from meshmatch.shapes.files import PLAIN_SUFFIXES, load_shape
 from meshmatch.shapes.input_files import read_text, stem_of, suffix_of
+from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import read_by_suffix
 
 _IN_MEMORY = 256 * 2**20  # bytes; more are kept in a temporary file
@@ -30,7 +32,7 @@ class Registered:
     """S shapes with the same vertices and faces, and their names.
 
     ``rotation`` leads into y up, z to the front, where it is known. ``left_out`` are names of shapes that are not to be
-    trusted, and why. ``template`` is the hash of the template, if they are fits.
+    trusted, and why. ``template`` is the hash of the template, if they are fits. ``parts`` gives parts by name.
     """
 
     points: Float[Floats, "S V 3"]
@@ -39,11 +41,20 @@ class Registered:
     rotation: Float[Floats, "3 3"] | None
     left_out: dict[str, str]
     template: str = ""
+    parts: Callable[[], Masks] = dict
 
-    def atlas(self, *, modes: int = 100, scale: Scale = "keep", robust: bool = False) -> Atlas:
-        """Their atlas; see `Atlas.of`."""
+    def atlas(self, *, modes: int = 100, scale: Scale = "keep", robust: bool = False, align_by: str = WHOLE) -> Atlas:
+        """Their atlas; see `Atlas.of`. ``align_by`` is what is superimposed, as `groups_of` has it."""
+        groups = groups_of(Shape(self.points[0], self.faces), align_by, self.parts)
         return Atlas.of(
-            self.points, self.faces, self.names, modes=modes, scale=scale, robust=robust, template=self.template
+            self.points,
+            self.faces,
+            self.names,
+            modes=modes,
+            scale=scale,
+            robust=robust,
+            template=self.template,
+            groups=groups,
         )
 
 
@@ -72,7 +83,7 @@ def registered_meshes(folder: str | Path) -> Iterator[Registered]:
         return shape.verts
 
     with held(len(files), first.V, read) as points:
-        yield Registered(points, first.faces, names, None, {})
+        yield Registered(points, first.faces, names, None, {}, parts=lambda: parts_of_file(files[0]))
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from tests.cli.conftest import Run
 from tests.collections.ellipsoids import ellipsoids
+from tests.conftest import icosphere
 
 
 @pytest.fixture(autouse=True)
@@ -118,6 +119,19 @@ def test_a_shape_unlike_the_others_is_told(run: Run, shapes: Path, tmp_path: Pat
     assert not any(name.endswith(".png") for name in told["files"])
 
 
+def test_shapes_of_parts_are_superimposed_by_one(run: Run, tmp_path: Path) -> None:
+    folder, rng, ball = tmp_path / "shapes", np.random.default_rng(0), icosphere(1)
+    folder.mkdir()
+    for k in range(6):
+        verts = np.concatenate([ball.verts * [1, 1.3, 2], 0.5 * ball.verts + [0, 2 * rng.standard_normal(), 4]])
+        save_shape(folder / f"{k}.ply", Shape(verts, np.concatenate([ball.faces, ball.faces + ball.V])))
+    answer = run("atlas", folder, "-o", tmp_path / "a", "--align-by", "1", "--no-measures", "--json")
+    assert answer.status == 0 and json.loads(answer.out)["align_by"] == "1"
+    found = Atlas.load(tmp_path / "a")
+    assert len(found.modes) == 1 and np.abs(found.modes[0, : ball.V]).max() < 1e-6
+    assert np.ptp(found.modes[0, ball.V :], axis=0) == pytest.approx(0, abs=1e-6)  # the other one moves as a whole
+
+
 def test_mirror_images_are_compared(run: Run, shapes: Path, tmp_path: Path) -> None:
     output = tmp_path / "a"
     answer = run("atlas", shapes, "-o", output, "--no-measures", "--permutations", 20, "--symmetry")
@@ -136,7 +150,9 @@ def test_mirror_images_are_compared(run: Run, shapes: Path, tmp_path: Path) -> N
     assert (output / "asymmetry.vtp").exists()
 
 
-@pytest.mark.parametrize("wrong", ["nowhere", "file", "input", "both", "unknown", "statistic", "table", "space", "row"])
+@pytest.mark.parametrize(
+    "wrong", ["nowhere", "file", "input", "both", "unknown", "statistic", "table", "space", "row", "part", "parts"]
+)
 def test_what_is_refused_leaves_nothing(run: Run, shapes: Path, tmp_path: Path, wrong: str) -> None:
     output, one = tmp_path / "atlas", group(tmp_path / "one.txt", range(4))
     other = group(tmp_path / "other.txt", range(3, 7) if wrong == "both" else range(7, 12))
@@ -150,6 +166,8 @@ def test_what_is_refused_leaves_nothing(run: Run, shapes: Path, tmp_path: Path, 
         "table": ("--metadata", one),
         "space": ("--model", "shape ~ size", "--space", "form"),
         "row": ("--model", "shape ~ x", "--metadata", table),
+        "part": ("--align-by", "femur"),
+        "parts": ("--align-by", "1", "--symmetry"),
     }
     before = sorted(tmp_path.rglob("*"))
     answer = run("atlas", where, "-o", shapes if wrong == "input" else output, *more.get(wrong, ()))

@@ -257,7 +257,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
 def test_short_numbers_become_long_ones(tmp_path: Path) -> None:
     given = ellipsoids(5)
     atlas = Atlas.of(given.points, given.faces)
-    short = {each.name: np.asarray(getattr(atlas, each.name)) for each in fields(atlas)}
+    short = {each.name: np.asarray(getattr(atlas, each.name)) for each in fields(atlas) if each.name != "groups"}
     np.savez(tmp_path / FILE, **short | {"weights": short["weights"].astype(np.float16), "version": np.int64(1)})
     found = Atlas.load(tmp_path)
     assert found.weights.dtype == np.float64 and np.allclose(found.weights, atlas.weights, rtol=1e-2)
