@@ -13,6 +13,8 @@ import pytest
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments.bench import speed
 from meshmatch.experiments.bench.speed import Case, cost_of, keep_to_cores, main, measure, sized, split
+from meshmatch.maps.files import load_map
+from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 
@@ -115,11 +117,21 @@ def test_the_first_run_does_not_count(tmp_path: Path, monkeypatch: pytest.Monkey
         return speed.Cost(len(commands), 0.0, 0.0)
 
     monkeypatch.setattr(speed, "cost_of", counted)
-    monkeypatch.setattr(speed, "shape_file", lambda word, folder: folder / word.replace("@", "-"))
-    case = Case(("match", "climber@500", "dancer@400", "-o", "@map"), 1.0)
+    monkeypatch.setattr(speed, "file_of", lambda word, folder: folder / word.replace("@", "-"))
+    case = Case(("match", "climber@500", "dancer@400", "-o", "@map.npy"), 1.0)
     assert [cost.wall for cost in measure(case, 3, tmp_path)] == [2, 3, 4]
     wanted = ["match", tmp_path / "climber-500", tmp_path / "dancer-400", "-o", tmp_path / "map.npy"]
     assert commands[0] == [sys.executable, "-m", "meshmatch", *map(str, wanted)]
+
+
+def test_maps_and_truths_are_made_once(tmp_path: Path) -> None:
+    known = speed.file_of("dancer@5000~dancer@4000", tmp_path)
+    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".npy", ".npz", ".ply", ".ply"]
+    source, target = (load_shape(speed.file_of(word, tmp_path)) for word in ("dancer@5000", "dancer@4000"))
+    found = load_map(speed.file_of("dancer@5000>dancer@4000", tmp_path), source, target)
+    off = np.linalg.norm(target.verts[np.load(known)] - target.verts[found.index], axis=1) / np.sqrt(target.area)
+    assert 0.005 < off.mean() < 0.06
+    assert len(list(tmp_path.iterdir())) == 4
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system keeps nobody on a core")

@@ -104,6 +104,27 @@ def test_pairs_near_each_other_are_as_far_as_in_the_whole(monkeypatch: pytest.Mo
     assert geodesics.between(a, b) == pytest.approx(true, abs=1e-12)
 
 
+def test_many_far_pairs_are_bounded_from_few_vertices(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(6)
+    sheet = grid(40, 40)
+    bent = Shape(sheet.verts + np.array([0.0, 0.0, 3.0]) * np.sin(sheet.verts[:, :1] / 4), sheet.faces, "bent")
+    geodesics = GeodesicDistances(bent)
+    a, b = rng.integers(0, bent.V, (2, 3000))
+    b[:300] = a[:300]
+    true = geodesics.rows(a)[np.arange(3000), b]
+    monkeypatch.setattr("meshmatch.maps.geodesics._MOST_DISTANCES", 100 * bent.V)
+    asked: list[int] = []
+    rows = geodesics.rows
+    monkeypatch.setattr(geodesics, "rows", lambda sources: asked.extend(sources) or rows(sources))
+    shares: list[float] = []
+    found = geodesics.between(a, b, shares.append)
+    assert len(asked) == len(set(asked)) < 600  # 1,400 different ones
+    assert (found[:300] == 0).all()
+    assert (np.abs(found - true) <= 0.031 * true + 2e-9).all()
+    assert found.mean() == pytest.approx(true.mean(), rel=0.005)
+    assert shares == sorted(shares) and shares[-1] == 1.0
+
+
 def test_a_seam_costs_nothing() -> None:
     sheet = grid(2, 2, name="cut")
     # The same sheet as two halves that share no vertex, as an OBJ with texture seams has them.

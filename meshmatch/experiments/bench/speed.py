@@ -27,9 +27,13 @@ from typing import Annotated, Any
 import numpy as np
 from typer import Option
 
+import meshmatch
+from meshmatch.arrays import Ints
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments import runner
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import edge_keys
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
@@ -44,7 +48,9 @@ class Case:
     ----------
     words : tuple of str
         What follows ``python -m meshmatch``; a word ``NAME@V`` stands for the file of the sample NAME brought to at
-        least V vertices, ``NAME@V+CHANGE`` for one that was also changed (`CHANGES`), ``@map`` for a file to write.
+        least V vertices, ``NAME@V+CHANGE`` for one that was also changed (`CHANGES`), ``NAME.glb`` for that sample, ``A>B``
+        for a map between two such words, ``A~B`` for a truth that differs from it (`truth_beside`), ``@FILE`` for a file
+        to write. What a case reads is made before it is measured.
     seconds, gigabytes : float
         The bars; nothing is asked of memory where it is 0.
     """
@@ -54,16 +60,26 @@ class Case:
     gigabytes: float = 0.0
 
 
+def _baking(size: int) -> tuple[str, ...]:
+    target = "climber@10000"
+    known = ("--map", f"dancer-textured.glb>{target}")
+    return ("transfer-texture", "dancer-textured.glb", target, "-o", "@dressed.glb", *known, "--size", str(size))
+
+
+_EVALUATED = "dancer@60000", "climber@60000"
 CASES = {
     "help": Case(("--help",), 0.1),
-    "pair": Case(("match", "climber@10000", "dancer@10000", "-o", "@map"), 3.0, 0.5),
-    "million": Case(("match", "dancer@1000000", "climber@10000", "-o", "@map"), 8.0, 1.0),
-    "onto a million": Case(("match", "climber@10000", "dancer@1000000", "-o", "@map"), 8.0, 1.0),
-    "noisy": Case(("match", "climber@10000+noise", "dancer@10000+noise", "-o", "@map"), 5.0),
-    "partial": Case(("match", "dancer@10000+upper", "climber@10000", "--partial", "-o", "@map"), 7.0),
-    "direct": Case(("match", "climber@10000", "dancer@10000", "--model", "none", "-o", "@map"), 8.0, 1.0),
-    "large direct": Case(("match", "climber@100000", "dancer@100000", "--model", "none", "-o", "@map"), 20.0),
-    "loose direct": Case(("match", "dancer@100000+loose", "climber@10000", "--model", "none", "-o", "@map"), 60.0),
+    "pair": Case(("match", "climber@10000", "dancer@10000", "-o", "@map.npy"), 3.0, 0.5),
+    "million": Case(("match", "dancer@1000000", "climber@10000", "-o", "@map.npy"), 8.0, 1.0),
+    "onto a million": Case(("match", "climber@10000", "dancer@1000000", "-o", "@map.npy"), 8.0, 1.0),
+    "noisy": Case(("match", "climber@10000+noise", "dancer@10000+noise", "-o", "@map.npy"), 5.0),
+    "partial": Case(("match", "dancer@10000+upper", "climber@10000", "--partial", "-o", "@map.npy"), 7.0),
+    "direct": Case(("match", "climber@10000", "dancer@10000", "--model", "none", "-o", "@map.npy"), 8.0, 1.0),
+    "large direct": Case(("match", "climber@100000", "dancer@100000", "--model", "none", "-o", "@map.npy"), 20.0),
+    "loose direct": Case(("match", "dancer@100000+loose", "climber@10000", "--model", "none", "-o", "@map.npy"), 60.0),
+    "evaluate": Case(("evaluate", ">".join(_EVALUATED), *_EVALUATED, "--truth", "~".join(_EVALUATED)), 10.0),
+    "texture 2048": Case(_baking(2048), 4.0),
+    "texture 8192": Case(_baking(8192), 25.0, 1.5),
 }
 
 
@@ -152,18 +168,37 @@ CHANGES: dict[str, Callable[[Shape], Shape]] = {
 }
 
 
-def _write_shape(word: str, path: Path) -> None:
-    size, _, change = word.partition("+")
-    sample, V = size.split("@")
-    shape = sized(load_shape(bundled_folder() / "samples" / f"{sample}.ply"), int(V))
-    save_shape(path, CHANGES[change](shape))
+def truth_beside(found: VertexMap, target: Shape) -> Ints:
+    """The vertices (V_src,) of the target beside the images of a map: 1 % of sqrt(area) from them along each axis."""
+    noise = 0.01 * np.sqrt(target.area) * np.random.default_rng(0).standard_normal((len(found.index), 3))
+    return np.asarray(cKDTree(target.verts).query(target.verts[found.index] + noise)[1], np.int64)
 
 
-def shape_file(word: str, folder: Path) -> Path:
-    """The file of a ``NAME@V``, made once, by a process of its own: a child's memory is counted from its parent's."""
-    path = folder / f"{word.replace('@', '-')}.ply"
+def _write(word: str, path: Path, made: list[Path]) -> None:
+    if ">" in word:
+        meshmatch.save_map(path, meshmatch.match(*made).map)
+    elif "~" in word:
+        source, target = load_shape(made[1]), load_shape(made[2])
+        np.save(path, truth_beside(meshmatch.load_map(made[0], source, target), target))
+    else:
+        size, _, change = word.partition("+")
+        sample, V = size.split("@")
+        shape = sized(load_shape(bundled_folder() / "samples" / f"{sample}.ply"), int(V))
+        save_shape(path, CHANGES[change](shape))
+
+
+def file_of(word: str, folder: Path) -> Path:
+    """The file of a word of a case, made once, by a process of its own: a child's memory is counted from its parent's."""
+    if word.endswith(".glb"):
+        return bundled_folder() / "samples" / word
+    both = word.replace("~", ">").split(">")
+    suffix = ".npz" if ">" in word else ".npy" if "~" in word else ".ply"
+    path = folder / "".join(letter if letter.isalnum() else "-" for letter in word)
+    path = path.with_suffix(suffix)
     if not path.exists():
-        maker = multiprocessing.get_context("spawn").Process(target=_write_shape, args=(word, path))
+        made = [] if len(both) == 1 else [file_of(each, folder) for each in both]
+        made = [file_of(">".join(both), folder), *made] if "~" in word else made
+        maker = multiprocessing.get_context("spawn").Process(target=_write, args=(word, path, made))
         maker.start()
         maker.join()
         if maker.exitcode:
@@ -175,8 +210,10 @@ def measure(case: Case, runs: int, folder: Path) -> list[Cost]:
     """Costs of `runs` runs after one that is not counted."""
     command = [sys.executable, "-m", "meshmatch"]
     for word in case.words:
-        made = str(folder / "map.npy") if word == "@map" else word
-        command.append(str(shape_file(word, folder)) if "@" in word[1:] else made)
+        if word.startswith("@"):
+            command.append(str(folder / word[1:]))
+        else:
+            command.append(str(file_of(word, folder)) if "@" in word or word.endswith(".glb") else word)
     return [cost_of(command) for _ in range(runs + 1)][1:]
 
 
