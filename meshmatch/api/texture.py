@@ -17,7 +17,7 @@ from meshmatch.arrays import Brief, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import as_path
 from meshmatch.progress import Progress, ProgressCallback
-from meshmatch.shapes.appearance import Appearance, vertex_colors_alone
+from meshmatch.shapes.appearance import Appearance, BakedMaterial, vertex_colors_alone
 from meshmatch.shapes.dressed_files import Dressed
 from meshmatch.shapes.files import ShapeLike, as_shape, load_shape
 from meshmatch.shapes.formats import gltf, obj_text
@@ -28,7 +28,16 @@ from meshmatch.threads import thread_limit
 from meshmatch.transfer import bake
 from meshmatch.transfer.bake import Baked, BakeOptions
 from meshmatch.transfer.source_layout import check_layout, source_layout
-from meshmatch.transfer.unwrap import Atlas, Keep, atlas_of, check_surface, new_atlas, shared_texels, too_many_layers
+from meshmatch.transfer.unwrap import (
+    Atlas,
+    Keep,
+    atlas_of,
+    check_surface,
+    new_atlas,
+    shared_texels,
+    tiles_of,
+    too_many_layers,
+)
 
 if TYPE_CHECKING:
     from meshmatch.render.compose import Composition
@@ -46,10 +55,11 @@ class TexturedResult(Brief):
     Attributes
     ----------
     dressed
-        The target with what was baked: ``uv`` (F, 3, 2), ``material``, and the ``turn`` that lets it stand upright in a glb.
+        The target with what was baked: ``uv`` (F, 3, 2), ``material``, the ``turn`` that lets it stand upright in a glb, and
+        ``tiles``: materials by the number of their tile, where the target's coordinates lie in several (UDIM).
     baked
-        What was baked: ``material``, its ``image`` (size, size, 4) uint8, and the shares of the surface that are not trusted
-        or discontinuous.
+        What was baked: ``material``, its ``image`` (size, size, 4) uint8 (of the first tile, if there are several), and the
+        shares of the surface that are not trusted or discontinuous.
     atlas
         The texture coordinates, and why the target's own were not used.
     maps
@@ -99,7 +109,7 @@ class TexturedResult(Brief):
         Raises
         ------
         OptionError
-            The suffix is another one.
+            The suffix is another one, or .glb and the target's coordinates lie in several tiles.
         OutputError
             A file cannot be written.
         """
@@ -195,12 +205,23 @@ def transfer_texture(
             atlas = _checked(
                 atlas, bake.contradicted(shape, look, mesh, maps.backward, atlas), mesh, options, uv, polygons
             )
-        baked = bake.transfer_texture(shape, look, mesh, maps.backward, atlas, options, report)
+        tiles: dict[int, BakedMaterial] = {}
+        if atlas.tiles is None:
+            baked = bake.transfer_texture(shape, look, mesh, maps.backward, atlas, options, report)
+        else:
+            baked, tiles = bake.transfer_tiles(shape, look, mesh, maps.backward, atlas, options, report)
     turn = np.eye(3)
     if file is None or file.suffix.lower() not in gltf.SUFFIXES:
         turn = turn_upright(maps, Path(shape.name).suffix.lower() in gltf.SUFFIXES)
-    dressed = Dressed(mesh, file, atlas.uv, atlas.own, baked.material, turn)
+    dressed = Dressed(mesh, file, atlas.laid, atlas.own, baked.material, turn, tiles)
     return TexturedResult(dressed, baked, atlas, maps, time.monotonic() - began)
+
+
+def tiles_of_file(path: Path, mesh: Shape, size: int) -> list[int]:
+    """The tiles (UDIM) that the coordinates of a target's file lie in, if each needs an image of its own of this size."""
+    own = None if mesh.is_cloud else load_coordinates(path, mesh)
+    found = None if own is None else tiles_of(mesh, own, size)
+    return [] if found is None else np.unique(found).tolist()
 
 
 def _checked(

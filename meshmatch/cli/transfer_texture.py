@@ -59,8 +59,9 @@ def transfer_texture(
     VALUE of --blank is a color such as #808080, or 0 for transparent. A glb or an obj keeps everything else of a TGT in
     the same format: nodes, skins, clips, groups, polygons. Another TGT is turned upright in a glb.
     """
+    from meshmatch.api.texture import tiles_of_file
     from meshmatch.shapes import textured_files
-    from meshmatch.shapes.dressed_files import tell_lost
+    from meshmatch.shapes.dressed_files import check_tiles, tell_lost
     from meshmatch.transfer.value_files import parse_color, save_colors
 
     transfer = Transfer(source, target, output, maps, run, picture)
@@ -78,7 +79,15 @@ def transfer_texture(
         raise OptionError(f"{b.name} gets vertex colors, which need no texture coordinates", hint)
     look = textured_files.load_appearance(source, a, image)
     layers = () if look.finish is None else look.finish.images
-    files = [output] if painted else textured_files.files_of(output, layers)
+    tiles: list[int] = []
+    if not painted and uv in ("auto", "keep"):
+        tiles = tiles_of_file(target, b, size)
+    if tiles and output.suffix.lower() != ".obj":
+        if uv == "keep":
+            check_tiles(output)
+        transfer.console.say(f"note: {output.suffix} has no tiles (UDIM), so {b.name} gets new texture coordinates")
+        uv, tiles = "new", []
+    files = [output] if painted else textured_files.files_of(output, layers, tiles)
     turn = None
     with transfer.outputs(image, files=files) as temporary:
         if painted:
@@ -96,7 +105,8 @@ def transfer_texture(
             if made.dressed.turned and output.suffix.lower() == ".glb":
                 turn = made.dressed.turn
                 transfer.console.say(f"note: a node turns {b.name} upright, along y")
-    what = "with vertex colors" if painted else f"with a texture of {size} x {size}"
+    textures = f"{len(tiles)} textures" if tiles else "a texture"
+    what = "with vertex colors" if painted else f"with {textures} of {size} x {size}"
     transfer.console.say(f"wrote {' '.join(str(file) for file in files)}: {transfer.names[1]} {what}")
     if picture is not None:
         from meshmatch.render.compose import compose_shapes
@@ -105,7 +115,7 @@ def transfer_texture(
         if turn is not None:  # the picture shows it as the target's file has it
             result = replace(result, verts=result.verts @ turn)
         transfer.draw(pair, compose_shapes([(a, look), (result, textured_files.find_appearance(output, result))]))
-    record = {"picture": picture, "files": [str(file) for file in files]} | record
+    record = {"picture": picture, "files": [str(file) for file in files], "tiles": tiles} | record
     return transfer.record(record, pair, float(pair.backward.confidence.mean()))
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.errors import warn
+from meshmatch.errors import OptionError, warn
 from meshmatch.outputs import replace_all_on_success
 from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
 from meshmatch.shapes.files import save_shape
@@ -19,7 +19,7 @@ from meshmatch.shapes.formats.gltf_dressed import colored, dressed
 from meshmatch.shapes.formats.gltf_edit import remembering
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.textured_files import check_textured, files_of, image_file
+from meshmatch.shapes.textured_files import check_textured, files_of, image_file, tile_file
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +28,8 @@ class Dressed:
 
     ``file`` is what it was read from, None where it came from arrays; ``uv`` are texture coordinates of each corner, v down,
     ``own`` if they are those of the file; ``turn`` is what turns a file without axes upright in a format that has them.
+    ``tiles`` are materials that differ only in their images, by the tile (UDIM, 1001 to 1100) of the coordinates that they
+    are for; without, one image holds all.
     """
 
     shape: Shape
@@ -36,6 +38,7 @@ class Dressed:
     own: bool
     material: BakedMaterial
     turn: Float[Floats, "3 3"] = field(default_factory=lambda: np.eye(3))
+    tiles: Mapping[int, BakedMaterial] = field(default_factory=dict)
 
     @property
     def turned(self) -> bool:
@@ -45,10 +48,13 @@ class Dressed:
     def save(self, path: Path) -> None:
         """Write a glb, or an obj with its material files; all of them, or none.
 
-        `OptionError` if the suffix is neither .glb nor .obj, `OutputError` if a file cannot be written.
+        `OptionError` if the suffix is neither .glb nor .obj, or the format has no tiles; `OutputError` if a file cannot be
+        written.
         """
         check_textured(path)
-        with replace_all_on_success(files_of(path, self.material.layers)) as places:
+        if self.tiles:
+            check_tiles(path)
+        with replace_all_on_success(files_of(path, self.material.layers, self.tiles)) as places:
             self.write(path, places)
 
     def write(self, path: Path, places: Sequence[Path]) -> None:
@@ -72,7 +78,7 @@ class Dressed:
 
     def _write_obj(self, path: Path, places: Sequence[Path]) -> None:
         made, name = self.material, "_".join((self.material.name or path.stem).split()) or "texture"
-        files = files_of(path, made.layers)
+        files = files_of(path, made.layers, self.tiles)
         if self.file is not None and self.file.suffix.lower() == ".obj":
             text, names = self._kept_text(self.file, files[1].name, name)
             places[0].write_bytes(text)
@@ -81,19 +87,13 @@ class Dressed:
             mesh = Textured(self.shape.verts, self.shape.faces[real], self.uv[real])
             obj.write_textured(places[0], mesh, files[1].name, name)
             names = [name]
-        images = {"color": made.color}
-        if made.normal is not None:
-            images["normal"] = made.normal
-        if made.surface is not None:
-            for k, word in ((1, "roughness"), (2, "metal")):
-                images[word] = np.dstack([*[made.surface[..., k]] * 3, made.surface[..., 3]])
-        if made.glow is not None:
-            images["emission"] = made.glow
-        where = dict(zip(files, places, strict=True))
-        named = {word: image_file(path, word) if word != "color" else files[2] for word in images}
-        obj.write_materials(places[1], names, made, {word: file.name for word, file in named.items()})
-        for word, image in images.items():
-            where[named[word]].write_bytes(png_bytes(image))
+        where, named = dict(zip(files, places, strict=True)), {}
+        for tile, material in (self.tiles or {0: made}).items():
+            for word, image in _images_of(material).items():
+                own = image_file(path, word)
+                named[word] = tile_file(own, "<UDIM>" if self.tiles else "").name
+                where[tile_file(own, tile)].write_bytes(png_bytes(image))
+        obj.write_materials(places[1], names, made, named)
         if made.occluded or made.unlit:
             lost = " and ".join(["an occlusion map"] * made.occluded + ["materials without light"] * made.unlit)
             warn(f"{path.name} does not have {lost}: an mtl holds none")
@@ -107,6 +107,26 @@ class Dressed:
         corners[polygons.triangles] = self.uv
         corners[:, 1] = 1.0 - corners[:, 1]
         return obj_text.with_material(data, library, name, corners)
+
+
+def _images_of(material: BakedMaterial) -> dict[str, Pixels]:
+    """Images of an mtl, by the words of `image_file`."""
+    images = {"color": material.color}
+    if material.normal is not None:
+        images["normal"] = material.normal
+    if material.surface is not None:
+        for k, word in ((1, "roughness"), (2, "metal")):
+            images[word] = np.dstack([*[material.surface[..., k]] * 3, material.surface[..., 3]])
+    if material.glow is not None:
+        images["emission"] = material.glow
+    return images
+
+
+def check_tiles(path: Path) -> None:
+    """Refuse to write tiles (UDIM) in a format that has none (`OptionError`)."""
+    if path.suffix.lower() != ".obj":
+        problem = f"{path.name}: {path.suffix} has no tiles (UDIM), in which the texture coordinates of the target lie"
+        raise OptionError(problem, "end the name in .obj, or ask for new coordinates with --uv new (uv='new')")
 
 
 def save_textured(path: str | Path, mesh: Textured, image: Pixels) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,17 +82,29 @@ def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] |
     return found if shape.F else None
 
 
-def files_of(path: Path, layers: Collection[Layer] = ()) -> list[Path]:
-    """What will be written for an output: an obj has companions, more of them with images of these layers."""
+def files_of(path: Path, layers: Collection[Layer] = (), tiles: Iterable[int] = ()) -> list[Path]:
+    """What will be written for an output: an obj has companions, more of them with images of these layers, and one of each
+    for every tile (UDIM).
+    """
     if path.suffix.lower() != ".obj":
         return [path]
     shown = [word for layer in layers for word in _SHOWN.get(layer, ())]
-    return [path, path.with_suffix(".mtl"), path.with_suffix(".png"), *(image_file(path, word) for word in shown)]
+    images = [image_file(path, word) for word in ("color", *shown)]
+    return [
+        path,
+        path.with_suffix(".mtl"),
+        *(tile_file(image, tile) for tile in list(tiles) or [""] for image in images),
+    ]
 
 
 def image_file(path: Path, word: str) -> Path:
     """The image beside an output that shows what a word says."""
-    return path.with_name(f"{path.stem}-{word}.png")
+    return path.with_suffix(".png") if word == "color" else path.with_name(f"{path.stem}-{word}.png")
+
+
+def tile_file(image: Path, tile: int | str) -> Path:
+    """The name of an image of one tile; without a tile, its own."""
+    return image.with_name(f"{image.stem}.{tile}{image.suffix}") if tile else image
 
 
 def check_textured(path: Path, colored: tuple[str, ...] = ()) -> None:

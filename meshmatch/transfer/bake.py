@@ -152,6 +152,33 @@ def transfer_texture(
     return Baked(material, float(inside.mean()), _share_of_surface(target, on[inside], low[inside.reshape(-1)]), torn)
 
 
+def transfer_tiles(
+    source: Shape,
+    look: Appearance,
+    target: Shape,
+    back: VertexMap,
+    atlas: Atlas,
+    options: BakeOptions = BakeOptions(),  # frozen
+    progress: Callable[[float], None] = lambda share: None,
+) -> tuple[Baked, dict[int, BakedMaterial]]:
+    """The same for an atlas of several tiles (UDIM): a material for each, and one with the images of the first that says
+    what alpha means in any, with shares of all.
+    """
+    tiles = atlas.tiles
+    assert tiles is not None
+    numbers = np.unique(tiles).tolist()
+    baked: list[Baked] = []
+    for k, tile in enumerate(numbers):
+        report = _within(progress, k / len(numbers), (k + 1) / len(numbers))
+        baked.append(transfer_texture(source, look, target, back, atlas.of_tile(tile), options, report))
+    area = np.array([target.face_areas[tiles == tile].sum() for tile in numbers])
+    low = float(np.dot(area, [each.low for each in baked]) / max(area.sum(), 1e-300))
+    alpha = max((each.material.alpha for each in baked), key=("opaque", "mask", "blend").index)
+    first = replace(baked[0].material, alpha=alpha)
+    whole = Baked(first, float(np.mean([each.used for each in baked])), low, baked[0].torn)
+    return whole, {tile: each.material for tile, each in zip(numbers, baked, strict=True)}
+
+
 def contradicted(source: Shape, look: Appearance, target: Shape, back: VertexMap, atlas: Atlas) -> float:
     """The share of the surface that has its places in the image together with others, and looks otherwise than these."""
     walker, look = _arranged(source, look)

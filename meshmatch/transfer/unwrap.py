@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.new_charts import flat_areas, new_charts
@@ -25,6 +25,8 @@ _MIN_USED, _MAX_STARVED = 0.05, 0.02
 # A triangle is starved if it has this share of the room that its area deserves.
 _STARVED = 1e-3
 _MARGIN = 2
+_FIRST_TILE = 1001
+_MOST_TEXELS = 1 << 28  # of all tiles together
 _NEW = "leave out --uv keep: new ones are made"
 # Length of an edge, in units of sqrt(area): xatlas takes seconds at this one, and hours at a few times as much.
 _MAX_EDGE = 500.0
@@ -40,6 +42,19 @@ class Atlas:
     shared: float = (
         0.0  # share of the used texels that several places have, as mirrored halves do: is there one answer?
     )
+    tiles: Int[Ints, " F"] | None = None  # of each face (UDIM, 1001 to 1100), where one image is not enough
+
+    @property
+    def laid(self) -> Float[Floats, "F 3 2"]:
+        """The coordinates as files have them: each tile in its place, to the right of 0..1 or above it (v below 0)."""
+        if self.tiles is None:
+            return self.uv
+        row, column = np.divmod(self.tiles - _FIRST_TILE, 10)
+        return self.uv + np.stack([column, -row], axis=1)[:, None]
+
+    def of_tile(self, tile: int) -> Atlas:
+        """The faces of one tile alone; the others have no area."""
+        return replace(self, uv=np.where((self.tiles == tile)[:, None, None], self.uv, 0.0), tiles=None)
 
 
 def atlas_of(
@@ -54,6 +69,10 @@ def atlas_of(
     name = shape.name or "the target"
     check_surface(shape)
     if own is not None and keep != "new":
+        tiles = tiles_of(shape, own, size)
+        if tiles is not None:
+            words = f"{name}: its own texture coordinates lie in the tiles {', '.join(map(str, np.unique(tiles)))}"
+            return Atlas(np.clip(_within(own, shape), 0.0, 1.0), True, f"{words}: an image for each", tiles=tiles)
         within, problem, twice = _checked(own, shape, size)
         if not problem:
             words = f"{name}: its own texture coordinates overlap on {100 * twice:.1f} % of their texels"
@@ -94,8 +113,7 @@ def _checked(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str, float]:
         return uv, "some are not numbers", 0.0
     if np.abs(uv[real]).max() > 1e6:
         return uv, "some are absurdly large", 0.0
-    out = np.where(real[:, None, None], uv, 0.0)
-    out = out - np.floor(out.min(axis=1, keepdims=True) + 1e-5)
+    out = _within(uv, shape)
     beyond = int((out.max(axis=(1, 2)) > 1.0 + 1e-5).sum())
     if beyond:
         return out, f"{beyond} faces reach out of range, over the edge of the image", 0.0
@@ -110,6 +128,39 @@ def _checked(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str, float]:
     if starved > _MAX_STARVED:
         return uv, f"{100 * starved:.0f} % of the surface has no room in the image", 0.0
     return uv, "", shared_texels(uv, size)
+
+
+def _within(uv: Floats, shape: Shape) -> Floats:
+    """Coordinates moved by whole numbers, a triangle at a time, so that they begin in 0..1; zeros without area."""
+    out = np.where((shape.face_areas > 0)[:, None, None], uv, 0.0)
+    return np.asarray(out - np.floor(out.min(axis=1, keepdims=True) + 1e-5))
+
+
+def tiles_of(shape: Shape, uv: Float[Floats, "F 3 2"], size: int) -> Int[Ints, " F"] | None:
+    """The tile (UDIM, 1001 to 1100) that each face's coordinates lie in (v down). None where one image is enough for all, or
+    tiles with images of `size` are not: faces reach from one into another, or several places share one.
+    """
+    real = shape.face_areas > 0
+    if not real.any() or not (np.isfinite(uv[real]).all() and np.abs(uv[real]).max() <= 10.0 + 1e-5):
+        return None
+    up = np.where(real[:, None, None], uv * [1.0, -1.0] + [0.0, 1.0], 0.0)
+    place = np.floor(up.min(axis=1) + 1e-5).astype(np.int64)
+    number = _FIRST_TILE + place @ [1, 10]
+    found = np.unique(number[real])
+    beyond = (up.max(axis=1) > place + 1.0 + 1e-5).any(axis=1) | (place < 0).any(axis=1) | (place > 9).any(axis=1)
+    if beyond[real].any() or len(found) < 2 or len(found) * size**2 > _MOST_TEXELS:
+        return None
+    within = np.clip(_within(uv, shape), 0.0, 1.0)
+    room, deserved = flat_areas(within), shape.face_areas / shape.face_areas.sum()
+    if room.sum() < _MIN_USED or deserved[room < _STARVED * deserved].sum() > _MAX_STARVED:
+        return None
+    if not too_many_layers(within, size) and shared_texels(within, size) <= _FEW:
+        return None
+    for tile in found:
+        inside = within[real & (number == tile)]
+        if too_many_layers(inside, size) or shared_texels(inside, size) > _FEW:
+            return None
+    return np.where(real, number, found[0])
 
 
 def too_many_layers(uv: Float[Floats, "F 3 2"], size: int) -> float:

@@ -182,6 +182,49 @@ def test_mirrored_coordinates_are_used_where_both_halves_look_alike(run: Run, pa
     assert np.abs(image[row, column, :3] - expected).mean() < 12
 
 
+def tiled(name: str) -> None:
+    """The target as an obj whose upper half lies in tile 1002, each half in all of its tile; written beside the others."""
+    fine = load_shape("b.ply")
+    upper = fine.verts[fine.faces][:, :, 2].mean(axis=1) > 0
+    uv = np.zeros((fine.F, 3, 2))
+    for half, column in ((upper, 1.0), (~upper, 0.0)):
+        uv[half] = unwrapped(Shape(fine.verts, fine.faces[half]), 64, 2) + np.array([column, 0.0])
+    lines = [f"v {x} {y} {z}" for x, y, z in fine.verts] + [f"vt {u} {1 - v}" for u, v in uv.reshape(-1, 2)]
+    for number, face in enumerate(fine.faces + 1):
+        lines.append("f " + " ".join(f"{vertex}/{3 * number + k + 1}" for k, vertex in enumerate(face)))
+    Path(name).write_text("\n".join(lines) + "\n")
+
+
+def test_each_tile_of_the_target_gets_an_image(run: Run, pair: Path) -> None:
+    tiled("b.obj")
+    answer = well(run(*call("--uv keep --json", "b.obj", "out.obj")))
+    record = told(answer)
+    assert record["uv"] == "own" and record["tiles"] == [1001, 1002]
+    files = ["out.obj", "out.mtl", "out.1001.png", "out.1002.png"]
+    assert record["files"] == files and all(Path(file).exists() for file in files)
+    assert "map_Kd out.<UDIM>.png" in Path("out.mtl").read_text() and not Path("out.png").exists()
+    kept = [line for line in Path("out.obj").read_text().splitlines() if line.startswith(("v", "f"))]
+    assert kept == Path("b.obj").read_text().splitlines()
+    shape = load_shape("out.obj")
+    look = load_appearance("out.obj", shape)
+    assert len(look.materials) == 2
+    points = sample_points()
+    for number, half in enumerate((points[:, 2] < -0.1, points[:, 2] > 0.1)):  # the lower tile is the first material
+        one = replace(
+            look, materials=(look.materials[number],), material=np.zeros_like(look.material), uv=look.uv % 1.0
+        )
+        difference = np.abs(colors_at(shape, one, points[half]) - seen("a.glb", points[half]))
+        assert np.median(difference) <= 4
+
+
+def test_a_glb_has_no_tiles(run: Run, pair: Path) -> None:
+    tiled("b.obj")
+    answer = well(run(*call("--json", "b.obj", "out.glb")))
+    assert told(answer)["uv"] == "new" and "has no tiles (UDIM)" in answer.err
+    before = {path.name for path in pair.iterdir()}
+    refused(run(*call("--uv keep", "b.obj", "no.glb")), "has no tiles", pair, before)
+
+
 def test_the_layout_of_the_source_is_carried_over(run: Run, pair: Path) -> None:
     """The image that comes out is that of the source."""
     answer = run(*call("--uv source --json"))

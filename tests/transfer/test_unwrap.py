@@ -8,7 +8,7 @@ from meshmatch.geometry.triangles import face_parts
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer import new_charts, unwrap
 from meshmatch.transfer.texels import faces_on, grow
-from meshmatch.transfer.unwrap import atlas_of, unwrapped
+from meshmatch.transfer.unwrap import atlas_of, tiles_of, unwrapped
 from tests.conftest import icosphere
 from tests.shapes.painted import CORNERS, FACES, UV
 
@@ -196,3 +196,46 @@ def test_no_seam_crosses_a_polygon() -> None:
     assert cut(whole) == 0
     found, twice = faces_on(whole * 512, 512)
     assert twice < 0.001 * (found >= 0).sum() and len(np.unique(found)) == shape.F + 1
+
+
+def in_tiles() -> tuple[Shape, np.ndarray]:
+    """Two squares side by side: the first fills tile 1001, the second 1012, above it and to the right."""
+    verts = np.concatenate([CORNERS, CORNERS + np.array([2.0, 0.0, 0.0])])
+    faces = np.concatenate([FACES, FACES + len(CORNERS)])
+    return Shape(verts, faces, "two"), np.concatenate([OWN, OWN + np.array([1.0, -1.0])])
+
+
+def test_coordinates_in_tiles_get_an_image_each() -> None:
+    shape, uv = in_tiles()
+    first = np.arange(shape.F) < len(FACES)
+    tiles = tiles_of(shape, uv, 64)
+    assert tiles is not None and tiles.tolist() == np.where(first, 1001, 1012).tolist()
+    atlas = atlas_of(shape, uv, 64, 2, "keep")
+    assert atlas.own and "the tiles 1001, 1012" in atlas.note
+    np.testing.assert_allclose(atlas.laid, uv)
+    np.testing.assert_allclose(atlas.uv, np.concatenate([OWN, OWN]), atol=1e-12)
+    one = atlas.of_tile(1012)
+    assert one.tiles is None and (one.uv[first] == 0).all() and (one.uv[~first] == atlas.uv[~first]).all()
+
+
+@pytest.mark.parametrize(
+    "move", ["apart in one image", "across a border", "below all tiles", "twice in a tile", "too large"]
+)
+def test_what_needs_no_tiles_or_fits_in_none(move: str) -> None:
+    shape, uv = in_tiles()
+    second, size = np.arange(shape.F) >= len(FACES), 64
+    if move == "apart in one image":
+        uv = np.where(second[:, None, None], uv * 0.4 + [0.5, -0.5], uv * 0.4)
+        uv[second] += [1.0 - 0.4, 0.0]
+    elif move == "across a border":
+        uv[second] += [0.5, 0.0]
+    elif move == "below all":
+        uv[second] += [0.0, 3.0]
+    elif move == "twice in a tile":
+        shape = Shape(
+            np.concatenate([shape.verts, shape.verts + 5]), np.concatenate([shape.faces, shape.faces + shape.V])
+        )
+        uv = np.concatenate([uv, uv])
+    else:
+        size = 16_384
+    assert tiles_of(shape, uv, size) is None
