@@ -38,6 +38,12 @@ def export(
     metadata: Path | None = optional(
         "TABLE", "What is known of each shape: a row each, with its name; metadata.csv then has it, too."
     ),
+    smooth: bool = Option(
+        False, "--smooth", help="The shapes of a folder are frames: smooth their motion in time, along their surfaces."
+    ),
+    cycle: bool = Option(
+        False, "--cycle", help="The same of a periodic motion: the last frame is followed by the first."
+    ),
     poor: bool = Option(False, "--poor", help="Write poor fits too."),
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -50,8 +56,9 @@ def export(
     console = Console(quiet)
     with console.progress() as progress:
         done = meshmatch.Collection(fits, progress=progress).export(
-            output, suffix=suffix, place=place, poor=poor, original=original, values=values, metadata=metadata
-        )
+            output, suffix=suffix, place=place, poor=poor, original=original, values=values, metadata=metadata,
+            smooth=smooth, cycle=cycle,
+        )  # fmt: skip
     if done.left_out:
         console.say(f"poor fits are left out: {', '.join(done.left_out)}; --poor writes them too")
     each = "with what is known of their vertices" if original else f"{done.vertices} vertices each"

@@ -22,7 +22,7 @@ from meshmatch.collections.named_parts import WHOLE, Masks, parts_of_template
 from meshmatch.collections.registered import Registered, held
 from meshmatch.collections.setting import Record, Setting, forget, template_at
 from meshmatch.collections.settle import settled
-from meshmatch.collections.sources import find_sources
+from meshmatch.collections.sources import find_sources, frame_times, natural
 from meshmatch.collections.stores import Store
 from meshmatch.collections.superimpose import Scale, superimpose
 from meshmatch.collections.workers import hired
@@ -354,6 +354,8 @@ class Collection(FitsFolder):
         original: bool = False,
         values: str | Path | None = None,
         metadata: str | Path | None = None,
+        smooth: bool = False,
+        cycle: bool = False,
     ) -> Exported:
         """Write the template on every shape, as meshes or as a table; vertex i is the same point on all of them.
 
@@ -377,6 +379,10 @@ class Collection(FitsFolder):
             A file of numbers of the template's vertices, which the originals then have too.
         metadata
             A table with a row for each shape, which metadata.csv then has too.
+        smooth
+            Shapes of a folder are frames: smooth the paths of the vertices in time, along the surfaces.
+        cycle
+            The same, and the last frame is followed by the first.
 
         Returns
         -------
@@ -389,7 +395,7 @@ class Collection(FitsFolder):
             The format or place is unknown, no fit is left, an original is not as it was, or the folder is not empty or
             cannot be written.
         """
-        how = Export(suffix, place, original, values, metadata)
+        how = Export(suffix, place, original, values, metadata, smooth, cycle)
         verdicts = {name: str(self._words(name)["verdict"]) for name in self._names_of_one_kind()}
         left_out = tuple(name for name, verdict in verdicts.items() if verdict == "poor" and not poor)
         names = [name for name in verdicts if name not in left_out]
@@ -399,10 +405,12 @@ class Collection(FitsFolder):
         if original and len(names) > 2:
             with self.registered(poor) as shapes:
                 mean = superimpose(shapes.points, shapes.faces)
-        about = self._about()["sequence"]
-        fits = Fits(
-            names, self.fit_of, self.places_of, files_of(self.store) if original else {}, self.template, bool(about)
-        )
+        in_time = smooth or cycle
+        sequence = in_time or bool(self._about()["sequence"])
+        files = files_of(self.store) if original or in_time else {}
+        names = sorted(names, key=natural) if sequence else names
+        times = frame_times({*files, *names}) if in_time else {}
+        fits = Fits(names, self.fit_of, self.places_of, files, self.template, sequence, times)
         return Exported(
             tuple(export(output, fits, how, mean, self.progress)), len(names), fits.template.shape.V, left_out
         )

@@ -5,16 +5,17 @@ from __future__ import annotations
 import csv
 import html
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.covariates import SIZE, Covariates, covariates
+from meshmatch.collections.motion import area_strain, smoothed
 from meshmatch.collections.registered import held
-from meshmatch.collections.sources import natural
 from meshmatch.collections.superimpose import Superimposed
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit
@@ -73,6 +74,10 @@ class Export:
         A file of numbers of the template's vertices that go with the shapes then.
     metadata
         A table with a row for each shape, which metadata.csv then has too.
+    smooth
+        Smooth the frames of sequences in time.
+    cycle
+        The same, and the last frame is followed by the first.
     """
 
     suffix: str = ""
@@ -80,6 +85,8 @@ class Export:
     original: bool = False
     values: str | Path | None = None
     metadata: str | Path | None = None
+    smooth: bool = False
+    cycle: bool = False
 
     def __post_init__(self) -> None:
         suffix = f".{self.suffix.removeprefix('.').lower()}" if self.suffix else ".vtp" if self.original else ".ply"
@@ -92,13 +99,20 @@ class Export:
             raise OptionError(f"{what} meshes are not exported as {suffix[:20]}", f"choose one of {', '.join(known)}")
         if self.original and self.place != "files":
             raise OptionError("original meshes stay where their files have them", "leave the place out")
+        if (self.smooth or self.cycle) and (self.original or self.place != "files"):
+            what = "frames are smoothed as registered meshes, where their files have them"
+            raise OptionError(what, "leave out the originals and the place")
         if self.values is not None and not self.original:
             raise OptionError("values go with the original meshes", "ask for these: original, --original")
 
 
 @dataclass(frozen=True, eq=False)
 class Fits:
-    """What is exported: names of shapes, and what gives the fit, the places and the file of each; the template of all."""
+    """What is exported: names of shapes, and what gives the fit, the places and the file of each; the template of all.
+
+    ``sequence``: shapes of a folder are frames; ``names`` are in the natural order then. ``times`` are the places of frames
+    in their sequence, where they are to be smoothed.
+    """
 
     names: Sequence[str]
     fit_of: Callable[[str], Fit]
@@ -106,6 +120,7 @@ class Fits:
     files: Mapping[str, str]
     template: Template
     sequence: bool
+    times: Mapping[str, int] = field(default_factory=dict)
 
 
 def mesh_of(fit: Fit, place: Place) -> Shape:
@@ -125,13 +140,18 @@ def export(
     values = None if how.values is None else load_values(how.values, fits.template.shape)
     table = None if how.metadata is None else covariates(how.metadata, names, np.full(len(names), np.nan))
 
-    def meshes() -> Iterator[tuple[str, Shape]]:
+    def plain() -> Iterator[tuple[str, Shape]]:
         for number, name in enumerate(names):
             fit = fits.fit_of(name)
             facts.add(name, fit)
             yield name, mesh_of(fit, how.place)
             if progress is not None:
                 progress("exporting", name, (number + 1) / len(names))
+
+    def meshes() -> Iterator[tuple[str, Shape]]:
+        return _in_time(plain(), fits, how.cycle) if how.smooth or how.cycle else plain()
+
+    moves = fits.sequence and how.place == "files" and not how.original
 
     with folder_on_success(output) as folder:
         files = []
@@ -143,8 +163,11 @@ def export(
             each = meshes()
             with held(len(names), fits.template.shape.V, lambda number: next(each)[1].verts) as points:
                 own = {"points": points, "faces": np.asarray(fits.template.shape.faces), "names": np.array(names)}
+                if moves:
+                    own |= _motions(names, points, own["faces"])
                 np.savez(folder / files[0], allow_pickle=False, **own, **facts.arrays())
         else:
+            first: dict[str, Shape] = {}
             for name, shape in meshes():
                 files.append(f"{name}{how.suffix}")
                 make_folder((folder / files[-1]).parent)
@@ -152,6 +175,11 @@ def export(
                     shape = _original(fits.files.get(name), fits.places_of(name))
                     arrays = _on_original(fits, name, mean, values)
                     (write_vtp if how.suffix == ".vtp" else write_vtk)(folder / files[-1], shape, arrays)
+                elif moves and how.suffix in ORIGINALS:
+                    began = first.setdefault(_folder_of(name), shape).verts
+                    (write_vtp if how.suffix == ".vtp" else write_vtk)(
+                        folder / files[-1], shape, _motion(shape.verts, began, shape.faces)
+                    )
                 else:
                     save_shape(folder / files[-1], shape)
             if fits.sequence and how.suffix == ".vtp":
@@ -160,6 +188,40 @@ def export(
             files.append("metadata.csv")
             facts.write(folder / files[-1], table)
         return files
+
+
+def _folder_of(name: str) -> str:
+    """The sequence that a frame belongs to."""
+    return name.rpartition("/")[0]
+
+
+def _in_time(meshes: Iterator[tuple[str, Shape]], fits: Fits, cycle: bool) -> Iterator[tuple[str, Shape]]:
+    """The frames of each sequence, smoothed in time."""
+    for _, own in groupby(fits.names, _folder_of):
+        names = list(own)
+        faces: list[Ints] = []
+
+        def read(_: int, faces: list[Ints] = faces) -> Floats:
+            shape = next(meshes)[1]
+            faces.append(shape.faces)
+            return shape.verts
+
+        with held(len(names), fits.template.shape.V, read) as points:
+            frames = smoothed(points, faces[0], [fits.times[name] for name in names], cycle)
+            for name, verts, own_faces in zip(names, frames, faces, strict=True):
+                yield name, Shape(verts, own_faces, name)
+
+
+def _motion(verts: Floats, first: Floats, faces: Int[Ints, "F 3"]) -> dict[str, np.ndarray]:
+    """How a frame has moved since the first one of its sequence."""
+    return {"displacement": verts - first, "area_strain": area_strain(verts, first, faces)}
+
+
+def _motions(names: Sequence[str], points: Floats, faces: Int[Ints, "F 3"]) -> dict[str, np.ndarray]:
+    """The same of all frames."""
+    first = {_folder_of(name): k for k, name in reversed(list(enumerate(names)))}
+    found = [_motion(own, points[first[_folder_of(name)]], faces) for name, own in zip(names, points, strict=True)]
+    return {title: np.stack([each[title] for each in found]) for title in found[0]}
 
 
 class _Facts:
@@ -226,8 +288,8 @@ def _on_original(fits: Fits, name: str, mean: Superimposed | None, values: Value
 def _write_series(folder: Path, names: Sequence[str]) -> list[str]:
     """ParaView's list of the frames of each folder, in their order."""
     frames: dict[str, list[str]] = {}
-    for name in sorted(names, key=natural):
-        frames.setdefault(name.rpartition("/")[0], []).append(name.rpartition("/")[2])
+    for name in names:
+        frames.setdefault(_folder_of(name), []).append(name.rpartition("/")[2])
     files = []
     for where, own in frames.items():
         rows = [f'<DataSet timestep="{k}" file="{html.escape(name)}.vtp"/>' for k, name in enumerate(own)]

@@ -321,9 +321,10 @@ def _believed(record: Record, usual: Usual | None) -> bool:
 
 
 def _write_table(store: Store, records: Sequence[Record]) -> None:
-    """``fits.csv``: a row for each shape."""
+    """``fits.csv``: a row for each shape, frame2 before frame10."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
-    table.writerows([getattr(record, name) for name in COLUMNS] for record in records)
+    ordered = sorted(records, key=lambda record: natural(record.name))
+    table.writerows([getattr(record, name) for name in COLUMNS] for record in ordered)
     save_text(store, TABLE, text.getvalue())

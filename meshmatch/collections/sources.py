@@ -57,6 +57,16 @@ def find_sources(shapes: str | Path | Sequence[str | Path], output: Store) -> tu
     return found, left_out
 
 
+def frame_times(names: Iterable[str]) -> dict[str, int]:
+    """The place of each frame in the sequence of its folder, from 0."""
+    counts: Counter[str] = Counter()
+    found = {}
+    for name in sorted(names, key=natural):
+        found[name] = counts[folder := name.rpartition("/")[0]]
+        counts[folder] += 1
+    return found
+
+
 def natural(name: str) -> list[tuple[int, str]]:
     """A key that sorts names as people do: frame2 before frame10."""
     parts = re.split(r"(\d+)", name)

@@ -100,9 +100,9 @@ def test_registered_meshes_are_exported(fits: Path, run: Run, tmp_path: Path, su
 
 def test_shapes_of_folders_are_exported_into_folders(fits: Path, tmp_path: Path) -> None:
     """Frames of a sequence with ParaView's list of each folder."""
-    given = all_climber(fits, "left/f10", "left/f2", "b", sequence=True)
+    given = all_climber(fits, "b", "left/f2", "left/f10", sequence=True)
     files = export(tmp_path / "out", given, Export(".vtp"), None)
-    assert files == ["left/f10.vtp", "left/f2.vtp", "b.vtp", "sequence.pvd", "left/sequence.pvd"]
+    assert files == ["b.vtp", "left/f2.vtp", "left/f10.vtp", "sequence.pvd", "left/sequence.pvd"]
     assert {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")} == set(files)
     frames = ElementTree.parse(tmp_path / "out" / "left" / "sequence.pvd").iter("DataSet")
     assert [(frame.get("timestep"), frame.get("file")) for frame in frames] == [("0", "f2.vtp"), ("1", "f10.vtp")]
