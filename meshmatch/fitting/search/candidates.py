@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats
-from meshmatch.fitting.search.frames import frames_of_part, frames_to_try, stands_upright
+from meshmatch.fitting.search.frames import frames_anywhere, frames_of_part, frames_to_try, stands_upright
 from meshmatch.fitting.search.predictor import (
     Candidate,
     Predictor,
@@ -60,9 +60,8 @@ class CandidateSettings:
     neighbours : how many neighbours those are
     scale_tolerance : relative change of the scale that ends the search
     scale_margin : candidates whose residual is more than this times the best one say nothing about a cloud's scale
-    unusual_residual : a shape that the network's own fits miss by more may be built like nobody that the aligner knows: with
-        a large head the core lies further down its own up axis
-    lower_cores : by how much the core is then tried further down
+    unusual_residual : a shape that the network's fits miss by more may stand as nothing that the aligner knows
+    careful_if_unusual : of the frames that are then tried, how many are fitted with care
     about_margin : residual, as a multiple of the best one, up to which this is refined the other way round as well
     shares : shares of the surface that a part may show
     min_share : the smallest share that a shape is taken to show
@@ -86,8 +85,8 @@ class CandidateSettings:
     neighbours: int = 8
     scale_tolerance: float = 0.005
     scale_margin: float = 1.1
-    unusual_residual: float = 0.05
-    lower_cores: tuple[float, ...] = (0.1, 0.2)
+    unusual_residual: float = 0.045
+    careful_if_unusual: int = 12
     about_margin: float = 1.1
     shares: tuple[float, ...] = (1.0, 0.8, 0.62, 0.48, 0.36)
     min_share: float = 0.2
@@ -117,25 +116,29 @@ def candidates_of_whole(task: FitTask) -> tuple[FitTask, list[Candidate]]:
     care = 2 if task.shape.is_cloud else 1
     starts = [(task.coarse, pose) for pose in frames_to_try(task.model, task.samples, task.config, task.shape.upright)]
     candidates = best_first(task.predictor.fit_all(starts, rounds=care, draws=care))
-    careful = task.config.careful
-    part = task.config.partial == "yes"  # which is no strange body
-    if candidates[0].residual > SETTINGS.unusual_residual and not (task.shape.is_cloud or part):
-        lower = [
-            (samples, RigidPose(pose.rotation, pose.center - down * pose.rotation[:, 1]))
-            for samples, pose in starts
-            for down in SETTINGS.lower_cores
-        ]
-        candidates = best_first([*candidates, *task.predictor.fit_all(lower, rounds=care, draws=care)])
-        careful *= 4
-    orientation(0.7)
+    orientation(0.6)
     if task.shape.is_cloud:
         task, candidates = _rescaled(task, candidates)
-    chosen = candidates[:careful]
+    chosen = candidates[: task.config.careful]
     chosen += [each for each in of_file(task, candidates) if each not in chosen]
     best = best_first(task.predictor.fit_all([(task.samples, each.pose) for each in chosen]))
+    orientation(0.8)
+    if best[0].residual > SETTINGS.unusual_residual and not task.shape.is_cloud and task.config.partial != "yes":
+        best = best_first([*best, *_turned_anywhere(task)])
     best += _about_face(task, best[0])
     orientation(1.0)
     return task, best_first(best)
+
+
+def _turned_anywhere(task: FitTask) -> list[Candidate]:
+    """Fits from the best of many frames, of a shape whose core frame the aligner does not know.
+
+    People who fold forward, do the splits or wear a large head are read well by the network once their core is found.
+    """
+    frames = frames_anywhere(task.model, task.samples, task.config)
+    rough = task.predictor.fit_all([(task.coarse, pose) for pose in frames], draws=1, measure=ranking_residual)
+    careful = SETTINGS.careful_if_unusual
+    return task.predictor.fit_all([(task.samples, each.pose) for each in best_first(rough)[:careful]])
 
 
 def _about_face(task: FitTask, best: Candidate) -> list[Candidate]:

@@ -30,6 +30,9 @@ _ALONG = (-0.3, -0.15, 0.0, 0.15)
 _OBEYS = 0.5  # cosine of the angle between an axis of a frame and the user's
 USUAL = 0.85
 """Cosine above which an orientation is a usual one, or that of the file."""
+_ANYWHERE = 144  # turns of a shape that stands as nothing that the aligner knows; 72 find less, 288 no more
+_BELOW = 0.15  # of generated people the core lies 0 to 0.3 below the middle, along its own up axis
+_SPIRAL = 1.533751168755204288118041  # the solution of x ** 4 = x + 4
 _AGREE = 30  # degrees: votes that are closer agree. Set by hand.
 # Turns of the core frame that a vote may be wrong by: about face, upside down, on its head, a quarter either way.
 _FLIPS = Rotation.from_rotvec(
@@ -58,15 +61,36 @@ def frames_to_try(
         frames = with_flips(propose(model.on(config.device), points, config.copies, config.hypotheses, config.seed))
         if upright and not any(stands_upright(pose) for pose in frames):
             frames.append(RigidPose.identity())
+    return _obeying(frames, config) or forced_frames(*_axes(config))
+
+
+def frames_anywhere(model: TrainedModel, samples: OrientedPoints, config: FitConfig) -> list[RigidPose]:
+    """Core frames turned evenly every way, those that obey the user's axes; none of a category whose orientation is not
+    searched.
+    """
+    if model.card.frame["orientation"] in ALIGNS:
+        return []
+    middle = samples.points.mean(0)
+    return _obeying([RigidPose(turn, middle - _BELOW * turn[:, 1]) for turn in _even_turns(_ANYWHERE)], config)
+
+
+def _obeying(frames: list[RigidPose], config: FitConfig) -> list[RigidPose]:
+    """Those whose axes are about the user's, if the user gives any."""
     up, front = _axes(config)
-    if up is None and front is None:
-        return frames
-    obeying = [
+    return [
         pose
         for pose in frames
         if (up is None or pose.rotation[:, 1] @ up > _OBEYS) and (front is None or pose.rotation[:, 2] @ front > _OBEYS)
     ]
-    return obeying or forced_frames(up, front)
+
+
+def _even_turns(count: int) -> Float[Floats, "count 3 3"]:
+    """Rotations spread evenly, by the spiral of Alexa (*Super-Fibonacci Spirals*, CVPR 2022)."""
+    step = np.arange(count) + 0.5
+    first, second = 2 * np.pi * step / np.sqrt(2), 2 * np.pi * step / _SPIRAL
+    inner, outer = np.sqrt(step / count), np.sqrt(1 - step / count)
+    quaternions = [inner * np.sin(first), inner * np.cos(first), outer * np.sin(second), outer * np.cos(second)]
+    return np.asarray(Rotation.from_quat(np.stack(quaternions, 1)).as_matrix())
 
 
 def stands_upright(pose: RigidPose) -> bool:
