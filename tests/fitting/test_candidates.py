@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from meshmatch.api.inputs import as_model
-from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit_config import FitConfig, Partial
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.search import candidates, frames, refinement
 from meshmatch.fitting.search.candidates import candidates_of_whole
 from meshmatch.fitting.search.discontinuities import discontinuous_share, neighbours
@@ -28,6 +30,7 @@ from meshmatch.progress import Progress
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
+from meshmatch.templates.template import read_template
 from tests.fitting.eggs import egg_model, scan_of
 
 STILL = RigidPose.identity()
@@ -42,27 +45,57 @@ def still(system: NodeSystem, residual: float = 0.03) -> Candidate:
     return Candidate(STILL, np.zeros((system.K, 3)), residual)
 
 
-@pytest.mark.parametrize(("residual", "tried", "careful"), [(0.03, 1, 3), (0.06, 3, 12)])
-def test_a_shape_that_the_network_misses_is_tried_with_its_core_further_down(
-    monkeypatch: pytest.MonkeyPatch, residual: float, tried: int, careful: int
+@pytest.mark.parametrize(("residual", "partial", "tried"), [(0.03, "auto", 0), (0.06, "auto", 144), (0.06, "yes", 0)])
+def test_a_shape_that_the_network_misses_is_turned_every_way(
+    monkeypatch: pytest.MonkeyPatch, residual: float, partial: Partial, tried: int
 ) -> None:
     model = egg_model()
-    task = FitTask.of(model, FitConfig(), Shape(model.template.shape.verts, model.template.shape.faces))
-    tried_frames = [RigidPose(np.eye(3)[[1, 2, 0]], np.full(3, 0.01 * k)) for k in range(6)]
-    monkeypatch.setattr(candidates, "frames_to_try", lambda *_: tried_frames)
+    task = FitTask.of(model, FitConfig(partial=partial), Shape(model.template.shape.verts, model.template.shape.faces))
+    monkeypatch.setattr(candidates, "frames_to_try", lambda *_: [STILL] * 6)
     asked: list[list[RigidPose]] = []
 
     def fit_all(self: Predictor, starts: list[tuple[OrientedPoints, RigidPose]], *_: int, **__: int) -> list[Candidate]:
         asked.append([pose for _, pose in starts])
-        return [Candidate(pose, np.zeros((task.system.K, 3)), residual) for _, pose in starts]
+        right = [pose.rotation[1, 1] < -0.95 for _, pose in starts]
+        still = np.zeros((task.system.K, 3))
+        return [
+            Candidate(pose, still, 0.02 if each else residual) for each, (_, pose) in zip(right, starts, strict=True)
+        ]
 
     monkeypatch.setattr(Predictor, "fit_all", fit_all)
-    candidates_of_whole(task)
-    assert sum(map(len, asked[:-2])) == tried * len(tried_frames)
-    assert len(asked[-2]) == careful
-    if tried > 1:
-        down = asked[1][0].center - tried_frames[0].center
-        assert np.allclose(down / np.linalg.norm(down), -tried_frames[0].rotation[:, 1])
+    _, found = candidates_of_whole(task)
+    assert [len(each) for each in asked] == [6, 3, *([tried, 12] if tried else []), 1]
+    assert (found[0].pose.rotation[1, 1] < -0.95) == bool(tried)
+
+
+def test_frames_anywhere_are_near_to_any_and_obey_the_user() -> None:
+    model = as_model("human")
+    samples = scan_of(model.template.shape, 500)
+    poses = frames.frames_anywhere(model, samples, FitConfig())
+    turns = Rotation.from_matrix([pose.rotation for pose in poses])
+    asked = Rotation.random(200, random_state=np.random.default_rng(0))
+    nearest = [np.degrees((turns * each.inv()).magnitude().min()) for each in asked]
+    assert max(nearest) < 45
+    below = [pose.rotation.T @ (pose.center - samples.points.mean(0)) for pose in poses]
+    assert np.ptp(below, axis=0).max() < 1e-9 and below[0][1] < 0
+    obeying = frames.frames_anywhere(model, samples, FitConfig(up="-z"))
+    assert 0 < len(obeying) < len(poses) / 2
+    assert all(pose.rotation[2, 1] < -0.5 for pose in obeying)
+    aligned = replace(model, card=replace(model.card, frame=model.card.frame | {"orientation": "rigid"}))
+    assert frames.frames_anywhere(aligned, samples, FitConfig()) == []
+
+
+def test_a_body_that_folds_forward_is_found() -> None:
+    """Its aligner takes it for another one upside down; turned every way, the network reads it."""
+    verts, hips = read_template("human-T").shape.verts, 0.05
+    share = np.clip((verts[:, 1] - hips) / 0.1 + 0.5, 0, 1)
+    angle = np.radians(160) * share**2 * (3 - 2 * share)
+    up, ahead = verts[:, 1] - hips, verts[:, 2]
+    up, ahead = up * np.cos(angle) - ahead * np.sin(angle), up * np.sin(angle) + ahead * np.cos(angle)
+    body = Shape(np.stack([verts[:, 0], hips + up, ahead], 1), read_template("human-T").shape.faces)
+    fit = Fitter(as_model("human"), FitConfig()).fit(body)
+    apart = np.linalg.norm(fit.points_in_file - body.verts, axis=1).mean() / np.sqrt(body.area)
+    assert apart < 0.03 and fit.verdict != "poor"
 
 
 @pytest.mark.parametrize(("front", "right"), [(None, True), ("z", False)])
