@@ -82,7 +82,7 @@ def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] |
     return found if shape.F else None
 
 
-def files_of(path: Path, layers: Collection[Layer] = (), tiles: Iterable[int] = ()) -> list[Path]:
+def files_of(path: Path, layers: Collection[Layer] = (), tiles: Iterable[int | str] = ()) -> list[Path]:
     """What will be written for an output: an obj has companions, more of them with images of these layers, and one of each
     for every tile (UDIM).
     """

@@ -50,11 +50,14 @@ class Atlas:
         if self.tiles is None:
             return self.uv
         row, column = np.divmod(self.tiles - _FIRST_TILE, 10)
-        return self.uv + np.stack([column, -row], axis=1)[:, None]
+        return np.asarray(self.uv + np.stack([column, -row], axis=1)[:, None])
 
     def of_tile(self, tile: int) -> Atlas:
         """The faces of one tile alone; the others have no area."""
-        return replace(self, uv=np.where((self.tiles == tile)[:, None, None], self.uv, 0.0), tiles=None)
+        others = np.flatnonzero(self.tiles != tile)
+        uv = self.uv.copy()
+        uv[others] = 0.0
+        return replace(self, uv=uv, tiles=None)
 
 
 def atlas_of(
@@ -160,7 +163,7 @@ def tiles_of(shape: Shape, uv: Float[Floats, "F 3 2"], size: int) -> Int[Ints, "
         inside = within[real & (number == tile)]
         if too_many_layers(inside, size) or shared_texels(inside, size) > _FEW:
             return None
-    return np.where(real, number, found[0])
+    return np.asarray(np.where(real, number, found[0]))
 
 
 def too_many_layers(uv: Float[Floats, "F 3 2"], size: int) -> float:
