@@ -6,7 +6,8 @@ naked, clothed, in skirts, or of other proportions, in other triangles, now and 
 only a half. The human model is fitted to each as `match` does it. The error is the mean distance between the fitted
 template's vertices and where they belong, over those that the shape shows, in centimetres of a person of 1.9 m2.
 
-Each body is a line of ``bodies.jsonl``, and its fit a file beside it: a run that was stopped goes on with what is missing.
+Each body is a line of ``bodies.jsonl``, and its fit a file beside it: a run that was stopped goes on with what is missing,
+and with ``--known`` where there are only its results.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from typer import Option
 
 from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
-from meshmatch.errors import MeshmatchError
+from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.verdict_cases import LIMBS, direction, faces_kept
 from meshmatch.experiments.bench.verdicts import REFUSED, VERDICTS
@@ -45,11 +46,21 @@ from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.maps.fit_files import write_fit
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.input_files import read_json
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template, read_template
 
 BANDS = (5.0, 8.0, 15.0, 30.0)
 _LOST_CM = 15.0
+_OFF_CM = 8.0
+_POSE_COLUMNS = {
+    "pose": "pose",
+    "bodies": "bodies:d",
+    "mean cm": "mean:.1f",
+    "median": "median:.1f",
+    "over 8 cm": "off:.0%",
+}
+_POSE_COLUMNS |= {"of these not poor": "not_poor:d"}
 _PEOPLE, _OTHER_PEOPLE = 64, 5300
 _TRIES = 6  # of which the pose is taken in which the body runs into itself least
 _STYLES = (0.78, 0.12, 0.06, 0.04, 0.0)  # plain, child, free, stylised, built of parts
@@ -235,6 +246,41 @@ def counted(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
+def by_pose(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row for every pose: how far the fits are off, and how many of those are not called poor."""
+    found = []
+    for pose in POSES:
+        some = [
+            row for row in rows if row["pose"] == pose and row["cut"] in ("none", "holes") and row["verdict"] != REFUSED
+        ]
+        if some:
+            errors = np.array([row["error"] for row in some])
+            told = np.array([row["verdict"] != "poor" for row in some])
+            off = errors > _OFF_CM
+            row = {"pose": pose, "bodies": len(some), "mean": errors.mean(), "median": np.median(errors)}
+            found.append(row | {"off": off.mean(), "not_poor": int((off & told).sum())})
+    return found
+
+
+def kept(row: dict[str, Any]) -> str:
+    """A body in few words, as `finished_bodies` reads them."""
+    error = f"{row['error']:.2f}" if "error" in row else ""
+    return "; ".join([str(row["seed"]), str(row["number"]), row["pose"], row["cut"], error, row["verdict"]])
+
+
+def finished_bodies(path: Path) -> list[dict[str, Any]]:
+    """The bodies of an earlier run's results."""
+    found = []
+    try:
+        for line in read_json(path)["values"]["rows"]:
+            seed, number, pose, cut, error, verdict = line.split("; ")
+            row = {"seed": int(seed), "number": int(number), "pose": pose, "cut": cut, "verdict": verdict}
+            found.append(row | ({"error": float(error)} if error else {}))
+    except (OSError, KeyError, TypeError, ValueError, AttributeError) as problem:
+        raise InputError(f"{path} has no bodies of an earlier run", "give a file that --save wrote") from problem
+    return found
+
+
 @runner.command
 def main(
     bodies: Annotated[int, Option(min=1, help="how many")] = 5000,
@@ -242,15 +288,17 @@ def main(
     threads: runner.Threads = 1,
     seed: runner.Seed = 1,
     seeds: Annotated[int, Option(min=1, help="the bodies are, by turns, of so many seeds from that one on")] = 2,
+    known: Annotated[Path | None, Option(help="results of an earlier run: its bodies are not fitted again")] = None,
 ) -> runner.Report:
     make_folder(output / "fits")
     path, template, matcher = output / "bodies.jsonl", read_template("human-T"), Matcher("human", FitConfig(), threads)
-    rows = [json.loads(line) for line in path.read_text("utf-8").splitlines()] if path.exists() else []
-    known = {(row["seed"], row["number"]) for row in rows}
+    rows = [] if known is None else finished_bodies(known)
+    rows += [json.loads(line) for line in path.read_text("utf-8").splitlines()] if path.exists() else []
+    done = {(row["seed"], row["number"]) for row in rows}
     drawn = [People(template, seed + k) for k in range(seeds)]
     for k in runner.track(range(bodies), "bodies"):
         people, number = drawn[k % seeds], k // seeds
-        if (people.seed, number) in known:
+        if (people.seed, number) in done:
             continue
         body, began = people.draw(number), time.process_time()
         row: dict[str, Any] = {"seed": people.seed, "number": number, **body.words, "V": body.shape.V}
@@ -264,7 +312,13 @@ def main(
         rows.append(row)
         with path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(runner.plain(row)) + "\n")
-    found, refused = counted(rows), sum(row["verdict"] == REFUSED for row in rows)
+    found, poses = counted(rows), by_pose(rows)
+    refused = sum(row["verdict"] == REFUSED for row in rows)
     columns = {"error": "error"} | {name: f"{name}:d" for name in (*VERDICTS, "all")}
-    tables = [runner.table(f"{len(rows)} bodies, of which {refused} refused", found, columns)]
-    return runner.Report({"bodies": len(rows), "refused": refused, "bands": found}, tables)
+    tables = [
+        runner.table(f"{len(rows)} bodies, of which {refused} refused", found, columns),
+        runner.table("By pose, of bodies of which no more than holes is missing", poses, _POSE_COLUMNS),
+    ]
+    lines = [kept(row) for row in sorted(rows, key=lambda row: (row["seed"], row["number"]))]
+    record = {"bodies": len(rows), "refused": refused, "bands": found, "poses": poses, "rows": lines}
+    return runner.Report(record, tables)
