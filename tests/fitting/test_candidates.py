@@ -31,6 +31,7 @@ from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import read_template
+from tests.conftest import icosphere
 from tests.fitting.eggs import egg_model, scan_of
 
 STILL = RigidPose.identity()
@@ -83,6 +84,12 @@ def test_frames_anywhere_are_near_to_any_and_obey_the_user() -> None:
     assert all(pose.rotation[2, 1] < -0.5 for pose in obeying)
     aligned = replace(model, card=replace(model.card, frame=model.card.frame | {"orientation": "rigid"}))
     assert frames.frames_anywhere(aligned, samples, FitConfig()) == []
+
+
+def test_where_the_orientation_is_not_searched_what_is_missed_widely_is_not_turned() -> None:
+    model = as_model("human")
+    aligned = replace(model, card=replace(model.card, frame=model.card.frame | {"orientation": "rigid"}))
+    assert Fitter(aligned, FitConfig()).fit(icosphere(3)).verdict == "poor"
 
 
 def test_a_body_that_folds_forward_is_found() -> None:

@@ -136,6 +136,8 @@ def _turned_anywhere(task: FitTask) -> list[Candidate]:
     People who fold forward, do the splits or wear a large head are read well by the network once their core is found.
     """
     frames = frames_anywhere(task.model, task.samples, task.config)
+    if not frames:  # the orientation of this category is not searched
+        return []
     rough = task.predictor.fit_all([(task.coarse, pose) for pose in frames], draws=1, measure=ranking_residual)
     careful = SETTINGS.careful_if_unusual
     return task.predictor.fit_all([(task.samples, each.pose) for each in best_first(rough)[:careful]])
