@@ -9,7 +9,7 @@ from typing import Any, get_args
 import numpy as np
 
 from meshmatch.arrays import frozen
-from meshmatch.collections.superimpose import Scale
+from meshmatch.collections.superimpose import MOST_GROUPS, Scale
 from meshmatch.errors import InputError
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.input_files import read_npz
@@ -77,7 +77,7 @@ def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _are_groups(given: np.ndarray) -> bool:
-    """Whether they count from 0, none left out, and -1."""
+    """Whether they count from 0, none left out and not too many, and -1."""
     found = np.unique(given)
     counted = found[found >= 0]
-    return bool(found[0] >= -1 and len(counted) and counted[-1] == len(counted) - 1)
+    return bool(found[0] >= -1 and 0 < len(counted) <= MOST_GROUPS and counted[-1] == len(counted) - 1)

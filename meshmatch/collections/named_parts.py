@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Int, Ints
+from meshmatch.collections.superimpose import MOST_GROUPS
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.places import Places
 from meshmatch.shapes.files import mesh_list
@@ -27,7 +28,7 @@ def groups_of(shape: Shape, by: str, named: Callable[[], Masks]) -> Int[Ints, " 
 
     ``by`` is "whole", "each", the number of a connected part, the largest first, or a name among those that ``named`` gives.
 
-    `OptionError`: there is no such part, or only one where each is asked for.
+    `OptionError`: there is no such part, or only one or too many where each is asked for.
     """
     if by == WHOLE:
         return None
@@ -35,6 +36,9 @@ def groups_of(shape: Shape, by: str, named: Callable[[], Masks]) -> Int[Ints, " 
     if by == EACH:
         if len(parts) < 2:
             raise OptionError("these shapes have one part, and it is superimposed alone", "leave out --align-by")
+        if len(parts) > MOST_GROUPS:
+            what = f"these shapes have {len(parts):,} connected parts, too many to superimpose each alone"
+            raise OptionError(what, f"{MOST_GROUPS} can be; merge vertices at one place, or leave out --align-by")
         return parts.number - 1
     if by.isascii() and by.isdecimal():
         if not 1 <= int(by[:9]) <= len(parts):

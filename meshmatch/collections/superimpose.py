@@ -26,6 +26,8 @@ Scale = Literal["keep", "remove"]
 Shapes: TypeAlias = Sequence[ArrayLike] | Floats
 """S arrays (V, 3): an array (S, V, 3), a list, or anything that gives one shape after the other when it is indexed."""
 _BLOCK = 4_000_000  # coordinates at a time: what is held in memory of a long list
+MOST_GROUPS = 256
+"""Of vertices that are moved together: every one is looked at for each group."""
 _ROUNDS, _CLOSE = 200, 1e-10  # at most; a change, as a share of the size, that ends them
 
 
@@ -205,6 +207,8 @@ def _checked_groups(groups: ArrayLike, weights: Float[Floats, " V"]) -> Int[Ints
     if found.shape != weights.shape or found.dtype.kind not in "iu" or found.min() < -1:
         raise InputError(f"groups must be {len(weights)} whole numbers from -1", "one for each vertex")
     count = int(found.max()) + 1
+    if count > MOST_GROUPS:
+        raise InputError(f"{count:,} groups of vertices are too many", f"{MOST_GROUPS} can be superimposed, each alone")
     if count < 1 or count > len(weights) or not (np.bincount(found[found >= 0], weights[found >= 0], count) > 0).all():
         raise InputError("a group of vertices has no surface", "number groups 0, 1, 2, ...")
     return found.astype(np.int64)

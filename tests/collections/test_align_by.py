@@ -159,6 +159,22 @@ def test_parts_are_named_or_numbered() -> None:
         groups_of(BALL, "each", dict)
 
 
+def test_a_soup_of_triangles_is_not_superimposed_part_by_part(tmp_path: Path) -> None:
+    """Each group looks at every vertex: as many groups as a file may hold would take for ever."""
+    faces = np.arange(900).reshape(-1, 3)
+    points = np.random.default_rng(0).standard_normal((4, 900, 3))
+    with pytest.raises(OptionError, match="300 connected parts, too many"):
+        groups_of(Shape(points[0], faces), "each", dict)
+    with pytest.raises(InputError, match="300 groups of vertices are too many"):
+        Atlas.of(points, faces, groups=np.arange(900) // 3)
+    Atlas.of(points, faces).save(tmp_path / FILE)
+    with np.load(tmp_path / FILE) as arrays:
+        given = dict(arrays) | {"groups": np.arange(900) // 3}
+    np.savez(tmp_path / "many.npz", **given)
+    with pytest.raises(InputError, match="damaged: groups"):
+        Atlas.load(tmp_path / "many.npz")
+
+
 def scene(path: Path, points: np.ndarray) -> None:
     found = trimesh.Scene()
     for name, verts in (("tibia", points[~FIRST]), ("femur", points[FIRST])):
