@@ -388,7 +388,8 @@ def evaluate(
     known = truth if isinstance(truth, tuple) and len(truth) == 2 else (None, truth)
     rng = np.random.default_rng(seed)
     with thread_limit(1):
-        told = CM if truth is None else error_unit(unit, target)
+        # Whether the target is a person takes a moment to find out: not where there are no errors to tell.
+        told = CM if truth is None and unit == "auto" else error_unit(unit, target)
         return evaluate_map(
             vertex_map, source, target, *known, backward=backward, unit=told, rng=rng, progress=progress
         )

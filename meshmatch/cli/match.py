@@ -235,12 +235,14 @@ def _rows(result: "Evaluation", threshold: float | None) -> list[tuple[str, str,
     rows, unit = [], result.unit
     if (errors := result.errors) is not None:
         digits, limit = ".2f" if unit.name == "cm" else ".3g", unit.lost if threshold is None else threshold
+        also = "" if unit.name == "x100" else "{:.2f} x 0.01 sqrt(area)"
         rows = [
-            (f"{name} error", f"{unit.factor * value:{digits}} {unit.symbol}", f"{100 * value:.2f} x 0.01 sqrt(area)")
+            (f"{name} error", f"{unit.factor * value:{digits}} {unit.symbol}", also.format(100 * value))
             for name, value in {"mean": errors.mean, "median": errors.median}.items()
         ]
+        limits = f"over {limit:{'.3g' if threshold is None else '.9g'}} {unit.symbol}"
         rows += [
-            (f"over {limit:.3g}", f"{100 * result.share_over(threshold):.2f} %", "of the points"),
+            ("large errors", f"{100 * result.share_over(threshold):.2f} %", limits),
             ("points", f"{errors.values.size}", f"geodesic: {result.geodesic}"),
         ]
     rows += [

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import meshmatch
+from meshmatch.errors import OptionError
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render import compose
@@ -83,7 +85,9 @@ def test_errors_are_in_the_unit_of_the_file_unless_it_is_a_person(evaluate: Call
     size = float(np.sqrt(load_shape("b.ply").area))
     assert record["mean"] == pytest.approx(record["mean_x100"] / 100 * size) and record["mean"] > 0
     assert record["threshold"] == pytest.approx(0.1 * size)
-    assert f"over {0.1 * size:.3g}" in evaluate("--truth column.txt").out
+    assert f"over {0.1 * size:.3g} (unit of the file)" in evaluate("--truth column.txt").out
+    shown = evaluate("--truth column.txt --unit x100 --threshold 1234.5").out
+    assert "over 1234.5 x 0.01 sqrt(area)" in shown and shown.splitlines()[0].count("sqrt(area)") == 1
     asked = json.loads(evaluate("--truth column.txt --unit cm --json").out)
     assert (asked["unit"], asked["threshold"], asked["mean"]) == ("cm", 15.0, record["mean_cm"])
 
@@ -96,7 +100,13 @@ def test_of_a_person_they_are_in_centimetres(run: Run, tmp_path: Path, monkeypat
     save_map("map.npz", VertexMap.between(climber, climber, index))
     Path("t.txt").write_text("0 0\n5 5\n")
     answer = run("evaluate", "map.npz", *2 * [str(SAMPLES / "climber.ply")], "--truth", "t.txt")
-    assert "cm" in well(answer).out.splitlines()[0] and "over 15 " in answer.out
+    assert "cm" in well(answer).out.splitlines()[0] and "over 15 cm" in answer.out
+
+
+def test_unit_counts_without_truth(folder: Path) -> None:
+    assert meshmatch.evaluate("map.npy", "a.ply", "b.ply", unit="x100").unit.name == "x100"
+    with pytest.raises(OptionError, match="invalid unit 'mm'"):
+        meshmatch.evaluate("map.npy", "a.ply", "b.ply", unit="mm")  # type: ignore[arg-type]
 
 
 def test_threshold(evaluate: Callable[[str], Answer]) -> None:

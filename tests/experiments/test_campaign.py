@@ -101,7 +101,9 @@ def test_a_run_goes_on_where_it_was_stopped(
     assert (record["bodies"], record["refused"], record["bands"][0]["all"]) == (3, 1, 2)
     rows = [json.loads(line) for line in (tmp_path / "bodies.jsonl").read_text().splitlines()]
     assert rows[0]["error"] == pytest.approx(0, abs=1e-6) and rows[0]["exchanged"] > 5
-    assert sum(row["bodies"] for row in record["poses"]) <= 2 and record["poses"][0]["mean"] == pytest.approx(0, abs=1e-6)
+    assert sum(row["bodies"] for row in record["poses"]) <= 2 and record["poses"][0]["mean"] == pytest.approx(
+        0, abs=1e-6
+    )
 
     saved, elsewhere = tmp_path / "results.json", ["--output", str(tmp_path / "elsewhere"), *words[2:]]
     assert campaign.main([*words, "3", "--save", str(saved)]) == 0
