@@ -22,7 +22,7 @@ from meshmatch.collections.named_parts import WHOLE, Masks, parts_of_template
 from meshmatch.collections.registered import Registered, held
 from meshmatch.collections.setting import Record, Setting, forget, template_at
 from meshmatch.collections.settle import settled
-from meshmatch.collections.sources import find_sources, frame_times, natural
+from meshmatch.collections.sources import find_sources, frame_times, in_sequences
 from meshmatch.collections.stores import Store
 from meshmatch.collections.superimpose import Scale, superimpose
 from meshmatch.collections.workers import hired
@@ -408,7 +408,7 @@ class Collection(FitsFolder):
         in_time = smooth or cycle
         sequence = in_time or bool(self._about()["sequence"])
         files = files_of(self.store) if original or in_time else {}
-        names = sorted(names, key=natural) if sequence else names
+        names = in_sequences(names) if sequence else names
         times = frame_times({*files, *names}) if in_time else {}
         fits = Fits(names, self.fit_of, self.places_of, files, self.template, sequence, times)
         return Exported(

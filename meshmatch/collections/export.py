@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import html
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -16,6 +17,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.covariates import SIZE, Covariates, covariates
 from meshmatch.collections.motion import area_strain, smoothed
 from meshmatch.collections.registered import held
+from meshmatch.collections.sources import folder_of
 from meshmatch.collections.superimpose import Superimposed
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit
@@ -110,8 +112,9 @@ class Export:
 class Fits:
     """What is exported: names of shapes, and what gives the fit, the places and the file of each; the template of all.
 
-    ``sequence``: shapes of a folder are frames; ``names`` are in the natural order then. ``times`` are the places of frames
-    in their sequence, where they are to be smoothed.
+    ``sequence``: shapes of a folder are frames; ``names`` are those of one folder after the other then, in natural order.
+    ``times`` are the places of all frames in their sequence, also of those that are not exported, where they are to be
+    smoothed.
     """
 
     names: Sequence[str]
@@ -176,7 +179,7 @@ def export(
                     arrays = _on_original(fits, name, mean, values)
                     (write_vtp if how.suffix == ".vtp" else write_vtk)(folder / files[-1], shape, arrays)
                 elif moves and how.suffix in ORIGINALS:
-                    began = first.setdefault(_folder_of(name), shape).verts
+                    began = first.setdefault(folder_of(name), shape).verts
                     (write_vtp if how.suffix == ".vtp" else write_vtk)(
                         folder / files[-1], shape, _motion(shape.verts, began, shape.faces)
                     )
@@ -190,14 +193,10 @@ def export(
         return files
 
 
-def _folder_of(name: str) -> str:
-    """The sequence that a frame belongs to."""
-    return name.rpartition("/")[0]
-
-
 def _in_time(meshes: Iterator[tuple[str, Shape]], fits: Fits, cycle: bool) -> Iterator[tuple[str, Shape]]:
     """The frames of each sequence, smoothed in time."""
-    for _, own in groupby(fits.names, _folder_of):
+    moments = Counter(map(folder_of, fits.times))
+    for folder, own in groupby(fits.names, folder_of):
         names = list(own)
         faces: list[Ints] = []
 
@@ -207,7 +206,7 @@ def _in_time(meshes: Iterator[tuple[str, Shape]], fits: Fits, cycle: bool) -> It
             return shape.verts
 
         with held(len(names), fits.template.shape.V, read) as points:
-            frames = smoothed(points, faces[0], [fits.times[name] for name in names], cycle)
+            frames = smoothed(points, faces[0], [fits.times[name] for name in names], cycle, moments[folder])
             for name, verts, own_faces in zip(names, frames, faces, strict=True):
                 yield name, Shape(verts, own_faces, name)
 
@@ -219,8 +218,8 @@ def _motion(verts: Floats, first: Floats, faces: Int[Ints, "F 3"]) -> dict[str, 
 
 def _motions(names: Sequence[str], points: Floats, faces: Int[Ints, "F 3"]) -> dict[str, np.ndarray]:
     """The same of all frames."""
-    first = {_folder_of(name): k for k, name in reversed(list(enumerate(names)))}
-    found = [_motion(own, points[first[_folder_of(name)]], faces) for name, own in zip(names, points, strict=True)]
+    first = {folder_of(name): k for k, name in reversed(list(enumerate(names)))}
+    found = [_motion(own, points[first[folder_of(name)]], faces) for name, own in zip(names, points, strict=True)]
     return {title: np.stack([each[title] for each in found]) for title in found[0]}
 
 
@@ -289,7 +288,7 @@ def _write_series(folder: Path, names: Sequence[str]) -> list[str]:
     """ParaView's list of the frames of each folder, in their order."""
     frames: dict[str, list[str]] = {}
     for name in names:
-        frames.setdefault(_folder_of(name), []).append(name.rpartition("/")[2])
+        frames.setdefault(folder_of(name), []).append(name.rpartition("/")[2])
     files = []
     for where, own in frames.items():
         rows = [f'<DataSet timestep="{k}" file="{html.escape(name)}.vtp"/>' for k, name in enumerate(own)]

@@ -24,19 +24,21 @@ _ASKED = 1500  # vertices that are asked which is best
 
 
 def smoothed(
-    points: Float[Floats, "T V 3"], faces: Int[Ints, "F 3"], times: Sequence[int], cycle: bool = False
+    points: Float[Floats, "T V 3"], faces: Int[Ints, "F 3"], times: Sequence[int], cycle: bool = False, moments: int = 0
 ) -> Iterator[Float[Floats, "V 3"]]:
     """The frames of a sequence, one after the other, with the paths of their vertices smoothed along their surfaces.
 
     ``times`` are the places of the T frames in the sequence, from 0, ascending, where some may be missing. ``cycle``: the
-    last frame is followed by the first.
+    last frame is followed by the first. ``moments``: how many frames the whole sequence has, if its last are missing.
 
     `OptionError`: too few or too many frames.
     """
-    if len(points) < LEAST or max(times) >= MOST:
-        many = f"{len(points)} frames" if len(points) < LEAST else f"{max(times) + 1:,} frames"
-        raise OptionError(f"{many} cannot be smoothed in time", f"a sequence of {LEAST} to {MOST:,} can")
-    known = np.isin(np.arange(max(times) + 1), times)
+    count = max(moments, max(times) + 1)
+    if len(points) < LEAST or count > MOST:
+        many = count if len(points) >= LEAST else len(points)
+        what = f"{many:,} frame{'s' * (many > 1)} of a sequence cannot be smoothed in time"
+        raise OptionError(what, f"{LEAST} to {MOST:,} can")
+    known = np.isin(np.arange(count), times)
     some = np.linspace(0, points.shape[1] - 1, _ASKED).astype(np.int64)
     smooth = _best_filter(np.asarray(points[:, some], np.float64).reshape(len(points), -1), known, cycle)
     first = np.asarray(points[0], np.float64)

@@ -61,10 +61,20 @@ def frame_times(names: Iterable[str]) -> dict[str, int]:
     """The place of each frame in the sequence of its folder, from 0."""
     counts: Counter[str] = Counter()
     found = {}
-    for name in sorted(names, key=natural):
-        found[name] = counts[folder := name.rpartition("/")[0]]
+    for name in in_sequences(names):
+        found[name] = counts[folder := folder_of(name)]
         counts[folder] += 1
     return found
+
+
+def folder_of(name: str) -> str:
+    """The sequence that a frame belongs to."""
+    return name.rpartition("/")[0]
+
+
+def in_sequences(names: Iterable[str]) -> list[str]:
+    """Frames of one folder after the other, in natural order; what lies in a subfolder is none of the folder's."""
+    return sorted(names, key=lambda name: (natural(folder := folder_of(name)), folder, natural(name), name))
 
 
 def natural(name: str) -> list[tuple[int, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from meshmatch.collections.export import Export, Fits, export
 from meshmatch.collections.motion import area_strain, smoothed
-from meshmatch.collections.sources import frame_times
+from meshmatch.collections.sources import frame_times, in_sequences
 from meshmatch.errors import OptionError
 from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.files import load_shape
@@ -60,7 +61,28 @@ def test_a_missing_frame_is_a_gap_in_time() -> None:
     assert off[0] < off[1]
 
 
-@pytest.mark.parametrize("times", [range(4), [*range(7), 5000]])
+def test_a_cycle_has_its_last_frames_even_where_they_are_missing(tmp_path: Path) -> None:
+    """Three of sixteen fits are poor; without them the first frame does not follow at once."""
+    points, names = pulsing(0.05), [f"frame{k}" for k in range(FRAMES)]
+    part = fits_of(points[:13], names[:13])
+    export(tmp_path / "cycle", replace(part, times=frame_times(names)), Export(".npz", cycle=True), None)
+    found = np.load(tmp_path / "cycle" / "coords.npz")["points"]
+    known = np.array(list(smoothed(points[:13], BALL.faces, range(13), True, FRAMES)))
+    shorter = np.array(list(smoothed(points[:13], BALL.faces, range(13), True)))
+    assert np.allclose(found, known)
+    ends = [0, 12]
+    off = [np.linalg.norm(some[ends] - pulsing()[ends], axis=2).mean() for some in (found, shorter)]
+    assert off[0] < off[1]
+
+
+def test_frames_of_a_subfolder_do_not_split_those_of_its_folder() -> None:
+    names = ["a1", "z1", "m/10", "m/9", "a10", "a2"]
+    assert in_sequences(names) == ["a1", "a2", "a10", "z1", "m/9", "m/10"]
+    assert in_sequences(["f1/2", "f01/1", "f1/1", "f01/2"]) == ["f01/1", "f01/2", "f1/1", "f1/2"]
+    assert list(frame_times({"x1", "x01"})) == ["x01", "x1"]
+
+
+@pytest.mark.parametrize("times", [range(1), range(4), [*range(7), 5000]])
 def test_too_few_or_too_many_are_refused(times: list[int]) -> None:
     with pytest.raises(OptionError, match="cannot be smoothed"):
         next(smoothed(pulsing()[: len(times)], BALL.faces, times))
