@@ -144,7 +144,7 @@ def atlas(
             print_rows(anova_rows(about[table]))
     console.say(f"wrote {output}: {', '.join(names)}")
     if json:
-        print_json({"output": output, "left_out": shapes.left_out, "files": names} | about)
+        print_json({"output": output, "left_out": shapes.left_out, "cut": shapes.cut, "files": names} | about)
 
 
 def _shapes(fits: str, poor: bool) -> AbstractContextManager["Registered"]:

@@ -467,20 +467,20 @@ class Collection(FitsFolder):
         InputError
             Fewer than three shapes are left.
         """
-        verdicts = {name: str(self._words(name)["verdict"]) for name in self._names_of_one_kind()}
-        left_out = {name: verdict for name, verdict in verdicts.items() if verdict == "poor" and not poor}
-        names = tuple(name for name in verdicts if name not in left_out)
+        words = {name: self._words(name) for name in self._names_of_one_kind()}
+        out = {name: "poor" for name, about in words.items() if about["verdict"] == "poor" and not poor}
+        names = tuple(name for name in words if name not in out)
         if len(names) < 3:
-            out = f" and {len(left_out)} poor ones" if left_out else ""
-            raise InputError(f"{self.store.location} holds {len(names)} fits{out}", "three or more are needed")
+            also = f" and {len(out)} poor ones" if out else ""
+            raise InputError(f"{self.store.location} holds {len(names)} fits{also}", "three or more are needed")
 
         def read(number: int) -> Float[Floats, "V 3"]:
             fit = self.fit_of(names[number])
             return np.asarray(fit.points * fit.frame.scale)
 
-        faces = np.asarray(self.template.shape.faces)
+        parts, cut = partial(self._parts, names), tuple(name for name in names if words[name]["partial"])
         with held(len(names), self.template.shape.V, read) as points:
-            yield Registered(points, faces, names, np.eye(3), left_out, self.template.hash, partial(self._parts, names))
+            yield Registered(points, self.template.shape.faces, names, np.eye(3), out, self.template.hash, parts, cut)
 
     def _parts(self, names: Sequence[str]) -> Masks:
         return parts_of_template(self.template, names, files_of(self.store), self.places_of)

@@ -14,9 +14,10 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.atlas import Atlas
+from meshmatch.collections.covariates import some
 from meshmatch.collections.named_parts import WHOLE, Masks, groups_of, parts_of_file
 from meshmatch.collections.superimpose import Scale
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, warn
 from meshmatch.shapes.files import PLAIN_SUFFIXES, load_shape
 from meshmatch.shapes.input_files import read_text, stem_of, suffix_of
 from meshmatch.shapes.shape import Shape
@@ -33,6 +34,7 @@ class Registered:
 
     ``rotation`` leads into y up, z to the front, where it is known. ``left_out`` are names of shapes that are not to be
     trusted, and why. ``template`` is the hash of the template, if they are fits. ``parts`` gives parts by name.
+    ``partial`` are names of fits to a part of a shape.
     """
 
     points: Float[Floats, "S V 3"]
@@ -42,9 +44,20 @@ class Registered:
     left_out: dict[str, str]
     template: str = ""
     parts: Callable[[], Masks] = dict
+    partial: tuple[str, ...] = ()
+
+    @property
+    def cut(self) -> tuple[str, ...]:
+        """Names of cut shapes among whole ones: none, where all are cut alike."""
+        return self.partial if len(self.partial) < len(self.names) else ()
 
     def atlas(self, *, modes: int = 100, scale: Scale = "keep", robust: bool = False, align_by: str = WHOLE) -> Atlas:
-        """Their atlas; see `Atlas.of`. ``align_by`` is what is superimposed, as `groups_of` has it."""
+        """Their atlas; see `Atlas.of`. ``align_by`` is what is superimposed, as `groups_of` has it.
+
+        Warns of cut shapes among whole ones (`MeshmatchWarning`).
+        """
+        if self.cut:
+            warn(f"{some(self.cut)}: cut, among whole shapes, and what is missing was guessed: leave out what is cut")
         groups = groups_of(Shape(self.points[0], self.faces), align_by, self.parts)
         return Atlas.of(
             self.points,

@@ -373,6 +373,23 @@ def test_poor_fits_are_left_out_of_an_atlas(
     assert main(["atlas", str(tmp_path / "gone"), "-o", str(tmp_path / "b"), "-q"]) == 1
 
 
+def test_a_cut_shape_in_an_atlas_of_whole_ones_is_told(
+    made: tuple[Path, tuple[Record, ...]], tmp_path: Path, capsys: pytest.CaptureFixture[str], undrawn: None
+) -> None:
+    folder = tmp_path / "fits"
+    shutil.copytree(made[0], folder)
+    collection = meshmatch.Collection(folder)
+    found = read_fit(folder / "fits" / "turned.safetensors", collection.template)
+    write_fit(folder / "fits" / "turned.safetensors", replace(found.fit, partial=True))
+    with pytest.warns(MeshmatchWarning, match="turned: cut, among whole shapes"):
+        collection.atlas(scale="remove")
+    words = ["atlas", str(folder), "-o", str(tmp_path / "atlas"), "-q", "--scale", "remove", "--json"]
+    assert main(words) == 0
+    answer = capsys.readouterr()
+    assert answer.err.startswith("warning: turned: cut") and answer.err.count("\n") == 1
+    assert json.loads(answer.out)["cut"] == ["turned"]
+
+
 def test_a_sequence_is_followed_and_a_lost_frame_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A body walks; in one frame it is somebody else, standing on his head."""
     dancer, climber = (load_shape(SAMPLES / f"{name}.ply") for name in ("dancer", "climber"))

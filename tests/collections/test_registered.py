@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from meshmatch.collections.registered import Registered, held, read_group, registered_meshes, size_ratio
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, MeshmatchWarning
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from tests.collections.ellipsoids import ellipsoids
@@ -80,6 +80,19 @@ def test_a_group_is_a_list_of_names(tmp_path: Path) -> None:
         read_group(file, shapes)
     with pytest.raises(InputError):
         read_group(tmp_path / "gone.txt", shapes)
+
+
+def test_cut_shapes_among_whole_ones_are_told() -> None:
+    given = ellipsoids(4, splits=1)
+    names = ("a", "b", "c", "d")
+    for cut in (("b",), ("b", "d")):
+        shapes = Registered(given.points, given.faces, names, None, {}, partial=cut)
+        with pytest.warns(MeshmatchWarning, match=f"^{', '.join(cut)}: cut, among whole shapes") as told:
+            shapes.atlas()
+        assert len(told) == 1 and shapes.cut == cut
+    for alike in ((), names):
+        shapes = Registered(given.points, given.faces, names, None, {}, partial=alike)
+        assert shapes.cut == () and shapes.atlas().names == names
 
 
 def test_sizes_that_are_far_apart_are_told() -> None:
