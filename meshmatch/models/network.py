@@ -42,6 +42,8 @@ class NetworkConfig:
 
     def __post_init__(self) -> None:
         # A card may come from anywhere: bound what building the network allocates.
+        if not isinstance(self.encoder, str):
+            _check_class(self.encoder)
         known = isinstance(self.encoder, type) or self.encoder in ("basis", "point")
         if not known or self.decoder not in ("flat", "node"):
             raise ModelError(f"unknown network: encoder {self.encoder!r}, decoder {self.decoder!r}", "update meshmatch")
@@ -69,7 +71,8 @@ class NetworkConfig:
             if encoder is None:
                 hint = "load it in Python: meshmatch.load_model(..., encoder=THE_CLASS)"
                 raise ModelError(f"the model has an encoder of its author's own, {named[:80]!r}", hint)
-            if _name_of(encoder) != named:
+            _check_class(encoder)
+            if encoder.__name__ != named.rpartition(".")[2]:  # its module may be another now, or __main__ then
                 raise ModelError(f"the model's encoder is {named[:80]!r}, not {_name_of(encoder)!r}")
             values = values | {"encoder": encoder}
         elif encoder is not None:
@@ -79,6 +82,15 @@ class NetworkConfig:
     def to_dict(self) -> dict[str, Any]:
         own = {"encoder": _name_of(self.encoder)} if isinstance(self.encoder, type) else {}
         return asdict(self) | own
+
+
+def _check_class(encoder: object) -> None:
+    """Refuse as an encoder what is no class with its methods (`ModelError`)."""
+    if not isinstance(encoder, type) or not all(
+        callable(getattr(encoder, name, None)) for name in ("features", "forward")
+    ):
+        what = f"an encoder of one's own is a class with features and forward, not {repr(encoder)[:80]}"
+        raise ModelError(what, "derive one from meshmatch.models.layers.Encoder, and give the class itself")
 
 
 def _name_of(encoder: type) -> str:

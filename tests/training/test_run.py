@@ -245,8 +245,16 @@ def test_an_encoder_of_ones_own_is_trained_kept_and_asked_for(prepared: Path, tm
     with pytest.raises(ModelError, match=f"an encoder of its author's own, '{name}'") as caught:
         load_model(folder)
     assert "encoder=" in caught.value.hint
-    with pytest.raises(ModelError, match="not 'torch"):
-        load_model(folder, encoder=torch.nn.Identity)
+    with pytest.raises(ModelError, match="not 'meshmatch.models.layers.Encoder"):
+        load_model(folder, encoder=Encoder)
+    for wrong in (Pooled(torch.ones(1, 3), 2), "Pooled", lambda basis, outputs: Pooled(basis, outputs), int):
+        with pytest.raises(ModelError, match="a class with features and forward"):
+            load_model(folder, encoder=wrong)  # type: ignore[arg-type]
+        if wrong != "Pooled":
+            with pytest.raises(ModelError, match="a class with features and forward"):
+                replace(NETWORK, encoder=wrong)
+    moved = type("Pooled", (Pooled,), {"__module__": "__main__"})
+    assert load_model(folder, encoder=moved).card.network["encoder"] == name
     model = load_model(folder, encoder=Pooled)
     assert model.card.network["encoder"] == name and isinstance(model.network.encoder, Pooled)
     eggs = np.asarray(egg_template().shape.verts)
