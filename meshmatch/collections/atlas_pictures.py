@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Float, Floats, UInts8
 from meshmatch.collections.asymmetry import Asymmetry
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.explain import Allometry, Explained
@@ -19,7 +19,7 @@ from meshmatch.collections.model_files import LEVEL
 from meshmatch.collections.permutation import PlaceTests
 from meshmatch.render.charts import Dots, draw_beside, draw_dots, draw_histogram, draw_scree
 from meshmatch.render.figures import Panel
-from meshmatch.render.picture import Look, render_shapes
+from meshmatch.render.picture import Look, draw_apart, render_shapes
 from meshmatch.render.scales import Scale, nice_step
 from meshmatch.shapes.shape import Shape
 
@@ -29,6 +29,7 @@ REACH = 2.0
 SHOWN, FURTHEST = 3, 3
 """Modes and shapes in pictures."""
 _MOST_EFFECTS = 12  # pictures of a model
+_END = 260  # pixels: the longest side of pictures at the ends of axes
 _BACK = np.diag([-1.0, 1.0, -1.0])
 _ABOVE = 0.95  # cosine: seen from straight above or below
 _AROUND = 0.1  # roots of the area: how far around the strongest effect the surface tells from where it is seen
@@ -156,8 +157,12 @@ def draw_charts(folder: Path, atlas: Atlas, measures: Measures | None, kind: Cha
     draw_beside(charts, folder / f"measures.{kind}", "modes")
 
 
-def draw_scores(folder: Path, atlas: Atlas, groups: Sequence[str], kind: ChartFormat) -> None:
-    """The share of the variance of each mode, and the shapes along the first two, with the hulls of groups."""
+def draw_scores(
+    folder: Path, atlas: Atlas, groups: Sequence[str], kind: ChartFormat, turn: Float[Floats, "3 3"]
+) -> None:
+    """The share of the variance of each mode, and the shapes along the first two, with the hulls of groups, and what the
+    mean becomes towards the ends of both axes.
+    """
     shares = atlas.variances / atlas.total
     draw_scree(folder / f"scree.{kind}", shares.tolist(), len(atlas.names) - 1)
     if len(shares) < 2:
@@ -165,8 +170,20 @@ def draw_scores(folder: Path, atlas: Atlas, groups: Sequence[str], kind: ChartFo
     points = (atlas.scores * atlas.deviations)[:, :2]
     names = {row: atlas.names[row] for row in furthest(atlas)}
     axes = [f"PC{k + 1} ({100 * shares[k]:.3g} %), unit of the files" for k in range(2)]
-    dots = Dots(points[:, 0].tolist(), points[:, 1].tolist(), axes[0], axes[1], names)
+    dots = Dots(points[:, 0].tolist(), points[:, 1].tolist(), axes[0], axes[1], names, _ends(atlas, turn))
     draw_dots(folder / f"components.{kind}", [dots], groups, hulls=True)
+
+
+def _ends(atlas: Atlas, turn: Float[Floats, "3 3"]) -> list[tuple[str, UInts8]]:
+    """Pictures of the mean with less and more of the first mode, then of the second, and their names."""
+    mean = atlas.mean_shape
+    ends = {f"PC{k + 1} {sign * REACH:+g} sd": (k, sign * REACH) for k in range(2) for sign in (-1, 1)}
+    scores = np.zeros((len(ends), len(atlas.modes)))
+    for row, (mode, score) in zip(scores, ends.values(), strict=True):
+        row[mode] = score
+    unit = float(np.sqrt(mean.area))
+    panels = [Panel(Shape(mean.verts + by, mean.faces), rotation=turn, unit=unit) for by in atlas.offsets(scores)]
+    return list(zip(ends, draw_apart(panels, _END), strict=True))
 
 
 def draw_allometry(folder: Path, found: Explained, about: Allometry, kind: ChartFormat) -> None:

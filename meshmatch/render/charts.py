@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from meshmatch.arrays import Floats
+from meshmatch.arrays import Floats, UInts8
 from meshmatch.errors import OptionError
 from meshmatch.maps.evaluate import CM, Errors, ErrorUnit
 from meshmatch.outputs import replace_on_success
@@ -36,6 +36,7 @@ _METADATA: dict[str, dict[str, None]] = {
     ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
 }
 _MOST_TERMS, _MOST_BARS, _MOST_GROUPS = 12, 20, 14
+_END = 58.0  # points: the longest side of the largest picture at the end of an axis
 _MARKERS = "os^Dv"  # one for each round through the colors
 _STYLE = Path(__file__).with_name("charts.mplstyle")
 
@@ -116,13 +117,16 @@ def draw_histogram(
 
 @dataclass(frozen=True, eq=False)
 class Dots:
-    """Places (N,) of dots in a chart, the words at its axes, and names of some of the dots."""
+    """Places (N,) of dots in a chart, the words at its axes, and names of some of the dots. ``ends`` are pictures (H, W, 4),
+    in one scale and with their names, for the low and the high end of the first axis, then of the second.
+    """
 
     x: Sequence[float]
     y: Sequence[float]
     xlabel: str
     ylabel: str
     names: Mapping[int, str] = field(default_factory=dict)
+    ends: Sequence[tuple[str, UInts8]] = ()
 
 
 def draw_scree(path: str | Path, shares: Sequence[float], most: int) -> None:
@@ -148,7 +152,8 @@ def draw_dots(path: str | Path, charts: Sequence[Dots], groups: Sequence[str], *
     """
     known = sorted({group for group in groups if group})
     members = {group: np.flatnonzero(np.array(groups) == group) for group in [*known, *([""] if "" in groups else [])]}
-    with saved(path, 4.2 * len(charts) + 1.2, 3.8) as figure:
+    room = _END / 72 if any(dots.ends for dots in charts) else 0.0
+    with saved(path, (4.2 + room) * len(charts) + 1.2, 3.8 + 1.6 * room) as figure:
         row = figure.subplots(1, len(charts), squeeze=False)[0]
         for axes, dots in zip(row, charts, strict=True):
             points = np.column_stack([dots.x, dots.y])
@@ -167,6 +172,7 @@ def draw_dots(path: str | Path, charts: Sequence[Dots], groups: Sequence[str], *
                 about = {"textcoords": "offset points", "color": _GREY, "fontsize": 7.5}
                 axes.annotate(short(name, 24), points[number], (4, 4), **about)
             axes.set(xlabel=short(dots.xlabel), ylabel=short(dots.ylabel))
+            _show_ends(axes, dots.ends)
             if hulls:  # a square in which both axes have one scale
                 low, high = points.min(axis=0), points.max(axis=0)
                 reach = 0.55 * float((high - low).max()) or 1.0
@@ -175,6 +181,23 @@ def draw_dots(path: str | Path, charts: Sequence[Dots], groups: Sequence[str], *
         if len(members) > 1:
             handles, labels = row[0].get_legend_handles_labels()
             figure.legend(handles[:_MOST_GROUPS], labels[:_MOST_GROUPS], loc="outside right upper")
+
+
+def _show_ends(axes: Axes, ends: Sequence[tuple[str, UInts8]]) -> None:
+    """Pictures at the ends of both axes, outside of them, each beside the words at its axis."""
+    from matplotlib.offsetbox import AnnotationBbox, OffsetImage, TextArea, VPacker
+
+    most = max((max(picture.shape[:2]) for _, picture in ends), default=1)
+    for number, (name, picture) in enumerate(ends):
+        second, high = divmod(number, 2)
+        image = OffsetImage(picture, zoom=_END / most)
+        words = TextArea(short(name, 24), textprops={"color": _GREY, "fontsize": 7.5})
+        box = VPacker(children=[image, words], align="center", pad=0, sep=2)
+        # Beside the words, so that the numbers at the axis have the room that they need.
+        across: Any = ((1, high), (axes.yaxis.label, "axes fraction"), (1, high))
+        along: Any = ((high, 1), ("axes fraction", axes.xaxis.label), (high, 1))
+        place, coordinates, alignment = across if second else along
+        axes.add_artist(AnnotationBbox(box, place, xycoords=coordinates, box_alignment=alignment, frameon=False, pad=0))
 
 
 def _outline(points: Floats) -> Floats | None:

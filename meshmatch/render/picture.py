@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -110,12 +110,27 @@ def render_shapes(
     return image.size
 
 
+def draw_apart(panels: Sequence[Panel], side: int, look: Look = Look()) -> list[UInts8]:
+    """Pictures (H, W, 4) in sRGB of shapes, each alone on nothing, without their labels: all in one scale, in which the
+    longest side of the largest has ``side`` pixels. Errors as `render_shapes`.
+    """
+    figures = [build_figure(panel, look.up, look.front, look.turn, look.tilt) for panel in panels]
+    pixel = max([1e-9, *(float(np.ptp(figure.box, axis=0).max()) for figure in figures)]) / (side - 2)
+    pictures = []
+    for figure in figures:
+        (left, bottom), (right, top) = figure.box.tolist()
+        width, height = (int(np.ceil(length / pixel)) + 2 for length in (right - left, top - bottom))
+        viewport = raster.Viewport(width, height, left - pixel, top + pixel, pixel)
+        pictures.append(_on_background(_trace([figure], np.zeros(1), viewport, replace(look, ground=False)), None))
+    return pictures
+
+
 def _image(panels: list[Panel], look: Look) -> Image.Image:
     figures = [build_figure(panel, look.up, look.front, look.turn, look.tilt) for panel in panels]
     names = [panel.label for panel in panels]
     page = lay_out([figure.box for figure in figures], any(names), look.legend, look.size)
     background = background_color(look.background)
-    image = Image.fromarray(_on_background(_trace(figures, page, look), background))
+    image = Image.fromarray(_on_background(_trace(figures, page.feet, page.viewport, look), background))
     dark = background is not None and np.dot(background, (0.3, 0.59, 0.11)) < 110
     ink: Ink = (226, 228, 232) if dark else (52, 54, 60)
     for name, (x, y), room in zip(names, page.names.tolist(), page.room.tolist(), strict=True):
@@ -127,21 +142,21 @@ def _image(panels: list[Panel], look: Look) -> Image.Image:
     return image
 
 
-def _trace(figures: list[Figure], page: Page, look: Look) -> raster.Layer:
-    placed = list(zip(figures, page.feet, strict=True))
+def _trace(figures: list[Figure], feet: Float[Floats, " N"], viewport: raster.Viewport, look: Look) -> raster.Layer:
+    placed = list(zip(figures, feet, strict=True))
     solid = [part.moved(foot) for figure, foot in placed for part in figure.solid]
     glass = [part.moved(foot) for figure, foot in placed for part in figure.glass]
     ground = None
     if look.ground and look.tilt > 0:
         spots = np.stack([figure.spot for figure in figures])
-        spots[:, 0] += page.feet
+        spots[:, 0] += feet
         ground = Ground(rotation_about_x(look.tilt) @ np.array([0.0, 1.0, 0.0]), 0.0, spots)
     hollow = all(figure.hollow for figure in figures)
     layer = None
     if solid:
-        layer = raster.draw(Scene(solid, None if hollow else ground), page.viewport)
+        layer = raster.draw(Scene(solid, None if hollow else ground), viewport)
     if glass:
-        veil = raster.draw(Scene(glass, ground if hollow else None, _GLASS), page.viewport)
+        veil = raster.draw(Scene(glass, ground if hollow else None, _GLASS), viewport)
         layer = veil if layer is None else raster.composite(veil, layer, _HIDDEN)
     assert layer is not None
     return layer

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from PIL import Image
 
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.atlas_files import Findings, record, write_folder
-from meshmatch.collections.atlas_pictures import draw_effect
+from meshmatch.collections.atlas_pictures import draw_effect, draw_scores
 from meshmatch.collections.measures import Measures, measure_atlas
 from meshmatch.collections.permutation import PlaceTests
 from meshmatch.shapes.files import load_shape
@@ -107,6 +108,13 @@ def test_every_file_says_what_the_atlas_knows(tmp_path: Path, atlas: Atlas) -> N
     for name in [*pictures, "effect-1-log-size"]:
         with Image.open(tmp_path / f"{name}.png") as image:
             assert np.asarray(image.convert("L")).std() > 5, name
+
+
+@pytest.mark.parametrize("kind", ["svg", "pdf"])
+def test_the_ends_of_the_first_modes_are_drawn(tmp_path: Path, atlas: Atlas, kind: Literal["svg", "pdf"]) -> None:
+    draw_scores(tmp_path, atlas, [""] * len(atlas.names), kind, np.eye(3))
+    drawn = (tmp_path / f"components.{kind}").read_bytes()
+    assert drawn.count(b"<image" if kind == "svg" else b"/Subtype /Image") >= 4
 
 
 def test_morph_targets_are_the_modes(tmp_path: Path, atlas: Atlas, undrawn: None) -> None:

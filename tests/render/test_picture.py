@@ -10,10 +10,12 @@ from PIL import Image
 from meshmatch.errors import OptionError, OutputError
 from meshmatch.render import Look, Panel, position_colors, render_shapes
 from meshmatch.render import picture as module
+from meshmatch.render.picture import draw_apart
 from meshmatch.render.scales import Scale, label_swatches
 from meshmatch.shapes.appearance import vertex_colors_alone
 from meshmatch.shapes.colors import label_colors, to_linear
 from meshmatch.shapes.shape import Shape
+from tests.conftest import icosphere
 
 SMALL = Look(size=(96, 96), up="y", front="z", turn=0.0, tilt=0.0)
 RED, GREEN, BLUE = np.eye(3)
@@ -399,3 +401,11 @@ def test_position_colors_follow_a_rotation_and_tell_places_apart() -> None:
     assert np.linalg.norm(colors[left] - colors[~left], axis=1).min() > 0.25  # a flip is seen at once
     flat = Shape(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]))
     assert np.isfinite(position_colors(flat)).all()
+
+
+def test_pictures_of_shapes_apart_have_one_scale() -> None:
+    ball = icosphere(2)
+    panels = [Panel(Shape(size * ball.verts, ball.faces), unit=1.0) for size in (1.0, 0.5)]
+    large, small = draw_apart(panels, 64)
+    assert large.shape[2] == 4 and large[0, 0, 3] == 0 and large[32, 32, 3] == 255
+    assert max(large.shape) == pytest.approx(64, abs=1) and max(small.shape) == pytest.approx(33, abs=2)
