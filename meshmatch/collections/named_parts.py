@@ -50,7 +50,8 @@ def groups_of(shape: Shape, by: str, named: Callable[[], Masks]) -> Int[Ints, " 
         close = get_close_matches(by, masks, n=1)
         known = f"did you mean {close[0]}? " if close else ""
         names = f"names: {', '.join(list(masks)[:12])}; " if masks else "they have no names; "
-        hint = f"{known}{names}numbers: 1 to {len(parts)}, the largest first; or {EACH}"
+        numbers = f"numbers: 1 to {len(parts)}, the largest first; or {EACH}" if len(parts) > 1 else "and one part"
+        hint = f"{known}{names}{numbers}"
         raise OptionError(f"these shapes have no part called {by!r}", hint)
     return np.where(masks[by], 0, -1)
 

@@ -157,6 +157,9 @@ def test_parts_are_named_or_numbered() -> None:
         assert told in caught.value.hint
     with pytest.raises(OptionError, match="one part"):
         groups_of(BALL, "each", dict)
+    with pytest.raises(OptionError) as caught:
+        groups_of(BALL, "femur", dict)
+    assert caught.value.hint == "they have no names; and one part"
 
 
 def test_a_soup_of_triangles_is_not_superimposed_part_by_part(tmp_path: Path) -> None:

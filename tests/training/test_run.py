@@ -245,7 +245,7 @@ def test_an_encoder_of_ones_own_is_trained_kept_and_asked_for(prepared: Path, tm
     with pytest.raises(ModelError, match=f"an encoder of its author's own, '{name}'") as caught:
         load_model(folder)
     assert "encoder=" in caught.value.hint
-    with pytest.raises(ModelError, match="not 'meshmatch.models.layers.Encoder"):
+    with pytest.raises(ModelError, match=r"not 'meshmatch\.models\.layers\.Encoder"):
         load_model(folder, encoder=Encoder)
     for wrong in (Pooled(torch.ones(1, 3), 2), "Pooled", lambda basis, outputs: Pooled(basis, outputs), int):
         with pytest.raises(ModelError, match="a class with features and forward"):
