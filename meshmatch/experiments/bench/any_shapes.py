@@ -228,6 +228,20 @@ def row_of(name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def _with_calibrations(report: runner.Report, found: _Found, one_way: _Found) -> runner.Report:
+    """The weights of both verdicts, and how they do on classes that did not give them."""
+    doubtful = {name: [row for row in some if row["both_ways"]] for name, some in found.items()}
+    fits = {"one way": one_way, "both ways, where one way leaves doubt": doubtful}
+    rows = [{"maps": which, **held_out(each)} for which, each in fits.items()]
+    table = runner.table("Verdicts by weights that other classes gave", rows, _HELD_OUT)
+    return replace(
+        report,
+        record={**report.record, "held out": rows},
+        tables=[*report.tables, table],
+        notes=[f"{which}: {fitted_calibration(_all(each))}" for which, each in fits.items()],
+    )
+
+
 @runner.command
 def main(
     classes: Annotated[str, Option(help="names, with commas between them; or all")] = "all",
@@ -260,17 +274,3 @@ def main(
         {"rows": rows, "pairs": everything}, [runner.table("Keypoints, x100 of sqrt(area)", rows, _COLUMNS)]
     )
     return _with_calibrations(report, found, one_way) if fit else report
-
-
-def _with_calibrations(report: runner.Report, found: _Found, one_way: _Found) -> runner.Report:
-    """The weights of both verdicts, and how they do on classes that did not give them."""
-    doubtful = {name: [row for row in some if row["both_ways"]] for name, some in found.items()}
-    fits = {"one way": one_way, "both ways, where one way leaves doubt": doubtful}
-    rows = [{"maps": which, **held_out(each)} for which, each in fits.items()]
-    table = runner.table("Verdicts by weights that other classes gave", rows, _HELD_OUT)
-    return replace(
-        report,
-        record={**report.record, "held out": rows},
-        tables=[*report.tables, table],
-        notes=[f"{which}: {fitted_calibration(_all(each))}" for which, each in fits.items()],
-    )
