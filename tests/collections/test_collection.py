@@ -353,14 +353,19 @@ def test_a_model_can_learn_from_fits(
         assert main(["train", "--shapes", str(made[0]), odd, "-o", str(tmp_path / "mine"), "-q"]) == 1
 
 
+def with_turned(fits: Path, folder: Path, **changes: Any) -> meshmatch.Collection:
+    """A copy of a collection in which the fit of ``turned`` is changed."""
+    shutil.copytree(fits, folder)
+    collection, file = meshmatch.Collection(folder), folder / "fits" / "turned.safetensors"
+    write_fit(file, replace(read_fit(file, collection.template).fit, **changes))
+    return collection
+
+
 def test_poor_fits_are_left_out_of_an_atlas(
     made: tuple[Path, tuple[Record, ...]], tmp_path: Path, capsys: pytest.CaptureFixture[str], undrawn: None
 ) -> None:
     folder = tmp_path / "fits"
-    shutil.copytree(made[0], folder)
-    collection = meshmatch.Collection(folder)
-    found = read_fit(folder / "fits" / "turned.safetensors", collection.template)
-    write_fit(folder / "fits" / "turned.safetensors", replace(found.fit, verdict="poor"))
+    collection = with_turned(made[0], folder, verdict="poor")
     with pytest.raises(InputError, match="holds 2 fits and 1 poor ones"):
         collection.atlas()
     with collection.registered(poor=True) as shapes:
@@ -377,10 +382,7 @@ def test_a_cut_shape_in_an_atlas_of_whole_ones_is_told(
     made: tuple[Path, tuple[Record, ...]], tmp_path: Path, capsys: pytest.CaptureFixture[str], undrawn: None
 ) -> None:
     folder = tmp_path / "fits"
-    shutil.copytree(made[0], folder)
-    collection = meshmatch.Collection(folder)
-    found = read_fit(folder / "fits" / "turned.safetensors", collection.template)
-    write_fit(folder / "fits" / "turned.safetensors", replace(found.fit, partial=True))
+    collection = with_turned(made[0], folder, partial=True)
     with pytest.warns(MeshmatchWarning, match="turned: cut, among whole shapes"):
         collection.atlas(scale="remove")
     words = ["atlas", str(folder), "-o", str(tmp_path / "atlas"), "-q", "--scale", "remove", "--json"]

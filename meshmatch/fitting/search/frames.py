@@ -30,8 +30,8 @@ _ALONG = (-0.3, -0.15, 0.0, 0.15)
 _OBEYS = 0.5  # cosine of the angle between an axis of a frame and the user's
 USUAL = 0.85
 """Cosine above which an orientation is a usual one, or that of the file."""
-_ANYWHERE = 144  # turns of a shape that stands as nothing that the aligner knows; 72 find less, 288 no more
-_BELOW = 0.15  # of generated people the core lies 0 to 0.3 below the middle, along its own up axis
+_ANYWHERE = 144  # turns of a shape that stands as nothing that the aligner knows
+_BELOW = 0.15  # how far a core then lies below the middle of its shape, along its own up axis (units of sqrt(area))
 _SPIRAL = 1.533751168755204288118041  # the solution of x ** 4 = x + 4
 _AGREE = 30  # degrees: votes that are closer agree. Set by hand.
 # Turns of the core frame that a vote may be wrong by: about face, upside down, on its head, a quarter either way.
