@@ -14,6 +14,7 @@ from meshmatch.geometry.triangles import Edges, edge_keys, same_rows, squared_le
 OUTLIER_SHARE = 0.02
 """A part with less than this share of the largest part's area is an outlier. This and the next two are set by hand."""
 _FAR = 0.25  # gap between two big parts, in diagonals of the largest, from which they count as apart
+_SHEET = 0.8  # a sheet's mean normal is so long: 0.5 of half a sphere, 0.64 of half a cylinder, 0.9 of leaves
 _NEAR = 0.05  # gap up to which a small part belongs to a shape that is made of small parts
 
 
@@ -182,7 +183,7 @@ def turn_faces(
     """Faces turned so that neighbours agree and the shape is not inside out, and how many were turned.
 
     A part whose faces disagreed is turned outwards by the sign of its volume; if they agreed everywhere, the
-    shape is turned as a whole, and only if its volume is clearly negative. An edge of more than two faces
+    shape is turned as a whole, and only if its volume is clearly negative and it is no sheet. An edge of more than two faces
     joins nothing. `cross` is the normal of each face, twice its area long.
     """
     flip = np.zeros(len(faces), bool)
@@ -200,9 +201,10 @@ def turn_faces(
         many = np.bincount(part, weights=np.where(flip, areas, -areas)) > 0
         turn = np.where(np.abs(volume) > 1e-3 * weight**1.5, volume < 0, many)
         flip = np.where(wrong[part], flip ^ turn[part], False)
-    # the volume under each face, seen from the middle
+    # the volume under each face, seen from the middle; a bent sheet, such as a leaf, has no outside
     above = np.einsum("fi,fi->f", corner - areas @ corner / total, cross) / 6.0
-    if np.where(flip, -above, above).sum() < -1e-3 * total**1.5:
+    sheet = np.linalg.norm(np.where(flip, -1.0, 1.0) @ cross) > 2 * total * _SHEET
+    if not sheet and np.where(flip, -above, above).sum() < -1e-3 * total**1.5:
         flip = ~flip
     if not flip.any():
         return faces, 0

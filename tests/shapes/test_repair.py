@@ -155,8 +155,10 @@ def turns() -> dict[str, tuple[Shape, object]]:
         "of a sheet none": (flat, []),
         "of the other side none": (Shape(flat.verts, flat.faces[:, ::-1]), []),
         "of a rough sheet none": (sheet(1e-3), []),
+        "of a bent sheet none": (Shape(flat.verts + 0.5 * flat.verts[:, :1] ** 2 * [0.0, 0, 1], flat.faces), []),
         "one of a sheet": (flat, [7]),
         "three of a sheet": (flat, [0, 1, 2]),
+        "all of a cup": (cup, slice(None)),
         **{f"of a cup at {z} none": (move(cup, [0, 0, z]), []) for z in (-100, 0, 100)},
     }
 
