@@ -57,9 +57,13 @@ _NEAR, _STRETCH = 0.045, 0.7
 # one whose legs were exchanged; and so must one that stands otherwise than the axes of the files say, or is mirrored:
 # 0.66 of mirrored femurs, 0.97 of ants, 0.88 of eggs that were turned wrongly.
 _SEARCHED, _TURNED = 0.9, MIRRORED_SHARE
+_AS_IT_STANDS = np.radians(40)  # a smaller turn is none: the axes of two files may be meant to be the same
 _SHRUNK = 0.93  # area of a mean of shapes that are posed, against theirs: 0.997 of femurs, 0.87 of ants
 _PART = 0.85  # so much of a whole's energy a part must have; 0.3 of a cut femur
 _TURNS = 2  # of a part, and of its mirror image, that are tried
+# Of a whole: up to so many turns are fitted, whose samples stay up to so many times as far apart as those of the best one.
+# Ends of leaves are told by their fits alone (1.0 to 1.2); of femurs all others are 2 and more, of knees 1.3.
+_ALIKE_TURNS, _NEARLY = 4, 1.35
 _LOST = 0.5  # trust of a search whose result is not believed
 
 
@@ -145,17 +149,16 @@ class _Task:
             features = replace(features, residual=one_way_residual(self.system, samples, vectors))
         return _Fitted(begin, samples, vectors, features)
 
-    def turned(self, side: Frame | None, how: Align = "rigid") -> _Begin:
-        """The template as it rests, on the shape, or on its mirror image, turned in any way, or near its file's axes."""
-        return self.turns(side, how)[0]
-
-    def turns(self, side: Frame | None, how: Align = "rigid", keep: int = 1) -> list[_Begin]:
-        """The same in several ways, the best one first."""
+    def turns(self, side: Frame | None, how: Align = "rigid", keep: int = 1, most: float = np.inf) -> list[_Begin]:
+        """The template as it rests, on the shape, or on its mirror image, turned in some ways, or near its file's axes: the
+        best way first, and others that lie up to ``most`` times as far off.
+        """
         outer = self._own if side is None else self._own.compose(side)
         normals = self._samples.normals if side is None else self._samples.normals @ side.rotation.T
         points = self._samples.points if side is None else side.apply(self._samples.points)
         samples = replace(self._samples, points=points, normals=normals).first(_ALIGNED_BY)
-        frames = [outer.compose(found.pose.frame) for found in align(samples, self._resting, how, keep)]
+        found = align(samples, self._resting, how, keep)
+        frames = [outer.compose(each.pose.frame) for each in found if each.residual <= most * found[0].residual]
         return [_Begin(frame, np.zeros((self.system.K, 3))) for frame in frames]
 
     def searched(self, side: Frame | None) -> list[_Begin]:
@@ -186,9 +189,12 @@ class _Task:
 
     def best(self, sides: Sequence[Frame | None]) -> tuple[_Fitted, float]:
         """The best fit of the shape; or of its mirror image, if that fits clearly better. And its `Fit.side`."""
-        found = [self.fitted(self.turned(side)) for side in sides]
+        begins = [self.turns(side, keep=_ALIKE_TURNS, most=_NEARLY) for side in sides]
+        found = [min(map(self.fitted, some), key=attrgetter("energy")) for some in begins]
         if sides[0] is None:
-            found[0] = _clearly_better(found[0], self.fitted(self.turned(None, "near")), _TURNED)
+            near = self.turns(None, "near")[0]
+            if np.trace(near.frame.rotation) > 1 + 2 * np.cos(_AS_IT_STANDS):
+                found[0] = _clearly_better(found[0], self.fitted(near), _TURNED)
         if not any(each.alike for each in found):
             for number, side in enumerate(sides):
                 for begin in self.searched(side):
