@@ -68,16 +68,16 @@ class Bone:
             ((0.0, 0.75, -0.66), (0.0, -5.0, 3.0), 12.0),
             ((-0.97, 0.0, -0.2), (-5.0, 0.0, 2.0), 25.0),
         ):
-            points += _near(directions, place, narrow) * np.array(push)
+            points += near(directions, place, narrow) * np.array(push)
         rng = np.random.default_rng(0)
         for place, much in zip(rng.standard_normal((_PLACES, 3)), self.varies, strict=True):
-            points += much * _near(directions, place, 6.0) * directions
+            points += much * near(directions, place, 6.0) * directions
         if self.group == "bump":
-            points += HIGH * _near(directions, BUMP, 40.0) * np.array(BUMP)
+            points += HIGH * near(directions, BUMP, 40.0) * np.array(BUMP)
         return np.asarray(self.size * points)
 
 
-def _near(directions: Float[Floats, "N 3"], place: Sequence[float] | Floats, narrow: float) -> Float[Floats, "N 1"]:
+def near(directions: Float[Floats, "N 3"], place: Sequence[float] | Floats, narrow: float) -> Float[Floats, "N 1"]:
     """1 at a place on the sphere, less further away."""
     toward = np.asarray(place) / np.linalg.norm(place)
     return np.asarray(np.exp(narrow * (directions @ toward - 1.0))[:, None])

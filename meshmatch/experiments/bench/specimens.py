@@ -1,0 +1,339 @@
+"""Collections of specimens of several kinds, as a laboratory has them, fitted without a model and by other ways.
+
+Specimens of a set are turned at random and triangulated each in its own way; of sets with sides every third is a mirror
+image, and of femurs the last two are cut by a plane. Truth: femurs are in correspondence, as are molars, leaves and knees,
+which are generated (`meshmatch.experiments.makers.molars_and_leaves`); hearts share vertices of the mesh that they come
+from; busts and birds have keypoints, the best of their symmetries. Errors are of all ordered pairs, straight in millimetres,
+or along the target in percent of sqrt(area) where there is no unit. A place is lost beyond a tenth of sqrt(area).
+
+- none: ``fit FOLDER --model none``.
+- own: ``prepare``, ``train --shapes`` of so many steps, and ``fit FOLDER --model own``, of the same specimens.
+- meshmonk: the first specimen is registered to all others, from a start that it is given: the similarity, and the side, that
+  brings true places together best.
+- pyclarcs: for bilateral symmetry; told as missing where it is not installed.
+
+CPU seconds are those of all processes. Kept in ``--work``, a run goes on where it was stopped.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from itertools import permutations
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+from typer import Option
+
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.collections.collection import Collection
+from meshmatch.collections.setting import Record
+from meshmatch.experiments import runner
+from meshmatch.experiments.bench import any_shapes
+from meshmatch.experiments.bench.methods import viscoelastic
+from meshmatch.experiments.bench.sets import Pair, load_folder
+from meshmatch.experiments.makers.molars_and_leaves import MAKERS, Registered
+from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.trees import cKDTree
+from meshmatch.geometry.triangles import interpolate, vertex_normals
+from meshmatch.maps.footpoints import Surface
+from meshmatch.maps.vertex_map import VERDICTS
+from meshmatch.models.registry import NO_MODEL
+from meshmatch.outputs import make_folder
+from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.prepare import prepare
+from meshmatch.training.recipes import recipe_for
+from meshmatch.training.train import train
+
+SIDED = ("femurs", "hearts", "knees", "molars")
+SETS = (*SIDED, "leaves", "bust", "bird")
+METHODS = (NO_MODEL, "own", "meshmonk", "pyclarcs")
+LOST = 0.1  # of sqrt(area)
+_CUT = 2  # femurs
+_THIN = 10_000  # triangles, for meshmonk
+_COLUMNS = {"set": "set", "method": "method", "specimens": "specimens:d", "error": "error:.2f", "unit": "unit"}
+_COLUMNS |= {"worst": "worst:.2f", "lost": "lost:.1%", "sides": "sides:.0%", "cut ones": "cut:.2f"}
+_COLUMNS |= {"good": "good:d", "fair": "fair:d", "poor": "poor:d", "CPU s": "cpu:.0f"}
+
+
+@dataclass(frozen=True, eq=False)
+class Specimen:
+    """A shape and its truth.
+
+    Places (P, 3) are the same on all of a set, in the coordinates of the shape, nan where it lacks them. Some of its
+    vertices (N,) lie at places with weights: at the corners (N, 3) of a triangle of places.
+    """
+
+    shape: Shape
+    places: Float[Floats, "P 3"]
+    vertices: Int[Ints, " N"]
+    corners: Int[Ints, "N 3"]
+    weights: Float[Floats, "N 3"]
+    mirrored: bool = False
+    cut: bool = False
+
+    def seen_on(self, other: Specimen) -> Float[Floats, "N 3"]:
+        """Where its vertices belong on another one; nan where that lacks them."""
+        return interpolate(other.places, self.corners, self.weights)
+
+
+@dataclass(frozen=True, eq=False)
+class Specimens:
+    """A set; ``folder`` is where keypoints are, of which the best symmetry counts."""
+
+    each: Mapping[str, Specimen]
+    unit: str
+    folder: Path | None = None
+
+    def errors(self, pair: Pair, points: Float[Floats, "N 3"]) -> Float[Floats, " N"]:
+        """How far off a source's vertices are, in the unit, given where they arrive on the target; nan where that lacks
+        them.
+        """
+        source, target = (self.each[name] for name in pair)
+        if self.folder is None:
+            return np.asarray(np.linalg.norm(points - source.seen_on(target), axis=1))
+        at = cKDTree(target.shape.verts).query(points)[1]
+        known = any_shapes.distances(self.folder, pair[1])
+        ways = [100 * known[way, at] for way in any_shapes.symmetries(self.folder, *pair)]
+        return np.asarray(min(ways, key=np.mean))
+
+    def lost(self, name: str) -> float:
+        """How far off a place of this target is lost, in the unit."""
+        return 100 * LOST if self.folder is not None else LOST * float(np.sqrt(self.each[name].shape.area))
+
+
+def turned(rng: np.random.Generator, mirror: bool, far: float) -> Frame:
+    """A motion at random; with a reflection where asked for."""
+    turn = Rotation.random(rng=rng).as_matrix()
+    return Frame(1.0, turn @ np.diag([-1.0, 1, 1]) if mirror else turn, rng.uniform(-far, far, 3))
+
+
+def moved(shape: Shape, frame: Frame) -> Shape:
+    """A shape elsewhere, facing out."""
+    return Shape(frame.apply(shape.verts), shape.faces[:, ::-1] if frame.mirrored else shape.faces, shape.name)
+
+
+def scanned(whole: Shape, rng: np.random.Generator, mirror: bool, cut: bool) -> Specimen:
+    """A shape of a set in correspondence as a scanner has it: in triangles of its own, perhaps without one end."""
+    shape, places = decimate(whole, int(whole.F * rng.uniform(0.5, 0.8))), np.array(whole.verts)
+    if cut:
+        long = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)[2][0]
+        along = long + 0.3 * rng.standard_normal(3)
+        along *= rng.choice([-1.0, 1.0]) / np.linalg.norm(along)
+        edge = float(np.quantile(places @ along, rng.uniform(0.2, 0.35)))
+        verts, faces = trimesh.intersections.slice_faces_plane(shape.verts, shape.faces, along, edge * along)[:2]
+        shape = Shape(np.asarray(verts), np.asarray(faces, np.int64), whole.name)
+        places[places @ along < edge] = np.nan
+    unit = float(np.sqrt(whole.area))
+    foot = Surface(whole.verts / unit, whole.faces, whole.vertex_normals).query(
+        shape.verts / unit, shape.vertex_normals
+    )
+    frame = turned(rng, mirror, unit)
+    at = np.arange(shape.V)
+    return Specimen(moved(shape, frame), frame.apply(places), at, whole.faces[foot.face], foot.barycentric, mirror, cut)
+
+
+def by_points(
+    shape: Shape, points: Int[Ints, " P"], count: int, rng: np.random.Generator, mirror: bool = False
+) -> Specimen:
+    """A shape of which some vertices are known: ``points`` are the vertices of places, -1 where it lacks one."""
+    known = np.flatnonzero(points >= 0)
+    shape = moved(shape, turned(rng, mirror, float(np.sqrt(shape.area))))
+    places = np.full((count, 3), np.nan)
+    places[known] = shape.verts[points[known]]
+    return Specimen(
+        shape, places, points[known], np.tile(known[:, None], 3), np.tile([1.0, 0, 0], (len(known), 1)), mirror
+    )
+
+
+def load(name: str, data: Path, count: int, seed: int) -> Specimens:
+    """A set of so many specimens, if it has as many."""
+    rng = np.random.default_rng([seed, SETS.index(name)])
+    mirrored = [name in SIDED and k % 3 == 2 for k in range(max(count, 100))]
+    if name in ("bust", "bird"):
+        folder = data / "shrec07" / name
+        names = runner.spread(any_shapes.shapes_of(folder), count)
+        points = {each: any_shapes.keypoints_of(folder, each) for each in names}
+        shapes = {each: load_shape(folder / f"{each}.ply") for each in names}
+        made = {each: by_points(shapes[each], points[each], len(points[each]), rng) for each in names}
+        return Specimens(made, "% of sqrt(area)", folder)
+    if name == "hearts":
+        shapes_of, truth = load_folder(data / "heart", ".truth.npy")
+        names, size = runner.spread(list(shapes_of), count), 1 + max(int(each[:, 0].max()) for each in truth.values())
+        made = {}
+        for number, each in enumerate(names):
+            points = np.full(size, -1)
+            points[truth[each][:, 0]] = np.arange(len(truth[each]))
+            made[each] = by_points(shapes_of[each], points, size, rng, mirrored[number])
+        return Specimens(made, "mm")
+    if name == "femurs":
+        files = runner.spread(runner.files_in(data / "femur", "*.ply"), count)
+        shapes = {path.stem: load_shape(path) for path in files}
+    else:
+        found: Registered = MAKERS[name](count, seed)
+        shapes = {f"{name}-{k:02d}": Shape(verts, found.faces, name) for k, verts in enumerate(found.verts)}
+    cut = [name == "femurs" and k >= len(shapes) - _CUT for k in range(len(shapes))]
+    each_how = zip(shapes.items(), mirrored, cut, strict=False)
+    return Specimens({key: scanned(shape, rng, *how) for (key, shape), *how in each_how}, "mm")
+
+
+Points = Callable[[Pair], Floats]
+"""Where the vertices of a source that are asked for arrive on a target."""
+
+
+@dataclass(frozen=True, eq=False)
+class Done:
+    """What a method makes of a set: where vertices arrive, and of a collection what is said of each fit."""
+
+    points: Points
+    records: Sequence[Record] = ()
+
+
+def collected(some: Specimens, scans: Path, work: Path, model: str | Path) -> Done:
+    """``meshmatch fit SCANS -o FITS --model MODEL``."""
+    collection = Collection(work, workers=1)
+    records = collection.fit(scans, model=model).records
+
+    def points(pair: Pair) -> Floats:
+        source, target = (some.each[name] for name in pair)
+        if not set(pair) <= set(collection.names):
+            return np.full((len(source.vertices), 3), target.shape.verts[0])
+        return collection.map(*pair).points(target.shape)[source.vertices]
+
+    return Done(points, records)
+
+
+def own(some: Specimens, scans: Path, work: Path, steps: int) -> Done:
+    """A model of the specimens' own."""
+    prepare(scans, work / "prepared")
+    recipe = recipe_for(work / "prepared").changed(steps=steps)
+    train(work / "model", shapes=work / "prepared", recipe=recipe)
+    return collected(some, scans, work / "fits", work / "model")
+
+
+def start_of(first: Specimen, other: Specimen) -> Frame:
+    """The similarity, with its reflection, that brings the places of one specimen to those of another."""
+    both = np.isfinite(first.places).all(axis=1) & np.isfinite(other.places).all(axis=1)
+    a, b = first.places[both], other.places[both]
+    centers = a.mean(axis=0), b.mean(axis=0)
+    left, values, right = np.linalg.svd((b - centers[1]).T @ (a - centers[0]))
+    side = -1.0 if first.mirrored != other.mirrored else 1.0
+    signs = np.array([1.0, 1.0, side * np.sign(np.linalg.det(left @ right))])
+    larger = float((values * signs).sum() / np.square(a - centers[0]).sum())
+    turn = (left * signs) @ right
+    return Frame(1 / larger, turn, centers[0] - centers[1] @ turn / larger)
+
+
+def monk(some: Specimens, scans: Path, work: Path) -> Done:
+    """The first specimen that is not cut, registered by meshmonk to all others."""
+    first = next(each for each in some.each.values() if not each.cut)
+    base, area = decimate(first.shape, _THIN), float(np.sqrt(first.shape.area))
+    on, units = {}, {}
+    for name, other in some.each.items():
+        start = start_of(first, other)
+        begun, unit = moved(base, start), area / start.scale
+        meshes = [
+            (each.verts / unit, each.vertex_normals, np.asarray(each.faces))
+            for each in (begun, decimate(other.shape, _THIN))
+        ]
+        on[name], units[name] = viscoelastic(*meshes) * unit, unit
+
+    def points(pair: Pair) -> Floats:
+        source = some.each[pair[0]]
+        unit, faces = units[pair[0]], base.faces[:, ::-1] if source.mirrored != first.mirrored else base.faces
+        verts, at = on[pair[0]] / unit, source.shape.verts[source.vertices] / unit
+        foot = Surface(verts, faces, vertex_normals(verts, faces)).query(
+            at, source.shape.vertex_normals[source.vertices]
+        )
+        return interpolate(on[pair[1]], faces[foot.face], foot.barycentric)
+
+    return Done(points)
+
+
+def _cpu() -> float:
+    """Seconds of CPU, those of processes that have ended with them."""
+    return sum(os.times()[:4])
+
+
+def sides_found(some: Specimens, records: Sequence[Record]) -> float | None:
+    """Share of specimens whose side is told rightly, whichever side the template is of."""
+    if not any(each.mirrored for each in some.each.values()):
+        return None
+    same = float(np.mean([bool(each.mirrored) == some.each[each.name].mirrored for each in records]))
+    return max(same, 1 - same)
+
+
+def measure(name: str, method: str, data: Path, count: int, steps: int, seed: int, work: Path) -> dict[str, Any]:
+    """A row."""
+    some = load(name, data, count, seed)
+    scans, place = work / "scans" / name, work / "fits" / f"{name}-{method}"
+    make_folder(scans)
+    for key, each in some.each.items():
+        save_shape(scans / f"{key}.ply", each.shape)
+    exact = {key: load_shape(scans / f"{key}.ply").verts - each.shape.verts for key, each in some.each.items()}
+    assert max(float(np.abs(off).max()) for off in exact.values()) < 1e-3
+    began = _cpu()
+    ways: dict[str, Callable[[Specimens, Path, Path], Done]] = {
+        NO_MODEL: partial(collected, model=NO_MODEL),
+        "own": partial(own, steps=steps),
+        "meshmonk": monk,
+    }
+    done = ways[method](some, scans, place)
+    cpu = _cpu() - began
+    means, lost, on_cut = {}, [], []
+    for pair in permutations(some.each, 2):
+        errors = some.errors(pair, done.points(pair))
+        errors = errors[np.isfinite(errors)]
+        means[pair] = float(errors.mean())
+        lost.append(float((errors > some.lost(pair[1])).mean()))
+        if any(some.each[one].cut for one in pair):
+            on_cut.append(means[pair])
+    worst = max(means, key=lambda pair: means[pair])
+    row: dict[str, Any] = {"set": name, "method": method, "specimens": len(some.each), "unit": some.unit}
+    row |= {"error": float(np.mean(list(means.values()))), "worst": means[worst], "worst_pair": list(worst)}
+    row |= {"lost": float(np.mean(lost)), "cut": float(np.mean(on_cut)) if on_cut else None, "cpu": cpu}
+    if done.records:
+        counts = Counter(each.verdict for each in done.records)
+        row |= {"sides": sides_found(some, done.records), **{each: counts[each] for each in VERDICTS[:3]}}
+    of_each = {each: [means[pair] for pair in means if each in pair] for each in some.each}
+    told = {each.name: [each.verdict, each.trust, each.reasons] for each in done.records}
+    return row | {"each": {key: [float(np.mean(off)), *told.get(key, [])] for key, off in of_each.items()}}
+
+
+@runner.command
+def main(
+    data: runner.Data = runner.DATA,
+    sets: Annotated[str, Option(help=f"of {', '.join(SETS)}")] = ",".join(SETS),
+    methods: Annotated[str, Option(help=f"of {', '.join(METHODS)}")] = ",".join(METHODS),
+    count: Annotated[int, Option(min=3, help="specimens of each set, if it has as many")] = 9,
+    steps: Annotated[int, Option(min=1, help="that own models are trained for")] = 200,
+    work: runner.Work = None,
+    threads: runner.Threads = 1,
+    seed: runner.Seed = 0,
+) -> runner.Report:
+    names = runner.names_of(sets, SETS, "set")
+    rows, skipped = [], []
+    with tempfile.TemporaryDirectory() as temporary:
+        place = work or Path(temporary)
+        for method in runner.names_of(methods, METHODS, "method"):
+            if method in METHODS[2:] and find_spec(method) is None:
+                skipped.append(f"skipped: {method} is not installed")
+                continue
+            asked = {"count": count, "seed": seed} | ({"steps": steps} if method == "own" else {})
+            for name in names:
+                runner.tell(f"{name}: {method}")
+                call = partial(measure, name, method, data, count, steps, seed, place)
+                rows.append(runner.once(place / "rows" / f"{name}-{method}.json", asked, call))
+    rows.sort(key=lambda row: names.index(row["set"]))
+    title = f"Specimens; own models of {steps} steps"
+    return runner.Report({"rows": rows}, [runner.table(title, rows, _COLUMNS)], skipped)
