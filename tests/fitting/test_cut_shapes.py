@@ -12,7 +12,9 @@ from meshmatch.fitting.without_model import fit_without_model, template_of
 from meshmatch.shapes.shape import Shape
 
 SCHEDULE = Schedule(steps=10, prior=(1e-3, 1e-6), scale=(0.1, 0.02), damping=1e-6)
-SMALL = ViscousConfig(nodes=150, radius=0.18, faces=1200, samples=1500, back_points=800, schedule=SCHEDULE)
+SMALL = ViscousConfig(
+    nodes=150, radius=0.18, faces=1200, samples=1500, back_points=800, schedule=SCHEDULE, point_share=0.01
+)
 
 
 @pytest.mark.parametrize("cut", [True, False])
