@@ -14,18 +14,28 @@ import numpy as np
 
 from meshmatch.collections.setting import FAILED, Record
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.judge.reasons import Reason, Verdict
+from meshmatch.fitting.judge.reasons import SIDE_IN_DOUBT, Reason, Verdict
 
 _FEWEST = 5  # fits, of which less say nothing about what is usual
 _GOOD, FAIR = 0.9, 0.5
 """Trust from which a fit is good, and fair, as of two shapes without a model."""
-# The logit of a right fit, and what it loses with the logarithms of stretch and residual over what is usual. Set by hand,
-# between right and wrong fits of three collections of femurs, some cut, warped, or other shapes in their place: right ones
-# were stretched up to 2.5 times as much as usual, wrong ones 4.9 times and more.
-_OFFSET, _STRETCH, _RESIDUAL = 3.1, 2.4, 3.0
 _ALONE = ("unsupervised", "doubt", "residual")  # reasons of fits that no others are known of
 _CLEAR, _MOST = 0.08, 0.8  # shapes have sides where so many of them have one that is clear, see `Fit.side`
 _STANDS_OUT = 1.5  # so many times what is usual is told
+
+
+@dataclass(frozen=True)
+class Weights:
+    """The logit of a right fit: ``offset``, less what the logarithms of stretch and residual over what is usual cost."""
+
+    offset: float
+    stretch: float
+    residual: float
+
+
+WEIGHTS = Weights(offset=3.1, stretch=2.4, residual=3.0)
+"""Set by hand, between right and wrong fits of three collections of femurs, some cut, warped, or other shapes in their
+place: right ones were stretched up to 2.5 times as much as usual, wrong ones 4.9 times and more."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +47,7 @@ class Usual:
     stretch: float
     residual: float
     scale: float
+    weights: Weights = WEIGHTS
 
     @classmethod
     def of(cls, records: Sequence[Record]) -> Usual | None:
@@ -44,14 +55,20 @@ class Usual:
         some = [each for each in records if each.stretch > 0 and each.residual > 0]
         if len(some) < _FEWEST:
             return None
-        return cls(
-            *(float(np.median([getattr(each, name) for each in some])) for name in ("stretch", "residual", "scale"))
+        stretch, residual, scale = (
+            float(np.median([getattr(each, name) for each in some])) for name in ("stretch", "residual", "scale")
         )
+        return cls(stretch, residual, scale)
 
     def trust(self, record: Record) -> float:
         """Probability (0..1) that a fit is right."""
-        stretch, residual = np.log(np.maximum(self._times(record), 1.0))
-        return float(record.likely / (1 + np.exp(_STRETCH * stretch + _RESIDUAL * residual - _OFFSET)))
+        own, (stretch, residual) = self.weights, self.signs(record)
+        return float(record.likely / (1 + np.exp(own.stretch * stretch + own.residual * residual - own.offset)))
+
+    def signs(self, record: Record) -> tuple[float, float]:
+        """What is weighed: logarithms of how many times as much as usual stretch and residual are, if it is more."""
+        stretch, residual = np.log(np.maximum(self._times(record), 1.0)).tolist()
+        return stretch, residual
 
     def stands_out(self, record: Record) -> bool:
         """Whether the template had to stretch much more than usual."""
@@ -76,6 +93,8 @@ class Usual:
         elif residual > _STANDS_OUT:
             apart = f"{100 * record.residual:.1f} % of sqrt(area) apart, {100 * self.residual:.1f} % is usual"
             reasons.insert(0, Reason("outlier", f"stands out of the collection: template and shape stay {apart}"))
+        if record.side < 0:
+            reasons.append(Reason("side", SIDE_IN_DOUBT))
         verdict: Verdict = "good"
         if fit.verdict == "poor" or trust < FAIR:
             verdict = "poor"

@@ -14,7 +14,7 @@ from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit, judged_fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.features import uncovered_share
-from meshmatch.fitting.judge.reasons import Reason, Verdict
+from meshmatch.fitting.judge.reasons import SIDE_IN_DOUBT, Reason, Verdict
 from meshmatch.fitting.judge.verdict import LIMITS, judge_registration
 from meshmatch.fitting.search.predictor import mirror_of
 from meshmatch.fitting.search.refinement import REFINEMENTS, fit_part, fit_whole
@@ -83,7 +83,7 @@ class Fitter:
         if found.core_frame.mirrored:
             notes = (f"{shape.name}: taken for the mirror image of what {card.name} knows",)
         if others and _cost(found) > _SURE_SIDE * _cost(others[0][0]):
-            doubts.append(Reason("side", "its mirror image fits nearly as well: left and right may be exchanged"))
+            doubts.append(Reason("side", SIDE_IN_DOUBT))
         if not card.correspondence:
             doubts.append(
                 Reason(

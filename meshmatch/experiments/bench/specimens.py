@@ -7,9 +7,9 @@ from; busts and birds have keypoints, the best of their symmetries. Errors are o
 or along the target in percent of sqrt(area) where there is no unit. A place is lost beyond a tenth of sqrt(area).
 
 - none: ``fit FOLDER --model none``.
-- own: ``prepare``, ``train --shapes`` of so many steps, and ``fit FOLDER --model own``, of the same specimens.
-- meshmonk: the first specimen is registered to all others, from a start that it is given: the similarity, and the side, that
-  brings true places together best.
+- own: ``prepare --grow-radii``, ``train --shapes`` of so many steps, and ``fit FOLDER --model own``, of the same specimens.
+- meshmonk: the first specimen is registered to all others, from a start that it is given: the similarity, and the
+  side, that brings true places together best.
 - pyclarcs: for bilateral symmetry; told as missing where it is not installed.
 
 CPU seconds are those of all processes. Kept in ``--work``, a run goes on where it was stopped.
@@ -51,7 +51,8 @@ from meshmatch.outputs import make_folder
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.prepare import prepare
+from meshmatch.templates.make import NodeConfig
+from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.training.recipes import recipe_for
 from meshmatch.training.train import train
 
@@ -156,6 +157,15 @@ def by_points(
     )
 
 
+def wholes(name: str, data: Path, count: int, seed: int) -> dict[str, Shape]:
+    """The shapes of a set in correspondence: femurs, or what is generated."""
+    if name == "femurs":
+        files = runner.spread(runner.files_in(data / "femur", "*.ply"), count)
+        return {path.stem: load_shape(path) for path in files}
+    found: Registered = MAKERS[name](count, seed)
+    return {f"{name}-{k:02d}": Shape(verts, found.faces, name) for k, verts in enumerate(found.verts)}
+
+
 def load(name: str, data: Path, count: int, seed: int) -> Specimens:
     """A set of so many specimens, if it has as many."""
     rng = np.random.default_rng([seed, SETS.index(name)])
@@ -172,16 +182,11 @@ def load(name: str, data: Path, count: int, seed: int) -> Specimens:
         names, size = runner.spread(list(shapes_of), count), 1 + max(int(each[:, 0].max()) for each in truth.values())
         made = {}
         for number, each in enumerate(names):
-            points = np.full(size, -1)
-            points[truth[each][:, 0]] = np.arange(len(truth[each]))
-            made[each] = by_points(shapes_of[each], points, size, rng, mirrored[number])
+            at = np.full(size, -1)
+            at[truth[each][:, 0]] = np.arange(len(truth[each]))
+            made[each] = by_points(shapes_of[each], at, size, rng, mirrored[number])
         return Specimens(made, "mm")
-    if name == "femurs":
-        files = runner.spread(runner.files_in(data / "femur", "*.ply"), count)
-        shapes = {path.stem: load_shape(path) for path in files}
-    else:
-        found: Registered = MAKERS[name](count, seed)
-        shapes = {f"{name}-{k:02d}": Shape(verts, found.faces, name) for k, verts in enumerate(found.verts)}
+    shapes = wholes(name, data, count, seed)
     cut = [name == "femurs" and k >= len(shapes) - _CUT for k in range(len(shapes))]
     each_how = zip(shapes.items(), mirrored, cut, strict=False)
     return Specimens({key: scanned(shape, rng, *how) for (key, shape), *how in each_how}, "mm")
@@ -215,7 +220,7 @@ def collected(some: Specimens, scans: Path, work: Path, model: str | Path) -> Do
 
 def own(some: Specimens, scans: Path, work: Path, steps: int) -> Done:
     """A model of the specimens' own."""
-    prepare(scans, work / "prepared")
+    prepare(scans, work / "prepared", PrepareConfig(NodeConfig("geodesic", grow=True)))
     recipe = recipe_for(work / "prepared").changed(steps=steps)
     train(work / "model", shapes=work / "prepared", recipe=recipe)
     return collected(some, scans, work / "fits", work / "model")

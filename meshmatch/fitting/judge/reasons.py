@@ -30,6 +30,7 @@ part lie beside it; a part ends where the shape has no edge; a knee bends forwar
 predicts other points for tilted and mirrored copies of the shape; no feature alone, but all together; it was taken for a
 part; its mirror image fits as well; the model was learned without
 correspondence, or there was none; other fits are equally good; it stands out of its collection."""
+SIDE_IN_DOUBT = "its mirror image fits nearly as well: left and right may be exchanged"
 
 
 class Reason(str):
