@@ -238,15 +238,16 @@ def fit_without_model(
     """Fit a template to a repaired shape; a mesh, or a cloud. Such a fit is fair at best, for nothing was learned of what
     corresponds.
 
-    ``start`` is a fit of another template of the same vertices to this shape, from which this one begins, and finds less but
-    more exactly. With ``mirror``
+    ``start`` is a fit of another template of the same vertices to this shape, from which this one begins. With ``mirror``
     the shape may be the mirror image of what the template shows; with ``other_side`` it is the one that ``start`` is not.
     Where ``whole`` is given, the sqrt(area) of a whole shape in the unit of the file, it may also be cut.
     """
-    config, began = config or (ViscousConfig() if start else ViscousConfig.choosing()), time.monotonic()
+    began, rough = time.monotonic(), config or ViscousConfig.choosing()
+    config = config or ViscousConfig()
     task = _Task(template, shape, config)
     if start is None:
-        found, lead = task.best((None, MIRROR) if mirror else (None,))
+        found, lead = _Task(template, shape, rough).best((None, MIRROR) if mirror else (None,))
+        found = found if rough is config else task.fitted(found.begin)
     elif other_side:
         found, lead = task.best((None if start.frame.mirrored else MIRROR,))[0], -start.side
     else:
