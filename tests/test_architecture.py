@@ -76,7 +76,6 @@ OWNERS = {
     "torch": {"arrays", "generators", "fields", "models", "training", "fitting", "implicit", "experiments"},
     "trimesh": {"shapes", "fitting", "experiments"},
     "typer": {"cli", "experiments"},
-    "xatlas": {"transfer"},
 }
 DISTRIBUTIONS = {
     "PIL": "pillow",

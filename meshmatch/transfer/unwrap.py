@@ -28,7 +28,7 @@ _MARGIN = 2
 _FIRST_TILE = 1001
 _MOST_TEXELS = 1 << 28  # of all tiles together
 _NEW = "leave out --uv keep: new ones are made"
-# Length of an edge, in units of sqrt(area): xatlas takes seconds at this one, and hours at a few times as much.
+# Length of an edge, in units of sqrt(area): a longer one leaves no room for anything else in a square.
 _MAX_EDGE = 500.0
 
 
@@ -67,7 +67,7 @@ def atlas_of(
     an error ("keep"), or new ones, with at least `padding` texels between charts, and no seam across one of the
     `polygons` that triangles (F,) are parts of.
 
-    `OptionError` for a cloud, or coordinates to keep that are not valid; `InputError` without area, or if xatlas fails.
+    `OptionError` for a cloud, or coordinates to keep that are not valid; `InputError` without area, or for threads.
     """
     name = shape.name or "the target"
     check_surface(shape)
@@ -99,7 +99,7 @@ def check_surface(shape: Shape) -> None:
 
 def new_atlas(shape: Shape, size: int, padding: int, keep: Keep, polygons: Ints | None, problem: str) -> Atlas:
     """New coordinates in the place of the file's own, with the problem that these have; `OptionError` if they are to be
-    kept, `InputError` if xatlas fails.
+    kept, `InputError` for threads.
     """
     words = f"{shape.name or 'the target'}: its own texture coordinates cannot be used: {problem}"
     if keep == "keep":
@@ -183,22 +183,20 @@ def shared_texels(uv: Float[Floats, "F 3 2"], size: int = 1024) -> float:
 
 
 def unwrapped(shape: Shape, size: int, padding: int, polygons: Ints | None = None) -> Floats:
-    """(F, 3, 2) new coordinates; `InputError` if none can be made."""
+    """(F, 3, 2) new coordinates, not mirrored; `InputError` for a shape as thin as a thread."""
     real = np.flatnonzero(shape.face_areas > 0)
     used, corners = np.unique(shape.faces[real], return_inverse=True)
     verts = shape.verts[used]
     verts = (verts - verts.mean(axis=0)) / max(float(np.sqrt(shape.face_areas.sum())), 1e-300)
     corners = corners.reshape(-1, 3)
     edges = verts[corners] - verts[corners[:, [1, 2, 0]]]
-    try:
-        if np.sqrt((edges**2).sum(axis=2).max()) > _MAX_EDGE:
-            raise RuntimeError("it has triangles as thin as a thread")
-        uv, faces = new_charts(verts, corners, size, padding, None if polygons is None else polygons[real])
-    except RuntimeError as error:
-        problem = f"{shape.name or 'the target'} cannot be unwrapped ({error})"
-        raise InputError(problem, "unwrap it in a modelling program, and use --uv keep") from error
+    if np.sqrt((edges**2).sum(axis=2).max()) > _MAX_EDGE:
+        problem = f"{shape.name or 'the target'} cannot be unwrapped (it has triangles as thin as a thread)"
+        raise InputError(problem, "unwrap it in a modelling program, and use --uv keep")
+    uv = new_charts(verts, corners, size, padding, None if polygons is None else polygons[real])
     out = np.zeros((shape.F, 3, 2))
     # Room at the border too: a repeated image goes on there with its other side.
     margin = min(_MARGIN, padding) / size
-    out[real] = margin + (1.0 - 2.0 * margin) * uv[faces]
+    uv[..., 1] = 1.0 - uv[..., 1]  # v runs down
+    out[real] = margin + (1.0 - 2.0 * margin) * uv
     return out

@@ -6,7 +6,7 @@ import pytest
 from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.triangles import face_parts
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer import new_charts, unwrap
+from meshmatch.transfer import unwrap
 from meshmatch.transfer.texels import faces_on, grow
 from meshmatch.transfer.unwrap import atlas_of, tiles_of, unwrapped
 from tests.conftest import icosphere
@@ -131,7 +131,7 @@ def test_many_faces_on_one_place_are_refused_before_they_are_drawn(monkeypatch: 
         atlas_of(shape, np.tile(OWN, (500, 1, 1)), 64, 2, "keep")
 
 
-def test_what_cannot_be_unwrapped(torus: Shape, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_unwrapped() -> None:
     with pytest.raises(OptionError, match="point cloud"):
         atlas_of(Shape(CORNERS, np.empty((0, 3), int), "cloud"), None, 64, 2)
     with pytest.raises(InputError, match="no triangle with an area"):
@@ -139,40 +139,12 @@ def test_what_cannot_be_unwrapped(torus: Shape, monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(OptionError, match="no texture coordinates to keep"):
         atlas_of(SQUARE, None, 64, 2, "keep")
 
-    def fails(*_: object) -> None:
-        raise RuntimeError("no")
-
-    monkeypatch.setattr(unwrap, "new_charts", fails)
-    with pytest.raises(InputError, match="cannot be unwrapped"):
-        unwrapped(torus, 64, 2)
-
 
 def test_a_thread_is_refused_before_it_takes_hours() -> None:
     ball = icosphere(1)
     assert np.isfinite(unwrapped(Shape(ball.verts * [1.0, 1e-6, 1e-6], ball.faces, "thin"), 64, 1)).all()
     with pytest.raises(InputError, match="as thin as a thread"):
         unwrapped(Shape(ball.verts * [1.0, 1e-12, 1e-12], ball.faces, "thread"), 64, 1)
-
-
-def test_charts_are_made_by_another_process(torus: Shape, monkeypatch: pytest.MonkeyPatch) -> None:
-    # an atlas that is freed can stop its process for ever
-    monkeypatch.setattr(new_charts.xatlas, "Atlas", lambda: pytest.fail("an atlas was made here"))
-    assert np.isfinite(unwrapped(torus, 64, 2)).all()
-
-
-def test_what_goes_wrong_in_the_other_process_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    nowhere = np.array([[0, 1, 7]])
-    with pytest.raises(RuntimeError, match=r"\w"):
-        new_charts.new_charts(CORNERS, nowhere, 64, 2)
-    monkeypatch.setattr(new_charts, "_PROGRAM", "import os; os.abort()")
-    with pytest.raises(RuntimeError, match="ended with status -6"):
-        new_charts.new_charts(CORNERS, FACES, 64, 2)
-
-
-def test_no_atlas_is_freed_before_the_process_ends(torus: Shape) -> None:
-    alive: list[object] = []
-    new_charts._made(torus.verts, torus.faces, np.arange(torus.F), 64, 2, alive)
-    assert len(alive) == 1 + len(new_charts._DENSITIES)
 
 
 def test_no_seam_crosses_a_polygon() -> None:

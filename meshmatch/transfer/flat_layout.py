@@ -1,0 +1,251 @@
+"""Pieces of a surface laid flat: as conformal as possible (least squares), then as rigid as possible (Liu et al. 2008)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array, csc_array, csr_array, sparray
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import SuperLU, splu
+
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+from meshmatch.geometry.triangles import face_parts, same_rows, triangle_areas, unit
+from meshmatch.transfer.texels import faces_on
+
+# All of these were set by hand.
+_HOPELESS = 1e6  # times the stretch that is allowed: of the conformal layout
+_ROUNDS = 5
+_COTANGENTS = 0.02, 20.0  # of thin triangles
+_THIN = 1e-3  # height over base: thinner triangles are laid out as if they had this one
+_NOTHING = 0.01  # share of the area that it has then: nobody sees whether a thinner one is turned over
+_UNTANGLED = 6  # rounds of moving corners between their neighbours where triangles are turned over
+_GRID = 1024  # texels across a piece on which it must not cover itself: at most,
+_FINE = 16  # and for each row of triangles
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Faces in the plane, counterclockwise where the surface is seen from outside, in the unit of the positions."""
+
+    uv: Float[Floats, "M 2"]
+    corners: Int[Ints, "F 3"]
+    seen: Bool[Bools, " F"]  # false for threads, of which nobody sees whether they are turned over
+    bad: Int[Ints, " K"]  # faces that are turned over, or lie on others
+    pair: tuple[int, int] | None = None  # two faces in the middle of what lies on itself
+
+    @classmethod
+    def of(cls, uv: Floats, corners: Ints, seen: Bools, least: int) -> Layout:
+        """Faces in the plane, with what is wrong with them."""
+        return cls(uv, corners, seen, *_bad(uv[corners], corners, seen, least))
+
+    def only(self, rows: Int[Ints, " K"], least: int) -> Layout:
+        """Some of the faces, where they lie."""
+        used, corners = np.unique(self.corners[rows], return_inverse=True)
+        return Layout.of(self.uv[used], corners.reshape(-1, 3), self.seen[rows], least)
+
+
+def laid_flat(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], most: float, least: int) -> Layout | None:
+    """Faces laid flat, of the area that they have.
+
+    Parameters
+    ----------
+    verts, faces
+        The piece, in units of any length.
+    most
+        Stretch or shrinking, whichever is more, that its mean over the area may reach.
+    least
+        Texels across the piece, at least, that are looked at to see whether it covers itself.
+
+    Returns
+    -------
+    layout
+        None for faces that do not hang together, or that would be stretched more.
+    """
+    corners = _welded(faces)
+    count = int(corners.max()) + 1
+    if face_parts(corners, count).max() > 0:
+        return None
+    points = np.empty((count, 3))
+    points[corners.ravel()] = verts[faces.ravel()]
+    flat = apart(points[corners])
+    areas, own = 0.5 * flat[:, 1, 0] * flat[:, 2, 1], triangle_areas(points, corners)
+    if not (areas > 0).all():
+        return None
+    try:
+        uv = _as_conformal(points, corners, flat, areas)
+        if _stretch(uv[corners], flat, own) > _HOPELESS * most:
+            return None
+        for step in _as_rigid(uv, corners, flat):
+            uv = step
+    except RuntimeError:  # nothing holds some corners
+        return None
+    if not np.isfinite(uv).all():
+        return None
+    uv = _untangled(uv, corners)
+    if _stretch(uv[corners], flat, own) > most:
+        return None
+    uv *= np.sqrt(own.sum() / np.abs(_signed(uv[corners])).sum())
+    return Layout.of(uv, corners, own > _NOTHING * areas, least)
+
+
+def _bad(laid: Floats, corners: Ints, seen: Bools, least: int) -> tuple[Int[Ints, " K"], tuple[int, int] | None]:
+    """Faces that are seen and turned over; and of two that share a texel the one closer to the border. And such two."""
+    F = len(laid)
+    over, pair = (_signed(laid) <= 0) & seen, None
+    grid = int(np.clip(_FINE * np.sqrt(F), least, _GRID))
+    low, high = laid.min(axis=(0, 1)), laid.max(axis=(0, 1))
+    image = (0.01 + 0.98 * (laid - low) / (high - low).max()) * grid
+    found, twice = faces_on(image, grid)
+    if twice:
+        other = F - 1 - faces_on(image[::-1], grid)[0]
+        differ = (found >= 0) & (found != other)
+        edges = np.sort(corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        number = same_rows(edges)
+        alone = (np.bincount(number, minlength=len(edges))[number] == 1).reshape(F, 3).sum(axis=1)
+        one, two = found[differ], other[differ]
+        over[np.where(alone[one] > alone[two], one, two)] = True
+        if len(one):
+            pair = int(one[len(one) // 2]), int(two[len(two) // 2])
+    return np.flatnonzero(over), pair
+
+
+def across(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> tuple[Ints, Ints, Floats]:
+    """The two faces at each edge that two faces run along in opposite directions, and its length."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    one, two = _twins(edges)
+    return one // 3, two // 3, np.linalg.norm(verts[edges[one, 0]] - verts[edges[one, 1]], axis=1)
+
+
+def apart(corners: Float[Floats, "F 3 3"]) -> Float[Floats, "F 3 2"]:
+    """Each triangle in a plane of its own: the first corner at 0, the second on the x axis."""
+    along, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    base = np.linalg.norm(along, axis=1)
+    flat = np.zeros((len(corners), 3, 2))
+    flat[:, 1, 0] = base
+    flat[:, 2, 0] = np.einsum("fi,fi->f", other, unit(along))
+    height = np.linalg.norm(other - flat[:, 2, :1] * unit(along), axis=1)
+    flat[:, 2, 1] = np.maximum(height, _THIN * np.maximum(base, np.linalg.norm(other, axis=1)))
+    return flat
+
+
+def _twins(edges: Int[Ints, "N 2"]) -> tuple[Ints, Ints]:
+    """Rows that are the same edge in opposite directions, where there are two of it."""
+    number = same_rows(np.sort(edges, axis=1))
+    order = np.argsort(number, kind="stable")
+    number, count = number[order], np.bincount(number)
+    first = np.flatnonzero((number[1:] == number[:-1]) & (count[number[1:]] == 2))
+    one, two = order[first], order[first + 1]
+    opposite = edges[one, 0] == edges[two, 1]
+    return one[opposite], two[opposite]
+
+
+def _welded(faces: Int[Ints, "F 3"]) -> Int[Ints, "F 3"]:
+    """Corners numbered anew: one number for those that faces with a common edge share."""
+    F = len(faces)
+    one, two = _twins(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
+    begin, end = (np.arange(3 * F), (np.arange(3 * F).reshape(F, 3)[:, [1, 2, 0]]).ravel())
+    rows, columns = np.concatenate([begin[one], end[one]]), np.concatenate([end[two], begin[two]])
+    graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(3 * F, 3 * F))
+    return np.asarray(connected_components(graph, directed=False)[1].reshape(F, 3), np.int64)
+
+
+def _as_conformal(points: Floats, corners: Ints, flat: Floats, areas: Floats) -> Float[Floats, "M 2"]:
+    """Least squares conformal maps (Lévy et al. 2002), two far points held."""
+    z = flat[..., 0] + 1j * flat[..., 1]
+    weights = (z[:, [2, 0, 1]] - z[:, [1, 2, 0]]) / np.sqrt(2 * areas)[:, None]
+    F, M = len(corners), len(points)
+    rows = np.repeat(np.arange(F), 3)
+    matrix = coo_array((weights.ravel(), (rows, corners.ravel())), shape=(F, M)).tocsc()
+    normal = (matrix.conj().T @ matrix).tocsc()
+    one = int(((points - points.mean(axis=0)) ** 2).sum(axis=1).argmax())
+    other = int(((points - points[one]) ** 2).sum(axis=1).argmax())
+    free = np.setdiff1d(np.arange(M), [one, other])
+    found = np.zeros(M, complex)
+    found[other] = np.linalg.norm(points[one] - points[other])
+    if len(free):
+        right = -(normal[:, [other]].toarray()[:, 0] * found[other])[free]
+        found[free] = _factors(normal[free][:, free]).solve(right)
+    uv = np.stack([found.real, found.imag], axis=1)
+    return np.asarray(uv * np.sqrt(areas.sum() / max(np.abs(_signed(uv[corners])).sum(), 1e-300)))
+
+
+def _as_rigid(uv: Floats, corners: Ints, flat: Floats) -> Iterator[Float[Floats, "M 2"]]:
+    """Layouts in which each triangle is closer to a turned copy of itself."""
+    M = len(uv)
+    into, out = np.roll(flat, -1, axis=1) - flat, np.roll(flat, -2, axis=1) - flat
+    cross = np.abs(into[..., 0] * out[..., 1] - into[..., 1] * out[..., 0])
+    weights = np.clip((into * out).sum(axis=2) / np.maximum(cross, 1e-300), *_COTANGENTS)  # of the opposite edges
+    begin, end = corners[:, [1, 2, 0]].ravel(), corners[:, [2, 0, 1]].ravel()
+    edges = flat[:, [2, 0, 1]] - flat[:, [1, 2, 0]]
+    w = weights.ravel()
+    values, rows = np.concatenate([-w, -w, w, w]), np.concatenate([begin, end, begin, end])
+    columns = np.concatenate([end, begin, begin, end])
+    solver = _factors(coo_array((values, (rows, columns)), shape=(M, M)).tocsc()[1:][:, 1:])
+    for _ in range(_ROUNDS):
+        now = uv[corners[:, [2, 0, 1]]] - uv[corners[:, [1, 2, 0]]]
+        products = np.einsum("fk,fki,fkj->fij", weights, now, edges)
+        angle = np.arctan2(products[:, 1, 0] - products[:, 0, 1], products[:, 0, 0] + products[:, 1, 1])
+        turn = np.exp(1j * angle)[:, None] * (edges[..., 0] + 1j * edges[..., 1]) * weights
+        pull = [
+            np.bincount(end, part, M) - np.bincount(begin, part, M) for part in (turn.real.ravel(), turn.imag.ravel())
+        ]
+        uv = np.zeros((M, 2))
+        uv[1:] = solver.solve(np.stack(pull, axis=1)[1:])
+        yield uv
+
+
+def _factors(matrix: sparray) -> SuperLU:
+    """Of a symmetric matrix without negative eigenvalues."""
+    options = {"SymmetricMode": True}
+    return splu(csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+
+
+def _untangled(uv: Floats, corners: Ints) -> Floats:
+    """Corners around triangles that are turned over, moved between their neighbours (Tutte); further ones each round."""
+    if (_signed(uv[corners]) > 0).all():
+        return uv
+    M = len(uv)
+    edges = corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    one_way = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(M, M)).tocsr()
+    both = csr_array(((one_way + one_way.T) > 0).astype(float))
+    border = np.zeros(M, bool)
+    border[np.unique(np.stack((one_way - one_way.T).nonzero()))] = True
+    uv, moved = uv.copy(), np.zeros(M, bool)
+    for _ in range(_UNTANGLED):
+        bad = _signed(uv[corners]) <= 0
+        if not bad.any():
+            break
+        moved[corners[bad].ravel()] = True
+        moved |= (both @ moved) > 0
+        inner: Bools = moved & ~border
+        if not inner.any():
+            break
+        rows = both[np.flatnonzero(inner)]
+        degree = coo_array((np.asarray(rows.sum(axis=1)), (np.arange(rows.shape[0]), np.arange(rows.shape[0]))))
+        right = rows[:, np.flatnonzero(~inner)] @ uv[~inner]
+        uv[inner] = _factors(degree - rows[:, np.flatnonzero(inner)]).solve(right)
+    return uv
+
+
+def _signed(laid: Float[Floats, "F 3 2"]) -> Float[Floats, " F"]:
+    one, two = laid[:, 1] - laid[:, 0], laid[:, 2] - laid[:, 0]
+    return np.asarray(0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]))
+
+
+def _stretch(laid: Float[Floats, "F 3 2"], flat: Float[Floats, "F 3 2"], areas: Float[Floats, " F"]) -> float:
+    """Mean over the area of stretch or shrinking, whichever is more, of faces that are not turned over; infinite if half
+    of the area is.
+    """
+    one, two = laid[:, 1] - laid[:, 0], laid[:, 2] - laid[:, 0]
+    along = one / flat[:, 1, :1]  # images of the axes
+    up = (two - along * flat[:, 2, :1]) / flat[:, 2, 1:]
+    turned = along[:, 0] * up[:, 1] - along[:, 1] * up[:, 0]
+    right = turned > 0
+    if right @ areas < 0.5 * areas.sum():
+        return np.inf
+    along, up, turned, areas = along[right], up[right], turned[right], areas[right]
+    squares = (along**2 + up**2).sum(axis=1)
+    most = (np.sqrt(squares + 2 * turned) + np.sqrt(np.maximum(squares - 2 * turned, 0))) / 2
+    return float(np.maximum(most, most / turned) @ areas / areas.sum())

@@ -1,0 +1,293 @@
+"""Charts side by side in a square image, as large as they fit.
+
+Each is put where it touches most of what is there, in the best of four turns; all places are tried at once by Fourier
+transforms of images of what is taken. Crumbs are put on shelves first, in one block.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.ndimage import maximum_filter
+from scipy.spatial import ConvexHull, QhullError
+
+from meshmatch.arrays import Bools, Float, Floats, Int, Ints
+from meshmatch.transfer.texels import texels_in
+
+# All of these were set by hand.
+_GRID, _FINE = 256, 4  # texels of the image in which places are looked for; how much finer they are at last
+_ALIKE = 1e-6  # what is closer is the same
+_MOVES = 4
+_SHUFFLED = 0.2
+_MOST = 80  # charts that are moved one by one
+_ORDERS = 3  # that are compared
+_SHRINK = 0.99  # of lengths, each time that not all charts found room
+_DENSE = 0.78  # of the image, that the charts and half of what is between them fill at the first try
+_LOW = 0.3  # how much it counts to lie low in the image, beside the share of the border that touches something
+_BETWEEN = 0.2  # of the image at most: what lies between crumbs
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """Triangles of a surface that lie flat together."""
+
+    members: Int[Ints, " n"]
+    uv: Float[Floats, "M 2"]  # in the unit of the surface
+    corners: Int[Ints, "n 3"]
+
+
+def tightest(uv: Float[Floats, "M 2"]) -> tuple[float, float]:
+    """The angle in radians at which the smallest rectangle around points lies, its long side along x; and its area."""
+    try:
+        hull = uv[ConvexHull(uv).vertices]
+    except QhullError:  # all on a line
+        hull = uv
+    edges = np.roll(hull, -1, axis=0) - hull
+    angle = np.arctan2(edges[:, 1], edges[:, 0])
+    cosine, sine = np.cos(angle), np.sin(angle)
+    wide = np.ptp(np.outer(cosine, hull[:, 0]) + np.outer(sine, hull[:, 1]), axis=1)
+    high = np.ptp(np.outer(cosine, hull[:, 1]) - np.outer(sine, hull[:, 0]), axis=1)
+    angle = np.where(wide >= high * (1 - _ALIKE), angle, angle + np.pi / 2) % np.pi
+    angle = np.where(angle > np.pi - _ALIKE, 0.0, angle)
+    least = float((wide * high).min())
+    ties = np.flatnonzero(wide * high <= least * (1 + _ALIKE))  # rounding is not to decide
+    return float(angle[ties].min()), least
+
+
+def hull(uv: Float[Floats, "M 2"]) -> float:
+    """The area of the convex hull."""
+    try:
+        return float(ConvexHull(uv).volume)
+    except QhullError:
+        return 0.0
+
+
+def packed(charts: list[Chart], padding: float, seed: int = 0) -> list[Float[Floats, "M 2"]]:
+    """Coordinates in 0..1 of each chart, all of one density and at least `padding` of the image apart, or less where there
+    are so many that little else would be left.
+    """
+    pieces = [_Piece(chart.uv, chart.corners) for chart in charts]
+    order = sorted(range(len(pieces)), key=lambda k: (-pieces[k].area, k))
+    large, crumbs = order[:_MOST], order[_MOST:]
+    moved = [pieces[k] for k in large]
+    shelves: list[Floats] = []
+    if crumbs:
+        total = sum(piece.area for piece in pieces)
+        between = min(padding, np.sqrt(_BETWEEN / len(crumbs))) * np.sqrt(2 * total)
+        shelves, size = _on_shelves([pieces[k] for k in crumbs], between)
+        moved.append(_Piece(np.array([[0, 0], [size[0], 0], size, [0, size[1]]]), np.array([[0, 1, 2], [0, 2, 3]])))
+    scale, places = _search(moved, padding, np.random.default_rng(seed))
+    out: list[Floats] = [np.empty(0)] * len(charts)
+    for k, piece, place in zip(large, moved, places, strict=False):
+        out[k] = place.of(piece.uv * scale)
+    for k, at in zip(crumbs, shelves, strict=True):
+        out[k] = places[-1].of(moved[-1].turned(pieces[k].uv + at) * scale)
+    return out
+
+
+class _Piece:
+    def __init__(self, uv: Floats, corners: Ints) -> None:
+        angle = tightest(uv)[0]
+        self.turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        self.low = (uv @ self.turn).min(axis=0)
+        self.uv, self.corners = self.turned(uv), corners
+        self.size = self.uv.max(axis=0)
+        one, two = (self.uv[corners[:, k]] - self.uv[corners[:, 0]] for k in (1, 2))
+        self.area = float(np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]).sum() / 2)
+        edges = corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        key = edges.min(axis=1) * len(uv) + edges.max(axis=1)
+        first, count = np.unique(key, return_index=True, return_counts=True)[1:]
+        self.border = edges[first[count == 1]]
+
+    def turned(self, uv: Floats) -> Floats:
+        return np.asarray(uv @ self.turn - self.low)
+
+    def mask(self, scale: float) -> Bools:
+        """The texels that it touches."""
+        uv = self.uv * scale
+        wide, high = np.floor(uv.max(axis=0)).astype(np.int64) + 1
+        out = np.zeros((high, wide), bool)
+        for _, x, y in texels_in(uv[self.corners]):
+            out[np.minimum(y, high - 1), np.minimum(x, wide - 1)] = True
+        begin, along = uv[self.border[:, 0]], uv[self.border[:, 1]] - uv[self.border[:, 0]]
+        steps = np.maximum(np.ceil(2 * np.abs(along).max(axis=1)), 1).astype(np.int64)
+        edge = np.repeat(np.arange(len(steps)), steps)
+        step = np.arange(len(edge)) - np.repeat(np.cumsum(steps) - steps, steps)
+        x, y = (begin[edge] + along[edge] * (step / steps[edge])[:, None]).astype(np.int64).T
+        out[np.minimum(y, high - 1), np.minimum(x, wide - 1)] = True
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Quarter turns, and then the way, of a piece whose image is `size` texels wide and high; of an image of `grid`."""
+
+    quarters: int
+    size: tuple[int, int]
+    x: int
+    y: int
+    grid: int
+
+    def of(self, uv: Floats) -> Floats:
+        wide, high = self.size
+        for _ in range(self.quarters):  # as rot90 turns an image
+            uv = np.stack([uv[:, 1], wide - uv[:, 0]], axis=1)
+            wide, high = high, wide
+        return np.asarray((uv + np.array([self.x, self.y])) / self.grid)
+
+
+@dataclass(frozen=True, eq=False)
+class _Turned:
+    """A piece as an image, and the transforms of it with what is around it, without and with its rim."""
+
+    quarters: int
+    image: Bools
+    room: Floats
+    rim: Floats
+    edge: int
+
+
+def _search(pieces: list[_Piece], padding: float, rng: np.random.Generator) -> tuple[float, list[_Place]]:
+    """Texels per unit, and the places, of the tightest of a few orders."""
+    longest = np.array([piece.size[0] * np.sqrt(piece.area) for piece in pieces])
+    longest = np.round(longest / max(float(longest.max()), 1e-300), 6)
+    scale, found = _first(pieces, padding), None
+    for k in range(_ORDERS):
+        order = np.argsort(-longest * np.exp(rng.normal(0, _SHUFFLED if k else 0.0, len(pieces))), kind="stable")
+        while (places := _placed(pieces, order, scale, padding)) is None and found is None:
+            scale *= _SHRINK**2
+        if places is None:
+            continue
+        while places is not None:
+            fine = _together(pieces, places, scale, padding)
+            if found is None or scale / fine[0].grid > found[0] / found[1][0].grid:
+                found = scale, fine
+            scale /= _SHRINK
+            places = _placed(pieces, order, scale, padding)
+        scale *= _SHRINK
+    assert found is not None
+    return found[0] * _FINE, found[1]
+
+
+def _together(pieces: list[_Piece], places: list[_Place], scale: float, padding: float) -> list[_Place]:
+    """Places in a finer image, which is cut where the pieces end: each piece moved down and to the left by what rounding has
+    left free.
+    """
+    apart, grid = int(np.ceil(padding * _GRID * _FINE)), _GRID * _FINE
+    masks = [piece.mask(scale * _FINE) for piece in pieces]
+    images = [np.rot90(mask, place.quarters) for mask, place in zip(masks, places, strict=True)]
+    at = []
+    for piece, place in zip(pieces, places, strict=True):
+        low = place.of(piece.uv * scale).min(axis=0) * grid
+        at.append(np.floor(low + 1e-6).astype(np.int64)[::-1])
+    taken = np.zeros((grid, grid), bool)
+    for image, (y, x) in zip(images, at, strict=True):
+        taken[y : y + image.shape[0], x : x + image.shape[1]] |= image
+    for turn in range(_MOVES):
+        axis = turn % 2
+        flat = taken if axis == 0 else taken.T
+        for k in sorted(range(len(pieces)), key=lambda k: (int(at[k][axis]), k)):
+            image = images[k] if axis == 0 else images[k].T
+            high, wide = image.shape
+            y, x = int(at[k][axis]), int(at[k][1 - axis])
+            flat[y : y + high, x : x + wide] &= ~image
+            y -= _fall(flat, image, y, x, apart)
+            flat[y : y + high, x : x + wide] |= image
+            at[k][axis] = y
+    end = max(int((corner + image.shape).max()) for corner, image in zip(at, images, strict=True))
+    return [
+        _Place(place.quarters, (mask.shape[1], mask.shape[0]), int(corner[1]), int(corner[0]), end)
+        for place, mask, corner in zip(places, masks, at, strict=True)
+    ]
+
+
+def _fall(taken: Bools, image: Bools, y: int, x: int, apart: int) -> int:
+    """How far an image can move to smaller rows, and stay apart from what is taken."""
+    grown = maximum_filter(np.pad(image, apart), 2 * apart + 1) if apart else image
+    low, left = max(y - apart, 0), max(x - apart, 0)
+    right = min(x + image.shape[1] + apart, taken.shape[1])
+    grown = grown[low - (y - apart) :, left - (x - apart) : right - (x - apart)][: taken.shape[0] - low]
+    rows = np.where(
+        taken[: low + len(grown), left:right], np.arange(1, low + len(grown) + 1, dtype=np.int32)[:, None], 0
+    )
+    below = np.maximum.accumulate(rows, axis=0)  # the row after the last that is taken, up to each
+    row, column = np.nonzero(grown & ~np.pad(grown, ((1, 0), (0, 0)))[:-1])
+    free = (row + low) - below[row + low, column]
+    return max(min(int(free.min()) if len(free) else y, y), 0)
+
+
+def _first(pieces: list[_Piece], padding: float) -> float:
+    area = sum(piece.area for piece in pieces)
+    around = sum(2 * float(piece.size.sum()) for piece in pieces) * padding * _GRID / 2
+    # scale^2 area + scale around = dense grid^2
+    return float((np.sqrt(around**2 + 4 * area * _DENSE * _GRID**2) - around) / (2 * area))
+
+
+def _placed(pieces: list[_Piece], order: Ints, scale: float, padding: float) -> list[_Place] | None:
+    """Places in this order; None if one finds none."""
+    grid, apart = _GRID, int(np.ceil(padding * _GRID))
+    span = next_fast_len(grid + 2 * apart + 2, real=True)
+    taken = np.zeros((span, span), np.float32)
+    places: list[_Place | None] = [None] * len(pieces)
+    for k in order.tolist():
+        mask = pieces[k].mask(scale)
+        if max(mask.shape) > grid:
+            return None
+        known = rfft2(taken)
+        best, found = -np.inf, None
+        for turned in _turns(mask, apart, span):
+            high, wide = turned.image.shape
+            free = irfft2(known * turned.room, (span, span))[: grid - high + 1, : grid - wide + 1] < 0.5
+            if not free.any():
+                continue
+            touched = irfft2(known * turned.rim, (span, span))[: grid - high + 1, : grid - wide + 1]
+            touched[[0, -1]] += wide
+            touched[:, [0, -1]] += high
+            low = (np.arange(grid - high + 1) + high) * (_LOW / grid)
+            score = np.where(free, touched / turned.edge - low[:, None], -np.inf)
+            at = int(np.round(score, 4).argmax())
+            if score.flat[at] > best + _ALIKE:
+                best, found = float(score.flat[at]), (turned, *divmod(at, score.shape[1]))
+        if found is None:
+            return None
+        turned, y, x = found
+        taken[y : y + turned.image.shape[0], x : x + turned.image.shape[1]] += turned.image
+        places[k] = _Place(turned.quarters, (mask.shape[1], mask.shape[0]), x, y, grid)
+    return [place for place in places if place]
+
+
+def _turns(mask: Bools, apart: int, span: int) -> list[_Turned]:
+    out = []
+    for quarters in range(4):
+        image = np.rot90(mask, quarters)
+        grown = maximum_filter(np.pad(image, apart), 2 * apart + 1) if apart else image
+        rim = maximum_filter(np.pad(grown, 1), 3)
+        room, touch = (_transform(each, margin, span) for each, margin in ((grown, apart), (rim, apart + 1)))
+        out.append(_Turned(quarters, image, room, touch, int(rim.sum()) - int(grown.sum())))
+    return out
+
+
+def _transform(image: Bools, margin: int, span: int) -> Floats:
+    """For sums over the image at every place: `margin` of it lies before each."""
+    whole = np.zeros((span, span), np.float32)
+    whole[: image.shape[0], : image.shape[1]] = image
+    return np.asarray(np.conj(rfft2(np.roll(whole, (-margin, -margin), (0, 1)))))
+
+
+def _on_shelves(pieces: list[_Piece], between: float) -> tuple[list[Floats], Floats]:
+    """Where pieces stand in rows, and the size of all, nearly a square."""
+    sizes = np.array([piece.size for piece in pieces]) + between
+    order = np.argsort(-sizes[:, 1], kind="stable")
+    width = max(float(np.sqrt(sizes.prod(axis=1).sum())), float(sizes[:, 0].max()))
+    ends = np.cumsum(sizes[order, 0])
+    at = np.zeros((len(pieces), 2))
+    begin, y, done = 0, 0.0, 0.0
+    while begin < len(order):
+        end = max(int(np.searchsorted(ends, done + width, side="right")), begin + 1)
+        row = order[begin:end]
+        at[row, 0], at[row, 1] = ends[begin:end] - sizes[row, 0] - done, y
+        y += float(sizes[row, 1].max())
+        begin, done = end, float(ends[end - 1])
+    return list(at), np.array([width, max(y, 1e-300)]) - between

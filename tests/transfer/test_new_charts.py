@@ -1,0 +1,105 @@
+"""New charts: they lie flat and apart, hold together, and do not cover themselves."""
+
+import numpy as np
+import pytest
+
+from meshmatch.geometry.triangles import triangle_areas
+from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.chart_regions import chart_regions
+from meshmatch.transfer.flat_layout import laid_flat
+from meshmatch.transfer.new_charts import flat_areas, new_charts
+from meshmatch.transfer.pack_charts import Chart, packed, tightest
+from meshmatch.transfer.texels import faces_on
+from tests.conftest import icosphere
+
+
+def sheet(count: int = 12, bend: float = 1.0) -> Shape:
+    """A square bent about the y axis by an angle."""
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0, 1, count + 1)] * 2, indexing="ij"))
+    angle = bend * (x - 0.5)
+    verts = np.stack([np.sin(angle) / max(bend, 1e-9), y, np.cos(angle) / max(bend, 1e-9)], axis=1)
+    at = np.arange((count + 1) ** 2).reshape(count + 1, -1)
+    a, b, c, d = (each.ravel() for each in (at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]))
+    return Shape(verts, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]))
+
+
+def scaled(shape: Shape) -> np.ndarray:
+    return np.asarray(shape.verts / np.sqrt(shape.face_areas.sum()))
+
+
+@pytest.mark.parametrize("bend", [0.01, 3.0])
+def test_what_can_be_unrolled_is_laid_flat_without_stretch(bend: float) -> None:
+    shape = sheet(bend=bend)
+    laid = laid_flat(shape.verts, shape.faces, 1.5, 128)
+    assert laid is not None and not len(laid.bad)
+    np.testing.assert_allclose(np.linalg.det(np.diff(laid.uv[laid.corners], axis=1)) / 2, shape.face_areas, rtol=0.01)
+
+
+def test_what_cannot_lie_flat_is_told() -> None:
+    ball, two = icosphere(2), sheet(2)
+    assert laid_flat(ball.verts, ball.faces, 1.5, 128) is None
+    assert laid_flat(two.verts, two.faces[[0, 7]], 1.5, 128) is None  # they do not hang together
+    spiral = sheet(40, bend=0.01)
+    whole = laid_flat(spiral.verts, spiral.faces, 1.5, 128)
+    assert whole is not None
+    uv = whole.uv.copy()
+    uv[:, 0] = np.abs(uv[:, 0] - uv[:, 0].mean())  # folded in the middle
+    folded = type(whole).of(uv, whole.corners, whole.seen, 512)
+    assert len(folded.bad) > spiral.F / 3
+
+
+def test_a_smooth_surface_needs_few_charts(torus: Shape) -> None:
+    charts = chart_regions(scaled(torus), torus.faces, np.arange(torus.F))
+    assert 2 <= len(charts) <= 24
+    members = np.concatenate([chart.members for chart in charts])
+    np.testing.assert_array_equal(np.sort(members), np.arange(torus.F))
+    areas = triangle_areas(scaled(torus), torus.faces)
+    for chart in charts:
+        laid = chart.uv[chart.corners]
+        assert (np.linalg.det(np.diff(laid, axis=1)) > 0).all()
+        assert flat_areas(laid).sum() == pytest.approx(areas[chart.members].sum(), rel=1e-6)
+
+
+def test_charts_fill_the_image(torus: Shape) -> None:
+    uv = new_charts(scaled(torus), torus.faces, 1024, 4)
+    assert flat_areas(uv).sum() > 0.55
+    assert faces_on(uv * 2048, 2048)[1] == 0
+
+
+def test_loose_triangles_end_soon() -> None:
+    """Each is a chart of its own, and all of them have room."""
+    rng = np.random.default_rng(0)
+    verts = (rng.random((3000, 1, 3)) + 0.01 * rng.normal(size=(3000, 3, 3))).reshape(-1, 3)
+    faces = np.arange(9000).reshape(-1, 3)
+    uv = new_charts(scaled(Shape(verts, faces)), faces, 1024, 8)
+    assert uv.min() >= 0 and uv.max() <= 1
+    assert (flat_areas(uv) > 0).all()
+    assert faces_on(uv * 4096, 4096)[1] == 0
+
+
+def test_packed_rectangles_are_apart() -> None:
+    rng = np.random.default_rng(1)
+    corners = np.array([[0, 1, 2], [0, 2, 3]])
+    charts = [
+        Chart(np.array([2 * k, 2 * k + 1]), np.array([[0, 0], [w, 0], [w, h], [0, h]]), corners)
+        for k, (w, h) in enumerate(rng.uniform(0.2, 1.0, (12, 2)))
+    ]
+    places = packed(charts, 8 / 512)
+    low, high = (np.array([getattr(each, end)(axis=0) for each in places]) * 512 for end in ("min", "max"))
+    for one in range(12):
+        for two in range(one):
+            gap = np.maximum(low[one] - high[two], low[two] - high[one]).max()
+            assert gap >= 8
+    scales = [
+        np.ptp(each, axis=0).prod() / np.ptp(chart.uv, axis=0).prod()
+        for each, chart in zip(places, charts, strict=True)
+    ]
+    np.testing.assert_allclose(scales, scales[0], rtol=1e-6)  # of one density
+    assert sum(np.ptp(each, axis=0).prod() for each in places) > 0.6
+
+
+def test_the_smallest_rectangle() -> None:
+    angle = 0.3
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    found, area = tightest(np.array([[0, 0], [3, 0], [3, 1], [0, 1], [1, 0.5]]) @ turn)
+    assert found == pytest.approx(angle) and area == pytest.approx(3.0)
