@@ -45,9 +45,16 @@ _KNOWN_WEIGHT = 0.05  # of each known pair; all other pairs together have about 
 _NEAR = 3  # vertices of the coarse mesh by which one of the fine mesh moves
 
 
-def _pairs(steps: int, prior: tuple[float, float], scale: tuple[float, float], back: int) -> NodeRefineConfig:
-    schedule = Schedule(steps=steps, prior=prior, scale=scale, damping=1e-6)
-    return NodeRefineConfig(schedule=schedule, point_share=0.1, back_points=back)
+def _pairs(
+    steps: int,
+    prior: tuple[float, float],
+    scale: tuple[float, float],
+    back: int,
+    along: float = 0.1,
+    momentum: float = 0.0,
+) -> NodeRefineConfig:
+    schedule = Schedule(steps=steps, prior=prior, scale=scale, damping=1e-6, momentum=momentum)
+    return NodeRefineConfig(schedule=schedule, point_share=along, back_points=back)
 
 
 _COARSE_NODES = SurfaceNodes(K=120, radius=0.2, gradient_points=400)
@@ -65,8 +72,10 @@ class DirectConfig:
     coarse_nodes, fine_nodes : nodes of both meshes
     first, second, third, last : least squares of all proposals, of the better ones, of the best on the fine mesh, of which
         the energies decide, and of the one that is taken, which may stretch more
-    better, best, returned : how many proposals are fitted a second, and a third time, and how many of each direction are
-        continued in the other one
+    along : least squares that go on from the third of those with the lowest energies, and are kept where they lower it:
+        samples hold vertices across the surface only, so that a limb glides along itself until its end is at an end
+    better, best, gliding, returned : how many proposals are fitted a second, and a third time, and glide, and how many of
+        each direction are continued in the other one
     unlike : share of vertices by which these differ at least
     both_ways : when the target is fitted to the source as well; "in doubt" is where the one way is not good
     from_source : whether the source is to be the template both ways too, and not the one that fits the other better
@@ -82,10 +91,12 @@ class DirectConfig:
     fine_nodes: SurfaceNodes = _FINE_NODES
     first: NodeRefineConfig = field(default_factory=lambda: _pairs(4, (3e-3, 1e-3), (0.12, 0.07), 1200))
     second: NodeRefineConfig = field(default_factory=lambda: _pairs(8, (1e-3, 1e-4), (0.1, 0.03), 1500))
-    third: NodeRefineConfig = field(default_factory=lambda: _pairs(8, (3e-4, 1e-4), (0.06, 0.02), 4000))
+    third: NodeRefineConfig = field(default_factory=lambda: _pairs(8, (3e-4, 1e-4), (0.06, 0.02), 4000, 0.1, 0.6))
+    along: NodeRefineConfig = field(default_factory=lambda: _pairs(24, (3e-4, 1e-4), (0.06, 0.02), 4000, 0.02, 0.8))
     last: NodeRefineConfig = field(default_factory=lambda: _pairs(6, (1e-4, 3e-5), (0.03, 0.02), 4000))
     better: int = 16
     best: int = 6
+    gliding: int = 2
     returned: int = 3
     unlike: float = 0.03
     both_ways: BothWays = "in doubt"
@@ -221,14 +232,19 @@ def finished(
     """The fine mesh of one shape fitted to another from where its vertices (V, 3) may belong, for each proposal."""
     fine, samples, near, config = own.fine, onto.samples, onto.neighbours, own.config
 
-    def fit(proposal: Proposal, goals: Float[Floats, "V 3"]) -> Tried:
-        vectors = fine.refined(samples, fine.system.vectors_to(goals), config.third)
+    def fit(proposal: Proposal, vectors: Float[Floats, "K 3"], how: NodeRefineConfig) -> Tried:
+        vectors = fine.refined(samples, vectors, how)
         return Tried(
             proposal, vectors, fine.system.moved(vectors), fine.features(onto.fine_mesh, samples, vectors, near)
         )
 
     report(0.0)
-    found = parallel_map(fit, [proposal for proposal, _ in begun], [goals for _, goals in begun])
+    found = parallel_map(lambda each: fit(each[0], fine.system.vectors_to(each[1]), config.third), begun)
+    report(0.6)
+    best = sorted(range(len(found)), key=lambda k: found[k].energy)[: config.gliding]
+    glided = parallel_map(lambda k: fit(found[k].proposal, found[k].vectors, config.along), best)
+    for k, each in zip(best, glided, strict=True):
+        found[k] = min(found[k], each, key=lambda tried: tried.energy)
     report(1.0)
     return found
 
