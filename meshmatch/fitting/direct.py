@@ -71,8 +71,8 @@ class DirectMatch:
     ``system`` moves the template by node vectors: where that is the source, the same for every shape that one source is
     registered to. ``tried`` are what the fits that were compared in the end began from, and their energies, best first;
     ``leads`` how much higher the energies of those are that differ from the best one, and ``over_guess`` that of the
-    guess, if there was one: 0 where it is much the same map. ``both_ways`` says that the energies are means of both
-    directions.
+    guess, if there was one: 0 where it is much the same map. Where the energies are means of both directions, ``one_way`` is
+    what the first of them alone would have given.
     """
 
     source: Fit
@@ -81,7 +81,7 @@ class DirectMatch:
     system: NodeSystem
     leads: tuple[float, ...] = ()
     over_guess: float = np.inf
-    both_ways: bool = False
+    one_way: DirectMatch | None = None
 
     @property
     def energy(self) -> float:
@@ -158,10 +158,18 @@ def match_either_side(
     to_image = image.one_way(report.stage("", 0.3, 0.6))
     if to_image[0].energy > MIRRORED_SHARE * there[0].energy:
         return search.matched(there, report, began)
-    found = image.matched(to_image, report, began)
+    return _of_mirror_image(image.matched(to_image, report, began), target)
+
+
+def _of_mirror_image(found: DirectMatch, target: Shape) -> DirectMatch:
+    """A match to the mirror image of a target as one to the target: its fit says that it is mirrored."""
     frame = MIRROR.compose(found.target.frame)
     up, front = (axis_name(frame.rotation[row]) for row in (1, 2))
-    return replace(found, target=replace(found.target, frame=frame, verts=target.verts, up=up, front=front))
+    return replace(
+        found,
+        target=replace(found.target, frame=frame, verts=target.verts, up=up, front=front),
+        one_way=found.one_way and _of_mirror_image(found.one_way, target),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,25 +222,35 @@ class _Search:
 
     def matched(self, there: list[Tried], report: Progress, began: float) -> DirectMatch:
         """The best of the fits as a match; both ways, if one way leaves doubt."""
-        config = self.source.config
-        found: Sequence[Tried | _BothWays] = there
-        leads = _leads(found, config.unlike)
-        judged, backwards = judge_direct(found[0].energy, leads), False
-        chosen = there[0]
-        if config.both_ways == "always" or (config.both_ways == "in doubt" and judged[0] != "good"):
-            found = both = self.both_ways(there, report.stage("", 0.6, 0.95))
-            leads = _leads(found, _SAME)
-            judged = judge_direct(found[0].energy, leads, DIRECT_BOTH_WAYS)
-            backwards = not config.from_source and both[0].back.energy < both[0].there.energy
-            chosen = both[0].back if backwards else both[0].there
-        own, other = (self.target, self.source) if backwards else (self.source, self.target)
-        vectors = own.fine.refined(other.samples, chosen.vectors, config.last, own.fine.viscous)
-        fits = _fits(own, other, vectors, chosen.features.residual, judged)
+        config, source, target = self.source.config, self.source, self.target
+        leads = _leads(there, config.unlike)
+        found = self._match(source, target, there[0], there, leads, judge_direct(there[0].energy, leads))
+        if config.both_ways == "always" or (config.both_ways == "in doubt" and found.verdict != "good"):
+            both = self.both_ways(there, report.stage("", 0.6, 0.95))
+            leads, best = _leads(both, _SAME), both[0]
+            judged = judge_direct(best.energy, leads, DIRECT_BOTH_WAYS)
+            backwards = not config.from_source and best.back.energy < best.there.energy
+            own, other, chosen = (target, source, best.back) if backwards else (source, target, best.there)
+            found = replace(self._match(own, other, chosen, both, leads, judged), one_way=found)
         report.stage("matching without a model")(1.0)
-        seconds = time.monotonic() - began
-        first, second = (replace(fit, seconds=seconds) for fit in (fits[::-1] if backwards else fits))
+        fits = (replace(fit, seconds=time.monotonic() - began) for fit in (found.source, found.target))
+        return replace(found, **dict(zip(("source", "target"), fits, strict=True)))
+
+    def _match(
+        self,
+        own: Side,
+        other: Side,
+        chosen: Tried,
+        found: Sequence[Tried | _BothWays],
+        leads: tuple[float, ...],
+        judged: tuple[Verdict, float, tuple[Reason, ...]],
+    ) -> DirectMatch:
+        """The chosen fit, of one side to the other, refined to the end, beside those that were ``found``."""
+        vectors = own.fine.refined(other.samples, chosen.vectors, own.config.last, own.fine.viscous)
+        fits = _fits(own, other, vectors, chosen.features.residual, judged)
+        source, target = fits if own is self.source else fits[::-1]
         tried = tuple((each.proposal.kind, each.energy) for each in found)
-        return DirectMatch(first, second, tried, own.fine.system, leads, self._over_guess(found), found is not there)
+        return DirectMatch(source, target, tried, own.fine.system, leads, self._over_guess(found))
 
     def _over_guess(self, found: Sequence[Tried | _BothWays]) -> float:
         """How much lower the energy of the best fit is than that of the guess."""

@@ -4,7 +4,8 @@ Every ordered pair of six shapes of each class. The error is the mean distance a
 keypoints of the source arrive and the target's own, in units of sqrt(area), times 100: the best of the symmetries that the
 class has. Those are in its ``symmetry.txt``; where there is none, as of chairs, they are the turns and reflections of
 its keypoints that most of its shapes have, and those that either shape of the pair has: a round table may be turned by
-a leg.
+a leg. Of table 141 the points of two legs are exchanged against those of its top, unlike those of all other tables: they
+are put back, and a last row says what the mean is as they are marked.
 
 Bearings, cups and mechanical parts can turn in themselves, so that only their verdicts count.
 """
@@ -31,12 +32,16 @@ from meshmatch.api.inputs import usable
 from meshmatch.api.matcher import Matcher
 from meshmatch.api.results import map_of_fits
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.errors import InputError
 from meshmatch.experiments import runner
-from meshmatch.fitting.direct import match_either_side
+from meshmatch.experiments.bench.baselines import METHODS, Choices
+from meshmatch.experiments.bench.methods import Method
+from meshmatch.fitting.direct import DirectMatch, match_either_side
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.calibration import DirectCalibration
 from meshmatch.fitting.judge.direct import judge_direct
-from meshmatch.fitting.one_way import BothWays, DirectConfig
+from meshmatch.fitting.one_way import DirectConfig
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.shapes.files import load_shape
 from meshmatch.templates.make import edge_graph
@@ -50,6 +55,8 @@ SHAPES = 6  # of each class
 OFF = 10.0
 # Of the keypoints' spread: how far a symmetry may miss them, at most and on average; one of most shapes, and one of a shape.
 _ALIKE, _EXACTLY = (0.4, 0.2), (0.25, 0.08)
+# Points that a shape has in another order than its class; of each point which one it is.
+_PUT_BACK = {("table", "141"): {6: 10, 7: 11, 10: 6, 11: 7}}
 _COLUMNS = {"class": "class", "pairs": "pairs:d", "mean": "mean:.1f", "median": "median:.1f", "under 10": "under:.0%"}
 _COLUMNS |= {
     "good": "good:d",
@@ -58,6 +65,8 @@ _COLUMNS |= {
     "error": "worst_error:.1f",
     "CPU s": "cpu:.1f",
 }
+_BESIDE = {"method": "method", "pairs": "pairs:d", "failed": "failed:d", "mean": "mean:.1f", "median": "median:.1f"}
+_BESIDE |= {"under 10": "under:.0%", "CPU s": "cpu:.1f"}
 _HELD_OUT = {"maps": "maps", "pairs": "pairs:d", "under 10": "right:d", "good": "good:d", "good over 10": "good_over:d"}
 _HELD_OUT |= {"under 10, good or fair": "right_not_poor:d"}
 
@@ -73,24 +82,27 @@ def shapes_of(folder: Path) -> list[str]:
 
 
 @cache
-def keypoints_of(folder: Path, shape: str) -> Int[Ints, " N"]:
-    return np.asarray(np.load(folder / f"{shape}.keypoints.npy", allow_pickle=False).astype(np.int64))
+def keypoints_of(folder: Path, shape: str, as_marked: bool = False) -> Int[Ints, " N"]:
+    """The vertices of the keypoints, in the order of the class, or as the file has them."""
+    found = np.load(folder / f"{shape}.keypoints.npy", allow_pickle=False).astype(np.int64)
+    moved = {} if as_marked else _PUT_BACK.get((folder.name, shape), {})
+    return np.array([found[moved.get(k, k)] for k in range(len(found))])
 
 
 @cache
-def distances(folder: Path, shape: str) -> Float[Floats, "N V"]:
+def distances(folder: Path, shape: str, as_marked: bool = False) -> Float[Floats, "N V"]:
     """From each keypoint to all vertices, along edges, in units of sqrt(area)."""
-    mesh = load_shape(folder / f"{shape}.ply")
-    found = dijkstra(edge_graph(mesh), directed=False, indices=keypoints_of(folder, shape)) / np.sqrt(mesh.area)
+    mesh, points = load_shape(folder / f"{shape}.ply"), keypoints_of(folder, shape, as_marked)
+    found = dijkstra(edge_graph(mesh), directed=False, indices=points) / np.sqrt(mesh.area)
     return np.asarray(np.where(np.isfinite(found), found, found[np.isfinite(found)].max()))
 
 
-def symmetries(folder: Path, *shapes: str) -> list[Int[Ints, " N"]]:
+def symmetries(folder: Path, *shapes: str, as_marked: bool = False) -> list[Int[Ints, " N"]]:
     """Permutations of the keypoints that a class allows, or one of these shapes, the identity first."""
     plain = np.arange(len(keypoints_of(folder, shapes_of(folder)[0])))
     if not (folder / "symmetry.txt").exists():
-        own = [each for shape in shapes for each in _of_positions(folder, shape, _EXACTLY)]
-        found = dict.fromkeys([tuple(plain.tolist()), *_of_most(folder), *own])
+        own = [each for shape in shapes for each in _of_positions(folder, shape, _EXACTLY, as_marked)]
+        found = dict.fromkeys([tuple(plain.tolist()), *_of_most(folder, as_marked), *own])
         return [np.array(each) for each in found]
     lines = (folder / "symmetry.txt").read_text().splitlines()
     orbits = [np.array(line.split(), np.int64) for line in lines if line.strip()]
@@ -114,10 +126,10 @@ Symmetry = tuple[int, ...]
 
 
 @cache
-def _of_positions(folder: Path, shape: str, most: tuple[float, float]) -> frozenset[Symmetry]:
+def _of_positions(folder: Path, shape: str, most: tuple[float, float], as_marked: bool) -> frozenset[Symmetry]:
     """Turns and reflections in the axes of a shape's file that bring keypoints onto keypoints."""
     octahedral = Rotation.create_group("O").as_matrix()
-    points = load_shape(folder / f"{shape}.ply").verts[keypoints_of(folder, shape)]
+    points = load_shape(folder / f"{shape}.ply").verts[keypoints_of(folder, shape, as_marked)]
     points = points - points.mean(0)
     points /= np.sqrt(np.square(points).sum(1).mean())
     found = set()
@@ -130,42 +142,62 @@ def _of_positions(folder: Path, shape: str, most: tuple[float, float]) -> frozen
     return frozenset(found)
 
 
-def _of_most(folder: Path) -> list[Symmetry]:
+def _of_most(folder: Path, as_marked: bool) -> list[Symmetry]:
     """The turns and reflections that half of the shapes have."""
     names = shapes_of(folder)
-    votes = Counter(each for name in names for each in sorted(_of_positions(folder, name, _ALIKE)))
+    votes = Counter(each for name in names for each in sorted(_of_positions(folder, name, _ALIKE, as_marked)))
     return [each for each, count in votes.items() if 2 * count >= len(names)]
 
 
-def error_of(folder: Path, pair: tuple[str, str], vertices: Int[Ints, " N"]) -> float:
-    """Mean distance of where keypoints arrive from where they belong, times 100; the best of the symmetries."""
-    known = distances(folder, pair[1])
-    return min(float(100 * known[each, vertices].mean()) for each in symmetries(folder, *pair))
+def error_of(folder: Path, pair: tuple[str, str], index: Int[Ints, " V"], as_marked: bool = False) -> float:
+    """Mean distance of where a map takes keypoints from where they belong, times 100; the best of the symmetries."""
+    known, arrived = distances(folder, pair[1], as_marked), index[keypoints_of(folder, pair[0], as_marked)]
+    return min(float(100 * known[each, arrived].mean()) for each in symmetries(folder, *pair, as_marked=as_marked))
 
 
-def measure(folder: Path, pair: tuple[str, str], model: str, seed: int, ways: BothWays = "in doubt") -> dict[str, Any]:
-    """Error, verdict and cost of one pair; ``ways`` of matches without a model."""
+def errors_of(folder: Path, pair: tuple[str, str], index: Int[Ints, " V"]) -> dict[str, float]:
+    """The error, and that of the points as they are marked."""
+    return {"error": error_of(folder, pair, index), "as_marked": error_of(folder, pair, index, as_marked=True)}
+
+
+def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[str, Any]:
+    """Error, verdict and cost of one pair; without a model and where both ways were tried, also what one gives alone."""
     source, target = (load_shape(folder / f"{name}.ply") for name in pair)
-    began, evidence = time.process_time(), {}
-    if model == NO_MODEL:
-        clean = usable(source), usable(target)
-        found = match_either_side(clean[0].shape, clean[1].shape, DirectConfig(seed=seed, both_ways=ways))
-        fits = replace(found.source, repaired=clean[0]), replace(found.target, repaired=clean[1])
-        mapped = map_of_fits(fits, fits, 1)
-        evidence = {"energy": found.energy, "leads": found.leads, "both_ways": found.both_ways}
-    else:
+    began = time.process_time()
+    if model != NO_MODEL:
         mapped = Matcher(model, FitConfig(seed=seed), threads=1).match(source, target).map
-    spent = time.process_time() - began
-    arrived = mapped.index[keypoints_of(folder, pair[0])]
+        return _row(folder, pair, mapped) | {"cpu": time.process_time() - began}
+    clean = usable(source), usable(target)
+
+    def row(found: DirectMatch) -> dict[str, Any]:
+        fits = replace(found.source, repaired=clean[0]), replace(found.target, repaired=clean[1])
+        return _row(folder, pair, map_of_fits(fits, fits, 1)) | {"energy": found.energy, "leads": found.leads}
+
+    found = match_either_side(clean[0].shape, clean[1].shape, DirectConfig(seed=seed))
+    best = row(found) | {"cpu": time.process_time() - began}
+    return best | {"one_way": found.one_way and row(found.one_way)}
+
+
+def _row(folder: Path, pair: tuple[str, str], mapped: VertexMap) -> dict[str, Any]:
     return {
         "pair": " to ".join(pair),
-        "error": error_of(folder, pair, arrived),
+        **errors_of(folder, pair, mapped.index),
         "verdict": mapped.verdict,
         "confidence": float(mapped.confidence.mean()),
         "ambiguous": any("ambiguous" in reason for reason in mapped.reasons),
-        "cpu": spent,
-        **evidence,
     }
+
+
+def measure_by(method: Method, folder: Path, pair: tuple[str, str]) -> dict[str, Any]:
+    """Error and cost of another method on one pair; where it fails, of the map of everything to the first vertex."""
+    source, target = (load_shape(folder / f"{name}.ply") for name in pair)
+    began, failed = time.process_time(), False
+    try:
+        index = method.map(source, method.fit(source), target, method.fit(target)).index
+    except InputError:
+        index, failed = np.zeros(source.V, np.int64), True
+    spent = time.process_time() - began
+    return {"pair": " to ".join(pair), **errors_of(folder, pair, index), "failed": failed, "cpu": spent}
 
 
 _Found = Mapping[str, Sequence[dict[str, Any]]]  # pairs of each class
@@ -209,6 +241,11 @@ def held_out(found: _Found) -> dict[str, Any]:
     return counts
 
 
+def _summary(errors: Float[Floats, " N"]) -> dict[str, Any]:
+    mean, median, under = float(errors.mean()), float(np.median(errors)), float((errors < OFF).mean())
+    return {"pairs": len(errors), "mean": mean, "median": median, "under": under}
+
+
 def row_of(name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The row of a class."""
     errors = np.array([each["error"] for each in found])
@@ -216,10 +253,7 @@ def row_of(name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     worst = int(errors.argmax())
     return {
         "class": name,
-        "pairs": len(found),
-        "mean": float(errors.mean()),
-        "median": float(np.median(errors)),
-        "under": float((errors < OFF).mean()),
+        **_summary(errors),
         "good": int(good.sum()),
         "good_over": int((good & (errors > OFF)).sum()),
         "worst": found[worst]["pair"],
@@ -228,9 +262,10 @@ def row_of(name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _with_calibrations(report: runner.Report, found: _Found, one_way: _Found) -> runner.Report:
+def _with_calibrations(report: runner.Report, found: _Found) -> runner.Report:
     """The weights of both verdicts, and how they do on classes that did not give them."""
-    doubtful = {name: [row for row in some if row["both_ways"]] for name, some in found.items()}
+    doubtful = {name: [row for row in some if row["one_way"]] for name, some in found.items()}
+    one_way = {name: [row["one_way"] or row for row in some] for name, some in found.items()}
     fits = {"one way": one_way, "both ways, where one way leaves doubt": doubtful}
     rows = [{"maps": which, **held_out(each)} for which, each in fits.items()]
     table = runner.table("Verdicts by weights that other classes gave", rows, _HELD_OUT)
@@ -238,7 +273,7 @@ def _with_calibrations(report: runner.Report, found: _Found, one_way: _Found) ->
         report,
         record={**report.record, "held out": rows},
         tables=[*report.tables, table],
-        notes=[f"{which}: {fitted_calibration(_all(each))}" for which, each in fits.items()],
+        notes=[*report.notes, *(f"{which}: {fitted_calibration(_all(each))}" for which, each in fits.items())],
     )
 
 
@@ -251,26 +286,60 @@ def main(
     data: runner.Data = runner.DATA,
     work: runner.Work = None,
     fit: Annotated[bool, Option("--fit", help="also find the weights of verdicts")] = False,
+    beside: Annotated[str, Option(help="methods of `bench.baselines` to measure too, with commas between them")] = "",
+    limit_beside: Annotated[int, Option(min=1, help="pairs of each class that they are measured on")] = 12,
 ) -> runner.Report:
     names = CLASSES if classes == "all" else runner.names_of(classes, (*CLASSES, *TURNING), "class")
     found: dict[str, list[dict[str, Any]]] = {}
-    one_way: dict[str, list[dict[str, Any]]] = {}
     asked = {"model": model, "seed": seed}
     for name in names:
         folder = folder_of(name, data)
         pairs = runner.spread(list(permutations(shapes_of(folder), 2)), limit_pairs)
-        found[name], one_way[name] = [], []
+        found[name] = []
         for pair in runner.track(pairs, name):
-            called = f"{name}-{'-'.join(pair)}"
-            row = runner.at_work(work, called, asked, partial(measure, folder, pair, model, seed))
+            row = runner.at_work(work, f"{name}-{'-'.join(pair)}", asked, partial(measure, folder, pair, model, seed))
             found[name].append(row)
-            if fit and row["both_ways"]:
-                call = partial(measure, folder, pair, model, seed, "no")
-                row = runner.at_work(work, f"{called}-one-way", asked | {"ways": "no"}, call)
-            one_way[name].append(row)
     everything = _all(found)
     rows = [*(row_of(name, some) for name, some in found.items()), row_of("all", everything)]
-    report = runner.Report(
-        {"rows": rows, "pairs": everything}, [runner.table("Keypoints, x100 of sqrt(area)", rows, _COLUMNS)]
-    )
-    return _with_calibrations(report, found, one_way) if fit else report
+    if any(each["error"] != each["as_marked"] for each in everything):
+        marked = [{**each, "error": each["as_marked"]} for each in everything]
+        rows.append(row_of("all, as marked", marked))
+    tables = [runner.table("Keypoints, x100 of sqrt(area)", rows, _COLUMNS)]
+    record: dict[str, Any] = {"rows": rows, "pairs": everything}
+    notes = list[str]()
+    if beside:
+        record["beside"], notes = _beside(found, beside, limit_beside, data, work, seed)
+        tables.append(
+            runner.table(f"Beside other methods, {limit_beside} pairs of each class", record["beside"], _BESIDE)
+        )
+    report = runner.Report(record, tables, notes)
+    return _with_calibrations(report, found) if fit else report
+
+
+def _beside(
+    found: _Found, methods: str, limit: int, data: Path, work: Path | None, seed: int
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """A row for each of some other methods on some pairs of each class, and for this one; and which could not run."""
+    some = {name: runner.spread(rows, limit) for name, rows in found.items()}
+    rows, missing = [{"method": "ours", "failed": 0, **_beside_row(_all(some))}], []
+    for name in runner.names_of(methods, METHODS, "method"):
+        (baseline,) = METHODS[name](Choices(seed=seed))
+        if baseline.method is None:
+            missing.append(f"skipped: {baseline.label}: {baseline.missing}")
+            continue
+        measured = []
+        for kind, own in some.items():
+            folder = folder_of(kind, data)
+            for pair in runner.track([row["pair"] for row in own], f"{name}, {kind}"):
+                first, _, second = pair.partition(" to ")
+                call = partial(measure_by, baseline.method, folder, (first, second))
+                asked = {"method": name, "seed": seed}
+                measured.append(runner.at_work(work, f"{kind}-{first}-{second}-{name}", asked, call))
+        failed = sum(row["failed"] for row in measured)
+        rows.append({"method": baseline.label, "failed": failed, **_beside_row(measured)})
+    return rows, missing
+
+
+def _beside_row(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    cpu = float(np.mean([row["cpu"] for row in rows]))
+    return {**_summary(np.array([row["error"] for row in rows])), "cpu": cpu}
