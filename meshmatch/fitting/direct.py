@@ -38,8 +38,9 @@ from meshmatch.threads import parallel_map
 # same.
 _SAME = 0.1
 # How much nearer a mirror image must lie, after rigid motions, to be tried (0.2 to 0.3 of femurs, up to 0.12 of creatures in
-# other poses), and what share of the energy its fit may have at most (see `meshmatch.fitting.without_model`).
-_MAYBE_MIRRORED, MIRRORED_SHARE = 0.15, 0.85
+# other poses), or to be tried where the relief is as little alike as of a palm and the back of a hand (0.6; 0.8 of two hands
+# of one side); and what share of the energy its fit may have at most: 0.82 to 0.86 of hands, 1 of symmetric shapes.
+_MIRRORED, _MAYBE_MIRRORED, _UNLIKE, _SHARE = 0.15, 0.03, 0.7, 0.9
 MIRROR = Frame(1.0, np.diag([-1.0, 1.0, 1.0]), np.zeros(3))
 _NORMALS = 0.1  # of unit normals beside positions, where vertices look for what was moved near them
 
@@ -148,15 +149,16 @@ def match_either_side(
     """As `match_directly`, with the mirror image of the target where that may be meant, and fits clearly better: a left bone
     onto a right one. The second fit then says that it is mirrored."""
     config = config or DirectConfig()
-    if nearer_mirrored(source, target, config.seed) < _MAYBE_MIRRORED:
-        return match_directly(source, target, config, known, progress, guess)
     began, report = time.monotonic(), Progress(progress, source.name)
     search = _Search.of(source, target, config, known, guess)
     there = search.one_way(report.stage("", 0.0, 0.3))
+    nearer = nearer_mirrored(source, target, config.seed)
+    if nearer < (_MAYBE_MIRRORED if there[0].features.likeness < _UNLIKE else _MIRRORED):
+        return search.matched(there, report, began)
     known, guess = (pairs and (pairs[0], MIRROR.apply(pairs[1])) for pairs in (known, guess))
     image = _Search.of(source, mirrored(target), config, known, guess)
     to_image = image.one_way(report.stage("", 0.3, 0.6))
-    if to_image[0].energy > MIRRORED_SHARE * there[0].energy:
+    if to_image[0].energy > _SHARE * there[0].energy:
         return search.matched(there, report, began)
     return _of_mirror_image(image.matched(to_image, report, began), target)
 

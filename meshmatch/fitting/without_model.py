@@ -19,7 +19,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.derived import derived
 from meshmatch.errors import InputError
 from meshmatch.fields.shape_functions import build_field
-from meshmatch.fitting.direct import MIRROR, MIRRORED_SHARE, match_directly
+from meshmatch.fitting.direct import MIRROR, match_directly
 from meshmatch.fitting.fit import Fit, judged_fit
 from meshmatch.fitting.fit_config import Schedule
 from meshmatch.fitting.fitter import cap_verdict
@@ -56,7 +56,7 @@ _NEAR, _STRETCH = 0.045, 0.7
 # a pose that was searched must have so much less than the shape as it is: 0.73 of it for an ant in another pose, 0.95 for
 # one whose legs were exchanged; and so must one that stands otherwise than the axes of the files say, or is mirrored:
 # 0.66 of mirrored femurs, 0.97 of ants, 0.88 of eggs that were turned wrongly.
-_SEARCHED, _TURNED = 0.9, MIRRORED_SHARE
+_SEARCHED, _TURNED = 0.9, 0.85
 _AS_IT_STANDS = np.radians(40)  # a smaller turn is none: the axes of two files may be meant to be the same
 _SHRUNK = 0.93  # area of a mean of shapes that are posed, against theirs: 0.997 of femurs, 0.87 of ants
 _PART = 0.85  # so much of a whole's energy a part must have; 0.3 of a cut femur
