@@ -77,7 +77,7 @@ def test_a_map_of_a_model_that_is_not_good_gives_way_to_a_better_one(
     direct_verdict: Any, over_guess: float, taken: bool, found: Any, shapes: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     target = replace(found.target, verdict=direct_verdict)
-    monkeypatch.setattr(direct, "match_directly", lambda *_: replace(found, target=target, over_guess=over_guess))
+    monkeypatch.setattr(direct, "match_either_side", lambda *_: replace(found, target=target, over_guess=over_guess))
     clean, configs = [usable(shape) for shape in shapes], [meshmatch.FitConfig()] * 2
     by_model: Any = SimpleNamespace(source_fit=replace(found.source, model="human"), target_fit=found.target)
     result = match_without_model(clean, configs, None, 1, None, guess=by_model)

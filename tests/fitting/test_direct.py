@@ -12,12 +12,19 @@ from scipy.spatial.transform import Rotation
 from meshmatch.fitting.direct import match_directly, match_either_side
 from meshmatch.fitting.fit import axis_name
 from meshmatch.fitting.judge.direct import DirectFeatures, judge_direct
-from meshmatch.fitting.one_way import DirectConfig
+from meshmatch.fitting.one_way import DirectConfig, Side, finished
 from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh, shortest_tour
-from meshmatch.fitting.search.proposals import Assignments, extremity_proposals, rigid_proposals, spectral_proposals
+from meshmatch.fitting.search.proposals import (
+    Assignments,
+    Proposal,
+    extremity_proposals,
+    rigid_proposals,
+    spectral_proposals,
+)
 from meshmatch.fitting.solve.driver import minimise
 from meshmatch.fitting.solve.surface_nodes import SurfaceNodes
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.progress import Progress
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.sides import mirrored, nearer_mirrored
@@ -231,13 +238,18 @@ def test_a_bent_turned_and_scaled_shape_is_found(pair: tuple[Shape, Shape]) -> N
     assert np.array_equal(again.target.points, found.target.points)
 
 
-def test_a_mirror_image_is_found_where_it_fits_clearly_better() -> None:
+def curled() -> Shape:
+    """An egg bent and curled as no mirror image of it is."""
     ball = trimesh.creation.icosphere(subdivisions=4)
-    x, y, z = (np.asarray(ball.vertices) * [0.5, 1.3, 0.35]).T  # bent and curled, as no mirror image of it is
+    x, y, z = (np.asarray(ball.vertices) * [0.5, 1.3, 0.35]).T
     curl = np.stack([x + 0.5 * y**2, y + 0.2 * x, z + 0.5 * y**3 + 0.4 * x * y], 1)
-    source = Shape(curl, np.asarray(ball.faces), "curl")
+    return Shape(curl, np.asarray(ball.faces), "curl")
+
+
+def test_a_mirror_image_is_found_where_it_fits_clearly_better() -> None:
+    source = curled()
     turn = Rotation.from_euler("xyz", (70, 130, -40), degrees=True)
-    plain = Shape(turn.apply(curl), source.faces, "turned")
+    plain = Shape(turn.apply(np.array(source.verts)), source.faces, "turned")
     target = mirrored(plain)
     assert nearer_mirrored(source, plain, 0) < 0 < 0.5 < nearer_mirrored(source, target, 0)
     finer = replace(QUICK, fine=5000, samples=8000, better=4, best=2)
@@ -303,3 +315,33 @@ def test_one_correspondence_is_found_from_either_side() -> None:
     backwards = (first, second) if np.any(there.source.vectors) else (second, first)
     kept = match_directly(*backwards, replace(quick, from_source=True))
     assert not np.any(kept.source.vectors) and np.any(kept.target.vectors)
+
+
+def test_a_limb_glides_along_itself_until_its_end_is_at_the_end() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    way = np.asarray(ball.vertices)
+    rod = np.clip((way[:, 0] - 0.5) / 0.5, 0, 1)  # a ball with one long limb
+    shape = frame_applied(Shape(way * [1, 1, 1] + rod[:, None] * [3.0, 0, 0], np.asarray(ball.faces), "club"))
+
+    def error(gliding: int) -> float:
+        config = replace(QUICK, fine=2400, samples=4000, gliding=gliding)
+        frame, thin = sqrt_area_frame(shape), ThinMesh.of(shape, config.coarse)
+        side = Side(shape, frame, shape, thin, None, config)
+        verts = side.fine_mesh.verts
+        along = np.clip((verts[:, 0] - 0.1) / np.ptp(shape.verts[:, 0]), 0, 1)
+        short = verts - 0.15 * np.sqrt(along)[:, None] * [1, 0, 0]
+        (found,) = finished(side, side, [(Proposal("guess", short), short)], Progress(None, "club"))
+        return float(np.linalg.norm(found.moved - verts, axis=1).mean())
+
+    assert error(gliding=1) < 0.6 * error(gliding=0)
+
+
+@pytest.mark.parametrize(("nearer", "alike", "asked"), [(0.1, 0.6, True), (0.1, 0.8, False), (0.01, 0.6, False)])
+def test_a_palm_on_the_back_of_a_hand_asks_for_the_mirror_image(
+    nearer: float, alike: float, asked: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = curled()
+    monkeypatch.setattr("meshmatch.fitting.direct.nearer_mirrored", lambda *_: nearer)
+    monkeypatch.setattr(ThinMesh, "likeness", lambda *_: alike)
+    found = match_either_side(source, mirrored(source), replace(QUICK, better=4, best=2, both_ways="no"))
+    assert found.target.frame.mirrored is asked
