@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -127,13 +128,21 @@ def test_two_files_become_a_walking_textured_dressed_character(tmp_path: Path, m
     assert Path("character.png").stat().st_size > 1000
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Small(ViscousConfig):
+    nodes: int = 150
+    radius: float = 0.18
+    faces: int = 1200
+    samples: int = 1500
+    back_points: int = 800
+    schedule: Schedule = field(default=Schedule(steps=10, prior=(1e-3, 1e-6), scale=(0.1, 0.02), damping=1e-6))
+
+
 @pytest.fixture
 def small_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fits without a model on few nodes, of few samples: enough for small bones."""
-    schedule = Schedule(steps=10, prior=(1e-3, 1e-6), scale=(0.1, 0.02), damping=1e-6)
-    small = ViscousConfig(nodes=150, radius=0.18, faces=1200, samples=1500, back_points=800, schedule=schedule)
     for module in (settle, without_model):
-        monkeypatch.setattr(module, "ViscousConfig", lambda: small)
+        monkeypatch.setattr(module, "ViscousConfig", _Small)
     monkeypatch.setattr(without_model, "_ALIGNED_BY", 300)
 
 
