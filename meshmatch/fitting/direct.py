@@ -235,8 +235,8 @@ class _Search:
             own, other, chosen = (target, source, best.back) if backwards else (source, target, best.there)
             found = replace(self._match(own, other, chosen, both, leads, judged), one_way=found)
         report.stage("matching without a model")(1.0)
-        fits = (replace(fit, seconds=time.monotonic() - began) for fit in (found.source, found.target))
-        return replace(found, **dict(zip(("source", "target"), fits, strict=True)))
+        first, second = (replace(fit, seconds=time.monotonic() - began) for fit in (found.source, found.target))
+        return replace(found, source=first, target=second)
 
     def _match(
         self,
