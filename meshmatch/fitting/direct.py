@@ -205,13 +205,17 @@ class _Search:
     def both_ways(self, there: list[Tried], report: Progress) -> list[_BothWays]:
         """The best fits of the source to the target, and of the target to the source, each continued the other way; best
         first."""
-        count = self.source.config.returned
         reverse = _Search(self.target, self.source, self.guess and self.guess[::-1])
-        there, back = there[:count], reverse.one_way(report.between(0.0, 0.7))[:count]
+        there, back = self._best(there), self._best(reverse.one_way(report.between(0.0, 0.7)))
         report = report.named("fits both ways")
         ways = zip(there, self._returned(there, report.between(0.7, 0.85)), strict=True)
         ways_back = zip(reverse._returned(back, report.between(0.85, 1.0)), back, strict=True)
         return sorted((_BothWays(*each) for each in (*ways, *ways_back)), key=lambda each: each.energy)
+
+    def _best(self, tried: list[Tried]) -> list[Tried]:
+        """The first few, and the guess, whose energy is asked for."""
+        count = self.source.config.returned
+        return tried[:count] + [each for each in tried[count:] if each.proposal.kind == "guess"]
 
     def _returned(self, tried: Sequence[Tried], report: Progress) -> list[Tried]:
         """The target fitted to the source by what takes the source to the target."""

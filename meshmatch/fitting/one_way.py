@@ -258,6 +258,8 @@ def fitted(own: Side, onto: Side, guess: KnownPairs | None, report: Progress) ->
     trying = report.named(f"fits of {len(proposals)} guesses").between(0.4, 0.8)
     tried = _screened(own.coarse, onto, proposals, config, trying)
     goals = [(each.proposal, verts + carried(verts, rested, each.moved - rested)) for each in tried]
+    if guess is not None and all(each.proposal.kind != "guess" for each in tried):  # its energy is asked for
+        goals.append((proposals[-1], verts + carried(verts, rested, proposals[-1].points - rested)))
     report = report.named("fits of the best guesses").between(0.8, 1.0)
     return sorted(finished(own, onto, goals, report), key=lambda each: each.energy)
 
