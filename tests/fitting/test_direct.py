@@ -268,6 +268,8 @@ def test_a_guess_is_much_the_same_as_what_is_found_or_its_energy_is_known(pair: 
         found = match_directly(source, target, QUICK, guess=(source.verts, goals))
         assert found.over_guess == 0 if right else found.over_guess > 0.01
     assert dict(found.tried)["guess"] == pytest.approx(found.energy + found.over_guess)
+    both = match_directly(source, target, replace(QUICK, both_ways="always", returned=1), guess=(source.verts, goals))
+    assert both.one_way is not None and 0.01 < both.over_guess < np.inf
 
 
 def test_known_pairs_settle_what_symmetry_leaves_open() -> None:
