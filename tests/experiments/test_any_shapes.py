@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from meshmatch.errors import InputError
 from meshmatch.experiments.bench import any_shapes
 from meshmatch.experiments.bench.any_shapes import error_of, keypoints_of, row_of, symmetries
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 
@@ -60,6 +62,23 @@ def test_the_error_is_along_the_surface_in_units_of_its_size(folder: Path) -> No
     lengths = any_shapes.distances(folder, "1")
     wrong[0] = int(lengths[0].argmax())
     assert error_of(folder, ("2", "1"), wrong) == pytest.approx(100 * lengths[0].max() / CORNERS)
+
+
+def test_another_method_that_fails_is_counted_as_a_map_to_one_vertex(folder: Path) -> None:
+    class Nearest:
+        def fit(self, shape: Shape) -> Shape:
+            return shape
+
+        def map(self, source: Shape, source_fit: Shape, target: Shape, target_fit: Shape) -> VertexMap:
+            return VertexMap.between(source, target, np.arange(source.V))
+
+    class Fails(Nearest):
+        def map(self, *_: object) -> VertexMap:
+            raise InputError("it gave up")
+
+    right, wrong = (any_shapes.measure_by(method, folder, ("1", "2")) for method in (Nearest(), Fails()))
+    assert (right["error"], right["failed"]) == (0.0, False)
+    assert wrong["failed"] and wrong["error"] > 20
 
 
 def test_a_row_counts_every_pair_and_names_the_worst() -> None:

@@ -277,6 +277,35 @@ def _with_calibrations(report: runner.Report, found: _Found) -> runner.Report:
     )
 
 
+def _beside(
+    found: _Found, methods: str, limit: int, data: Path, work: Path | None, seed: int
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """A row for each of some other methods on some pairs of each class, and for this one; and which could not run."""
+    some = {name: runner.spread(rows, limit) for name, rows in found.items()}
+    rows, missing = [{"method": "ours", "failed": 0, **_beside_row(_all(some))}], []
+    for name in runner.names_of(methods, METHODS, "method"):
+        (baseline,) = METHODS[name](Choices(seed=seed))
+        if baseline.method is None:
+            missing.append(f"skipped: {baseline.label}: {baseline.missing}")
+            continue
+        measured = []
+        for kind, own in some.items():
+            folder = folder_of(kind, data)
+            for pair in runner.track([row["pair"] for row in own], f"{name}, {kind}"):
+                first, _, second = pair.partition(" to ")
+                call = partial(measure_by, baseline.method, folder, (first, second))
+                asked = {"method": name, "seed": seed}
+                measured.append(runner.at_work(work, f"{kind}-{first}-{second}-{name}", asked, call))
+        failed = sum(row["failed"] for row in measured)
+        rows.append({"method": baseline.label, "failed": failed, **_beside_row(measured)})
+    return rows, missing
+
+
+def _beside_row(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    cpu = float(np.mean([row["cpu"] for row in rows]))
+    return {**_summary(np.array([row["error"] for row in rows])), "cpu": cpu}
+
+
 @runner.command
 def main(
     classes: Annotated[str, Option(help="names, with commas between them; or all")] = "all",
@@ -314,32 +343,3 @@ def main(
         )
     report = runner.Report(record, tables, notes)
     return _with_calibrations(report, found) if fit else report
-
-
-def _beside(
-    found: _Found, methods: str, limit: int, data: Path, work: Path | None, seed: int
-) -> tuple[list[dict[str, Any]], list[str]]:
-    """A row for each of some other methods on some pairs of each class, and for this one; and which could not run."""
-    some = {name: runner.spread(rows, limit) for name, rows in found.items()}
-    rows, missing = [{"method": "ours", "failed": 0, **_beside_row(_all(some))}], []
-    for name in runner.names_of(methods, METHODS, "method"):
-        (baseline,) = METHODS[name](Choices(seed=seed))
-        if baseline.method is None:
-            missing.append(f"skipped: {baseline.label}: {baseline.missing}")
-            continue
-        measured = []
-        for kind, own in some.items():
-            folder = folder_of(kind, data)
-            for pair in runner.track([row["pair"] for row in own], f"{name}, {kind}"):
-                first, _, second = pair.partition(" to ")
-                call = partial(measure_by, baseline.method, folder, (first, second))
-                asked = {"method": name, "seed": seed}
-                measured.append(runner.at_work(work, f"{kind}-{first}-{second}-{name}", asked, call))
-        failed = sum(row["failed"] for row in measured)
-        rows.append({"method": baseline.label, "failed": failed, **_beside_row(measured)})
-    return rows, missing
-
-
-def _beside_row(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    cpu = float(np.mean([row["cpu"] for row in rows]))
-    return {**_summary(np.array([row["error"] for row in rows])), "cpu": cpu}
