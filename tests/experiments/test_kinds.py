@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from meshmatch.api.matcher import Matcher
 from meshmatch.experiments.bench import kinds
 from meshmatch.experiments.bench.sets import Pair
 from meshmatch.experiments.makers.cut_scans import CutScan
@@ -48,11 +49,11 @@ def test_pairs_without_a_model_have_no_fits_of_their_own(
     build(tmp_path)
     (tmp_path / "faust").rename(tmp_path / "animal")
 
-    def match(self: kinds.Matcher, source: Shape, target: Shape) -> SimpleNamespace:
+    def match(self: Matcher, source: Shape, target: Shape) -> SimpleNamespace:
         index = np.arange(source.V)
         return SimpleNamespace(map=VertexMap(source.name, target.name, index, target_vertices=target.V, verdict="fair"))
 
-    monkeypatch.setattr(kinds.Matcher, "match", match)
+    monkeypatch.setattr(Matcher, "match", match)
     words = ["--data", str(tmp_path), "--cache", str(tmp_path / "cache"), "--sets", "animals", "--model", "none"]
     assert kinds.main([*words, "--limit-pairs", "4"]) == 0
     record = json.loads(capsys.readouterr().out.splitlines()[-1])["animals"]
@@ -69,7 +70,7 @@ def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
     egg = egg_model()
     both = TrainedModel(replace(egg.card, mirror="auto"), egg.template, egg.inference)
     subjects = kinds.cut_scans("hand", 3, 0, tmp_path / "cache")
-    record, tables = kinds.measured("hand", subjects, kinds.Matcher(both))
+    record, tables = kinds.measured("hand", subjects, Matcher(both))
     assert [str(table.title).split()[-1] for table in tables] == ["length", "verdict", "sides", "Sides"]
     assert {row["of"]: row["pairs"] for row in record["sides"]} == {
         "left to right": 2,

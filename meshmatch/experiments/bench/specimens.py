@@ -239,7 +239,8 @@ def by_pairs(some: Specimens, scans: Path, work: Path) -> Done:
     judged: list[tuple[str, bool]] = []
 
     def points(pair: Pair) -> Floats:
-        (source, target), (one, other) = ([of[name] for name in pair] for of in (files, some.each))
+        source, target = (files[name] for name in pair)
+        one, other = (some.each[name] for name in pair)
         found = matcher.match(source, target)
         turned_over = found.source_fit.frame.mirrored != found.target_fit.frame.mirrored
         judged.append((found.map.verdict, turned_over == (one.mirrored != other.mirrored)))
