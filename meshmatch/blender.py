@@ -126,7 +126,8 @@ def _is_new(copy: Path, file: Path, path: Path) -> bool:
 def _run(source: Path, output: Path) -> _Trouble | None:
     """Let Blender convert a file; why it did not, None if it did. What it leaves out is told."""
     script = SCRIPTS / "convert.py"
-    words = [*command((source if output.suffix == ".glb" else output).name), str(script)]
+    theirs = (source if output.suffix == ".glb" else output).name  # the other one is ours, and temporary
+    words = [*command(theirs), str(script)]
     words += ["--", str(source.absolute()), str(output.absolute())]
     with tempfile.TemporaryFile() as said:
         try:
@@ -147,5 +148,5 @@ def _run(source: Path, output: Path) -> _Trouble | None:
         return _Trouble("Blender wrote nothing", f"is {words[0]} Blender? {_HINT}")
     notes = dict.fromkeys(line.removeprefix("note: ") for line in lines if line.startswith("note: "))
     for line in list(notes)[:8]:
-        warn(f"{source.name}: {line}")
+        warn(f"{theirs}: {line}")
     return None

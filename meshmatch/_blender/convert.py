@@ -115,6 +115,17 @@ def image_above(socket):
     return None
 
 
+def tell_clips(suffix):
+    """Tell which clips a format leaves out that holds but one."""
+    names = {}
+    for each in bpy.data.objects:
+        data = each.animation_data
+        if data is not None and data.action is not None:
+            names |= dict.fromkeys([data.action.name, *(track.name for track in data.nla_tracks)])
+    if len(names) > 1:
+        note(f"a {suffix} file holds one clip: of {len(names)} only {next(iter(names))}")
+
+
 def lay_images_bare():
     """Lay images directly on their materials: exporters do not look behind the product with a color."""
     for material in bpy.data.materials:
@@ -160,8 +171,11 @@ def main(source, output):
     if not shown():
         raise SystemExit("there is no mesh in it")
     leave_out_strangers(os.path.dirname(source))
-    if not output.lower().endswith(".glb"):
+    suffix = os.path.splitext(output)[1].lower()
+    if suffix != ".glb":
         lay_images_bare()
+    if suffix in (".usdz", ".dae"):
+        tell_clips(suffix)
     write(output, prepare())
     if not os.path.isfile(output):
         raise SystemExit("Blender wrote nothing")

@@ -10,6 +10,7 @@ from pathlib import Path
 from meshmatch.api.bound import bound_to, carried_along
 from meshmatch.api.results import MapPair, MovedMesh
 from meshmatch.api.transfer import MapLike, find_maps
+from meshmatch.api.upright import turn_upright
 from meshmatch.arrays import Int, Ints
 from meshmatch.outputs import as_path
 from meshmatch.shapes.files import ShapeLike, as_shape
@@ -40,6 +41,8 @@ class GarmentResult(MovedMesh):
         The garment's file, if it came from one.
     binding
         The skeleton that moves the garment in a .glb: the target's, or else its own, carried along.
+    turn
+        (3, 3) the rotation after which it stands along y, as a .glb does; None where it stands so, or that is not known.
     body
         The target's file, if it came from one.
 
@@ -75,7 +78,8 @@ class GarmentResult(MovedMesh):
         """
         if join:
             check_into(self.body, as_path(path))
-        save_moved(path, self.original, self.shape, self.turns, self.binding, self.body if join else None)
+        into = self.body if join else None
+        save_moved(path, self.original, self.shape, self.turns, self.binding, self.turn, into)
 
     def _repr_html_(self) -> str:
         from meshmatch.api.notebook import carried_html
@@ -132,7 +136,8 @@ def transfer_garment(garment: ShapeLike, source: ShapeLike, target: ShapeLike, m
         found = carry_garment(cloth, maps.forward, maps.source, maps.target, maps.threads)
         shape = replace(cloth, verts=found.verts)
         binding = bound_to(maps, body, cloth, original) or carried_along(original, shape, target.upright)
+        turn = None if target.upright else turn_upright(maps, source.upright)
     seconds = time.monotonic() - began
     return GarmentResult(
-        shape, found.turns, found.pushed, found.sunk, maps, seconds, body, original=original, binding=binding
+        shape, found.turns, found.pushed, found.sunk, maps, seconds, body, original=original, binding=binding, turn=turn
     )

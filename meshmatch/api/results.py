@@ -52,17 +52,20 @@ class MovedMesh(Brief):
         The mesh's file, if it came from one.
     binding
         The skeleton that moves it in a .glb, if there is one.
+    turn
+        (3, 3) the rotation after which it stands along y, as a .glb does; None where it stands so, or that is not known.
     """
 
     shape: Shape
     turns: Float[Floats, "V 3 3"]
     original: Path | None = field(default=None, kw_only=True)
     binding: Binding | None = field(default=None, kw_only=True)
+    turn: Float[Floats, "3 3"] | None = field(default=None, kw_only=True)
 
     def save(self, path: str | Path) -> None:
         """Write the mesh; an .obj from an .obj keeps all of its text but the positions and the directions of normals, and
         its materials and images are copied beside it. A .glb from a .glb, .gltf or .vrm keeps everything but positions and
-        what turns with them.
+        what turns with them. In a .glb a node turns the mesh upright.
 
         Parameters
         ----------
@@ -76,7 +79,7 @@ class MovedMesh(Brief):
         OutputError
             A file cannot be written.
         """
-        save_moved(path, self.original, self.shape, self.turns, self.binding)
+        save_moved(path, self.original, self.shape, self.turns, self.binding, self.turn)
 
 
 @dataclass(frozen=True, eq=False)

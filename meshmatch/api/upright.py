@@ -18,15 +18,22 @@ def trust(source: Shape, maps: MapPair) -> Float[Floats, " V"]:
     return np.where(source.valid, (share + 1e-3) * (maps.forward.assumed_confidence + 1e-3), 0.0)
 
 
+def turn_of_fit(fit: object) -> Float[Floats, "3 3"] | None:
+    """The turn after which a shape stands along y, by its fit; None if that does not know how it stands."""
+    if not isinstance(fit, Fit):
+        return None
+    up = np.zeros(3)
+    up["xyz".index(fit.up[1])] = -1.0 if fit.up[0] == "-" else 1.0
+    return turn_of(up)
+
+
 def turn_upright(maps: MapPair, along_y: bool) -> Float[Floats, "3 3"]:
     """The turn about one axis, by right angles, after which the target stands along y: by its fit, or else as the source
     does, if that stands ``along_y``; where neither is known, none.
     """
-    fit = None if maps.match is None else maps.match.target_fit
-    if isinstance(fit, Fit):
-        up = np.zeros(3)
-        up["xyz".index(fit.up[1])] = -1.0 if fit.up[0] == "-" else 1.0
-        return turn_of(up)
+    known = None if maps.match is None else turn_of_fit(maps.match.target_fit)
+    if known is not None:
+        return known
     if not along_y:
         return np.eye(3)
     with thread_limit(1):

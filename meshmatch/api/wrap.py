@@ -16,6 +16,7 @@ from meshmatch.api import matching
 from meshmatch.api.bound import carried_along
 from meshmatch.api.inputs import LandmarkPairs
 from meshmatch.api.results import MatchResult, MovedMesh
+from meshmatch.api.upright import turn_of_fit
 from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit_config import FitConfig
@@ -25,6 +26,7 @@ from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
+from meshmatch.transfer.carry_rig import upright
 from meshmatch.transfer.wrap import wrap_onto
 
 if TYPE_CHECKING:
@@ -53,6 +55,8 @@ class WrapResult(MovedMesh):
         The base's file, if it came from one.
     binding
         The base's skeleton, with its joints where the skin around them lies now; in a .glb it moves the mesh.
+    turn
+        (3, 3) the rotation after which it stands along y, as a .glb does; None where it stands so, or that is not known.
 
     Examples
     --------
@@ -143,8 +147,14 @@ def wrap(
         wrapped = wrap_onto(mesh, near.verts, surface, kept, found.threads)
     shape = replace(mesh, verts=wrapped.verts)
     binding = carried_along(original, shape, surface.upright)
+    turn = None if surface.upright else turn_of_fit(found.target_fit)
+    if turn is None and mesh.upright and not surface.upright:
+        with thread_limit(1):
+            turn = upright(mesh, shape.verts, mesh.vertex_areas)
     seconds = time.monotonic() - began
-    return WrapResult(shape, wrapped.turns, wrapped.distance, kept, found, seconds, original=original, binding=binding)
+    return WrapResult(
+        shape, wrapped.turns, wrapped.distance, kept, found, seconds, original=original, binding=binding, turn=turn
+    )
 
 
 def _free(base: Shape, numbers: ArrayLike) -> Bools:

@@ -45,7 +45,8 @@ def transfer_garment(
     plan.make_folders()
     with transfer.outputs(garment, files=plan.files) as temporary:
         result = meshmatch.transfer_garment(garment, source, target, transfer)
-        plan.write(temporary, result.shape, result.turns, result.binding, target if join else None)
+        into = target if join else None
+        plan.write(temporary, result.shape, result.turns, result.binding, result.turn, into)
     a, b = result.maps.source, result.maps.target
     if b.is_cloud:
         console.say(f"note: {transfer.names[1]} is a point cloud: nothing was pushed out of it")
@@ -56,6 +57,8 @@ def transfer_garment(
         console.warn(f"{len(result.sunk)} of {worn.V} vertices are below the skin of {transfer.names[1]}")
     if result.binding is not None and output.suffix.lower() == ".glb":
         console.say(f"{len(result.binding.rig.joints)} joints move {garment.name}")
+    if not join and plan.is_turned(result.binding, result.turn):
+        console.say(f"note: a node turns {garment.name} upright, along y")
     written = " ".join(str(file) for file in plan.files)
     console.say(f"wrote {written}: {garment.name} on {transfer.names[1]} ({result.seconds:.1f} s)")
     if picture is not None:

@@ -66,7 +66,7 @@ def wrap(
         found = result.match.map
         words.refuse_poor(run.strict, found.verdict, found.reasons, "the map")
         binding = carried_along(base, result.shape, b.upright)
-        plan.write(temporary, result.shape, result.turns, binding)
+        plan.write(temporary, result.shape, result.turns, binding, result.turn)
     words.tell_match(console, result.match, names)
     words.tell_verdict(console, found.verdict, found.reasons, "the map")
     apart = result.distance[~result.free & a.valid]
@@ -76,6 +76,8 @@ def wrap(
     console.say(f"distance to {names[1]} (its size is {np.sqrt(b.area):.4g}): {told}{kept}")
     if binding is not None and output.suffix.lower() == ".glb":
         console.say(f"the {len(binding.rig.joints)} joints of {names[0]} have moved along")
+    if plan.is_turned(binding, result.turn):
+        console.say(f"note: a node turns {names[0]} upright, along y")
     console.say(f"wrote {' '.join(map(str, plan.files))}: {names[0]} on {names[1]} ({result.seconds:.1f} s)")
     if picture is not None:
         from meshmatch.render.compose import compose_fit

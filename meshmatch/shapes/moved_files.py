@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from meshmatch import blender
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.geometry.trees import cKDTree
@@ -21,6 +22,7 @@ from meshmatch.shapes.colors import bytes_of
 from meshmatch.shapes.dressed_files import Dressed
 from meshmatch.shapes.files import check_suffix, save_shape
 from meshmatch.shapes.formats import gltf, obj_look, obj_text
+from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_join import joined
 from meshmatch.shapes.formats.gltf_moved import moved
 from meshmatch.shapes.formats.gltf_rigged import Binding, rigged
@@ -85,19 +87,30 @@ class MovedFile:
         shape: Shape,
         turns: Float[Floats, "V 3 3"],
         binding: Binding | None = None,
+        turn: Float[Floats, "3 3"] | None = None,
         into: Path | None = None,
     ) -> None:
         """Write the moved mesh and the copies where they wait to get the names of `files`.
 
         The shape has the original's vertices in its order; ``turns`` is the rotation around each of them. A skeleton moves
-        them in a glb, if there is a ``binding``; the glb may be put ``into`` another one, whose joints these are. What the
-        format does not hold is told.
+        them in a glb, if there is a ``binding``; the glb may be put ``into`` another one, whose joints these are. Without
+        either, a node makes the ``turn`` that lets a glb stand upright. What the format does not hold is told.
         """
         self._write_mesh(places, shape, turns, still=binding is None)
         place = places[0]
         if place.suffix.lower() == ".glb" and (binding is not None or into is not None):
             add = partial(_added, shape=shape, binding=binding, into=into)
             place.write_bytes(gltf.understood(self.output, place.read_bytes(), "scene makes", add))
+        elif self.is_turned(binding, turn):
+            assert turn is not None
+            place.write_bytes(
+                gltf.understood(self.output, place.read_bytes(), "scene makes", partial(_turned, turn=turn))
+            )
+
+    def is_turned(self, binding: Binding | None, turn: Float[Floats, "3 3"] | None) -> bool:
+        """Whether a node turns the mesh upright in this output: not where a skeleton does."""
+        has_nodes = self.output.suffix.lower() == ".glb" or blender.is_converted(self.output)
+        return has_nodes and binding is None and turn is not None and not np.array_equal(turn, np.eye(3))
 
     def _write_mesh(self, places: Sequence[Path], shape: Shape, turns: Float[Floats, "V 3 3"], still: bool) -> None:
         for place, (_, file) in zip(places[1:], self.copies, strict=True):
@@ -131,6 +144,7 @@ def save_moved(
     shape: Shape,
     turns: Float[Floats, "V 3 3"],
     binding: Binding | None = None,
+    turn: Float[Floats, "3 3"] | None = None,
     into: Path | None = None,
 ) -> None:
     """Write a mesh that was read from a file and has moved; all files appear, or none. Errors as `MovedFile.planned`, and
@@ -139,7 +153,7 @@ def save_moved(
     plan = MovedFile.planned(Path(path), original)
     plan.make_folders()
     with replace_all_on_success(plan.files) as places:
-        plan.write(places, shape, turns, binding, into)
+        plan.write(places, shape, turns, binding, turn, into)
 
 
 def check_into(file: Path | None, output: Path) -> None:
@@ -149,6 +163,12 @@ def check_into(file: Path | None, output: Path) -> None:
         raise OptionError(f"nothing can be put into {name}", f"the target must be one of {', '.join(gltf.SUFFIXES)}")
     if output.suffix.lower() != ".glb":
         raise OptionError(f"{output.name} cannot hold the target and what is put into it", "end the output in .glb")
+
+
+def _turned(document: gltf.Document, turn: Float[Floats, "3 3"]) -> bytes:
+    editor = Editor(document)
+    editor.turn(turn)
+    return editor.to_bytes()
 
 
 def _added(document: gltf.Document, shape: Shape, binding: Binding | None, into: Path | None) -> bytes:

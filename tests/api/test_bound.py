@@ -119,6 +119,21 @@ def test_its_own_joints_go_where_the_skin_goes(body: Path) -> None:
         assert away.mean() < 0.05 * longer
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_a_garment_on_a_body_that_lies_stands_upright_in_a_glb(tmp_path: Path, known: bool) -> None:
+    """As the source does, if that stands; else it stays as it lies."""
+    lie = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    source, target, garment = tmp_path / ("a.glb" if known else "a.ply"), tmp_path / "b.ply", tmp_path / "stocking.ply"
+    save_shape(source, tube())
+    save_shape(target, Shape(tube().verts @ lie.T, tube().faces))
+    save_shape(garment, tube())
+    result = meshmatch.transfer_garment(garment, source, target, same_numbers(load_shape(source), load_shape(target)))
+    out = tmp_path / "out.glb"
+    result.save(out)
+    expected = result.shape.verts @ lie if known else result.shape.verts
+    np.testing.assert_allclose(load_shape(out).verts, expected, atol=1e-5)
+
+
 def test_a_vrm_keeps_its_joints(body: Path) -> None:
     """Its extension says which node is which bone."""
     path = body.with_suffix(".vrm")

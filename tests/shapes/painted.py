@@ -49,6 +49,11 @@ def write_document(
         width = 1 if array.ndim == 1 else array.shape[1]
         kind = {1: "SCALAR", 16: "MAT4"}.get(width, f"VEC{width}")
         accessors.append({"bufferView": k, "componentType": kinds[array.dtype.name], "count": len(array), "type": kind})
+        if (
+            kind in ("SCALAR", "VEC3") and array.dtype.kind == "f" and np.isfinite(array).all()
+        ):  # times and positions need it
+            rows = array.reshape(len(array), -1)
+            accessors[k] |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
         views.append({"buffer": 0, "byteOffset": len(body), "byteLength": array.nbytes})
         body += array.tobytes() + b"\0" * (-array.nbytes % 4)
     if normalized >= 0:

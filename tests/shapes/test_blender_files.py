@@ -15,6 +15,8 @@ from meshmatch.errors import InputError, MeshmatchWarning, OptionError, OutputEr
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.formats import gltf_out
+from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_rig import read_rig
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.textured_files import find_appearance, load_appearance
@@ -213,6 +215,29 @@ def test_blender_keeps_place_skeleton_and_weights(suffix: str, tmp_path: Path) -
     places = dict(zip(rig.names, rig.worlds()[:, :3, 3], strict=True))
     for joint in given.joints:
         np.testing.assert_allclose(places[given.names[joint]], given.worlds()[joint, :3, 3], atol=2e-3)
+
+
+def test_what_blender_says_names_the_file_of_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(tmp_path, monkeypatch, "print('note: odd'); shutil.copyfile(source, output)")
+    with pytest.warns(MeshmatchWarning, match=r"^mine\.fbx: odd"):
+        meshmatch.save_shape(tmp_path / "mine.fbx", tube())
+
+
+@needs_blender
+@pytest.mark.parametrize("suffix", [".usdz", ".dae", ".fbx"])
+def test_clips_that_a_format_does_not_hold_are_told(suffix: str, tmp_path: Path) -> None:
+    write_tube(tmp_path / "tube.glb")
+    document = Document(tmp_path / "tube.glb", (tmp_path / "tube.glb").read_bytes())
+    editor = Editor(document)
+    editor.json["animations"].append(editor.json["animations"][0] | {"name": "again"})
+    (tmp_path / "tube.glb").write_bytes(editor.to_bytes())
+    path = tmp_path / f"tube{suffix}"
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        blender.from_glb(tmp_path / "tube.glb", path, path)
+    words = [str(each.message) for each in said]
+    told = [f"tube{suffix}: a {suffix} file holds one clip: of 2 only bend"]
+    assert words == ([] if suffix == ".fbx" else told)
 
 
 @needs_blender

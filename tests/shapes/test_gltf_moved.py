@@ -9,16 +9,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import MeshmatchWarning
-from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.gltf import INSTANCES, Document
 from meshmatch.shapes.formats.gltf_morphs import read_morphs
 from meshmatch.shapes.moved_files import save_moved
 from meshmatch.shapes.shape import Shape
 from tests.shapes.morphs import SCALE, TURN, UP, write_morphs
+from tests.shapes.painted import CORNERS, FACES
 from tests.transfer.rigs import BEND, played, write_tube
 
 SPIN = Rotation.from_rotvec([0.4, -1.2, 0.8])
 GROWN = 3.0
+
+
+def square() -> tuple[np.ndarray, np.ndarray]:
+    return CORNERS.astype(float), np.asarray(FACES)
 
 
 def moved(path: Path) -> tuple[Path, Shape]:
@@ -101,6 +106,22 @@ def test_tangents_and_rows_without_a_place(tmp_path: Path) -> None:
     own = (TURN.inv() * SPIN * TURN).apply([1.0, 0, 0])
     assert np.allclose(found[[0, 2, 3]], [[*own, -1]] * 3, atol=1e-6)
     assert np.allclose(load_shape(out).verts[1], shape.verts[1], atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:out.ply does not have")
+@pytest.mark.parametrize("original", [True, False])
+def test_a_node_turns_what_lies_upright(tmp_path: Path, original: bool) -> None:
+    """Vertices keep their frame below it; other formats have no nodes."""
+    path = tmp_path / ("scene.glb" if original else "scene.ply")
+    write_morphs(path) if original else save_shape(path, Shape(*square(), "square"))
+    shape, still = load_shape(path), np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    turns = np.tile(np.eye(3), (shape.V, 1, 1))
+    for out in (tmp_path / "out.glb", tmp_path / "out.ply"):
+        save_moved(out, path, shape, turns, turn=still)
+        expected = shape.verts @ still.T if out.suffix == ".glb" else shape.verts
+        assert np.allclose(load_shape(out).verts, expected, atol=1e-6)
+    document = Document(tmp_path / "out.glb", (tmp_path / "out.glb").read_bytes())
+    assert "upright" in [node.get("name") for node in document.nodes]
 
 
 def test_copies_of_a_mesh_become_one_mesh_each(tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def write_tube(path: Path, *, stands: float = 0.0, clips: bool = True, **more: A
     """
     shape = tube()
     weights = weights_of(shape.verts[:, 1])
-    joints = np.tile([1, 2, 3, 0], (shape.V, 1)).astype("u1")
+    joints = (np.pad(weights > 0, ((0, 0), (0, 1))) * [1, 2, 3, 0]).astype("u1")
     inverse = np.tile(np.eye(4), (4, 1, 1))
     turn = Rotation.from_euler("x", -90, degrees=True).as_matrix()
     for joint, place in enumerate((np.zeros(3), np.zeros(3), KNEE, FOOT)):
