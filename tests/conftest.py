@@ -31,6 +31,35 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path not in slow)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def kept_glb() -> Iterator[None]:
+    """With MESHMATCH_KEEP_GLB=FOLDER, keep every glb that the package makes there, each once, for
+    `meshmatch.experiments.bench.viewers` to validate.
+    """
+    if not (named := os.environ.get("MESHMATCH_KEEP_GLB")):
+        yield
+        return
+    from meshmatch.shapes.formats import gltf_edit, gltf_out
+
+    folder = Path(named)
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def keeping(make: Callable[..., bytes]) -> Callable[..., bytes]:
+        def kept(*words: Any) -> bytes:
+            made = make(*words)
+            test = os.environ.get("PYTEST_CURRENT_TEST", "no-test").partition("::")
+            name = f"{Path(test[0]).stem}-{sha256(made).hexdigest()[:12]}.glb"
+            (folder / name).write_bytes(made)
+            return made
+
+        return kept
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gltf_edit.Editor, "to_bytes", keeping(gltf_edit.Editor.to_bytes))
+        patch.setattr(gltf_out, "_glb", keeping(gltf_out._glb))
+        yield
+
+
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder that all processes of one run share."""

@@ -108,7 +108,7 @@ class Import(NamedTuple):
 def trees() -> dict[str, ast.Module]:
     """Every module of the package by its dotted name, without what runs inside Blender."""
     found = {}
-    for path in sorted(set(PACKAGE.rglob("*.py")) - set((PACKAGE / "_blender").rglob("*.py"))):
+    for path in sorted(path for path in PACKAGE.rglob("*.py") if "_blender" not in path.parts):
         parts = path.relative_to(ROOT).with_suffix("").parts
         name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
         found[name] = ast.parse(path.read_text(encoding="utf-8"), str(path))

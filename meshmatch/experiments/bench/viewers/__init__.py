@@ -1,0 +1,1 @@
+"""Whether what meshmatch writes is opened by others, as it was written."""

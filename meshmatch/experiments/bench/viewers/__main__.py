@@ -1,0 +1,139 @@
+"""Whether what meshmatch writes is opened by others, as it was written.
+
+Every verb that writes shapes makes its files, of every format, from the samples and the characters of the bench. Khronos'
+validator (npm's gltf-validator) reads each glb; Blender and three.js (npm's, in Chromium) open every file. Their meshes,
+triangles, bones, clips, morph targets and images are counted and compared with what the file holds, and where it lies with
+what meshmatch reads; both draw it, as it lies and in the middle of its first clip with its first blendshape, from one
+place: what they draw should cover the same pixels. The pictures are left in OUTPUT/pictures, with one sheet of all.
+
+Nothing is installed: `npm install --prefix FOLDER gltf-validator three` and --modules FOLDER/node_modules; Blender as for
+files that it reads (MESHMATCH_BLENDER); Chromium from the path or MESHMATCH_CHROMIUM. Of a target that has issues itself
+only those that it did not have are counted. --also names a folder of other glb files, such as those that tests wrote
+(MESHMATCH_KEEP_GLB=FOLDER pytest): they are validated.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Annotated, Any
+
+from typer import Argument, Option
+
+from meshmatch.errors import InputError
+from meshmatch.experiments import runner
+from meshmatch.experiments.bench.viewers.expected import Written, differences
+from meshmatch.experiments.bench.viewers.made import Made, made
+from meshmatch.experiments.bench.viewers.opened import TOOLS, Found, check_tools, in_blender, in_three, validated
+from meshmatch.experiments.bench.viewers.sheet import covered, draw_sheet, overlap
+from meshmatch.outputs import make_folder
+
+AS_WRITTEN, NO_READER = "as written", "has no reader"
+_GLTF = (".glb", ".gltf", ".vrm")
+_OVERLAP = 0.9  # of the pixels that either covers; the rest are edges
+COLUMNS = {
+    "file": "file", "by": "verb", "errors": "errors:d", "warnings": "warnings:d", "joints": "bones:d", "clips": "clips:d",
+    "shapes": "morphs:d", "images": "images:d", "Blender": "blender", "three.js": "three",
+}  # fmt: skip
+
+
+SUMMARY = {
+    "by": "verb", "files": "formats", "errors": "errors:d", "warnings": "warnings:d", "as written in Blender": "blender:>",
+    "in three.js": "three:>", "otherwise": "otherwise:>",
+}  # fmt: skip
+
+
+def issues(found: Found, file: Path, target: Path | None) -> Counter[tuple[int, str]]:
+    """Errors and warnings of a file, by severity and code, that its target does not have."""
+
+    def of(path: Path) -> Counter[tuple[int, str]]:
+        record = found[str(path)]
+        return Counter([(0, str(record["error"]))] if "error" in record else
+                       [(each["severity"], each["code"]) for each in record["issues"] if each["severity"] < 2])  # fmt: skip
+
+    return of(file) - (Counter() if target is None else of(target))
+
+
+def _rows(files: list[Made], valid: Found | None, opened: dict[str, Found], pictures: Path) -> list[dict[str, Any]]:
+    rows = []
+    for each in files:
+        written = Written.of(each.path)
+        row: dict[str, Any] = {"file": each.path.name, "verb": each.verb} | written.counts
+        if valid is not None and each.path.suffix in _GLTF:
+            new = issues(valid, each.path, each.target)
+            row["errors"] = sum(many for (severity, _), many in new.items() if severity == 0)
+            row["warnings"] = sum(new.values()) - row["errors"]
+            row["issues"] = sorted(code for _, code in new)
+        for tool, found in opened.items():
+            record = found[str(each.path)]
+            wrong = [record["error"]] if "error" in record else differences(written, record, tool)
+            drawn = pictures / f"{each.path.name}-{tool}.png"
+            if "error" not in record and (not drawn.exists() or covered(drawn) < 0.02):
+                wrong.append("nothing is seen")
+            row[tool] = ", ".join(wrong) or AS_WRITTEN
+        if len(opened) == 2 and all(row[tool] == AS_WRITTEN for tool in opened):
+            for ending in ("-moved",) if written.begins("three") else ("", "-moved"):
+                both = [pictures / f"{each.path.name}-{tool}{ending}.png" for tool in opened]
+                if all(path.exists() for path in both) and (share := overlap(*both)) < _OVERLAP:
+                    row["three"] = f"{'moved, ' * bool(ending)}covers {share:.0%} of the same pixels as in Blender"
+        rows.append(row)
+    return rows
+
+
+def _summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each verb."""
+    found = []
+    for verb in dict.fromkeys(row["verb"] for row in rows):
+        some = [row for row in rows if row["verb"] == verb]
+        formats = Counter(row["file"].rpartition(".")[2] for row in some)
+        one: dict[str, Any] = {"verb": verb, "formats": ", ".join(f"{many} {name}" for name, many in formats.items())}
+        valid = [row for row in some if "errors" in row]
+        one |= {key: sum(row[key] for row in valid) for key in ("errors", "warnings") if valid}
+        otherwise = []
+        for tool, name in (("blender", "Blender"), ("three", "three.js")):
+            opened = [row for row in some if row.get(tool, NO_READER) != NO_READER]
+            if opened:
+                one[tool] = f"{sum(row[tool] == AS_WRITTEN for row in opened)} of {len(opened)}"
+            wrong = [row for row in opened if row[tool] != AS_WRITTEN]
+            otherwise += [f"{row['file'].rpartition('.')[2]} in {name}: {row[tool]}" for row in wrong]
+        found.append(one | {"otherwise": "; ".join(otherwise)})
+    return found
+
+
+@runner.command
+def main(
+    output: Annotated[Path, Argument(help="a folder for the files; what is there is not made again")],
+    data: runner.Data = runner.DATA,
+    modules: Annotated[Path, Option(help="npm's folder node_modules")] = Path("node_modules"),
+    tools: Annotated[str, Option(help=f"of {', '.join(TOOLS)}")] = ",".join(TOOLS),
+    also: Annotated[Path | None, Option(help="validate the glb files of this folder, too")] = None,
+) -> runner.Report:
+    chosen = runner.names_of(tools, TOOLS, "tool")
+    check_tools(chosen, modules)
+    pictures = output / "pictures"
+    make_folder(pictures)
+    files = made(
+        output.absolute(), data.absolute(), "blender" in chosen, lambda lines: list(runner.track(lines, "files"))
+    )
+    others = [] if also is None else runner.files_in(also, "*.glb")
+    valid, opened = None, {}
+    if "validator" in chosen:
+        gltf = {each for one in files for each in (one.path, one.target) if each is not None and each.suffix in _GLTF}
+        valid = validated(sorted({*gltf, *others}), modules)
+    paths = [each.path for each in files]
+    if "blender" in chosen:
+        opened["blender"] = in_blender(paths, pictures.absolute())
+    if "three" in chosen:
+        opened["three"] = in_three([path for path in paths if path.suffix != ".blend"], pictures, modules)
+        opened["three"] |= {str(path): {"error": NO_READER} for path in paths if path.suffix == ".blend"}
+    rows = _rows(files, valid, opened, pictures)
+    draw_sheet(output / "sheet.png", [each.path.name for each in files], pictures)
+    notes, record = [f"drew {output / 'sheet.png'}"], dict[str, Any](rows=rows)
+    if valid is not None and others:
+        told = {file.name: sorted({code for _, code in new}) for file in others if (new := issues(valid, file, None))}
+        notes.append(f"{len(others)} other files: {len(others) - len(told)} without errors and warnings")
+        record |= {"others": len(others), "others_with_issues": told}
+    tables = [runner.table("Opened elsewhere", rows, COLUMNS), runner.table("By verb", _summary(rows), SUMMARY)]
+    bad = [row["file"] for row in rows if row.get("errors") or row.get("warnings")]
+    stopped = InputError(f"with errors or warnings: {', '.join(bad)}", "--save has them") if bad else None
+    return runner.Report(record, tables, notes, stopped)
