@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array, csc_array, csr_array, sparray
-from scipy.sparse.csgraph import connected_components
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
-from meshmatch.geometry.triangles import face_parts, same_rows, triangle_areas, unit
+from meshmatch.geometry.triangles import same_rows, triangle_areas, unit
 from meshmatch.transfer.texels import faces_on
 
 # All of these were set by hand.
@@ -63,9 +64,9 @@ def laid_flat(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], most: float,
     layout
         None for faces that do not hang together, or that would be stretched more.
     """
-    corners = _welded(faces)
+    corners, whole = _welded(faces)
     count = int(corners.max()) + 1
-    if face_parts(corners, count).max() > 0:
+    if not whole:
         return None
     points = np.empty((count, 3))
     points[corners.ravel()] = verts[faces.ravel()]
@@ -141,32 +142,47 @@ def _twins(edges: Int[Ints, "N 2"]) -> tuple[Ints, Ints]:
     return one[opposite], two[opposite]
 
 
-def _welded(faces: Int[Ints, "F 3"]) -> Int[Ints, "F 3"]:
-    """Corners numbered anew: one number for those that faces with a common edge share."""
+def _welded(faces: Int[Ints, "F 3"]) -> tuple[Int[Ints, "F 3"], bool]:
+    """Corners numbered anew, those as one that faces with a common edge share; and whether the faces hang together."""
     F = len(faces)
     one, two = _twins(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
-    begin, end = (np.arange(3 * F), (np.arange(3 * F).reshape(F, 3)[:, [1, 2, 0]]).ravel())
-    rows, columns = np.concatenate([begin[one], end[one]]), np.concatenate([end[two], begin[two]])
-    graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(3 * F, 3 * F))
-    return np.asarray(connected_components(graph, directed=False)[1].reshape(F, 3), np.int64)
+    corner = np.arange(3 * F)
+    begin, end = corner, corner.reshape(F, 3)[:, [1, 2, 0]].ravel()
+    welded = _together(3 * F, np.concatenate([begin[one], end[one]]), np.concatenate([end[two], begin[two]]))
+    whole = not _together(F, one // 3, two // 3).any()
+    return np.unique(welded, return_inverse=True)[1].reshape(F, 3), whole
+
+
+def _together(count: int, one: Int[Ints, " N"], two: Int[Ints, " N"]) -> Int[Ints, " count"]:
+    """The least of all that hang together, for each; of so few at a time sparse graphs cost more."""
+    least = np.arange(count)
+    while (differ := least[one] != least[two]).any():
+        one, two = one[differ], two[differ]
+        ends = least[one], least[two]
+        np.minimum.at(least, np.maximum(*ends), np.minimum(*ends))
+        while (further := least[least] != least).any():
+            least[further] = least[least[further]]
+    return least
 
 
 def _as_conformal(points: Floats, corners: Ints, flat: Floats, areas: Floats) -> Float[Floats, "M 2"]:
     """Least squares conformal maps (Lévy et al. 2002), two far points held."""
     z = flat[..., 0] + 1j * flat[..., 1]
     weights = (z[:, [2, 0, 1]] - z[:, [1, 2, 0]]) / np.sqrt(2 * areas)[:, None]
-    F, M = len(corners), len(points)
-    rows = np.repeat(np.arange(F), 3)
-    matrix = coo_array((weights.ravel(), (rows, corners.ravel())), shape=(F, M)).tocsc()
-    normal = (matrix.conj().T @ matrix).tocsc()
+    M = len(points)
     one = int(((points - points.mean(axis=0)) ** 2).sum(axis=1).argmax())
     other = int(((points - points[one]) ** 2).sum(axis=1).argmax())
-    free = np.setdiff1d(np.arange(M), [one, other])
     found = np.zeros(M, complex)
     found[other] = np.linalg.norm(points[one] - points[other])
-    if len(free):
-        right = -(normal[:, [other]].toarray()[:, 0] * found[other])[free]
-        found[free] = _factors(normal[free][:, free]).solve(right)
+    free = np.ones(M, bool)
+    free[[one, other]] = False
+    if free.any():
+        products = (weights.conj()[:, :, None] * weights[:, None, :]).ravel()
+        rows, columns = np.repeat(corners, 3, axis=1).ravel(), np.tile(corners, 3).ravel()
+        held = columns == other
+        pulled = -products[held] * found[other]
+        right = np.bincount(rows[held], pulled.real, M) + 1j * np.bincount(rows[held], pulled.imag, M)
+        found[free] = _factors(products, rows, columns, free).solve(right[free])
     uv = np.stack([found.real, found.imag], axis=1)
     return np.asarray(uv * np.sqrt(areas.sum() / max(np.abs(_signed(uv[corners])).sum(), 1e-300)))
 
@@ -182,12 +198,13 @@ def _as_rigid(uv: Floats, corners: Ints, flat: Floats) -> Iterator[Float[Floats,
     w = weights.ravel()
     values, rows = np.concatenate([-w, -w, w, w]), np.concatenate([begin, end, begin, end])
     columns = np.concatenate([end, begin, begin, end])
-    solver = _factors(coo_array((values, (rows, columns)), shape=(M, M)).tocsc()[1:][:, 1:])
+    solver = _factors(values, rows, columns, np.arange(M) > 0)
+    complex_edges = (edges[..., 0] + 1j * edges[..., 1]) * weights
     for _ in range(_ROUNDS):
         now = uv[corners[:, [2, 0, 1]]] - uv[corners[:, [1, 2, 0]]]
-        products = np.einsum("fk,fki,fkj->fij", weights, now, edges)
-        angle = np.arctan2(products[:, 1, 0] - products[:, 0, 1], products[:, 0, 0] + products[:, 1, 1])
-        turn = np.exp(1j * angle)[:, None] * (edges[..., 0] + 1j * edges[..., 1]) * weights
+        turned = ((now[..., 0] + 1j * now[..., 1]) * complex_edges.conj()).sum(axis=1)
+        size = np.abs(turned)
+        turn = (np.where(size > 0, turned, 1.0) / np.where(size > 0, size, 1.0))[:, None] * complex_edges
         pull = [
             np.bincount(end, part, M) - np.bincount(begin, part, M) for part in (turn.real.ravel(), turn.imag.ravel())
         ]
@@ -196,10 +213,13 @@ def _as_rigid(uv: Floats, corners: Ints, flat: Floats) -> Iterator[Float[Floats,
         yield uv
 
 
-def _factors(matrix: sparray) -> SuperLU:
-    """Of a symmetric matrix without negative eigenvalues."""
+def _factors(values: NDArray[Any], rows: Ints, columns: Ints, kept: Bools) -> SuperLU:
+    """Of the rows and columns that are kept of a symmetric matrix without negative eigenvalues, a sum of entries."""
+    place = np.cumsum(kept) - 1
+    both, count = kept[rows] & kept[columns], int(kept.sum())
+    matrix = coo_array((values[both], (place[rows[both]], place[columns[both]])), shape=(count, count)).tocsc()
     options = {"SymmetricMode": True}
-    return splu(csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
 
 
 def _untangled(uv: Floats, corners: Ints) -> Floats:
@@ -208,24 +228,30 @@ def _untangled(uv: Floats, corners: Ints) -> Floats:
         return uv
     M = len(uv)
     edges = corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    one_way = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(M, M)).tocsr()
-    both = csr_array(((one_way + one_way.T) > 0).astype(float))
+    key, number = np.unique(edges.min(axis=1) * M + edges.max(axis=1), return_inverse=True)
+    forward = edges[:, 0] < edges[:, 1]
+    once = np.bincount(number, forward) != np.bincount(number, ~forward)
+    one, two = key // M, key % M
     border = np.zeros(M, bool)
-    border[np.unique(np.stack((one_way - one_way.T).nonzero()))] = True
+    border[one[once]] = border[two[once]] = True
+    begin, end = np.concatenate([one, two]), np.concatenate([two, one])
+    degree = np.bincount(begin, minlength=M)
     uv, moved = uv.copy(), np.zeros(M, bool)
     for _ in range(_UNTANGLED):
         bad = _signed(uv[corners]) <= 0
         if not bad.any():
             break
         moved[corners[bad].ravel()] = True
-        moved |= (both @ moved) > 0
+        moved[end[moved[begin]]] = True
         inner: Bools = moved & ~border
         if not inner.any():
             break
-        rows = both[np.flatnonzero(inner)]
-        degree = coo_array((np.asarray(rows.sum(axis=1)), (np.arange(rows.shape[0]), np.arange(rows.shape[0]))))
-        right = rows[:, np.flatnonzero(~inner)] @ uv[~inner]
-        uv[inner] = _factors(degree - rows[:, np.flatnonzero(inner)]).solve(right)
+        held = inner[begin] & ~inner[end]
+        right = np.stack([np.bincount(begin[held], axis, M) for axis in uv[end[held]].T], axis=1)
+        every = np.arange(M)
+        values = np.concatenate([-np.ones(len(begin)), degree.astype(float)])
+        rows, columns = np.concatenate([begin, every]), np.concatenate([end, every])
+        uv[inner] = _factors(values, rows, columns, inner).solve(right[inner])
     return uv
 
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft2, next_fast_len, rfft2
+from numpy.typing import NDArray
+from scipy.fft import fft, ifft, irfft, next_fast_len, rfft, rfft2
 from scipy.ndimage import maximum_filter
 from scipy.spatial import ConvexHull, QhullError
 
@@ -20,6 +21,7 @@ from meshmatch.transfer.texels import texels_in
 _GRID, _FINE = 256, 4  # texels of the image in which places are looked for; how much finer they are at last
 _ALIKE = 1e-6  # what is closer is the same
 _MOVES = 4
+_LOOK = 64  # rows below a piece that are looked at, at once
 _SHUFFLED = 0.2
 _MOST = 80  # charts that are moved one by one
 _ORDERS = 3  # that are compared
@@ -87,6 +89,17 @@ def packed(charts: list[Chart], padding: float, seed: int = 0) -> list[Float[Flo
     return out
 
 
+@dataclass(frozen=True, eq=False)
+class _Turned:
+    """A piece as an image, after quarter turns; with what is around it, without and with its rim; and how long that is."""
+
+    quarters: int
+    image: Bools
+    room: Bools
+    rim: Bools
+    edge: int
+
+
 class _Piece:
     def __init__(self, uv: Floats, corners: Ints) -> None:
         angle = tightest(uv)[0]
@@ -100,9 +113,21 @@ class _Piece:
         key = edges.min(axis=1) * len(uv) + edges.max(axis=1)
         first, count = np.unique(key, return_index=True, return_counts=True)[1:]
         self.border = edges[first[count == 1]]
+        self._known: tuple[float, int, list[_Turned]] = 0.0, 0, []
 
     def turned(self, uv: Floats) -> Floats:
         return np.asarray(uv @ self.turn - self.low)
+
+    def turns(self, scale: float, apart: int) -> list[_Turned]:
+        """Its image in four turns; those of the last scale are kept."""
+        if self._known[:2] != (scale, apart):
+            mask = self.mask(scale)
+            grown = maximum_filter(np.pad(mask, apart), 2 * apart + 1) if apart else mask
+            rim = maximum_filter(np.pad(grown, 1), 3)
+            edge = int(rim.sum()) - int(grown.sum())
+            turned = ((np.rot90(mask, k), np.rot90(grown, k), np.rot90(rim, k)) for k in range(4))
+            self._known = scale, apart, [_Turned(k, *images, edge) for k, images in enumerate(turned)]
+        return self._known[2]
 
     def mask(self, scale: float) -> Bools:
         """The texels that it touches."""
@@ -138,17 +163,6 @@ class _Place:
         return np.asarray((uv + np.array([self.x, self.y])) / self.grid)
 
 
-@dataclass(frozen=True, eq=False)
-class _Turned:
-    """A piece as an image, and the transforms of it with what is around it, without and with its rim."""
-
-    quarters: int
-    image: Bools
-    room: Floats
-    rim: Floats
-    edge: int
-
-
 def _search(pieces: list[_Piece], padding: float, rng: np.random.Generator) -> tuple[float, list[_Place]]:
     """Texels per unit, and the places, of the tightest of a few orders."""
     longest = np.array([piece.size[0] * np.sqrt(piece.area) for piece in pieces])
@@ -161,12 +175,12 @@ def _search(pieces: list[_Piece], padding: float, rng: np.random.Generator) -> t
         if places is None:
             continue
         while places is not None:
-            fine = _together(pieces, places, scale, padding)
-            if found is None or scale / fine[0].grid > found[0] / found[1][0].grid:
-                found = scale, fine
-            scale /= _SHRINK
-            places = _placed(pieces, order, scale, padding)
-        scale *= _SHRINK
+            last = places
+            places = _placed(pieces, order, scale / _SHRINK, padding)
+            scale = scale if places is None else scale / _SHRINK
+        fine = _together(pieces, last, scale, padding)
+        if found is None or scale / fine[0].grid > found[0] / found[1][0].grid:
+            found = scale, fine
     assert found is not None
     return found[0] * _FINE, found[1]
 
@@ -206,16 +220,25 @@ def _together(pieces: list[_Piece], places: list[_Place], scale: float, padding:
 def _fall(taken: Bools, image: Bools, y: int, x: int, apart: int) -> int:
     """How far an image can move to smaller rows, and stay apart from what is taken."""
     grown = maximum_filter(np.pad(image, apart), 2 * apart + 1) if apart else image
+    fallen = 0
+    while (step := _free_below(taken, grown, y - fallen, x, apart)) == _LOOK:  # there may be more
+        fallen += step
+    return fallen + step
+
+
+def _free_below(taken: Bools, grown: Bools, y: int, x: int, apart: int) -> int:
+    """How far an image, given with what must stay free around it, can move to smaller rows; `_LOOK` at most."""
+    width = grown.shape[1] - 2 * apart
     low, left = max(y - apart, 0), max(x - apart, 0)
-    right = min(x + image.shape[1] + apart, taken.shape[1])
+    right = min(x + width + apart, taken.shape[1])
     grown = grown[low - (y - apart) :, left - (x - apart) : right - (x - apart)][: taken.shape[0] - low]
-    rows = np.where(
-        taken[: low + len(grown), left:right], np.arange(1, low + len(grown) + 1, dtype=np.int32)[:, None], 0
-    )
+    begin = max(low - _LOOK, 0)
+    number = np.arange(begin + 1, low + len(grown) + 1, dtype=np.int32)[:, None]
+    rows = np.where(taken[begin : low + len(grown), left:right], number, 0)
     below = np.maximum.accumulate(rows, axis=0)  # the row after the last that is taken, up to each
     row, column = np.nonzero(grown & ~np.pad(grown, ((1, 0), (0, 0)))[:-1])
-    free = (row + low) - below[row + low, column]
-    return max(min(int(free.min()) if len(free) else y, y), 0)
+    free = (row + low) - below[row + low - begin, column]
+    return max(min(int(free.min()) if len(free) else y, y, _LOOK), 0)
 
 
 def _first(pieces: list[_Piece], padding: float) -> float:
@@ -229,23 +252,29 @@ def _placed(pieces: list[_Piece], order: Ints, scale: float, padding: float) -> 
     """Places in this order; None if one finds none."""
     grid, apart = _GRID, int(np.ceil(padding * _GRID))
     span = next_fast_len(grid + 2 * apart + 2, real=True)
-    taken = np.zeros((span, span), np.float32)
+    taken = np.zeros((span, span), np.float32)  # behind what may lie before a piece: its rim
+    inside = taken[apart + 1 :, apart + 1 :]
     places: list[_Place | None] = [None] * len(pieces)
     for k in order.tolist():
-        mask = pieces[k].mask(scale)
-        if max(mask.shape) > grid:
+        turns = pieces[k].turns(scale, apart)
+        shape = turns[0].image.shape
+        if max(shape) > grid:
             return None
-        known = rfft2(taken)
         best, found = -np.inf, None
-        for turned in _turns(mask, apart, span):
+        known, transforms = rfft2(taken), []
+        for turned in turns:
             high, wide = turned.image.shape
-            free = irfft2(known * turned.room, (span, span))[: grid - high + 1, : grid - wide + 1] < 0.5
+            rows, columns = grid - high + 1, grid - wide + 1
+            if turned.quarters < 2:
+                transforms.append([_transform(each, span) for each in (turned.room, turned.rim)])
+            room, rim = transforms[turned.quarters % 2]
+            free = _sums(known, room, turned.quarters, turned.room.shape, 1, rows, columns) < 0.5
             if not free.any():
                 continue
-            touched = irfft2(known * turned.rim, (span, span))[: grid - high + 1, : grid - wide + 1]
+            touched = _sums(known, rim, turned.quarters, turned.rim.shape, 0, rows, columns)
             touched[[0, -1]] += wide
             touched[:, [0, -1]] += high
-            low = (np.arange(grid - high + 1) + high) * (_LOW / grid)
+            low = (np.arange(rows) + high) * (_LOW / grid)
             score = np.where(free, touched / turned.edge - low[:, None], -np.inf)
             at = int(np.round(score, 4).argmax())
             if score.flat[at] > best + _ALIKE:
@@ -253,27 +282,34 @@ def _placed(pieces: list[_Piece], order: Ints, scale: float, padding: float) -> 
         if found is None:
             return None
         turned, y, x = found
-        taken[y : y + turned.image.shape[0], x : x + turned.image.shape[1]] += turned.image
-        places[k] = _Place(turned.quarters, (mask.shape[1], mask.shape[0]), x, y, grid)
+        inside[y : y + turned.image.shape[0], x : x + turned.image.shape[1]] += turned.image
+        places[k] = _Place(turned.quarters, (shape[1], shape[0]), x, y, grid)
     return [place for place in places if place]
 
 
-def _turns(mask: Bools, apart: int, span: int) -> list[_Turned]:
-    out = []
-    for quarters in range(4):
-        image = np.rot90(mask, quarters)
-        grown = maximum_filter(np.pad(image, apart), 2 * apart + 1) if apart else image
-        rim = maximum_filter(np.pad(grown, 1), 3)
-        room, touch = (_transform(each, margin, span) for each, margin in ((grown, apart), (rim, apart + 1)))
-        out.append(_Turned(quarters, image, room, touch, int(rim.sum()) - int(grown.sum())))
-    return out
+def _transform(image: Bools, span: int) -> NDArray[np.complex64]:
+    """Of an image at the corner of an empty one."""
+    rows = np.zeros((len(image), span), np.float32)
+    rows[:, : image.shape[1]] = image
+    whole = np.zeros((span, span // 2 + 1), np.complex64)
+    whole[: len(image)] = rfft(rows, axis=1)
+    return np.asarray(fft(whole, axis=0, overwrite_x=True))
 
 
-def _transform(image: Bools, margin: int, span: int) -> Floats:
-    """For sums over the image at every place: `margin` of it lies before each."""
-    whole = np.zeros((span, span), np.float32)
-    whole[: image.shape[0], : image.shape[1]] = image
-    return np.asarray(np.conj(rfft2(np.roll(whole, (-margin, -margin), (0, 1)))))
+def _sums(
+    known: NDArray[np.complex64],
+    image: NDArray[np.complex64],
+    quarters: int,
+    size: tuple[int, ...],
+    first: int,
+    rows: int,
+    columns: int,
+) -> Float[Floats, "R C"]:
+    """What is taken of an image at every place from the ``first``, by transforms: its own, or those before half a turn."""
+    span = len(known)
+    begin, left = (first + size[0] - 1, first + size[1] - 1) if quarters >= 2 else (first, first)
+    product = ifft(known * (image if quarters >= 2 else np.conj(image)), axis=0, overwrite_x=True)
+    return np.asarray(irfft(product[begin : begin + rows], span, axis=1)[:, left : left + columns])
 
 
 def _on_shelves(pieces: list[_Piece], between: float) -> tuple[list[Floats], Floats]:
