@@ -78,8 +78,8 @@ class Fit(Pickled):
         Share of template vertices where the deformation folds (det F <= 0), and mean change of volume, of these node
         vectors; None if it was read from a file that does not say.
     side
-        Logarithm of how many times as much energy the other side has, the mirror image or the shape as it is; 0 where it
-        was not tried.
+        Logarithm of how many times as much the template must stretch for the other side, the mirror image or the shape as
+        it is; 0 where it was not tried.
 
     Examples
     --------

@@ -53,9 +53,9 @@ _ONTO = Schedule(steps=6, prior=(1e-2, 1e-3), scale=(1.0, 1.0), damping=1e-6)
 # Set by hand, on femurs, hearts, ants and four-legged animals: a shape to which the template comes so near, and stretches so
 # little (0.6 for hearts, 0.8 and more for ants in other poses), stands as the template does;
 _NEAR, _STRETCH = 0.045, 0.7
-# a pose that was searched must have so much less than the shape as it is: 0.73 of it for an ant in another pose, 0.95 for
-# one whose legs were exchanged; and so must one that stands otherwise than the axes of the files say, or is mirrored:
-# 0.66 of mirrored femurs, 0.97 of ants, 0.88 of eggs that were turned wrongly.
+# a pose that was searched, and is not believed, must have so much less than the shape as it is: 0.73 of it for an ant in
+# another pose, 0.95 for one whose legs were exchanged; and so must one that stands otherwise than the axes of the files
+# say, or is mirrored: 0.66 of mirrored femurs, 0.97 of ants, 0.88 of eggs that were turned wrongly.
 _SEARCHED, _TURNED = 0.9, 0.85
 _AS_IT_STANDS = np.radians(40)  # a smaller turn is none: the axes of two files may be meant to be the same
 _SHRUNK = 0.93  # area of a mean of shapes that are posed, against theirs: 0.997 of femurs, 0.87 of ants
@@ -65,6 +65,8 @@ _TURNS = 2  # of a part, and of its mirror image, that are tried
 # Ends of leaves are told by their fits alone (1.0 to 1.2); of femurs all others are 2 and more, of knees 1.3.
 _ALIKE_TURNS, _NEARLY = 4, 1.35
 _LOST = 0.5  # trust of a search whose result is not believed
+_NOTHING = 0.01  # a smaller stretch is none
+_FAR = 1.0  # stretch beyond which a softer fit folds: of busts 1.2 to 1.9, of all other kinds up to 0.8
 
 
 def template_of(shape: Shape, name: str, config: ViscousConfig) -> Template:
@@ -189,8 +191,7 @@ class _Task:
 
     def best(self, sides: Sequence[Frame | None]) -> tuple[_Fitted, float]:
         """The best fit of the shape; or of its mirror image, if that fits clearly better. And its `Fit.side`."""
-        begins = [self.turns(side, keep=_ALIKE_TURNS, most=_NEARLY) for side in sides]
-        found = [min(map(self.fitted, some), key=attrgetter("energy")) for some in begins]
+        found = [self.best_turn(side) for side in sides]
         if sides[0] is None:
             near = self.turns(None, "near")[0]
             if np.trace(near.frame.rotation) > 1 + 2 * np.cos(_AS_IT_STANDS):
@@ -198,12 +199,23 @@ class _Task:
         if not any(each.alike for each in found):
             for number, side in enumerate(sides):
                 for begin in self.searched(side):
-                    found[number] = _clearly_better(self.fitted(begin), found[number], _SEARCHED)
+                    factor = 1.0 if begin.trust >= _LOST else _SEARCHED
+                    found[number] = _clearly_better(self.fitted(begin), found[number], factor)
         if len(found) == 1:
             return found[0], 0.0
         plain, other = found
         best = _clearly_better(other, plain, _TURNED)
-        return best, float(np.log((plain if best is other else other).energy / best.energy))
+        stretches = [max(each.features.stretch, _NOTHING) for each in (plain if best is other else other, best)]
+        return best, float(np.log(stretches[0] / stretches[1]))
+
+    def best_turn(self, side: Frame | None) -> _Fitted:
+        """The best fit of the shape, or of its mirror image, where the template is only turned. Far from its own form its
+        stretch says little: the turn that lies closest is then as good a guess as any.
+        """
+        closest, *others = map(self.fitted, self.turns(side, keep=_ALIKE_TURNS, most=_NEARLY))
+        for other in others:
+            closest = _clearly_better(other, closest, 1.0 if other.alike else _TURNED)
+        return closest
 
     def best_part(self, sides: Sequence[Frame | None]) -> _Fitted:
         """The best fit of a part, of either side."""
@@ -244,14 +256,16 @@ def fit_without_model(
     """
     began, rough = time.monotonic(), config or ViscousConfig.choosing()
     config = config or ViscousConfig()
-    task = _Task(template, shape, config)
+    task, stiff = _Task(template, shape, config), _Task(template, shape, rough)
     if start is None:
-        found, lead = _Task(template, shape, rough).best((None, MIRROR) if mirror else (None,))
-        found = found if rough is config else task.fitted(found.begin)
+        found, lead = stiff.best((None, MIRROR) if mirror else (None,))
+        found = found if rough is config or found.features.stretch > _FAR else task.fitted(found.begin)
     elif other_side:
         found, lead = task.best((None if start.frame.mirrored else MIRROR,))[0], -start.side
     else:
         found, lead = task.best_from(start), start.side
+        if rough is not config and found.features.stretch > _FAR:
+            found = stiff.best_from(start)
     system, partial = task.system, False
 
     def judged_as(found: _Fitted) -> Judgement:

@@ -81,11 +81,20 @@ def test_of_few_and_of_fits_that_do_not_say_nothing_is_usual() -> None:
 
 def test_sides_are_taken_where_nearly_all_have_a_clear_one() -> None:
     stretches = [0.2] * 6
-    clear = records(stretches, [0.3, 0.12, -0.1, 0.4, 0.25, -0.2])
+    clear = records(stretches, [0.3, 0.12, -0.2, 0.4, 0.25, -0.25])
     assert on_the_other_side(clear) == {"s2", "s5"}
     symmetric = records(stretches, [0.01, 0.02, -0.03, 0.01, -0.12, 0.09])
     assert on_the_other_side(symmetric) == set()
     assert on_the_other_side(clear[:3]) == set()
+
+
+def test_only_a_side_that_is_worse_is_in_doubt() -> None:
+    usual, ball = Usual.of(records([0.2] * 6)), icosphere(1)
+    assert usual is not None
+    fit = replace(some_fit(ball.verts, ball.faces), verdict="fair", reasons=(UNSURE,))
+    judged = [usual.judged(fit, record) for record in records([0.2] * 3, [0.3, -0.03, -0.2])]
+    assert [each.verdict for each in judged] == ["good", "good", "fair"]
+    assert [reason.code for each in judged for reason in each.reasons] == ["side"]
 
 
 def test_a_record_of_other_types_is_not_read() -> None:

@@ -30,7 +30,7 @@ from meshmatch.models.registry import load_model
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
-from meshmatch.templates.template import Template
+from meshmatch.templates.template import Template, template_radius
 from meshmatch.training.train import build_loss_points
 from tests.conftest import icosphere
 from tests.experiments.small_bench import BODY, build, order
@@ -68,13 +68,14 @@ def setting(eggs: Template, monkeypatch: pytest.MonkeyPatch) -> Setting:
 
 def test_every_view_looks_at_the_same_cells() -> None:
     runs = all_runs(list(VIEWS))
-    assert len(runs) == len(set(runs)) == 39
-    assert runs[0] == BASE
-    assert len({run.name for run in runs}) == 39
+    assert len(runs) == len(set(runs)) == len({run.name for run in runs}) == 47
+    runs = [run for run in runs if not run.steps]
+    assert len(runs) == 39 and runs[0] == BASE
     assert BASE.name == "base"
     assert Run(field="rbf", constraint="vol+arap", seed=2).name == "field-rbf.constraint-vol-arap.seed-2"
-    for view in VIEWS.values():
-        assert view.runs[0] == BASE
+    for name, view in VIEWS.items():
+        assert view.runs[0] == BASE or name == "length"
+    assert {replace(run, steps=0) for run in VIEWS["length"].runs} == {BASE, replace(BASE, constraint="none")}
     # all but table 4's runs and the repetitions differ from the base in one thing, or in two of a table
     for run in runs:
         apart = [each.name for each in fields(run) if getattr(run, each.name) != getattr(BASE, each.name)]
@@ -85,7 +86,7 @@ def test_every_view_looks_at_the_same_cells() -> None:
 
 
 def test_cells_differ_in_representation_and_constraints_alone() -> None:
-    setting = Setting(threads=2)
+    setting = Setting(threads=2, loss="ours")
     for field in FIELDS:
         none, arap, vol, both, every = (setting.recipe(Run(field, each, seed=3)) for each in CONSTRAINTS)
         assert none.network == both.network == every.network
@@ -94,6 +95,10 @@ def test_cells_differ_in_representation_and_constraints_alone() -> None:
         assert [r.train.loss.arap for r in (none, arap, vol, both, every)] == [0, 2e-3, 0, 2e-3, 2e-3]
         assert [r.train.loss.blend for r in (none, arap, vol, both, every)] == [0, 0, 0, 0, 1e-3]
         assert (none.train.threads, none.train.seed) == (2, 3)
+    papers = Setting().recipe(replace(BASE, constraint="vol")).train.loss
+    radius = template_radius(Setting().resting("T"))
+    assert (papers.volume, papers.arap, papers.blend, papers.robust) == (5e-3, 0, 0, False)
+    assert papers.reconstruction == 1 / radius**2 and 0.5 < radius < 2  # squared lengths in the unit sphere
     chosen = Setting(batch=8).recipe(replace(BASE, kernel="cubic"))
     assert (chosen.train.shapes, chosen.kernel) == (8, "cubic")
     assert chosen.network.align_basis == chosen.network.corrections == 0

@@ -3,15 +3,19 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from meshmatch.api.matcher import Matcher
 from meshmatch.experiments.bench import kinds
 from meshmatch.experiments.bench.sets import Pair
 from meshmatch.experiments.makers.cut_scans import CutScan
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.shape import Shape
 from tests.experiments.small_bench import build
 from tests.fitting.eggs import egg_model, write_model
 
@@ -39,6 +43,24 @@ def test_every_pair_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert set(record["verdicts"]) == {"tr_reg_000", "tr_reg_001", "tr_reg_010"}
 
 
+def test_pairs_without_a_model_have_no_fits_of_their_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    build(tmp_path)
+    (tmp_path / "faust").rename(tmp_path / "animal")
+
+    def match(self: Matcher, source: Shape, target: Shape) -> SimpleNamespace:
+        index = np.arange(source.V)
+        return SimpleNamespace(map=VertexMap(source.name, target.name, index, target_vertices=target.V, verdict="fair"))
+
+    monkeypatch.setattr(Matcher, "match", match)
+    words = ["--data", str(tmp_path), "--cache", str(tmp_path / "cache"), "--sets", "animals", "--model", "none"]
+    assert kinds.main([*words, "--limit-pairs", "4"]) == 0
+    record = json.loads(capsys.readouterr().out.splitlines()[-1])["animals"]
+    assert record["all"]["pairs"] == 4 and record["verdicts"] == {}
+    assert [(row["of"], row["pairs"]) for row in record["verdict"]] == [("fair", 4)]
+
+
 def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Balls of which one is said to be a left hand; nothing is mirrored by a model of what is symmetric."""
     balls = [load_shape(file) for file in sorted(build(tmp_path).glob("faust/*.ply"))]
@@ -48,7 +70,7 @@ def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
     egg = egg_model()
     both = TrainedModel(replace(egg.card, mirror="auto"), egg.template, egg.inference)
     subjects = kinds.cut_scans("hand", 3, 0, tmp_path / "cache")
-    record, tables = kinds.measured("hand", subjects, kinds.Matcher(both))
+    record, tables = kinds.measured("hand", subjects, Matcher(both))
     assert [str(table.title).split()[-1] for table in tables] == ["length", "verdict", "sides", "Sides"]
     assert {row["of"]: row["pairs"] for row in record["sides"]} == {
         "left to right": 2,

@@ -1,14 +1,19 @@
 """Specimens of the bench have the truth that they claim, and what is measured of them is right."""
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from meshmatch.api.matcher import Matcher
 from meshmatch.collections.setting import Record
 from meshmatch.experiments.bench import specimens
-from meshmatch.experiments.bench.specimens import Specimens, by_points, main, scanned, sides_found, start_of
+from meshmatch.experiments.bench.specimens import Done, Specimens, by_points, main, scanned, sides_found, start_of
 from meshmatch.experiments.makers.molars_and_leaves import MAKERS
+from meshmatch.geometry.frames import Frame
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
 
@@ -54,8 +59,22 @@ def test_a_side_is_found_whichever_the_template_has() -> None:
     rng, points = np.random.default_rng(0), np.array([1, 2])
     some = Specimens({str(k): by_points(shape, points, 2, rng, k == 2) for k in range(3)}, "mm")
     told = [Record(str(k), "", mirrored=int(k != 2)) for k in range(3)]
-    assert sides_found(some, told) == 1 and sides_found(some, [Record("1", ""), Record("2", "")]) == 0.5
-    assert sides_found(Specimens({"0": some.each["0"]}, "mm"), told[:1]) is None
+    nothing = Done(lambda pair: np.zeros((2, 3)))
+    assert sides_found(some, replace(nothing, records=told)) == 1
+    assert sides_found(some, replace(nothing, records=[Record("1", ""), Record("2", "")])) == 0.5
+    assert sides_found(some, replace(nothing, pairs=[("good", True)] * 3 + [("poor", False)])) == 0.75
+    assert sides_found(Specimens({"0": some.each["0"]}, "mm"), nothing) is None
+
+
+def test_pairs_are_matched_by_themselves_and_asked_for_sides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def match(self: Matcher, source: Shape, target: Shape) -> SimpleNamespace:
+        same = VertexMap("a", "b", np.zeros(source.V, np.int64), target_vertices=target.V, verdict="fair")
+        fits = [SimpleNamespace(frame=Frame(1.0, np.diag([sign, 1, 1]), np.zeros(3))) for sign in (1.0, -1.0)]
+        return SimpleNamespace(map=same, source_fit=fits[0], target_fit=fits[1])
+
+    monkeypatch.setattr(Matcher, "match", match)
+    row = specimens.measure("leaves", specimens.PAIRS, tmp_path, 3, 1, 4, 0, tmp_path)
+    assert (row["fair"], row["good"], row["sides"]) == (4, 0, None) and row["lost"] > 0
 
 
 def test_the_command_goes_on_with_the_rows_that_are_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

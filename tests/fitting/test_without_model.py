@@ -10,13 +10,18 @@ from scipy.spatial.transform import Rotation
 from meshmatch.errors import InputError
 from meshmatch.fitting import without_model
 from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.judge.direct import DirectFeatures
+from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.fitting.without_model import fit_without_model, mean_shape, template_of, viscous_system
+from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.sides import mirrored
 from meshmatch.templates.template import Template
 from tests.fitting.test_direct import QUICK, bent, creature
 
+IDENTITY = Frame(1.0, np.eye(3), np.zeros(3))
 CONFIG = ViscousConfig(nodes=200, radius=0.2, samples=3000, back_points=1500)
 
 
@@ -61,6 +66,43 @@ def test_what_no_pose_fits_is_poor(template: Template, monkeypatch: pytest.Monke
     rod = creature(3)
     rod = replace(rod, verts=rod.verts * [0.1, 4.0, 0.1])
     assert fit_without_model(template, rod, CONFIG, mirror=False).verdict == "poor"
+
+
+@pytest.mark.parametrize(("stretch", "energies", "chosen"), [(0.3, (0.03, 0.029), 1), (1.5, (0.06, 0.055), 0)])
+def test_another_turn_is_taken_where_the_template_is_near_or_the_fit_is_clearly_better(
+    template: Template, monkeypatch: pytest.MonkeyPatch, stretch: float, energies: tuple[float, ...], chosen: int
+) -> None:
+    task = without_model._Task(template, creature(3), CONFIG)
+    begins = [without_model._Begin(IDENTITY, np.zeros((task.system.K, 3))) for _ in energies]
+
+    def fitted(begin: without_model._Begin) -> without_model._Fitted:
+        energy = energies[begins.index(begin)]
+        features = DirectFeatures(residual=energy - 0.03 * stretch, stretch=stretch)
+        return without_model._Fitted(begin, task._samples, begin.vectors, features)
+
+    monkeypatch.setattr(task, "turns", lambda *_, **__: begins)
+    monkeypatch.setattr(task, "fitted", fitted)
+    assert task.best_turn(None).begin is begins[chosen]
+
+
+@pytest.mark.parametrize("far", [False, True])
+def test_the_last_fit_is_softer_unless_the_template_is_far(
+    template: Template, monkeypatch: pytest.MonkeyPatch, far: bool
+) -> None:
+    asked: list[ViscousConfig] = []
+
+    def still(system: NodeSystem, samples: OrientedPoints, config: ViscousConfig, *_: Any) -> Any:
+        asked.append(config)
+        return np.zeros((system.K, 3))
+
+    monkeypatch.setattr(without_model, "viscous_vectors", still)
+    monkeypatch.setattr(without_model, "_FAR", -1.0 if far else 1.0)
+    fit = fit_without_model(template, template.shape, mirror=False)
+    assert asked[0] == ViscousConfig.choosing()
+    assert asked[-1] == (ViscousConfig.choosing() if far else ViscousConfig())
+    asked.clear()
+    fit_without_model(template, template.shape, start=fit)
+    assert (ViscousConfig.choosing() in asked) == far
 
 
 def test_the_mean_of_poses_keeps_the_size_of_what_turns(template: Template) -> None:

@@ -1,4 +1,4 @@
-"""Animals, hands and heads through models that have never seen one of them.
+"""Animals, hands and heads through models that have never seen one of them, or without a model.
 
 Cats, dogs, cows, horses and hippos of the benchmark, each fitted once and turned every way; then every ordered pair is
 matched as `match` does it, and every landmark counts. The error is the distance along the target between the matched and
@@ -27,12 +27,14 @@ from typer import Option
 from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Ints
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.pairs import matched
+from meshmatch.experiments.bench.pairs import matched, matched_directly
 from meshmatch.experiments.bench.scores import TruthDistances
 from meshmatch.experiments.bench.sets import Pair, Shapes, load_folder, ordered_pairs
 from meshmatch.experiments.makers.cut_scans import make_scans, scan_errors
+from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.registry import NO_MODEL
 
 OFF = 0.1
 """In units of sqrt(area): a point further off is lost."""
@@ -125,19 +127,24 @@ def cut_scans(kind: str, count: int, seed: int, cache: Path | None) -> Subjects:
 
 
 def measured(
-    name: str, subjects: Subjects, matcher: Matcher, limit: int | None = None
+    name: str, subjects: Subjects, matcher: Matcher, limit: int | None = None, direct: bool = False
 ) -> tuple[dict[str, Any], list[Table]]:
-    """Record and tables of all pairs of a set, or of ``limit`` of them: all together, by groups, by the worse verdict."""
-    fits, found = matched(matcher, subjects.shapes, ordered_pairs(subjects.shapes, limit), name)
+    """Record and tables of all pairs of a set, or of ``limit`` of them: all together, by groups, by the worse verdict;
+    ``direct`` without a model."""
+    pairs, fits = ordered_pairs(subjects.shapes, limit), dict[str, Fit]()
+    if direct:
+        found = matched_directly(matcher, subjects.shapes, pairs, name)
+    else:
+        fits, found = matched(matcher, subjects.shapes, pairs, name)
     errors = subjects.errors({pair: each.map for pair, each in found.items()})
     whole = rows_of(errors, lambda _: "all")[0]
     groups = {"verdict": lambda pair: found[pair].verdict, **subjects.groups}
     rows = {heading: rows_of(errors, group) for heading, group in groups.items()}
     record: dict[str, Any] = {"all": whole, **rows, "verdicts": {each: fit.verdict for each, fit in fits.items()}}
-    title = f"{name} with {matcher.model.card.name}: {subjects.title}"
+    title = f"{name} {'without a model' if direct else f'with {matcher.model.card.name}'}: {subjects.title}"
     tables = [runner.table(title, [whole], {"of": "of", **_COLUMNS})]
     tables += [runner.table(f"By {heading}", some, {heading: "of", **_COLUMNS}) for heading, some in rows.items()]
-    if matcher.model.card.mirror == "auto":
+    if not direct and matcher.model.card.mirror == "auto":
         wrong = {each for each, fit in fits.items() if fit.frame.mirrored != subjects.left[each]}
         good = sum(each.verdict == "good" and len(wrong & set(pair)) == 1 for pair, each in found.items())
         sides: dict[str, Any] = {"shapes": len(fits), "left": sum(subjects.left.values())}
@@ -151,7 +158,7 @@ def measured(
 def main(
     data: runner.Data = runner.DATA,
     sets: Annotated[str, Option(help=f"of {', '.join(SETS)}")] = ",".join(SETS),
-    model: Annotated[str | None, Option(help="default: the kind's own")] = None,
+    model: Annotated[str | None, Option(help="default: the kind's own; or none")] = None,
     limit_pairs: runner.LimitPairs = None,
     limit_shapes: Annotated[int | None, Option(min=2, help="animals, evenly spread")] = None,
     scans: Annotated[int, Option(min=2, help="hands, and heads")] = 10,
@@ -164,6 +171,6 @@ def main(
     for name in runner.names_of(sets, SETS, "set"):
         matcher = Matcher(model or MODELS.get(name, name), FitConfig(seed=seed), threads)
         subjects = animals(data, limit_shapes, cache) if name == "animals" else cut_scans(name, scans, seed, cache)
-        record[name], some = measured(name, subjects, matcher, limit_pairs)
+        record[name], some = measured(name, subjects, matcher, limit_pairs, model == NO_MODEL)
         tables += some
     return runner.Report(record, tables)

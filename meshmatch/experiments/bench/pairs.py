@@ -1,4 +1,4 @@
-"""The loop of the benchmarks of kinds and characters: every shape fitted once, pairs matched as `match` does."""
+"""The loops of the benchmarks of kinds and characters: pairs matched as `match` does, by fits or without a model."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ VERDICTS = ("good", "fair", "poor")
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """The map of a pair, the worse verdict of its fits, and the CPU seconds of both fits and the map."""
+    """The map of a pair, the worse verdict of its fits, and the CPU seconds of all that it took."""
 
     map: VertexMap
     verdict: str
@@ -40,3 +40,13 @@ def matched(
         seconds = spent[a] + spent[b] + time.process_time() - began
         found[a, b] = Matched(vertex_map, max(fits[a].verdict, fits[b].verdict, key=VERDICTS.index), seconds)
     return fits, found
+
+
+def matched_directly(matcher: Matcher, shapes: Shapes, pairs: Sequence[Pair], what: str) -> dict[Pair, Matched]:
+    """Maps by pair, each without a model."""
+    found = {}
+    for a, b in track(pairs, what, len(pairs)):
+        began = time.process_time()
+        vertex_map = matcher.match(shapes[a], shapes[b]).map
+        found[a, b] = Matched(vertex_map, str(vertex_map.verdict), time.process_time() - began)
+    return found

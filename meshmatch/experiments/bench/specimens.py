@@ -8,6 +8,7 @@ or along the target in percent of sqrt(area) where there is no unit. A place is 
 
 - none: ``fit FOLDER --model none``.
 - own: ``prepare --grow-radii``, ``train --shapes`` of so many steps, and ``fit FOLDER --model own``, of the same specimens.
+- pairs: ``match A B --model none`` of every pair by itself, or of ``--limit-pairs`` of them.
 - meshmonk: the first specimen is registered to all others, from a start that it is given: the similarity, and the
   side, that brings true places together best.
 - pyclarcs: for bilateral symmetry; told as missing where it is not installed.
@@ -21,7 +22,7 @@ import os
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
 from itertools import permutations
@@ -33,6 +34,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from typer import Option
 
+from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.collection import Collection
 from meshmatch.collections.setting import Record
@@ -58,7 +60,9 @@ from meshmatch.training.train import train
 
 SIDED = ("femurs", "hearts", "knees", "molars")
 SETS = (*SIDED, "leaves", "bust", "bird")
-METHODS = (NO_MODEL, "own", "meshmonk", "pyclarcs")
+PAIRS = "pairs"
+METHODS = (NO_MODEL, "own", PAIRS, "meshmonk", "pyclarcs")
+_OTHERS = METHODS[3:]
 LOST = 0.1  # of sqrt(area)
 _CUT = 2  # femurs
 _THIN = 10_000  # triangles, for meshmonk
@@ -198,10 +202,12 @@ Points = Callable[[Pair], Floats]
 
 @dataclass(frozen=True, eq=False)
 class Done:
-    """What a method makes of a set: where vertices arrive, and of a collection what is said of each fit."""
+    """What a method makes of a set: where vertices arrive, and what is said of each fit of a collection, or of each pair:
+    the verdict, and whether sides were told rightly."""
 
     points: Points
     records: Sequence[Record] = ()
+    pairs: list[tuple[str, bool]] = field(default_factory=list)
 
 
 def collected(some: Specimens, scans: Path, work: Path, model: str | Path) -> Done:
@@ -224,6 +230,23 @@ def own(some: Specimens, scans: Path, work: Path, steps: int) -> Done:
     recipe = recipe_for(work / "prepared").changed(steps=steps)
     train(work / "model", shapes=work / "prepared", recipe=recipe)
     return collected(some, scans, work / "fits", work / "model")
+
+
+def by_pairs(some: Specimens, scans: Path, work: Path) -> Done:
+    """``meshmatch match A B --model none``."""
+    matcher = Matcher(NO_MODEL, threads=1)
+    files = {name: load_shape(scans / f"{name}.ply") for name in some.each}
+    judged: list[tuple[str, bool]] = []
+
+    def points(pair: Pair) -> Floats:
+        source, target = (files[name] for name in pair)
+        one, other = (some.each[name] for name in pair)
+        found = matcher.match(source, target)
+        turned_over = found.source_fit.frame.mirrored != found.target_fit.frame.mirrored
+        judged.append((found.map.verdict, turned_over == (one.mirrored != other.mirrored)))
+        return found.map.points(target)[one.vertices]
+
+    return Done(points, pairs=judged)
 
 
 def start_of(first: Specimen, other: Specimen) -> Frame:
@@ -270,15 +293,20 @@ def _cpu() -> float:
     return sum(os.times()[:4])
 
 
-def sides_found(some: Specimens, records: Sequence[Record]) -> float | None:
-    """Share of specimens whose side is told rightly, whichever side the template is of."""
+def sides_found(some: Specimens, done: Done) -> float | None:
+    """Share of specimens whose side is told rightly, whichever side the template is of; or of pairs."""
     if not any(each.mirrored for each in some.each.values()):
         return None
+    if done.pairs:
+        return float(np.mean([right for _, right in done.pairs]))
+    records = done.records
     same = float(np.mean([bool(each.mirrored) == some.each[each.name].mirrored for each in records]))
     return max(same, 1 - same)
 
 
-def measure(name: str, method: str, data: Path, count: int, steps: int, seed: int, work: Path) -> dict[str, Any]:
+def measure(
+    name: str, method: str, data: Path, count: int, steps: int, limit: int | None, seed: int, work: Path
+) -> dict[str, Any]:
     """A row."""
     some = load(name, data, count, seed)
     scans, place = work / "scans" / name, work / "fits" / f"{name}-{method}"
@@ -291,13 +319,17 @@ def measure(name: str, method: str, data: Path, count: int, steps: int, seed: in
     ways: dict[str, Callable[[Specimens, Path, Path], Done]] = {
         NO_MODEL: partial(collected, model=NO_MODEL),
         "own": partial(own, steps=steps),
+        PAIRS: by_pairs,
         "meshmonk": monk,
     }
     done = ways[method](some, scans, place)
     cpu = _cpu() - began
     means, lost, on_cut = {}, [], []
-    for pair in permutations(some.each, 2):
-        errors = some.errors(pair, done.points(pair))
+    for pair in runner.spread(list(permutations(some.each, 2)), limit if method == PAIRS else None):
+        began = _cpu()
+        arrived = done.points(pair)
+        cpu += _cpu() - began
+        errors = some.errors(pair, arrived)
         errors = errors[np.isfinite(errors)]
         means[pair] = float(errors.mean())
         lost.append(float((errors > some.lost(pair[1])).mean()))
@@ -307,9 +339,9 @@ def measure(name: str, method: str, data: Path, count: int, steps: int, seed: in
     row: dict[str, Any] = {"set": name, "method": method, "specimens": len(some.each), "unit": some.unit}
     row |= {"error": float(np.mean(list(means.values()))), "worst": means[worst], "worst_pair": list(worst)}
     row |= {"lost": float(np.mean(lost)), "cut": float(np.mean(on_cut)) if on_cut else None, "cpu": cpu}
-    if done.records:
-        counts = Counter(each.verdict for each in done.records)
-        row |= {"sides": sides_found(some, done.records), **{each: counts[each] for each in VERDICTS[:3]}}
+    if done.records or done.pairs:
+        counts = Counter([each.verdict for each in done.records] or [verdict for verdict, _ in done.pairs])
+        row |= {"sides": sides_found(some, done), **{each: counts[each] for each in VERDICTS[:3]}}
     of_each = {each: [means[pair] for pair in means if each in pair] for each in some.each}
     told = {each.name: [each.verdict, each.trust, each.reasons] for each in done.records}
     return row | {"each": {key: [float(np.mean(off)), *told.get(key, [])] for key, off in of_each.items()}}
@@ -322,6 +354,7 @@ def main(
     methods: Annotated[str, Option(help=f"of {', '.join(METHODS)}")] = ",".join(METHODS),
     count: Annotated[int, Option(min=3, help="specimens of each set, if it has as many")] = 9,
     steps: Annotated[int, Option(min=1, help="that own models are trained for")] = 200,
+    limit_pairs: runner.LimitPairs = None,
     work: runner.Work = None,
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
@@ -331,13 +364,14 @@ def main(
     with tempfile.TemporaryDirectory() as temporary:
         place = work or Path(temporary)
         for method in runner.names_of(methods, METHODS, "method"):
-            if method in METHODS[2:] and find_spec(method) is None:
+            if method in _OTHERS and find_spec(method) is None:
                 skipped.append(f"skipped: {method} is not installed")
                 continue
-            asked = {"count": count, "seed": seed} | ({"steps": steps} if method == "own" else {})
+            asked: dict[str, Any] = {"count": count, "seed": seed}
+            asked |= {"steps": steps} if method == "own" else {"pairs": limit_pairs} if method == PAIRS else {}
             for name in names:
                 runner.tell(f"{name}: {method}")
-                call = partial(measure, name, method, data, count, steps, seed, place)
+                call = partial(measure, name, method, data, count, steps, limit_pairs, seed, place)
                 rows.append(runner.once(place / "rows" / f"{name}-{method}.json", asked, call))
     rows.sort(key=lambda row: names.index(row["set"]))
     title = f"Specimens; own models of {steps} steps"

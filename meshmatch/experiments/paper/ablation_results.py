@@ -157,12 +157,17 @@ def number(values: Sequence[float]) -> str:
     return words if len(values) == 1 else f"{words} ± {stdev(values):.2f}"
 
 
+def percent(values: Sequence[float]) -> str:
+    """A mean share in percent; a dash for what was not measured."""
+    return f"{fmean(values):.0%}" if values else "-"
+
+
 def errors_table(view: View, known: Known, sets: Sequence[str], budget: str) -> Table:
     """Steps, held-out error, mean and median on each set beside the paper's mean."""
     columns = {head: head for head in view.heads}
     columns |= {"steps": "steps:>", "held out": "held out:>"}
     for name in sets:
-        columns |= {name: f"{name}:>", f"{name} median": f"{name} median:>"}
+        columns |= {name: f"{name}:>", f"{name} median": f"{name} median:>", f"{name} over 15": f"{name} over 15:>"}
         if name in PAPER_SETS and any(row.paper for row in view.rows):
             columns[f"{name} paper"] = f"{name} paper:.1f"
     rows = []
@@ -178,6 +183,7 @@ def errors_table(view: View, known: Known, sets: Sequence[str], budget: str) -> 
         for name in sets:
             row[name] = number(known.error(run, name, each.method))
             row[f"{name} median"] = number(known.error(run, name, each.method, "median_cm"))
+            row[f"{name} over 15"] = percent(known.error(run, name, each.method, "share_over_15cm"))
             if each.paper is not None and name in PAPER_SETS:
                 row[f"{name} paper"] = each.paper[PAPER_SETS.index(name)]
     return table(f"{view.title}, errors in cm: {budget}", rows, columns)

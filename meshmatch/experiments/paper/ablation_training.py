@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -33,7 +33,7 @@ from meshmatch.models.network import NetworkConfig
 from meshmatch.models.registry import CARD
 from meshmatch.outputs import make_folder
 from meshmatch.templates.make import NodeConfig, Strategy, lay_nodes
-from meshmatch.templates.template import Template, read_template
+from meshmatch.templates.template import Template, read_template, template_radius
 from meshmatch.threads import set_threads
 from meshmatch.training.datasets import Batch
 from meshmatch.training.loop import TrainConfig, Trainer
@@ -68,6 +68,9 @@ STRAINED = 200
 """At how many of the loss points the energies of the regularisers are taken."""
 
 
+Loss = Literal["paper", "ours"]
+
+
 @dataclass(frozen=True)
 class Setting:
     """What all runs share; plain values, so that a process of its own can be told.
@@ -76,10 +79,13 @@ class Setting:
     ----------
     batch : int, optional
         Shapes of a step; None for the recipe's.
+    loss
+        "ours", or "paper": mean squared distances, and the weights of its table 1 for lengths in the unit sphere.
     """
 
     threads: int = 1
     batch: int | None = None
+    loss: Loss = "paper"
 
     def recipe(self, run: Run) -> Recipe:
         """`SMALL` with the run's choices; constraints that it does not have weigh nothing.
@@ -87,7 +93,7 @@ class Setting:
         No network has an aligner or learned corrections: the orientation is given, the same to all runs, and what is
         compared is the deformation.
         """
-        given = SMALL.train.loss
+        given = SMALL.train.loss if self.loss == "ours" else _paper_loss(self.resting(run.pose))
         loss = replace(
             given,
             volume=given.volume if "vol" in run.constraint else 0.0,
@@ -125,6 +131,11 @@ class Setting:
         """What draws shapes to learn from, and shapes of people that nobody learned from."""
         template = self.resting(pose)
         return human_source(template, 1024, 0), human_source(template, 64, 1)
+
+
+def _paper_loss(template: Template) -> CorrespondenceLoss:
+    """The paper's, for lengths in units of sqrt(area)."""
+    return CorrespondenceLoss(reconstruction=1 / template_radius(template) ** 2)
 
 
 @lru_cache(maxsize=4)

@@ -35,6 +35,7 @@ class Run:
     pose : of the template, one of `POSES`
     shapes : how many there are to learn from
     supervised : on how many template points the right place is told
+    steps : of its training; 0 for as many as the command says
     """
 
     field: FieldName = "mls"
@@ -46,6 +47,7 @@ class Run:
     shapes: int = 2000
     supervised: int = 1000
     kernel: Kernel = "smooth"
+    steps: int = 0
     seed: int = 0
 
     @property
@@ -115,6 +117,8 @@ _PAPER7 = {
     ("geodesic", "T"): (5.0, 6.9), ("geodesic", "A"): (5.2, 7.4),
     ("uniform", "T"): (5.1, 6.9), ("uniform", "A"): (5.9, 9.5),
 }  # fmt: skip
+LENGTHS = (1_000, 3_000, 10_000, 30_000)
+"""Steps of training at which one asks whether errors still fall."""
 PAPER_MS = {
     "pointwise": {"none": 32.0, "vol+arap": 250.4, "vol+arap+Z": 4098.3},
     "rbf": {"none": 8.0, "vol+arap": 8.2, "vol+arap+Z": 12.6},
@@ -135,6 +139,15 @@ def _numbers(name: str, counts: Sequence[int]) -> tuple[Row, ...]:
 
 
 VIEWS = {
+    "length": View(
+        "Length of training",
+        ("constraint",),
+        tuple(
+            Row((each,), replace(BASE, constraint=each, steps=steps))
+            for steps in LENGTHS
+            for each in ("none", BASE.constraint)
+        ),
+    ),
     "table4": View(
         "Table 4",
         ("constraint", "field"),

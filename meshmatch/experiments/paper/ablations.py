@@ -2,8 +2,9 @@
 
 Tables 4 (representations and constraints: errors and cost), 5 (regularisers), 6 (nodes and radius, kernel), 7 (how nodes
 are chosen); figures 8 (template pose), 9 (training shapes), 10 (supervised points). All are views of one set of runs. Each
-run is trained once, from the beginning, for the same number of --steps, and measured on shapes that it has not seen and on
-pairs of the benchmark's sets.
+run is trained once, from the beginning, and measured on shapes that it has not seen and on pairs of the benchmark's sets.
+All are trained for the same number of --steps; how many that should be, the view "length" says, which trains with and
+without constraints for 1,000 to 30,000.
 
 What is measured lies in the output folder and is not measured again, so that a stopped command goes on with what is
 missing; --show measures nothing and shows what is there. The tables say the budget. Errors are in cm at 1.9 m2 of skin:
@@ -36,7 +37,7 @@ from meshmatch.experiments.paper.ablation_errors import (
     subject,
 )
 from meshmatch.experiments.paper.ablation_results import claims, claims_table, tables
-from meshmatch.experiments.paper.ablation_training import Setting, timed, train_run
+from meshmatch.experiments.paper.ablation_training import Loss, Setting, timed, train_run
 from meshmatch.experiments.paper.ablation_views import VIEWS, Known, Run, all_runs, methods_of
 from meshmatch.geometry.frames import Frame
 from meshmatch.models.registry import find_model
@@ -73,16 +74,17 @@ class Kept:
 
     def train(self, run: Run) -> dict[str, Any] | None:
         """How its training went; {"skipped": why} where nodes cannot be laid."""
+        steps = run.steps or self.steps
 
         def measured() -> dict[str, Any]:
-            runner.tell(f"training {run.name}: {self.steps} steps")
+            runner.tell(f"training {run.name}: {steps} steps")
             try:
-                found = train_run(run, self.setting, self.folder / run.name / "model", self.steps)
+                found = train_run(run, self.setting, self.folder / run.name / "model", steps)
             except TemplateError as error:
                 found = {"skipped": error.message}
             return {**self.here(), **found}
 
-        asked = {"run": asdict(run), "setting": asdict(self.setting), "steps": self.steps}
+        asked = {"run": asdict(run), "setting": asdict(self.setting), "steps": steps}
         return self.answer(self.folder / run.name / "trained.json", asked, measured)
 
     def errors(self, run: Run, trained: dict[str, Any]) -> dict[tuple[Run, str, str], dict[str, Any]]:
@@ -156,7 +158,7 @@ class Kept:
 
     def budget(self) -> str:
         """What the numbers cost, in words."""
-        words = [f"{self.steps} steps of every run"]
+        words = [f"{self.steps} steps of every run", f"{self.setting.loss} loss"]
         if self.setting.batch:
             words.append(f"batches of {self.setting.batch}")
         words.append(f"{self.measure.code_steps} steps on the code")
@@ -176,6 +178,7 @@ def main(
     code_steps: Annotated[int, Option(min=1, help="of the search over codes")] = 100,
     methods: Annotated[str, Option(help="refinements, where a view asks for them")] = ",".join(METHODS),
     batch: Annotated[int | None, Option(min=1, help="shapes of a step; 32 by default")] = None,
+    loss: Annotated[Loss, Option(help="squared distances and the weights of the paper, or ours")] = "paper",
     threads: runner.Threads = 1,
     model: runner.Model = "human",
     data: runner.Data = runner.DATA,
@@ -185,7 +188,7 @@ def main(
     names = [name for name in VIEWS if name in runner.names_of(views, VIEWS, "view")]
     runs = all_runs(names, seeds, runner.names_of(repeated, VIEWS, "view"))
     benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
-    setting, measure = Setting(threads, batch), Measure(shapes=shapes, code_steps=code_steps)
+    setting, measure = Setting(threads, batch, loss), Measure(shapes=shapes, code_steps=code_steps)
     wanted = runner.names_of(methods, METHODS, "method")
     kept = Kept(output, setting, measure, steps, model, benches, cache, show, wanted)
     known = kept.known(runs, names, rounds)

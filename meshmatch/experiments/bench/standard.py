@@ -1,0 +1,202 @@
+"""The published splits of remeshed people and animals, for those who have the data: table 1 of most papers.
+
+Folders are laid out as others keep them, ``FAUST_r/off/*.off`` and ``FAUST_r/corres/*.vts``: line k of a shape's list is the
+vertex, counted from 1, of the point k that all shapes of the set have.
+
+- FAUST_r: the last 20 shapes (tr_reg_080 to 099); SCAPE_r: the last 20 (mesh052 to 071).
+- SHREC19_r: all but shape 40, which is a part.
+- SMAL_r: those that ``test_cat.txt`` names.
+- TOPKIDS: every shape to the first, kid00; line k of ``corres/NAME_ref.vts`` is the vertex of kid00 for vertex k.
+
+All ordered pairs of different shapes count, none left out. The error is the geodesic distance on the target between the
+matched and the true vertex, in units of sqrt(area), times 100: the mean over points, then over pairs. Intervals are of 95 %,
+by drawing shapes with replacement. No shape of any of these sets was used to train a model that ships.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import permutations
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from typer import Option
+
+from meshmatch.api.matcher import Matcher
+from meshmatch.arrays import Floats, Int, Ints
+from meshmatch.errors import InputError
+from meshmatch.experiments import runner
+from meshmatch.experiments.bench.pairs import matched, matched_directly
+from meshmatch.experiments.bench.scores import TruthDistances
+from meshmatch.experiments.bench.sets import Pair, Shapes
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.models.registry import NO_MODEL
+from meshmatch.shapes.files import load_shape
+
+REFERENCE = "kid00"
+MODELS = {"FAUST_r": "human", "SCAPE_r": "human", "SHREC19_r": "human", "SMAL_r": "quadruped", "TOPKIDS": "human"}
+_TEST, _PART, _NAMES = 20, "40", "test_cat.txt"
+_DRAWS = 2000
+_COLUMNS = {
+    "set": "set",
+    "model": "model",
+    "shapes": "shapes:d",
+    "pairs": "pairs:d",
+    "mean": "mean:.2f",
+    "95 %": "interval",
+}
+_COLUMNS |= {"median pair": "median:.2f", "worst": "worst:.1f", "over 10": "off:.1%", "CPU s a pair": "cpu:.2f"}
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Shapes and pairs of a set, and its truth: ``points`` of every shape (N,), or vertices of the reference (V,)."""
+
+    shapes: Shapes
+    pairs: Sequence[Pair]
+    points: Mapping[str, Int[Ints, " N"]]
+
+    def of(self, pair: Pair) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
+        """Vertices of the source whose partners are known, and these."""
+        source, target = pair
+        if target == REFERENCE:
+            return np.arange(len(self.points[source])), self.points[source]
+        return self.points[source], self.points[target]
+
+
+def split_of(name: str, data: Path) -> Split:
+    """A published split.
+
+    Raises
+    ------
+    InputError
+        The folder or a list is missing, or a list does not fit its shape.
+    """
+    folder, to_reference = data / name, name == "TOPKIDS"
+    files = {path.stem: path for path in sorted(runner.files_in(folder / "off", "*.off"), key=_number)}
+    names = _chosen(name, folder, list(files))
+    if missing := [each for each in names if each not in files]:
+        raise InputError(f"{folder / 'off'} has no {missing[0]}.off")
+    shapes = {each: load_shape(files[each]) for each in names}
+    points = {}
+    for each in names:
+        if to_reference and each == REFERENCE:
+            continue
+        points[each] = vertices_in(folder / "corres" / f"{each}{'_ref' if to_reference else ''}.vts")
+        within = shapes[REFERENCE].V if to_reference else shapes[each].V
+        if points[each].min() < 0 or points[each].max() >= within:
+            raise InputError(f"{folder / 'corres'}: the list of {each} names vertices that are not there")
+        if to_reference and len(points[each]) != shapes[each].V:
+            raise InputError(f"{folder / 'corres'}: the list of {each} has not one line for each of its vertices")
+    pairs = [(each, REFERENCE) for each in points] if to_reference else list(permutations(names, 2))
+    if len({len(each) for each in points.values()}) > 1 and not to_reference:
+        raise InputError(f"{folder / 'corres'}: the lists are of different length")
+    return Split(shapes, pairs, points)
+
+
+def _number(path: Path) -> tuple[int, str]:
+    """The order of files by the digits in their names."""
+    digits = "".join(letter for letter in path.stem if letter.isdigit())
+    return int(digits or 0), path.stem
+
+
+def _chosen(name: str, folder: Path, names: list[str]) -> list[str]:
+    if name in ("FAUST_r", "SCAPE_r"):
+        return names[-_TEST:]
+    if name == "SHREC19_r":
+        return [each for each in names if each != _PART]
+    if name == "TOPKIDS":
+        return [REFERENCE, *(each for each in names if each != REFERENCE)]
+    try:
+        return (folder / _NAMES).read_text("utf-8").split()
+    except OSError as error:
+        raise InputError(f"{folder} has no {_NAMES}", "it names the shapes of the test split, one a line") from error
+
+
+def vertices_in(path: Path) -> Int[Ints, " N"]:
+    """A list of vertices counted from 1, one a line, counted from 0."""
+    try:
+        found = np.loadtxt(path, ndmin=1)
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {path}", "it lists vertices, counted from 1, one a line") from error
+    if found.ndim != 1 or not len(found) or (found != found.astype(np.int64)).any():
+        raise InputError(f"{path} is no list of vertices", "it lists vertices, counted from 1, one a line")
+    return found.astype(np.int64) - 1
+
+
+def errors_of(split: Split, indices: Mapping[Pair, Int[Ints, " V"]], cache: Path | None) -> dict[Pair, Floats]:
+    """Errors at all points of every pair, times 100."""
+    found: dict[Pair, Floats] = {}
+    for target in runner.track(sorted({pair[1] for pair in indices}), "measuring"):
+        mine = [pair for pair in indices if pair[1] == target]
+        known = np.arange(split.shapes[target].V) if target == REFERENCE else split.points[target]
+        distances = TruthDistances(split.shapes[target], known, cache)
+        if target != REFERENCE:
+            at = distances.errors([indices[pair][split.points[pair[0]]] for pair in mine])
+            found |= {pair: 100 * each.astype(np.float64) for pair, each in zip(mine, at, strict=True)}
+            continue
+        for pair in mine:
+            asked = np.unique(split.points[pair[0]])
+            rows = distances.of(asked)[np.searchsorted(asked, split.points[pair[0]]), indices[pair]]
+            found[pair] = 100 * rows.astype(np.float64)
+    return found
+
+
+def interval_over_shapes(means: Mapping[Pair, float], seed: int = 0) -> tuple[float, float]:
+    """Of 95 %, of the mean over pairs, if shapes were drawn again with replacement."""
+    names = sorted({name for pair in means for name in pair})
+    a, b = np.array([[names.index(name) for name in pair] for pair in means]).T
+    values = np.array(list(means.values()))
+    rng, drawn = np.random.default_rng(seed), []
+    for _ in range(_DRAWS):
+        times = np.bincount(rng.integers(len(names), size=len(names)), minlength=len(names))
+        # Of pairs with one shape, such as a reference, that shape always counts.
+        weight = times[a] * np.where(len(set(b)) == 1, 1, times[b])
+        if weight.sum():
+            drawn.append(float(weight @ values / weight.sum()))
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def row_of(name: str, model: str, split: Split, errors: Mapping[Pair, Floats], cpu: float) -> dict[str, Any]:
+    """A row of the table."""
+    means = {pair: float(each.mean()) for pair, each in errors.items()}
+    values, (low, high) = np.array(list(means.values())), interval_over_shapes(means)
+    row = {"set": name, "model": model, "shapes": len({each for pair in means for each in pair}), "pairs": len(means)}
+    row |= {"mean": float(values.mean()), "low": low, "high": high, "interval": f"{low:.2f} to {high:.2f}"}
+    row |= {"median": float(np.median(values)), "worst": float(values.max()), "cpu": cpu}
+    return row | {"off": float(np.mean([(each > 10).mean() for each in errors.values()]))}
+
+
+@runner.command
+def main(
+    data: Annotated[Path, Option(help="folder of the sets' folders")],
+    sets: Annotated[str, Option(help=f"of {', '.join(MODELS)}; default: those that are there")] = "",
+    model: Annotated[str | None, Option(help="default: human, or quadruped; or none")] = None,
+    limit_pairs: runner.LimitPairs = None,
+    cache: runner.Cache = None,
+    threads: runner.Threads = 1,
+    seed: runner.Seed = 0,
+) -> runner.Report:
+    names = runner.names_of(sets, MODELS, "set") or [name for name in MODELS if (data / name).is_dir()]
+    if not names:
+        raise InputError(f"{data} has none of {', '.join(MODELS)}", "docs/datasets.md says how they are laid out")
+    rows = []
+    for name in names:
+        split, chosen = split_of(name, data), model or MODELS[name]
+        pairs = runner.spread(list(split.pairs), limit_pairs)
+        runner.tell(f"{name}: {len(split.shapes)} shapes, {len(pairs)} pairs")
+        matcher = Matcher(chosen, FitConfig(seed=seed), threads)
+        if chosen == NO_MODEL:
+            found = matched_directly(matcher, split.shapes, pairs, name)
+        else:
+            used = {each for pair in pairs for each in pair}
+            found = matched(matcher, {each: split.shapes[each] for each in split.shapes if each in used}, pairs, name)[
+                1
+            ]
+        errors = errors_of(split, {pair: each.map.index for pair, each in found.items()}, cache)
+        cpu = float(np.mean([each.seconds for each in found.values()]))
+        rows.append(row_of(name, chosen, split, errors, cpu))
+    return runner.Report({"rows": rows}, [runner.table("Standard splits, error x 100 / sqrt(area)", rows, _COLUMNS)])

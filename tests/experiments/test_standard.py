@@ -1,0 +1,103 @@
+"""Standard splits: how folders are read, which shapes and pairs count, and what errors are; balls that share a truth."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.arrays import Ints
+from meshmatch.errors import InputError
+from meshmatch.experiments.bench import standard
+from meshmatch.experiments.bench.standard import errors_of, interval_over_shapes, main, split_of
+from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.shape import Shape
+from tests.conftest import icosphere
+from tests.fitting.eggs import egg_model, write_model
+
+BALL = icosphere(2)
+
+
+def write(folder: Path, name: str, corres: Ints | None, suffix: str = "") -> Shape:
+    """A ball whose vertices stand in another order, and a list of vertices, counted from 1."""
+    for part in ("off", "corres"):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    save_shape(folder / "off" / f"{name}.off", BALL)
+    if corres is not None:
+        np.savetxt(folder / "corres" / f"{name}{suffix}.vts", corres + 1, "%d")
+    return BALL
+
+
+def test_the_splits_are_the_published_ones(tmp_path: Path) -> None:
+    for number in range(78, 100):
+        write(tmp_path / "FAUST_r", f"tr_reg_{number:03d}", np.arange(5))
+    found = split_of("FAUST_r", tmp_path)
+    assert list(found.shapes) == [f"tr_reg_{number:03d}" for number in range(80, 100)] and len(found.pairs) == 380
+    for number in (1, 2, 10, 40):
+        write(tmp_path / "SHREC19_r", str(number), np.arange(5))
+    assert list(split_of("SHREC19_r", tmp_path).shapes) == ["1", "2", "10"]  # without the part
+    for name in ("cow_a", "cow_b", "dog"):
+        write(tmp_path / "SMAL_r", name, np.arange(3))
+    with pytest.raises(InputError, match=r"has no test_cat\.txt"):
+        split_of("SMAL_r", tmp_path)
+    (tmp_path / "SMAL_r" / "test_cat.txt").write_text("cow_b\ncow_a\n")
+    assert split_of("SMAL_r", tmp_path).pairs == [("cow_b", "cow_a"), ("cow_a", "cow_b")]
+
+
+def test_lists_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "SHREC19_r"
+    write(folder, "1", np.arange(4))
+    write(folder, "2", np.arange(3))
+    with pytest.raises(InputError, match="different length"):
+        split_of("SHREC19_r", tmp_path)
+    write(folder, "2", np.array([0, 1, 2, BALL.V]))
+    with pytest.raises(InputError, match="not there"):
+        split_of("SHREC19_r", tmp_path)
+    (folder / "corres" / "2.vts").write_text("a\n")
+    with pytest.raises(InputError, match="cannot read"):
+        split_of("SHREC19_r", tmp_path)
+    write(tmp_path / "TOPKIDS", "kid00", None)
+    write(tmp_path / "TOPKIDS", "kid01", np.arange(4), "_ref")
+    with pytest.raises(InputError, match="one line for each"):
+        split_of("TOPKIDS", tmp_path)
+
+
+def test_errors_are_at_the_points_of_the_truth(tmp_path: Path) -> None:
+    write(tmp_path / "SHREC19_r", "1", np.array([3, 4, 5]))
+    write(tmp_path / "SHREC19_r", "2", np.array([7, 8, 9]))
+    split = split_of("SHREC19_r", tmp_path)
+    index = np.zeros(BALL.V, np.int64)
+    index[[3, 4, 5]] = 7, 8, 8
+    errors = errors_of(split, {("1", "2"): index}, tmp_path)["1", "2"]
+    assert errors[:2].tolist() == [0, 0] and errors[2] > 1
+    write(tmp_path / "TOPKIDS", "kid00", None)
+    write(tmp_path / "TOPKIDS", "kid01", np.roll(np.arange(BALL.V), 1), "_ref")
+    split = split_of("TOPKIDS", tmp_path)
+    assert split.pairs == [("kid01", "kid00")]
+    right = errors_of(split, {("kid01", "kid00"): np.roll(np.arange(BALL.V), 1)}, tmp_path)["kid01", "kid00"]
+    wrong = errors_of(split, {("kid01", "kid00"): np.arange(BALL.V)}, tmp_path)["kid01", "kid00"]
+    assert right.max() == 0 < wrong.min()
+
+
+def test_intervals_are_of_shapes() -> None:
+    one_odd = {(a, b): 1.0 + 8.0 * ("c" in (a, b)) for a in "abcdefgh" for b in "abcdefgh" if a != b}
+    low, high = interval_over_shapes(one_odd)
+    assert 1.0 <= low < 3.0 < high < 9.0
+    same = interval_over_shapes(dict.fromkeys(one_odd, 2.0))
+    assert same == (2.0, 2.0)
+    to_reference = {(str(k), "kid00"): float(k) for k in range(20)}
+    low, high = interval_over_shapes(to_reference)
+    assert 6 < low < 9.5 < high < 13
+
+
+def test_the_command_finds_the_sets_that_are_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = write_model(egg_model(), tmp_path / "egg")
+    for name in ("1", "2", "3"):
+        write(tmp_path / "SHREC19_r", name, np.arange(10))
+    words = ["--data", str(tmp_path), "--cache", str(tmp_path / "cache"), "--model", str(model)]
+    assert main(words) == 0
+    (row,) = json.loads(capsys.readouterr().out.splitlines()[-1])["rows"]
+    assert (row["set"], row["shapes"], row["pairs"]) == ("SHREC19_r", 3, 6) and row["low"] <= row["mean"] <= row["high"]
+    assert main(["--data", str(tmp_path / "egg")]) == 1
+    assert "docs/datasets.md" in capsys.readouterr().err
+    assert set(standard.MODELS) == {"FAUST_r", "SCAPE_r", "SHREC19_r", "SMAL_r", "TOPKIDS"}
