@@ -40,6 +40,7 @@ def match_without_model(
 
     `InputError` where a shape cannot be matched: large parts far apart, or a cloud that is no surface.
     """
+    from meshmatch.fitting.alike import match_alike
     from meshmatch.fitting.one_way import DirectConfig
 
     source, target = clean
@@ -48,6 +49,8 @@ def match_without_model(
     by_model = None if guess is None else (guess.source_fit.points_in_file, guess.target_fit.points_in_file)
     direct = DirectConfig(seed=configs[0].seed)
     found = _matched(source, target, configs[0], direct, threads, progress, known, by_model)
+    if known is None and guess is None:
+        found = match_alike(source.shape, target.shape, found, configs[0], progress)
     fits = replace(found.source, repaired=source), replace(found.target, repaired=target)
     verdict = found.verdict
     if guess is not None and verdict != "good" and (verdict == "poor" or found.over_guess < _CLEARLY):
@@ -57,8 +60,11 @@ def match_without_model(
         if pairs is not None:
             mapped = judged_by_pairs(mapped, target.original, pairs, fits[1].frame.scale)
     notes = direct_notes(clean, configs, unknown)
-    if fits[1].frame.mirrored:
+    if fits[0].frame.mirrored != fits[1].frame.mirrored:
         notes = (*notes, f"{target.shape.name}: taken for a mirror image of {source.shape.name}")
+    for fit, one, other in zip(fits, clean, clean[::-1], strict=True):
+        if fit.partial:
+            notes = (*notes, f"{one.shape.name}: taken for a part of {other.shape.name}")
     if guess is not None:
         notes = (_BETTER.format(guess.source_fit.model), *notes)
     return MatchResult(mapped, fits[0], fits[1], fits[1].seconds, notes, (fits[0], fits[1]), threads)

@@ -60,7 +60,10 @@ _SEARCHED, _TURNED = 0.9, 0.85
 _AS_IT_STANDS = np.radians(40)  # a smaller turn is none: the axes of two files may be meant to be the same
 _SHRUNK = 0.93  # area of a mean of shapes that are posed, against theirs: 0.997 of femurs, 0.87 of ants
 _PART = 0.85  # so much of a whole's energy a part must have; 0.3 of a cut femur
+# Of a whole that stands as the template does: 0.36 to 0.55 of cut femurs, 0.56 and more of leaves of another size.
+_PART_OF_ALIKE = 0.55
 _TURNS = 2  # of a part, and of its mirror image, that are tried
+_FEW, _FEW_STEPS = 4000, 12  # samples and steps by which two shapes that were matched are fitted anew, to choose
 # Of a whole: up to so many turns are fitted, whose samples stay up to so many times as far apart as those of the best one.
 # Ends of leaves are told by their fits alone (1.0 to 1.2); of femurs all others are 2 and more, of knees 1.3.
 _ALIKE_TURNS, _NEARLY = 4, 1.35
@@ -266,41 +269,107 @@ def fit_without_model(
         found, lead = task.best_from(start), start.side
         if rough is not config and found.features.stretch > _FAR:
             found = stiff.best_from(start)
-    system, partial = task.system, False
+    as_whole = _Judged.of(task, found)
+    if whole is None:
+        return as_whole.fit(lead, began)
+    part_task = _Task(template, shape, config, whole)
+    part = part_task.best_part((None, MIRROR) if mirror else (None,))
+    clearly = 1.0 if as_whole.judgement.verdict == "poor" else _PART
+    return (_Judged.of(part_task, part) if part.energy < clearly * found.energy else as_whole).fit(lead, began)
 
-    def judged_as(found: _Fitted) -> Judgement:
-        residual = found.features.residual
-        return judge(compute_features(system, found.vectors, found.samples, residual, template.labels, partial=partial))
 
-    judged = judged_as(found)
+def fit_alike(
+    template: Template,
+    shape: Shape,
+    begun: tuple[Float[Floats, "N 3"], Fit],
+    config: ViscousConfig | None = None,
+    mirror: bool = True,
+    whole: float | None = None,
+) -> tuple[Fit, bool] | None:
+    """Fit a template to a repaired shape that may stand as it does, or be a part of it, and has been matched to it.
+
+    Parameters
+    ----------
+    begun
+        Positions (N, 3) on the resting template, and a fit whose points (N, 3) say where a search found them to belong.
+    mirror, whole
+        As of `fit_without_model`.
+
+    Returns
+    -------
+    Fit
+        Of more nodes, and more samples, than those of a search.
+    bool
+        Whether it began where the search ended; else where the template is only turned, which is clearly better.
+
+    None where the shape stands otherwise than the template.
+    """
+    began, config = time.monotonic(), config or ViscousConfig()
+    rough = ViscousConfig.choosing()
+    few = replace(rough, samples=_FEW, back_points=_FEW, schedule=replace(rough.schedule, steps=_FEW_STEPS))
+    few, sides = replace(few, seed=config.seed), (None, MIRROR) if mirror else (None,)
+    task, (resting, start) = _Task(template, shape, few), begun
+    at = np.asarray(cKDTree(task.system.verts).query(resting)[1], np.int64)
+    first = task.fitted(_Begin(start.frame, task.onto(at, start.points)))
+    best = first
+    for side in sides:
+        best = _clearly_better(task.best_turn(side), best, _TURNED)
     if whole is not None:
-        part = _Task(template, shape, config, whole).best_part((None, MIRROR) if mirror else (None,))
-        if part.energy < (1.0 if judged.verdict == "poor" else _PART) * found.energy:
-            found, partial = part, True
-            judged = judged_as(found)
-    frame, residual = found.begin.frame, found.features.residual
-    unsure = Reason("unsupervised", "fitted without a trained model: surfaces that lie close need not correspond")
-    notes = ("taken for the mirror image of the template",) if frame.mirrored else ()
-    fit = judged_fit(
-        judged,
-        system,
-        frame,
-        found.vectors,
-        template_hash=template.hash,
-        residual=residual,
-        verts=shape.verts,
-        seconds=time.monotonic() - began,
-        seed=config.seed,
-        model=NO_MODEL,
-        notes=notes,
-        side=lead,
-        partial=partial,
-    )
-    # The trust is that of the fit itself: a collection compares it with others.
-    trust = min(fit.trust, found.begin.trust)
-    doubts = (reason for reason in found.begin.doubts if reason.code == "ambiguous")
-    fit = replace(cap_verdict(fit, [*doubts, unsure]), trust=trust)
-    if found.begin.trust >= _LOST:
-        return fit
-    lost = Reason("doubt", "no pose of the template is clearly right for this shape")
-    return replace(fit, verdict="poor", reasons=(lost, *fit.reasons))
+        part = _Task(template, shape, few, whole).best_part(sides)
+        if part.energy < (_PART_OF_ALIKE if best.alike else _PART) * best.energy:
+            task = _Task(template, shape, config, whole)
+            return _Judged.of(task, task.fitted(part.begin)).fit(0.0, began), False
+    if not best.alike:
+        return None
+    task = _Task(template, shape, config)
+    return _Judged.of(task, task.fitted(best.begin)).fit(0.0, began), best is first
+
+
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    """Where least squares ended, and what is said of it."""
+
+    task: _Task
+    found: _Fitted
+    judgement: Judgement
+
+    @classmethod
+    def of(cls, task: _Task, found: _Fitted) -> _Judged:
+        features = compute_features(
+            task.system,
+            found.vectors,
+            found.samples,
+            found.features.residual,
+            task.template.labels,
+            partial=task.partial,
+        )
+        return cls(task, found, judge(features))
+
+    def fit(self, lead: float, began: float) -> Fit:
+        """As a fit, which is fair at best; ``lead`` is its `Fit.side`."""
+        task, found = self.task, self.found
+        frame = found.begin.frame
+        unsure = Reason("unsupervised", "fitted without a trained model: surfaces that lie close need not correspond")
+        fit = judged_fit(
+            self.judgement,
+            task.system,
+            frame,
+            found.vectors,
+            template_hash=task.template.hash,
+            residual=found.features.residual,
+            verts=task.shape.verts,
+            seconds=time.monotonic() - began,
+            seed=task.config.seed,
+            model=NO_MODEL,
+            notes=("taken for the mirror image of the template",) if frame.mirrored else (),
+            side=lead,
+            partial=task.partial,
+        )
+        # The trust is that of the fit itself: a collection compares it with others.
+        trust = min(fit.trust, found.begin.trust)
+        doubts = (reason for reason in found.begin.doubts if reason.code == "ambiguous")
+        fit = replace(cap_verdict(fit, [*doubts, unsure]), trust=trust)
+        if found.begin.trust >= _LOST:
+            return fit
+        lost = Reason("doubt", "no pose of the template is clearly right for this shape")
+        return replace(fit, verdict="poor", reasons=(lost, *fit.reasons))

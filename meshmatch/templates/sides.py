@@ -78,12 +78,19 @@ def is_other_side(shape: Repaired, others: Sequence[Repaired], scale: Scale, see
     return evidence < 0
 
 
+def apart(source: Shape, target: Shape, seed: int) -> tuple[float, float]:
+    """How far apart a source and a target lie, turned as they fit best, and a source and the mirror image of the target; in
+    units of sqrt(area), normals included."""
+    one, other = (_samples(shape, "area", [seed, number]) for number, shape in enumerate((source, target)))
+    same, image = (align(each, one, "rigid")[0].residual for each in (other, _image(other)))
+    return same, image
+
+
 def nearer_mirrored(source: Shape, target: Shape, seed: int) -> float:
     """How much nearer the mirror image of the target comes to the source than the target itself, both turned as they fit
     best: the logarithm of the ratio of their distances.
     """
-    one, other = (_samples(shape, "area", [seed, number]) for number, shape in enumerate((source, target)))
-    same, image = (align(each, one, "rigid")[0].residual for each in (other, _image(other)))
+    same, image = apart(source, target, seed)
     return float(np.log(same / image))
 
 

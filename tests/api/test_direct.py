@@ -17,7 +17,7 @@ from meshmatch.api.inputs import usable
 from meshmatch.api.matcher import Matcher
 from meshmatch.cli.app import app
 from meshmatch.errors import InputError, OptionError
-from meshmatch.fitting import direct
+from meshmatch.fitting import alike, direct
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.maps.deformed import deformed
 from meshmatch.shapes.repair import repair
@@ -92,6 +92,7 @@ def test_a_mirror_image_is_taken_unless_it_is_not_wanted(
     frame = direct.MIRROR.compose(found.target.frame)
     image = replace(found, target=replace(found.target, frame=frame))
     monkeypatch.setattr(direct, "match_either_side", lambda *_: image)
+    monkeypatch.setattr(alike, "match_alike", lambda *given: given[2])
     monkeypatch.setattr(direct, "match_directly", lambda *_: found)
     clean = [usable(shape) for shape in shapes]
     for mirror, said in ((None, True), ("no", False)):

@@ -36,6 +36,7 @@ from meshmatch.errors import InputError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.baselines import METHODS, Choices
 from meshmatch.experiments.bench.methods import Method
+from meshmatch.fitting.alike import match_alike
 from meshmatch.fitting.direct import DirectMatch, match_either_side
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.calibration import DirectCalibration
@@ -173,7 +174,8 @@ def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[
         fits = replace(found.source, repaired=clean[0]), replace(found.target, repaired=clean[1])
         return _row(folder, pair, map_of_fits(fits, fits, 1)) | {"energy": found.energy, "leads": found.leads}
 
-    found = match_either_side(clean[0].shape, clean[1].shape, DirectConfig(seed=seed))
+    shapes = clean[0].shape, clean[1].shape
+    found = match_alike(*shapes, match_either_side(*shapes, DirectConfig(seed=seed)), FitConfig(seed=seed))
     best = row(found) | {"cpu": time.process_time() - began}
     return best | {"one_way": found.one_way and row(found.one_way)}
 

@@ -1,0 +1,119 @@
+"""Two shapes that stand alike, such as two femurs, or of which one is a part of the other, matched more finely.
+
+A search without a model (`meshmatch.fitting.direct`) allows for any pose, so its fits have few nodes, and are held along the
+surface. Specimens of one kind need less freedom, and the whole of a broken bone is larger than what is left of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from meshmatch.fitting.direct import MIRROR, DirectMatch
+from meshmatch.fitting.fit import Fit, axis_name
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fitter import may_show_part
+from meshmatch.fitting.solve.regularity import Regularity
+from meshmatch.fitting.solve.viscous import ViscousConfig
+from meshmatch.fitting.without_model import fit_alike, template_of, viscous_system
+from meshmatch.geometry.frames import Frame, kabsch
+from meshmatch.progress import Progress, ProgressCallback
+from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.make import low_mesh
+from meshmatch.templates.sides import apart
+from meshmatch.templates.template import Template
+
+# How near shapes that stand alike must come by a rigid motion, in units of sqrt(area): femurs, knees and molars come to 0.04
+# to 0.06, hearts and leaves up to 0.066; people, ants and fish to 0.069 and more.
+_ALIKE = 0.067
+
+
+def match_alike(
+    source: Shape, target: Shape, found: DirectMatch, config: FitConfig, progress: ProgressCallback | None = None
+) -> DirectMatch:
+    """A direct match, made finer where the shapes stand alike, or where one is open and clearly better seen as a part.
+
+    A part is as large as it is in the whole: the files are in one unit.
+
+    Parameters
+    ----------
+    source, target
+        Repaired shapes.
+    found
+        What `match_either_side` made of them.
+    config
+        Whether parts and mirror images are looked for, and the seed.
+    progress
+        As of `match_directly`.
+
+    Returns
+    -------
+    DirectMatch
+        The same, or two fits of one template with more nodes: of the source, or of the larger one where one is open.
+    """
+    if source.is_cloud or target.is_cloud:
+        return found
+    smaller, larger = sorted((source, target), key=lambda shape: shape.area)
+    part = may_show_part(smaller, config)
+    whole, other = (larger, smaller) if part else (source, target)
+    if not part and min(apart(source, target, config.seed)) > _ALIKE:
+        return found
+    report = Progress(progress, other.name).stage("fits of shapes that stand alike")
+    report(0.0)
+    viscous = ViscousConfig(seed=config.seed)
+    template, frame = template_of(whole, whole.name, viscous), _frame_of(whole, viscous)
+    of_whole, of_other = (found.source, found.target) if whole is source else (found.target, found.source)
+    resting = frame.apply(of_whole.points_in_file)
+    if of_whole.frame.mirrored:  # the template is not
+        of_other = replace(of_other, frame=of_other.frame.compose(MIRROR), points=MIRROR.apply(of_other.points))
+    size = float(np.sqrt(whole.area)) if part else None
+    finer = fit_alike(template, other, (resting, of_other), viscous, config.mirror != "no", size)
+    report(1.0)
+    if finer is None:
+        return found
+    fit, as_found = finer
+    if as_found:
+        moving = found.target if found.source.verdict == "good" else found.source
+        fit = replace(fit, verdict=found.verdict, reasons=moving.reasons, trust=moving.trust)
+    fits = _at_rest(fit, template, whole, frame), _as_it_rests(fit, template)
+    first, second = fits if whole is source else fits[::-1]
+    return replace(found, source=first, target=second, system=viscous_system(template))
+
+
+def _as_it_rests(fit: Fit, template: Template) -> Fit:
+    """The same fit in the core frame in which the moved template is not turned against the resting one."""
+    system = viscous_system(template)
+    turn = kabsch(system.verts, fit.points)
+    core, points = fit.frame.compose(turn.frame), turn.to_local(fit.points)
+    up, front = (axis_name(core.rotation[row]) for row in (1, 2))
+    return replace(fit, frame=core, points=points, vectors=system.vectors_to(points), up=up, front=front)
+
+
+def _frame_of(shape: Shape, config: ViscousConfig) -> Frame:
+    """From the file of a shape to the template that is made of it."""
+    kept, faces = low_mesh(shape, config.faces)
+    return sqrt_area_frame(Shape(shape.verts[kept], faces))
+
+
+def _at_rest(fit: Fit, template: Template, shape: Shape, frame: Frame) -> Fit:
+    """The fit of the template to the shape that it is made of, beside that to another one."""
+    return replace(
+        fit,
+        frame=frame,
+        points=np.asarray(template.shape.verts),
+        vectors=np.zeros_like(fit.vectors),
+        residual=0.0,
+        verts=shape.verts,
+        verdict="good",
+        reasons=(),
+        notes=(),
+        trust=1.0,
+        signs=None,
+        regularity=Regularity(),
+        partial=False,
+        side=0.0,
+        up="+y",
+        front="+z",
+    )

@@ -1,0 +1,76 @@
+"""Shapes that stand alike are matched more finely without a model, and broken ones as parts of whole ones."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from meshmatch.arrays import Bools, Floats
+from meshmatch.experiments.makers.bones import Scanned, draw_bones, scan
+from meshmatch.fitting import alike
+from meshmatch.fitting.alike import match_alike
+from meshmatch.fitting.direct import DirectMatch, match_either_side
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.solve.viscous import ViscousConfig
+from meshmatch.geometry.trees import cKDTree
+from meshmatch.shapes.shape import Shape
+from tests.fitting.test_direct import QUICK
+
+FAST = replace(QUICK, both_ways="no")
+RIGHT, LEFT = (scan(draw_bones(3)[number], 900) for number in (0, 2))
+
+
+@pytest.fixture(autouse=True)
+def fast(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer nodes and samples than of specimens."""
+    few = partial(ViscousConfig, nodes=300, radius=0.13, faces=1500, samples=3000, back_points=2000)
+    monkeypatch.setattr(alike, "ViscousConfig", few)
+
+
+def cut(bone: Scanned, high: float) -> tuple[Shape, Bools]:
+    """What lies below a height of a bone's axis, and which vertices those are."""
+    kept = bone.directions[:, 2] < high
+    faces = bone.shape.faces[kept[bone.shape.faces].all(1)]
+    used = np.unique(faces)
+    return Shape(bone.shape.verts[used], np.searchsorted(used, faces), "broken"), np.isin(np.arange(len(kept)), used)
+
+
+def errors(found: DirectMatch, source: Scanned, target: Scanned, of: Shape, kept: Bools | None = None) -> Floats:
+    """How far from their places, in mm, those vertices of a source arrive on a target."""
+    directions = source.directions if kept is None else source.directions[kept]
+    at = cKDTree(found.source.points_in_file).query(of.verts)[1]
+    return np.asarray(np.linalg.norm(found.target.points_in_file[at] - target.places(directions), axis=1))
+
+
+def test_specimens_get_a_finer_fit_that_keeps_the_verdict() -> None:
+    found = match_either_side(RIGHT.shape, LEFT.shape, FAST)
+    finer = match_alike(RIGHT.shape, LEFT.shape, found, FitConfig())
+    assert len(finer.target.vectors) == 300 != len(found.target.vectors)
+    assert finer.target.frame.mirrored and finer.source.template_hash == finer.target.template_hash
+    assert not finer.source.vectors.any()
+    worse, better = (errors(each, RIGHT, LEFT, RIGHT.shape).mean() for each in (found, finer))
+    assert better < worse and better < 4
+    assert (finer.verdict, finer.reasons) == (found.verdict, found.reasons)
+
+
+def test_what_stands_otherwise_and_clouds_are_left_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = match_either_side(RIGHT.shape, RIGHT.shape, replace(FAST, better=2, best=1))
+    cloud = Shape(RIGHT.shape.verts, np.empty((0, 3), np.int64))
+    assert match_alike(cloud, RIGHT.shape, found, FitConfig()) is found
+    monkeypatch.setattr(alike, "apart", lambda *_: (0.08, 0.07))
+    assert match_alike(RIGHT.shape, RIGHT.shape, found, FitConfig()) is found
+
+
+@pytest.mark.parametrize("source_is_broken", [True, False])
+def test_a_broken_one_is_a_part_of_a_whole_one(source_is_broken: bool) -> None:
+    broken, kept = cut(LEFT, -0.1)
+    pair = (broken, RIGHT.shape) if source_is_broken else (RIGHT.shape, broken)
+    plain = match_either_side(*pair, replace(FAST, better=2, best=1))
+    seen = match_alike(*pair, plain, FitConfig())
+    of_broken, of_whole = (seen.source, seen.target) if source_is_broken else (seen.target, seen.source)
+    assert of_broken.partial and not of_whole.partial and seen.verdict != "good"
+    assert of_broken.frame.mirrored and not of_whole.frame.mirrored
+    assert of_whole.template_hash == of_broken.template_hash and not of_whole.vectors.any()
+    swapped = replace(seen, source=of_broken, target=of_whole)
+    assert errors(swapped, LEFT, RIGHT, broken, kept).mean() < 4
