@@ -23,14 +23,15 @@ from meshmatch.geometry.oriented import OrientedPoints
 @dataclass(frozen=True, kw_only=True)
 class ViscousConfig(Pairing):
     """Nodes of a template, and the schedule of its fits; lengths in units of sqrt(area). Tuned on three hearts, ten
-    femurs and generated knees."""
+    femurs and generated knees; the last scale on nine femurs, ten hearts and generated
+    knees."""
 
     nodes: int = 600
     radius: float = 0.085
     faces: int = 10_000  # of a template
     samples: int = 16_000  # of a shape
     schedule: Schedule = field(
-        default=Schedule(steps=24, prior=(1e-4, 1e-6), scale=(0.1, 0.02), damping=1e-6, momentum=0.5)
+        default=Schedule(steps=24, prior=(1e-4, 1e-6), scale=(0.1, 0.01), damping=1e-6, momentum=0.5)
     )
     point_share: float = 0.0003  # what is nearest says little of where a point belongs along the surface
     pair_normals: float = 0.012  # of normals in the search for pairs
@@ -41,7 +42,7 @@ class ViscousConfig(Pairing):
     @classmethod
     def choosing(cls) -> ViscousConfig:
         """To choose among poses: stiffer, and drawn to what is nearest, for the wrong ones to cost more."""
-        stiffer = replace(cls().schedule, prior=(1e-3, 1e-6), momentum=0.0)
+        stiffer = replace(cls().schedule, prior=(1e-3, 1e-6), scale=(0.1, 0.02), momentum=0.0)
         return cls(schedule=stiffer, point_share=0.01)
 
 
