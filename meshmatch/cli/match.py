@@ -1,6 +1,6 @@
 """``meshmatch match``, ``register`` and ``evaluate``: maps of two shapes, fits of one, and how good a map is."""
 
-from math import isfinite
+from math import isinf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -196,8 +196,8 @@ def evaluate(
     by both maps.
     """
     told = options.check_truth(truth, points)
-    if threshold is not None and not isfinite(threshold):
-        raise OptionError(f"--threshold must be a length, not {threshold}", "leave it out for the usual one")
+    if threshold is not None and isinf(threshold):
+        raise OptionError("--threshold must be a length, not inf", "leave it out for the usual one")
     for what, file in (("curve", curve), ("picture", picture)):
         if file is not None and not told:
             raise OptionError(f"a {what} of errors needs ground truth", "give it with --truth or --points")

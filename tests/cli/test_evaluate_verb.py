@@ -118,10 +118,9 @@ def test_threshold(evaluate: Callable[[str], Answer]) -> None:
     assert 63 / V <= all_wrong <= 64 / V and none == 0.0
 
 
-@pytest.mark.parametrize("limit", ["inf", "nan"])
-def test_a_threshold_is_a_length(run: Run, folder: Path, limit: str) -> None:
-    answer = run("evaluate", "map.npy", "a.ply", "b.ply", "--threshold", limit)
-    refused(answer, f"not {limit}", folder, {path.name for path in folder.iterdir()})
+def test_a_threshold_is_a_length(run: Run, folder: Path) -> None:
+    answer = run("evaluate", "map.npy", "a.ply", "b.ply", "--threshold", "inf")
+    refused(answer, "not inf", folder, {path.name for path in folder.iterdir()})
 
 
 def test_seed_chooses_the_pairs_of_the_distortion(evaluate: Callable[[str], Answer]) -> None:
