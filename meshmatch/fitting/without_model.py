@@ -63,6 +63,7 @@ _PART = 0.85  # so much of a whole's energy a part must have; 0.3 of a cut femur
 # Of a whole that stands as the template does: 0.36 to 0.55 of cut femurs, 0.56 and more of leaves of another size.
 _PART_OF_ALIKE = 0.55
 _TURNS = 2  # of a part, and of its mirror image, that are tried
+_OTHER_SIDE = 0.86  # so much of the stretch a mirror image may need, to be meant: 0.48 to 0.83 of molars, 0.99 of birds
 _FEW, _FEW_STEPS = 4000, 12  # samples and steps by which two shapes that were matched are fitted anew, to choose
 # Of a whole: up to so many turns are fitted, whose samples stay up to so many times as far apart as those of the best one.
 # Ends of leaves are told by their fits alone (1.0 to 1.2); of femurs all others are 2 and more, of knees 1.3.
@@ -313,10 +314,16 @@ def fit_alike(
     first = task.fitted(_Begin(start.frame, task.onto(at, start.points)))
     best = first
     for side in sides:
-        best = _clearly_better(task.best_turn(side), best, _TURNED)
+        turned = task.best_turn(side)
+        other = turned.begin.frame.mirrored != best.begin.frame.mirrored
+        relaxed = (
+            whole is None and other and turned.alike and turned.features.stretch < _OTHER_SIDE * best.features.stretch
+        )
+        best = turned if relaxed else _clearly_better(turned, best, _TURNED)
     if whole is not None:
         part = _Task(template, shape, few, whole).best_part(sides)
-        if part.energy < (_PART_OF_ALIKE if best.alike else _PART) * best.energy:
+        poor = _Judged.of(task, best).judgement.verdict == "poor"
+        if part.energy < (1.0 if poor else _PART_OF_ALIKE if best.alike else _PART) * best.energy:
             task = _Task(template, shape, config, whole)
             return _Judged.of(task, task.fitted(part.begin)).fit(0.0, began), False
     if not best.alike:
