@@ -64,6 +64,7 @@ SUMMARY = (
     Row("animals", "animals", {"of": "all"}, _X100, "% of √area"),
     Row("hands, generated", "hands", {"of": "all"}, _X100, "% of the length"),
     Row("heads, generated", "heads", {"of": "all"}, _X100, "% of the length"),
+    Row("animals, without a model", "animals-none", {"of": "all"}, _X100, "% of √area"),
     Row("15 kinds, without a model", "any-shapes", {"class": "all"}, ("mean", "median", "", "", "pairs"), "% of √area"),
 )
 
