@@ -62,6 +62,14 @@ def test_what_stands_otherwise_and_clouds_are_left_as_they_are(monkeypatch: pyte
     assert match_alike(RIGHT.shape, RIGHT.shape, found, FitConfig()) is found
 
 
+def test_cracks_are_no_rim() -> None:
+    whole = RIGHT.shape
+    assert alike._longest_rim(whole) == 0
+    cracked = Shape(whole.verts, np.delete(whole.faces, np.arange(0, whole.F, 40), 0))
+    broken = cut(RIGHT, -0.1)[0]
+    assert 0 < alike._longest_rim(cracked) < alike._RIM < alike._longest_rim(broken)
+
+
 @pytest.mark.parametrize("source_is_broken", [True, False])
 def test_a_broken_one_is_a_part_of_a_whole_one(source_is_broken: bool) -> None:
     broken, kept = cut(LEFT, -0.1)
