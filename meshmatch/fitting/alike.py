@@ -31,7 +31,6 @@ from meshmatch.templates.template import Template
 # How near shapes that stand alike must come by a rigid motion, in units of sqrt(area): femurs, knees and molars come to 0.04
 # to 0.06, hearts and leaves up to 0.066; people, ants and fish to 0.069 and more.
 _ALIKE = 0.067
-_SMALLER = 0.9  # so much of the area of the whole a part has at most
 _RIM = 0.3  # length of the longest boundary of a part at least, in units of sqrt(area); cracks of a mesh are shorter
 
 
@@ -61,7 +60,7 @@ def match_alike(
     if source.is_cloud or target.is_cloud:
         return found
     smaller, larger = sorted((source, target), key=lambda shape: shape.area)
-    part = smaller.area < _SMALLER * larger.area and may_show_part(smaller, config) and _longest_rim(smaller) > _RIM
+    part = may_show_part(smaller, config) and _longest_rim(smaller) > _RIM
     whole, other = (larger, smaller) if part else (source, target)
     if not part and min(apart(source, target, config.seed)) > _ALIKE:
         return found
