@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -43,14 +44,15 @@ def match_without_model(
     from meshmatch.fitting.alike import match_alike
     from meshmatch.fitting.one_way import DirectConfig
 
-    source, target = clean
+    began, (source, target) = time.monotonic(), clean
     pairs = None if landmarks is None else landmark_vertices(clean, landmarks)
     known = None if pairs is None else (source.original.verts[pairs[0]], target.original.verts[pairs[1]])
     by_model = None if guess is None else (guess.source_fit.points_in_file, guess.target_fit.points_in_file)
     direct = DirectConfig(seed=configs[0].seed)
     found = _matched(source, target, configs[0], direct, threads, progress, known, by_model)
     if known is None and guess is None:
-        found = match_alike(source.shape, target.shape, found, configs[0], progress)
+        with thread_limit(1):
+            found = match_alike(source.shape, target.shape, found, configs[0], progress)
     fits = replace(found.source, repaired=source), replace(found.target, repaired=target)
     verdict = found.verdict
     if guess is not None and verdict != "good" and (verdict == "poor" or found.over_guess < _CLEARLY):
@@ -67,7 +69,7 @@ def match_without_model(
             notes = (*notes, f"{one.shape.name}: taken for a part of {other.shape.name}")
     if guess is not None:
         notes = (_BETTER.format(guess.source_fit.model), *notes)
-    return MatchResult(mapped, fits[0], fits[1], fits[1].seconds, notes, (fits[0], fits[1]), threads)
+    return MatchResult(mapped, fits[0], fits[1], time.monotonic() - began, notes, (fits[0], fits[1]), threads)
 
 
 def fit_to_first(

@@ -86,6 +86,22 @@ def test_a_map_of_a_model_that_is_not_good_gives_way_to_a_better_one(
 
 
 @pytest.mark.usefixtures("quick")
+def test_a_pair_may_be_alike_unless_something_is_known_of_it(
+    shapes: tuple[Shape, Shape], found: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Landmarks and the map of a model have been heeded by the search, and would not be again."""
+    part = replace(found, source=replace(found.source, partial=True), target=replace(found.target, seconds=1e6))
+    monkeypatch.setattr(direct, "match_either_side", lambda *_: found)
+    monkeypatch.setattr(alike, "match_alike", lambda *_: part)
+    clean, configs = [usable(shape) for shape in shapes], [meshmatch.FitConfig()] * 2
+    result = match_without_model(clean, configs, None, 1, None)
+    assert "source: taken for a part of target" in result.notes
+    assert result.seconds < 1e6  # of all that was done, not of one fit
+    same = np.arange(5), np.arange(5)
+    assert not any("part" in note for note in match_without_model(clean, configs, same, 1, None).notes)
+
+
+@pytest.mark.usefixtures("quick")
 def test_a_mirror_image_is_taken_unless_it_is_not_wanted(
     shapes: tuple[Shape, Shape], found: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
