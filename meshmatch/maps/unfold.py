@@ -16,7 +16,7 @@ from scipy.sparse import csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
-from meshmatch.arrays import Bool, Bools, Floats, Ints
+from meshmatch.arrays import Bools, Floats, Ints
 from meshmatch.geometry.triangles import dot, same_rows, squared_lengths, triangle_areas, triangle_vectors, unit
 from meshmatch.maps.folds import CRUSHED, area_ratios, facing, normals_at
 from meshmatch.maps.mapped_mesh import MappedMesh, length_of
@@ -61,14 +61,14 @@ class _Images:
         self.target = Shape(target.verts / length_of(target), target.faces, invalid=target.invalid)
         self.areas = triangle_areas(self.verts, self.faces)
         self.ratio = area_ratios(self.points, self.normals, self.verts, self.faces)
-        self.torn = self._torn()
+        self.torn = self._torn(self.points, self.faces)
         self.surface: MappedMesh | None = None
 
-    def _torn(self) -> Bool[Bools, " F"]:
-        """Which faces the map pulls apart. Their corners never move."""
-        found = np.zeros(len(self.faces), bool)
-        for start, end in zip(self.faces.T, self.faces[:, [1, 2, 0]].T, strict=True):
-            own, image = (np.sqrt(squared_lengths(each[start] - each[end])) for each in (self.verts, self.points))
+    def _torn(self, points: Floats, faces: Ints) -> Bools:
+        """(F,) which faces images (V, 3) pull apart. Where the map does, their corners never move."""
+        found = np.zeros(len(faces), bool)
+        for start, end in zip(faces.T, faces[:, [1, 2, 0]].T, strict=True):
+            own, image = (np.sqrt(squared_lengths(each[start] - each[end])) for each in (self.verts, points))
             found |= image > _STRETCH * own + _SLACK
         return found
 
@@ -97,9 +97,12 @@ class _Images:
             np.bincount(of_face, np.where(each < CRUSHED, own, 0.0), part.max() + 1)
             for each in (self.ratio[near], ratio)
         )
-        better = (after < before)[part]
+        # Where little is sound around, and much moves, a solution may lie anywhere; the rim, which is held, then tears.
+        tears = np.bincount(of_face, self._torn(points, self.faces[near]) & ~self.torn[near], part.max() + 1) > 0
+        improved = (after < before) & ~tears
+        better = improved[part]
         self._take(rows[better], points, normals, (found[0][better], found[1][better], found[2][better]))
-        changed = near[(after < before)[of_face]]
+        changed = near[improved[of_face]]
         self.ratio[changed] = area_ratios(self.points, self.normals, self.verts, self.faces[changed])
         return True
 

@@ -7,7 +7,7 @@ from trimesh.creation import icosphere
 from meshmatch.arrays import Ints
 from meshmatch.maps.folds import Folds
 from meshmatch.maps.mapped_mesh import MappedMesh
-from meshmatch.maps.unfold import unfolded
+from meshmatch.maps.unfold import _Images, unfolded
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
@@ -151,3 +151,16 @@ def test_triangles_without_height_do_not_keep_folds_shut() -> None:
     before, after = (Folds.of(each, source, target) for each in (found, unfolded(found, source, target)))
     assert before.flipped > 0.002
     assert after.flipped < 0.5 * before.flipped
+
+
+def test_what_would_be_torn_from_its_surroundings_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh, solved = icosphere(5), _Images._solved
+    disc = Shape(mesh.vertices * [1.0, 1.0, 0.1], mesh.faces)
+    away = np.linalg.norm(disc.verts[:, :2] - [0.5, 0], axis=1, keepdims=True)
+    inward = np.clip((away - 0.2) / 0.2, 0.2, 1.0)  # one place on both sides is crushed
+    places = np.where(away < 0.5, [0.5, 0, 0] + (disc.verts - [0.5, 0, 0]) * [1, 1, 0] * inward, disc.verts)
+    places[:, 2] = disc.verts[:, 2]
+    found = put(disc, disc, places)
+    assert Folds.of(unfolded(found, disc, disc), disc, disc).crushed < Folds.of(found, disc, disc).crushed
+    monkeypatch.setattr(_Images, "_solved", lambda *each: solved(*each) - [0.4, 0, 0])  # without a fold, but far away
+    np.testing.assert_array_equal(unfolded(found, disc, disc).points(disc), found.points(disc))
