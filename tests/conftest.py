@@ -3,6 +3,7 @@
 import base64
 import os
 import pickle
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from hashlib import sha256
@@ -47,8 +48,9 @@ def kept_glb() -> Iterator[None]:
     def keeping(make: Callable[..., bytes]) -> Callable[..., bytes]:
         def kept(*words: Any) -> bytes:
             made = make(*words)
-            test = os.environ.get("PYTEST_CURRENT_TEST", "no-test").partition("::")
-            name = f"{Path(test[0]).stem}-{sha256(made).hexdigest()[:12]}.glb"
+            file, _, test = os.environ.get("PYTEST_CURRENT_TEST", "").partition(" ")[0].partition("::")
+            words = re.sub(r"\W+", "-", f"{Path(file).stem} {test}").strip("-")
+            name = f"{words}-{sha256(made).hexdigest()[:8]}.glb"
             (folder / name).write_bytes(made)
             return made
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import meshmatch
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError, MeshmatchWarning, OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.gltf import Document, digest
@@ -19,6 +19,7 @@ from meshmatch.shapes.shape import Shape
 from tests.shapes.painted import encoded, quarters, write_document
 from tests.transfer.rigs import BEND, KNEE, NODES, played, tube, volume, write_tube
 
+UPRIGHT = np.array([[0, 0, 0, 1]] * 2, "f4")
 JOINTS = ("root", "hip", "knee", "foot")
 
 
@@ -161,7 +162,9 @@ def two_parts(path: Path, hanging: bool = False) -> dict[str, Any]:
 
 
 def test_a_glb_stays_as_it_came(source: Path) -> None:
-    """Nodes, materials, images, arrays and their bytes; a mesh that stands twice is there twice, for its weights differ."""
+    """Nodes, materials, images, arrays and their bytes. A mesh that stands twice is there twice, for its weights differ, and
+    hangs from nothing but its skeleton, in the same order.
+    """
     target = source.with_name("target.glb")
     before = two_parts(target)
     shape = load_shape(target)
@@ -173,8 +176,10 @@ def test_a_glb_stays_as_it_came(source: Path) -> None:
     for kind in ("accessors", "bufferViews"):
         assert after.json[kind][: len(before[kind])] == before[kind]
     for old, new in zip(before["nodes"], after.json["nodes"], strict=False):
-        assert new == old | {key: new[key] for key in ("mesh", "skin") if "mesh" in old}
-    assert after.json["scenes"] == [{"name": "all", "nodes": [0, 3, 4]}]
+        own = {key: value for key, value in old.items() if key not in ("children", "scale")}
+        own.pop("translation" if "mesh" in old else "", None)
+        assert new == own | {key: new[key] for key in ("mesh", "skin") if "mesh" in old}
+    assert after.json["scenes"] == [{"name": "all", "nodes": [0, 1, 2, 3, 4]}]
     assert len(after.json["meshes"]) == 2
     for mesh in after.json["meshes"]:
         attributes = mesh["primitives"][0]["attributes"]
@@ -183,6 +188,40 @@ def test_a_glb_stays_as_it_came(source: Path) -> None:
     assert after.body.startswith(Document(target, target.read_bytes()).body)
     assert np.abs(load_shape(out).verts - shape.verts).max() < 1e-5
     assert np.array_equal(load_shape(out).faces, shape.faces)
+
+
+def test_meshes_that_move_something_else(source: Path) -> None:
+    """A camera stays where its mesh was; a mesh that hangs from a mesh does not."""
+    target = source.with_name("target.glb")
+    nodes = two_parts(target)["nodes"]
+    nodes[0]["children"], nodes[1]["children"] = [1], [2]
+    shape = tube()
+    arrays = shape.verts.astype("f4"), shape.faces.ravel().astype("u2"), np.arange(2, dtype="f4"), UPRIGHT
+    primitive = {"attributes": {"POSITION": 0}, "indices": 1}
+    channels = [{"sampler": 0, "target": {"node": node, "path": "rotation"}} for node in (0, 1)]
+    clip = {"name": "wave", "samplers": [{"input": 2, "output": 3}], "channels": channels}
+    document = {"nodes": nodes, "meshes": [{"primitives": [primitive]}], "scenes": [{"nodes": [3, 0]}]}
+    document |= {"animations": [clip]}
+    write_document(target, document, *arrays)
+    where = load_shape(target).verts
+    with pytest.warns(MeshmatchWarning, match="clips of target.glb that moved a mesh as a whole do so no more"):
+        out, _ = rigged(source, target)
+    found = Document(out, out.read_bytes()).json
+    assert found["scenes"][0]["nodes"] == [3, 0, 1, 2, 4]
+    assert [each["target"]["node"] for each in found["animations"][0]["channels"]] == [0]
+    assert not any({"children", "scale"} & found["nodes"][k].keys() for k in (1, 2))
+    np.testing.assert_allclose(load_shape(out).verts, where, atol=1e-5)
+    nodes[1] |= {"camera": 0}
+    camera = {"type": "perspective", "perspective": {"yfov": 1, "znear": 0.1}}
+    write_document(target, document | {"cameras": [camera]}, *arrays)
+    with pytest.warns(MeshmatchWarning, match="as a whole"):
+        out, _ = rigged(source, target)
+    found = Document(out, out.read_bytes()).json
+    assert found["scenes"][0]["nodes"][:4] == [3, 0, len(found["nodes"]) - 1, 2]
+    assert found["nodes"][1] == {key: nodes[1][key] for key in ("name", "scale", "camera")}
+    assert found["nodes"][-1]["name"] == "left"
+    assert [each["target"]["node"] for each in found["animations"][0]["channels"]] == [0, 1]  # of the camera
+    np.testing.assert_allclose(load_shape(out).verts, where, atol=1e-5)
 
 
 def test_a_gltf_becomes_a_glb_that_needs_no_other_file(source: Path) -> None:
@@ -220,20 +259,24 @@ def test_a_skeleton_of_its_own_is_replaced(source: Path, stands: float) -> None:
     target = source.with_name("target.glb")
     write_tube(target, stands=stands)
     document = Document(target, target.read_bytes()).json
-    animation = document["animations"][0]
+    nodes, animation = [*document["nodes"], {"name": "lamp"}], document["animations"][0]
     animation["name"] = "old"
     samplers = [animation["samplers"][0]] * 2
-    channels = [{"sampler": k, "target": {"node": node, "path": "rotation"}} for k, node in enumerate((3, 6))]
-    write_tube(
-        target, stands=stands, animations=[animation, {"name": "mesh", "samplers": samplers, "channels": channels}]
-    )
+    channels = [{"sampler": k, "target": {"node": node, "path": "rotation"}} for k, node in enumerate((3, 7))]
+    swings = {"name": "swing", "samplers": samplers, "channels": channels}
+    write_tube(target, stands=stands, nodes=nodes, scenes=[{"nodes": [0, 6, 7]}], animations=[animation, swings])
     shape = load_shape(target)
     out, result = rigged(source, target)
     found = Document(out, out.read_bytes())
     assert result.replaced == 4
     assert len(found.json["skins"]) == 1
-    assert [node["name"] for node in found.json["nodes"]] == ["tube", "source", *NODES[:-1]]  # all of the old is gone
-    assert [(each["name"], len(each["channels"])) for each in found.json["animations"]][:1] == [("mesh", 1)]
+    assert [node["name"] for node in found.json["nodes"]] == [
+        "tube",
+        "lamp",
+        "source",
+        *NODES[:-1],
+    ]  # all of the old is gone
+    assert [(each["name"], len(each["channels"])) for each in found.json["animations"]][:1] == [("swing", 1)]
     assert [each["name"] for each in found.json["animations"]][1:] == ["bend"]
     assert np.abs(load_shape(out).verts - shape.verts).max() < 1e-5
     same = found.json["meshes"][0]["primitives"][0]["attributes"]["POSITION"] == 0
@@ -248,7 +291,8 @@ def test_nodes_that_something_else_needs_stay(source: Path) -> None:
     nodes = Document(target, target.read_bytes()).json["nodes"]
     nodes[4]["extensions"] = {"KHR_lights_punctual": {"light": 0}}
     nodes[5]["extras"] = {"mine": 1}
-    more: dict[str, Any] = {"nodes": nodes, "extensionsUsed": ["KHR_lights_punctual"]}
+    lights = {"KHR_lights_punctual": {"lights": [{"type": "point"}]}}
+    more: dict[str, Any] = {"nodes": nodes, "extensionsUsed": [*lights], "extensions": lights}
     write_tube(target, **more)
     out, _ = rigged(source, target)
     kept = Document(out, out.read_bytes()).json["nodes"]

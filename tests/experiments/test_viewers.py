@@ -11,10 +11,11 @@ import pytest
 from PIL import Image
 
 from meshmatch.errors import OptionError
-from meshmatch.experiments.bench.viewers.__main__ import AS_WRITTEN, issues
+from meshmatch.experiments.bench.viewers import valid
+from meshmatch.experiments.bench.viewers.__main__ import AS_WRITTEN
 from meshmatch.experiments.bench.viewers.expected import Written, differences
 from meshmatch.experiments.bench.viewers.made import THROUGH_BLENDER, commands
-from meshmatch.experiments.bench.viewers.opened import HERE, check_tools
+from meshmatch.experiments.bench.viewers.opened import HERE, check_tools, issues
 from meshmatch.experiments.bench.viewers.sheet import covered, draw_sheet, overlap
 from meshmatch.shapes.files import load_shape
 from tests.shapes.morphs import write_morphs
@@ -105,7 +106,8 @@ def test_pictures_are_compared_by_what_they_cover(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
-def test_the_script_of_the_validator_tells_of_each_file(tmp_path: Path) -> None:
+def test_the_script_of_the_validator_tells_of_each_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Through a stand-in, which warns of every file that is long enough."""
     module = tmp_path / "gltf-validator"
     module.mkdir()
     issue = "{severity: 1, code: 'ODD', message: 'odd', pointer: '/a'}"
@@ -120,6 +122,10 @@ def test_the_script_of_the_validator_tells_of_each_file(tmp_path: Path) -> None:
     lines = subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines()
     first, second = map(json.loads, lines)
     assert first["issues"][0]["code"] == "ODD" and second["error"] == "Error: short"
+    assert valid.main([str(tmp_path), "--modules", str(tmp_path)]) == 1
+    told = capsys.readouterr()
+    assert "2 files, 0 without errors and warnings" in told.out and "ODD" in told.out
+    assert "2 of 2 files have errors or warnings" in told.err
 
 
 def test_the_saved_run_found_every_glb_valid() -> None:

@@ -94,8 +94,9 @@ def scene(path: Path, **more: Any) -> None:
         np.array([[255, 0, 0, 255]] * 4, "u1"),
         (0.1 * CORNERS).astype("f4"),
         np.frombuffer(encoded(quarters()), "u1"),
+        np.tile(np.array([[1.0, 0, 0, 1]], "f4"), (4, 1)),
     ]
-    attributes = {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2, "TEXCOORD_1": 3, "COLOR_0": 5}
+    attributes = {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2, "TEXCOORD_1": 3, "COLOR_0": 5, "TANGENT": 8}
     parts = [
         {"attributes": attributes, "indices": 4, "material": 0, "targets": [{"POSITION": 6}]},
         {"attributes": {"POSITION": 0, "TEXCOORD_0": 2}, "indices": 4, "material": 1, "targets": [{"POSITION": 6}]},
@@ -162,7 +163,7 @@ def test_strips_and_shared_materials(tmp_path: Path) -> None:
     """A strip becomes triangles; a material of a mesh that is not in the scene stays for that."""
     path = tmp_path / "strip.glb"
     strip = {"attributes": {"POSITION": 0}, "mode": 5, "material": 0}
-    away = {"attributes": {"POSITION": 0}, "material": 0}
+    away = strip | {"mode": 6}
     document = {
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}, {"mesh": 1}],

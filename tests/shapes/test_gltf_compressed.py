@@ -70,10 +70,11 @@ def meshopt_file(path: Path, cut: int = 0, count: int | None = None) -> Path:
         return plain | {"extensions": {MESHOPT: inside | {"mode": mode}}}
 
     V = shape.V if count is None else count
+    box = {"min": shape.verts.min(axis=0).tolist(), "max": shape.verts.max(axis=0).tolist()}
     views = [view(0, len(packed), 12, V, "ATTRIBUTES")]
     views.append(view(len(packed) + (-len(packed) % 4), len(indexed), 4, len(corners), "TRIANGLES"))
     accessors = [
-        {"bufferView": 0, "componentType": 5126, "count": V, "type": "VEC3"},
+        {"bufferView": 0, "componentType": 5126, "count": V, "type": "VEC3"} | box,
         {"bufferView": 1, "componentType": 5125, "count": len(corners), "type": "SCALAR"},
     ]
     buffers = [{"byteLength": len(data)}, {"byteLength": 10**6, "extensions": {MESHOPT: {"fallback": True}}}]

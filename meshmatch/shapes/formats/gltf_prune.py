@@ -40,9 +40,14 @@ def prune(json: Json, before: dict[str, set[int]]) -> bool:
     return some
 
 
+def nodes_are_ours(json: Json) -> bool:
+    """Whether no extension might refer to a node."""
+    return all(_KNOWN.fullmatch(name) for name in (*json.get("extensionsUsed", []), *json.get("extensions", {})))
+
+
 def drop_nodes(json: Json, candidates: Iterable[int]) -> None:
     """Take out those nodes that hold nothing, and that nothing refers to; none where an extension might."""
-    if "extensions" in json or not all(_KNOWN.fullmatch(name) for name in json.get("extensionsUsed", [])):
+    if not nodes_are_ours(json):
         return
     nodes, left = json["nodes"], set(candidates)
     channels = [channel["target"] for clip in json.get("animations", []) for channel in clip["channels"]]

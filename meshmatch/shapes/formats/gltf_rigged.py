@@ -5,6 +5,7 @@ Specification: Khronos glTF 2.0, sections 3.7.3 and 3.11.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.arrays import Brief, Float, Floats, Floats32, Int, Ints
+from meshmatch.errors import warn
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor, drawn
-from meshmatch.shapes.formats.gltf_prune import drop_nodes
+from meshmatch.shapes.formats.gltf_prune import drop_nodes, nodes_are_ours
 from meshmatch.shapes.formats.gltf_rig import Clip, Rig, nodes_of_skeleton
 
 _SAME = 1e-6  # of the size of a mesh: vertices that a skin moves by less than this are not moved
@@ -98,6 +100,7 @@ def rigged(document: Document, binding: Binding) -> tuple[bytes, int]:
             before.add(node["skin"])
         node["skin"] = skins[standing.tobytes()]
     gone = _drop_skins(editor, before)
+    _lift(editor, document)
     arrays: dict[bytes, int] = {}
     for clip in rig.clips:
         _add_clip(editor, clip, names, arrays)
@@ -194,14 +197,71 @@ def _drop_skins(editor: Editor, before: set[int]) -> set[int]:
         if "skin" in node:
             node["skin"] = number[node["skin"]]
     editor.json["skins"] = [skins[k] for k in kept]
+    _drop_channels(editor, lambda target: target.get("node") in joints)
+    return joints
+
+
+def _drop_channels(editor: Editor, gone: Callable[[dict[str, Any]], bool]) -> None:
+    """Let clips move some targets no more, and go where they move nothing."""
     for animation in editor.json.get("animations", []):
-        channels = animation["channels"]
-        animation["channels"] = [each for each in channels if each["target"].get("node") not in joints]
+        animation["channels"] = [each for each in animation["channels"] if not gone(each["target"])]
     if "animations" in editor.json:
         editor.json["animations"] = [each for each in editor.json["animations"] if each["channels"]]
         if not editor.json["animations"]:
             del editor.json["animations"]
-    return joints
+
+
+def _lift(editor: Editor, document: Document) -> None:
+    """Let what a skin moves now hang from nothing, without a transform, in the order of the scene: glTF ignores transforms
+    above a skinned mesh, and not all viewers do. A node that holds something else as well stays, without its mesh.
+    """
+    if not nodes_are_ours(editor.json):
+        return
+    nodes = editor.json["nodes"]
+    joints = {joint for skin in editor.json["skins"] for joint in skin["joints"]}
+    clips = [channel["target"] for clip in editor.json.get("animations", []) for channel in clip["channels"]]
+    parents = {child: number for number, node in enumerate(document.nodes) for child in node.get("children", [])}
+    skinned = drawn(document)
+    trees: dict[int, list[int]] = {}  # meshes that a skin moves, in the order of the scene
+    root: dict[int, int] = {}
+    for number in document.world:  # parents before children
+        root[number] = root.get(parents.get(number, -1), number)
+        if number in skinned:
+            trees.setdefault(root[number], []).append(number)
+    new = {number for number in skinned if "skin" not in document.nodes[number]}
+    trees = {top: some for top, some in trees.items() if not new.isdisjoint(some)}  # others lay there with their skins
+    lifted = {number for some in trees.values() for number in some}
+    place: dict[int, int] = {}
+    for number in sorted(lifted):
+        node = nodes[number]
+        if (
+            number in joints
+            or not lifted.issuperset(node.get("children", []))
+            or node.keys() & {"camera", "extensions"}
+        ):
+            held = {key: node.pop(key) for key in ("mesh", "skin", "weights") if key in node}
+            place[number] = editor.add("nodes", held | ({"name": node["name"]} if "name" in node else {}))
+    for target in clips:
+        if target["path"] == "weights":
+            target["node"] = place.get(target.get("node", -1), target.get("node"))
+    whole = lifted - place.keys()
+    for number in {parents[number] for number in whole if number in parents}:
+        left = [child for child in nodes[number].pop("children") if child not in whole]
+        nodes[number] |= {"children": left} if left else {}
+    for scene in editor.json["scenes"]:
+        tops = scene.get("nodes", [])
+        listed = [[top, *(place.get(each, each) for each in trees.get(top, []))] for top in tops]
+        scene["nodes"] = list(dict.fromkeys(number for each in listed for number in each))
+    for number in whole:
+        for key in ("translation", "rotation", "scale", "matrix"):
+            nodes[number].pop(key, None)
+    above = new & lifted
+    for number in reversed(document.world):
+        if number in above and number in parents:
+            above.add(parents[number])
+    if any(target.get("node") in above and target["path"] != "weights" for target in clips):
+        warn(f"clips of {document.name} that moved a mesh as a whole do so no more, for its skeleton moves it")
+    _drop_channels(editor, lambda target: target.get("node") in whole and target["path"] != "weights")
 
 
 def _add_clip(editor: Editor, clip: Clip, names: list[int], arrays: dict[bytes, int]) -> None:

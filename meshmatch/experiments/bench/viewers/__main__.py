@@ -8,8 +8,7 @@ place: what they draw should cover the same pixels. The pictures are left in OUT
 
 Nothing is installed: `npm install --prefix FOLDER gltf-validator three` and --modules FOLDER/node_modules; Blender as for
 files that it reads (MESHMATCH_BLENDER); Chromium from the path or MESHMATCH_CHROMIUM. Of a target that has issues itself
-only those that it did not have are counted. --also names a folder of other glb files, such as those that tests wrote
-(MESHMATCH_KEEP_GLB=FOLDER pytest): they are validated.
+only those that it did not have are counted.
 """
 
 from __future__ import annotations
@@ -24,7 +23,15 @@ from meshmatch.errors import InputError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.viewers.expected import Written, differences
 from meshmatch.experiments.bench.viewers.made import Made, made
-from meshmatch.experiments.bench.viewers.opened import TOOLS, Found, check_tools, in_blender, in_three, validated
+from meshmatch.experiments.bench.viewers.opened import (
+    TOOLS,
+    Found,
+    check_tools,
+    in_blender,
+    in_three,
+    issues,
+    validated,
+)
 from meshmatch.experiments.bench.viewers.sheet import covered, draw_sheet, overlap
 from meshmatch.outputs import make_folder
 
@@ -41,17 +48,6 @@ SUMMARY = {
     "by": "verb", "files": "formats", "errors": "errors:d", "warnings": "warnings:d", "as written in Blender": "blender:>",
     "in three.js": "three:>", "otherwise": "otherwise:>",
 }  # fmt: skip
-
-
-def issues(found: Found, file: Path, target: Path | None) -> Counter[tuple[int, str]]:
-    """Errors and warnings of a file, by severity and code, that its target does not have."""
-
-    def of(path: Path) -> Counter[tuple[int, str]]:
-        record = found[str(path)]
-        return Counter([(0, str(record["error"]))] if "error" in record else
-                       [(each["severity"], each["code"]) for each in record["issues"] if each["severity"] < 2])  # fmt: skip
-
-    return of(file) - (Counter() if target is None else of(target))
 
 
 def _rows(files: list[Made], valid: Found | None, opened: dict[str, Found], pictures: Path) -> list[dict[str, Any]]:
@@ -106,7 +102,6 @@ def main(
     data: runner.Data = runner.DATA,
     modules: Annotated[Path, Option(help="npm's folder node_modules")] = Path("node_modules"),
     tools: Annotated[str, Option(help=f"of {', '.join(TOOLS)}")] = ",".join(TOOLS),
-    also: Annotated[Path | None, Option(help="validate the glb files of this folder, too")] = None,
 ) -> runner.Report:
     chosen = runner.names_of(tools, TOOLS, "tool")
     check_tools(chosen, modules)
@@ -115,11 +110,10 @@ def main(
     files = made(
         output.absolute(), data.absolute(), "blender" in chosen, lambda lines: list(runner.track(lines, "files"))
     )
-    others = [] if also is None else runner.files_in(also, "*.glb")
     valid, opened = None, {}
     if "validator" in chosen:
         gltf = {each for one in files for each in (one.path, one.target) if each is not None and each.suffix in _GLTF}
-        valid = validated(sorted({*gltf, *others}), modules)
+        valid = validated(sorted(gltf), modules)
     paths = [each.path for each in files]
     if "blender" in chosen:
         opened["blender"] = in_blender(paths, pictures.absolute())
@@ -128,12 +122,7 @@ def main(
         opened["three"] |= {str(path): {"error": NO_READER} for path in paths if path.suffix == ".blend"}
     rows = _rows(files, valid, opened, pictures)
     draw_sheet(output / "sheet.png", [each.path.name for each in files], pictures)
-    notes, record = [f"drew {output / 'sheet.png'}"], dict[str, Any](rows=rows)
-    if valid is not None and others:
-        told = {file.name: sorted({code for _, code in new}) for file in others if (new := issues(valid, file, None))}
-        notes.append(f"{len(others)} other files: {len(others) - len(told)} without errors and warnings")
-        record |= {"others": len(others), "others_with_issues": told}
     tables = [runner.table("Opened elsewhere", rows, COLUMNS), runner.table("By verb", _summary(rows), SUMMARY)]
     bad = [row["file"] for row in rows if row.get("errors") or row.get("warnings")]
     stopped = InputError(f"with errors or warnings: {', '.join(bad)}", "--save has them") if bad else None
-    return runner.Report(record, tables, notes, stopped)
+    return runner.Report({"rows": rows}, tables, [f"drew {output / 'sheet.png'}"], stopped)

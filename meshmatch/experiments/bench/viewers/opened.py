@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import tempfile
 import threading
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -72,6 +73,17 @@ def validated(files: Sequence[Path], modules: Path) -> Found:
         )
     records = [json.loads(line) for line in done.stdout.splitlines()]
     return {str(Path(record.pop("file"))): record for record in records}
+
+
+def issues(found: Found, file: Path, target: Path | None = None) -> Counter[tuple[int, str]]:
+    """Errors and warnings of a file, by severity and code, that its target does not have."""
+
+    def of(path: Path) -> Counter[tuple[int, str]]:
+        record = found[str(path)]
+        return Counter([(0, str(record["error"]))] if "error" in record else
+                       [(each["severity"], each["code"]) for each in record["issues"] if each["severity"] < 2])  # fmt: skip
+
+    return of(file) - (Counter() if target is None else of(target))
 
 
 def in_blender(files: Sequence[Path], pictures: Path) -> Found:
