@@ -14,7 +14,7 @@ from numbers import Integral
 
 import numpy as np
 
-from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32
+from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32, UInts8
 from meshmatch.errors import OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Alpha, Appearance, BakedMaterial, Finish, Layer, Pixels
@@ -37,6 +37,7 @@ _COARSE = 1.25
 _GLANCE, _SEARCH, _ALIKE = 128, 1024, 32
 _CHUNK = 1 << 16
 _BAND = 1 << 22  # texels that are painted together
+_PIECES = 16  # of an image, in which its texels are counted
 
 
 @dataclass(frozen=True)
@@ -137,9 +138,12 @@ def transfer_texture(
     color = ColorPainter(look, walker)
     painters: dict[Layer, Painter] = {} if look.finish is None else _painters(look.finish, walker, locator, uv)
     (image, *others), low = _painted([color, *painters.values()], locator, on.reshape(-1), options, progress)
-    alpha = _fill_and_blank(image, on.reshape(-1) >= 0, low, options, color.sampler.alpha)
+    untrusted = _share_of_surface(target, on, inside, low.reshape(inside.shape))
+    painted = on.reshape(-1) >= 0
+    del on  # four bytes a texel
+    alpha = _fill_and_blank(image, painted, low, options, color.sampler.alpha)
     for other, painter in zip(others, painters.values(), strict=True):
-        _fill(other, (on.reshape(-1) >= 0) & ~(low & options.fill), options, painter.linear)
+        _fill(other, _weights(painted & ~low if options.fill else painted), options, painter.linear)
     for each in (image, *others):
         if options.padding == 0:
             each[~inside] = 0
@@ -149,7 +153,7 @@ def transfer_texture(
     torn = float(target.face_areas[locator.discontinuous].sum()) / max(target.area, 1e-300)
     plain = BakedMaterial(image, alpha, color.sampler.cutoff, _name_of(look))
     material = _finished(plain, look, dict(zip(painters, others, strict=True)))
-    return Baked(material, float(inside.mean()), _share_of_surface(target, on[inside], low[inside.reshape(-1)]), torn)
+    return Baked(material, float(inside.mean()), untrusted, torn)
 
 
 def transfer_tiles(
@@ -377,9 +381,9 @@ def _fill_and_blank(image: Pixels, painted: Bools, low: Bools, options: BakeOpti
     """Fill in what is not painted, treat low confidence as the options say, and return what alpha then means."""
     pixels = image.reshape(-1, 4)
     known = painted & ~low if options.fill or options.blank is not None else painted
-    weight = known.astype(np.float32)
+    weight = _weights(known)
     if alpha != "opaque":
-        weight *= np.maximum(pixels[:, 3], 1) / np.float32(255)
+        np.minimum(weight, np.maximum(pixels[:, 3], 1), out=weight)
     _fill(image, weight, options)
     if options.blank is not None:
         red, green, blue, share = np.round(255 * np.array(options.blank)).astype(np.uint8).tolist()
@@ -391,16 +395,23 @@ def _fill_and_blank(image: Pixels, painted: Bools, low: Bools, options: BakeOpti
     return alpha
 
 
-def _fill(image: Pixels, weight: Bools | Floats32, options: BakeOptions, linear: bool = False) -> None:
+def _weights(known: Bools) -> UInts8:
+    """All, or nothing."""
+    return np.multiply(known, 255, dtype=np.uint8)
+
+
+def _fill(image: Pixels, weight: UInts8, options: BakeOptions, linear: bool = False) -> None:
     """Fill in the texels of an image whose weight (N,) is 0, where the options ask for that."""
     if options.padding or options.fill:
-        fill(image, weight.astype(np.float32, copy=False).reshape(image.shape[:2]), linear)
+        fill(image, weight.reshape(image.shape[:2]), linear)
 
 
-def _share_of_surface(target: Shape, inside: Ints32, low: Bools) -> float:
-    """How much of the target's area has the texels that are `low` (N,), by the triangle (N,) on each."""
-    count = np.bincount(inside, minlength=target.F)
-    part = np.bincount(inside[low], minlength=target.F)
+def _share_of_surface(target: Shape, on: Ints32, inside: Bools, low: Bools) -> float:
+    """How much of the target's area has texels that are `low` (H, W), by the triangle on each that is `inside`."""
+    count, part = np.zeros(target.F, np.int64), np.zeros(target.F, np.int64)
+    for face, within, unsure in zip(*(np.array_split(each, _PIECES) for each in (on, inside, low)), strict=True):
+        count += np.bincount(face[within], minlength=target.F)
+        part += np.bincount(face[within & unsure], minlength=target.F)
     some = count > 0
     area = target.face_areas[some]
     return float((area * part[some] / count[some]).sum() / max(area.sum(), 1e-300))

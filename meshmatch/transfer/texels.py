@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32
+from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32, UInts8
 from meshmatch.shapes.appearance import Appearance, Material, Pixels, Wrap
 from meshmatch.shapes.colors import LINEAR_OF_BYTE, bytes_of
 
@@ -109,12 +110,13 @@ def beside_another(values: Ints32) -> Bools:
     return out
 
 
-def fill(pixels: Pixels, weight: Floats32, linear: bool = False) -> list[Pixels]:
+def fill(pixels: Pixels, weight: UInts8, linear: bool = False) -> list[Pixels]:
     """All levels of (H, W, 4) pixels, these first, each half as large as the one before, down to one texel. Those whose
     weight (H, W) is 0 are filled, in place; if nothing at all is known, everything counts.
     `linear` pixels are numbers, which are averaged as they are.
     """
-    levels, weights = [pixels], [weight if (weight > 0).any() else np.ones_like(weight)]
+    levels: list[Pixels] = [pixels]
+    weights: list[UInts8 | Floats32] = [weight if weight.any() else np.ones_like(weight)]
     while max(levels[-1].shape[:2]) > 1:
         smaller, lighter = _next_level(levels[-1], weights[-1], linear)
         levels.append(smaller)
@@ -130,35 +132,52 @@ def fill(pixels: Pixels, weight: Floats32, linear: bool = False) -> list[Pixels]
     return levels
 
 
-def _next_level(pixels: Pixels, weight: Floats32, linear: bool) -> tuple[Pixels, Floats32]:
-    height, width = pixels.shape[:2]
-    out = np.zeros(((height + 1) // 2, (width + 1) // 2, 4), np.uint8)
+def _next_level(pixels: Pixels, weight: UInts8 | Floats32, linear: bool) -> tuple[Pixels, Floats32]:
+    """Means of fours of pixels, and their weights, at most 1; beyond the edge there is nothing that counts."""
+    out = np.zeros((*_half(weight.shape), 4), np.uint8)
     total = np.zeros(out.shape[:2], np.float32)
     table = _BYTES if linear else LINEAR_OF_BYTE
-    for low in range(0, height, 2 * _ROWS):
-        part, own = pixels[low : low + 2 * _ROWS], weight[low : low + 2 * _ROWS]
-        odd = tuple((0, n % 2) for n in own.shape)
-        if odd != ((0, 0), (0, 0)):
-            part, own = np.pad(part, (*odd, (0, 0))), np.pad(own, odd)
-        known = _sum_of_fours([own[at] for at in _FOURS])
-        rows, safe = slice(low // 2, low // 2 + len(known)), np.maximum(known, 1e-20)
+    for rows, whole in _bands(weight.shape):
+        part, own = _even(pixels[whole]), _even(weight[whole])
+        shares = own if own.dtype == np.float32 else _SHARE.take(own)
+        known = _sum_of_fours([shares[at] for at in _FOURS])
+        safe = np.maximum(known, 1e-20)
         for k in range(4):
             amounts = _BYTES if k == 3 else table
-            sums = _sum_of_fours([amounts.take(part[(*at, k)]) * own[at] for at in _FOURS])
+            sums = _sum_of_fours([amounts.take(part[(*at, k)]) * shares[at] for at in _FOURS])
             mean = (sums / safe).astype(np.float32)
             out[rows, :, k] = np.round(mean) if amounts is _BYTES else bytes_of(mean)
         total[rows] = np.minimum(known, np.float32(1.0))
     return out, total
 
 
-def _halved(values: Floats32, weight: Floats32) -> tuple[Floats32, Floats32]:
-    """Means of fours of values (H, W, C), and their weights, at most 1; beyond the edge there is nothing that counts."""
-    odd = tuple((0, n % 2) for n in weight.shape)
-    if odd != ((0, 0), (0, 0)):
-        values, weight = np.pad(values, (*odd, (0, 0))), np.pad(weight, odd)
-    products = values * weight[..., None]
-    sums, known = (_sum_of_fours([each[at] for at in _FOURS]) for each in (products, weight))
-    return (sums / np.maximum(known, 1e-20)[..., None]).astype(np.float32), np.minimum(known, np.float32(1.0))
+def _halved(values: UInts8 | Floats32, weight: Floats32) -> tuple[Floats32, Floats32]:
+    """The same for numbers (H, W), which are not rounded."""
+    means, total = np.zeros(_half(weight.shape), np.float32), np.zeros(_half(weight.shape), np.float32)
+    for rows, whole in _bands(weight.shape):
+        shares = _even(weight[whole])
+        products = _even(values[whole]) * shares
+        sums, known = (_sum_of_fours([each[at] for at in _FOURS]) for each in (products, shares))
+        means[rows] = sums / np.maximum(known, 1e-20)
+        total[rows] = np.minimum(known, np.float32(1.0))
+    return means, total
+
+
+def _half(shape: tuple[int, ...]) -> tuple[int, int]:
+    return (shape[0] + 1) // 2, (shape[1] + 1) // 2
+
+
+def _bands(shape: tuple[int, ...]) -> Iterator[tuple[slice, slice]]:
+    """Rows of the next level, and those that they are made of; some at a time."""
+    for low in range(0, shape[0], 2 * _ROWS):
+        high = min(low + 2 * _ROWS, shape[0])
+        yield slice(low // 2, (high + 1) // 2), slice(low, high)
+
+
+def _even(values: NDArray[Any]) -> NDArray[Any]:
+    """With zeros beside the last row and column, where their numbers are odd."""
+    odd = tuple((0, n % 2) for n in values.shape[:2])
+    return values if odd == ((0, 0), (0, 0)) else np.pad(values, (*odd, *((0, 0),) * (values.ndim - 2)))
 
 
 def _sum_of_fours(four: list[Floats32]) -> Floats32:
@@ -173,20 +192,21 @@ class Pyramid:
     def __init__(self, material: Material, known: Bools | None = None) -> None:
         assert material.image is not None
         pixels = material.image.copy()
-        weight = np.ones(pixels.shape[:2], np.float32) if known is None else known.astype(np.float32)
         alpha = pixels[..., 3].copy()
+        weight = np.full_like(alpha, 255) if material.alpha == "opaque" else alpha.copy()
         if material.alpha == "opaque":
             pixels[..., 3] = 255
-        else:
-            weight *= alpha / np.float32(255)
+        if known is not None:
+            weight *= known
         levels = fill(pixels, weight, material.linear)
         self.table = _SHARE if material.linear else LINEAR_OF_BYTE
         if material.alpha != "opaque":  # colors are made up, not the holes between them
             pixels[..., 3] = alpha
-            means, share = alpha.astype(np.float32)[..., None], np.ones(alpha.shape, np.float32)
+            means: UInts8 | Floats32 = alpha
+            share: Floats32 = np.broadcast_to(np.float32(1.0), alpha.shape)
             for level in levels[1:]:
                 means, share = _halved(means, share)
-                level[..., 3] = np.round(means[..., 0])
+                level[..., 3] = np.round(means)
         self.heights, self.widths = np.array([level.shape[:2] for level in levels]).T
         # All levels one after the other: red, green, blue and alpha in one number.
         self.texels = np.concatenate([np.ascontiguousarray(level).view(np.uint32).ravel() for level in levels])

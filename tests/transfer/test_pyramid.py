@@ -34,7 +34,7 @@ def test_an_unknown_texel_takes_the_mean_of_its_three_neighbours_as_light() -> N
     pixels[..., 3] = 255
     pixels[0, 0, 0], pixels[0, 1, 0], pixels[1, 0, 0] = 255, 0, 255
     pixels[1, 1] = (1, 2, 3, 4)
-    fill(pixels, np.array([[1, 1], [1, 0]], np.float32))
+    fill(pixels, np.array([[255, 255], [255, 0]], np.uint8))
     want = round(255 * float(to_srgb(2 / 3)))
     assert pixels[1, 1].tolist() == [want, 0, 0, 255]
     assert pixels[0].tolist() == [[255, 0, 0, 255], [0, 0, 0, 255]]  # what is known stays
@@ -55,7 +55,7 @@ def test_one_color_stays_one_color(shape: tuple[int, int]) -> None:
 
 def test_nothing_known_leaves_everything() -> None:
     pixels = np.full((4, 4, 4), 9, np.uint8)
-    fill(pixels, np.zeros((4, 4), np.float32))
+    fill(pixels, np.zeros((4, 4), np.uint8))
     assert (pixels == 9).all()
 
 
@@ -69,7 +69,7 @@ def test_no_mip_level_of_a_filled_image_shows_the_background() -> None:
     pixels[known] = np.concatenate([rng.integers(180, 256, (known.sum(), 3)), np.full((known.sum(), 1), 255)], 1)
     darkest = [level.min() for level in means(pixels)[:4]]
     assert max(darkest) < 0.1  # that is: unfilled it would show
-    fill(pixels, known.astype(np.float32))
+    fill(pixels, 255 * known.astype(np.uint8))
     assert min(level.min() for level in means(pixels)) >= to_linear(178 / 255)
 
 
