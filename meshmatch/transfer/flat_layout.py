@@ -21,6 +21,7 @@ _ROUNDS = 5
 _COTANGENTS = 0.02, 20.0  # of thin triangles
 _THIN = 1e-3  # height over base: thinner triangles are laid out as if they had this one
 _NOTHING = 0.01  # share of the area that it has then: nobody sees whether a thinner one is turned over
+_SHORT = 1e-9  # of sqrt(area): an edge without length
 _UNTANGLED = 6  # rounds of moving corners between their neighbours where triangles are turned over
 _GRID = 1024  # texels across a piece on which it must not cover itself: at most,
 _FINE = 16  # and for each row of triangles
@@ -98,6 +99,7 @@ def _bad(laid: Floats, corners: Ints, seen: Bools, least: int) -> tuple[Int[Ints
     grid = int(np.clip(_FINE * np.sqrt(F), least, _GRID))
     low, high = laid.min(axis=(0, 1)), laid.max(axis=(0, 1))
     image = (0.01 + 0.98 * (laid - low) / (high - low).max()) * grid
+    image[~seen] = 0.0
     found, twice = faces_on(image, grid)
     if twice:
         other = F - 1 - faces_on(image[::-1], grid)[0]
@@ -110,6 +112,20 @@ def _bad(laid: Floats, corners: Ints, seen: Bools, least: int) -> tuple[Int[Ints
         if len(one):
             pair = int(one[len(one) // 2]), int(two[len(two) // 2])
     return np.flatnonzero(over), pair
+
+
+def joined(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, "F 3"]:
+    """Faces with one number for what is one vertex: the ends of an edge without length, and those of two open edges that lie
+    at one place, as at seams of files that give each side vertices of its own. `verts` in units of sqrt(area).
+    """
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    short = edges[((verts[edges[:, 0]] - verts[edges[:, 1]]) ** 2).sum(axis=1) < _SHORT**2]
+    number = same_rows(np.sort(edges, axis=1))
+    free = edges[np.bincount(number)[number] == 1]
+    one, two = _twins(same_rows(verts)[free])
+    begin = [short[:, 0], free[one, 0], free[one, 1]]
+    end = [short[:, 1], free[two, 1], free[two, 0]]
+    return _together(len(verts), np.concatenate(begin), np.concatenate(end))[faces]
 
 
 def across(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> tuple[Ints, Ints, Floats]:

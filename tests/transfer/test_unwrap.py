@@ -7,6 +7,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.triangles import face_parts
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer import unwrap
+from meshmatch.transfer.flat_layout import joined
 from meshmatch.transfer.texels import faces_on, grow
 from meshmatch.transfer.unwrap import atlas_of, tiles_of, unwrapped
 from tests.conftest import icosphere
@@ -59,6 +60,30 @@ def test_faces_without_area_are_left_out(cube: Shape) -> None:
     uv = unwrapped(Shape(cube.verts, faces), 64, 1)
     assert (uv[12:] == 0).all()
     assert (uv[:12].reshape(12, -1).max(axis=1) > 0).all()
+
+
+def test_vertices_of_their_own_do_not_part_faces(torus: Shape) -> None:
+    """As flat shading, old seams and stl files give them; nor do slivers between vertices at one place."""
+    few = len(np.unique(charts(unwrapped(torus, 256, 2), torus)))
+    loose = Shape(torus.verts[torus.faces].reshape(-1, 3), np.arange(3 * torus.F).reshape(-1, 3))
+    uv = unwrapped(loose, 256, 2)
+    assert len(np.unique(charts(uv, torus))) <= few + 2
+    assert faces_on(uv * 256, 256)[1] == 0
+    new, (a, b, c) = torus.V, torus.faces[0]
+    verts = np.concatenate([torus.verts, torus.verts[[a]] + 1e-13])
+    split = Shape(verts, np.concatenate([[[new, b, c]], torus.faces[1:], [[b, new, a], [new, c, a]]]))
+    uv = unwrapped(split, 256, 2)
+    assert not uv[torus.F :].any() and len(np.unique(charts(uv, split)[: torus.F])) <= few + 2
+
+
+def test_ends_of_open_edges_at_one_place_are_one_vertex() -> None:
+    """And those of edges without length; but not where more than two sheets meet."""
+    corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (1, 1, 1e-12), (2, 0, 0), (0, 0, 1)]
+    verts = np.array([corners[k] for k in (0, 1, 2, 1, 2, 3, 4, 5, 1, 2, 6)], float)
+    faces = np.array([[0, 1, 2], [3, 5, 4], [3, 6, 5], [3, 7, 6]])
+    np.testing.assert_array_equal(joined(verts, faces), [[0, 1, 2], [1, 5, 2], [1, 5, 5], [1, 7, 5]])
+    three = np.array([[0, 1, 2], [3, 5, 4], [8, 10, 9]])
+    np.testing.assert_array_equal(joined(verts, three), three)
 
 
 def test_size_and_place_of_a_shape_do_not_matter(cube: Shape) -> None:
