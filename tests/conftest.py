@@ -46,8 +46,8 @@ def kept_glb() -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
 
     def keeping(make: Callable[..., bytes]) -> Callable[..., bytes]:
-        def kept(*words: Any) -> bytes:
-            made = make(*words)
+        def kept(*words: Any, **more: Any) -> bytes:
+            made = make(*words, **more)
             file, _, test = os.environ.get("PYTEST_CURRENT_TEST", "").partition(" ")[0].partition("::")
             words = re.sub(r"\W+", "-", f"{Path(file).stem} {test}").strip("-")
             name = f"{words}-{sha256(made).hexdigest()[:8]}.glb"

@@ -38,3 +38,14 @@ def turn_upright(maps: MapPair, along_y: bool) -> Float[Floats, "3 3"]:
         return np.eye(3)
     with thread_limit(1):
         return upright(maps.source, maps.forward.points(maps.target), trust(maps.source, maps))
+
+
+def turn_of_moved(mesh: Shape, verts: Float[Floats, "V 3"], surface: Shape, fit: object) -> Float[Floats, "3 3"] | None:
+    """The same for a mesh that was moved onto a surface: by the fit of that, or else as the mesh stood, if it came from a
+    file with axes; None where it stands so, or that is not known.
+    """
+    known = None if surface.upright else turn_of_fit(fit)
+    if known is not None or surface.upright or not mesh.upright:
+        return known
+    with thread_limit(1):
+        return upright(mesh, verts, mesh.vertex_areas)

@@ -16,7 +16,7 @@ from meshmatch.api import matching
 from meshmatch.api.bound import carried_along
 from meshmatch.api.inputs import LandmarkPairs
 from meshmatch.api.results import MatchResult, MovedMesh
-from meshmatch.api.upright import turn_of_fit
+from meshmatch.api.upright import turn_of_moved
 from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit_config import FitConfig
@@ -26,7 +26,6 @@ from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
-from meshmatch.transfer.carry_rig import upright
 from meshmatch.transfer.wrap import wrap_onto
 
 if TYPE_CHECKING:
@@ -147,10 +146,7 @@ def wrap(
         wrapped = wrap_onto(mesh, near.verts, surface, kept, found.threads)
     shape = replace(mesh, verts=wrapped.verts)
     binding = carried_along(original, shape, surface.upright)
-    turn = None if surface.upright else turn_of_fit(found.target_fit)
-    if turn is None and mesh.upright and not surface.upright:
-        with thread_limit(1):
-            turn = upright(mesh, shape.verts, mesh.vertex_areas)
+    turn = turn_of_moved(mesh, shape.verts, surface, found.target_fit)
     seconds = time.monotonic() - began
     return WrapResult(
         shape, wrapped.turns, wrapped.distance, kept, found, seconds, original=original, binding=binding, turn=turn

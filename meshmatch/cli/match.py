@@ -96,7 +96,8 @@ def register(
     the last bits. With --onto, the mesh of SHAPE is deformed onto TARGET, which stays where it is.
     """
     from meshmatch.api.matching import matcher_for
-    from meshmatch.shapes.files import check_suffix
+    from meshmatch.api.upright import turn_of_fit
+    from meshmatch.shapes.files import check_suffix, save_upright
 
     how.check(not_implicit=["dense", "onto"])
     check_suffix(output)
@@ -114,7 +115,7 @@ def register(
         words.refuse_poor(run.strict, fit.verdict, fit.reasons)
         plain = meshmatch.Shape(fit.points_in_file, fit.faces, output.stem)
         fitted = matcher.dense(fit) if dense else plain  # type: ignore[arg-type]
-        meshmatch.save_shape(temporary, fitted)
+        turned = save_upright(temporary, fitted, None if loaded.upright else turn_of_fit(fit))
     if picture is not None:
         from meshmatch.render.compose import compose_fit
 
@@ -122,6 +123,8 @@ def register(
     console.say(*fit.notes)
     console.say(f"fitted the template of {fit.model} to {loaded.name}: {words.fit_words(fit)}")
     words.tell_verdict(console, fit.verdict, fit.reasons)
+    if turned:
+        console.say("note: a node turns the template upright, along y")
     console.say(f"wrote {output}: {fitted.V} vertices, {fitted.F} faces ({fit.seconds:.1f} s)")
     if picture is not None:
         console.say(f"drew {picture}: the template over the shape, and their distance")
@@ -135,6 +138,8 @@ def _register_onto(
 ) -> None:
     """Deform the mesh of one shape onto another."""
     from meshmatch.api.matching import match as match_shapes
+    from meshmatch.api.upright import turn_of_moved
+    from meshmatch.shapes.files import save_upright
 
     names = words.names_of([shape, onto])
     with replace_on_success(output) as temporary:
@@ -149,13 +154,15 @@ def _register_onto(
         found = result.map
         words.refuse_poor(run.strict, found.verdict, found.reasons, "the registration")
         moved = result.deformed_source()
-        meshmatch.save_shape(temporary, moved)
+        turned = save_upright(temporary, moved, turn_of_moved(a, moved.verts, b, result.target_fit))
     if picture is not None:
         from meshmatch.render.compose import compose_fit
 
         compose_fit(b, moved, result.rotations[1], what=f"the mesh of {names[0]}").render(picture)
     words.tell_match(console, result, names)
     words.tell_verdict(console, found.verdict, found.reasons, "the registration")
+    if turned:
+        console.say(f"note: a node turns {names[0]} upright, along y")
     console.say(f"wrote {output}: the mesh of {names[0]} on {names[1]}, {moved.V} vertices ({result.seconds:.1f} s)")
     if picture is not None:
         console.say(f"drew {picture}: the mesh over {names[1]}, and their distance")

@@ -407,7 +407,7 @@ class Collection(FitsFolder):
                 mean = superimpose(shapes.points, shapes.faces)
         in_time = smooth or cycle
         sequence = in_time or bool(self._about()["sequence"])
-        files = files_of(self.store) if original or in_time else {}
+        files = files_of(self.store) if original or in_time or how.suffix == ".glb" else {}
         names = in_sequences(names) if sequence else names
         times = frame_times({*files, *names}) if in_time else {}
         fits = Fits(names, self.fit_of, self.places_of, files, self.template, sequence, times)

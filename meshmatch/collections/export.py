@@ -13,6 +13,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from meshmatch.api.upright import turn_of_fit
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.covariates import SIZE, Covariates, covariates
 from meshmatch.collections.motion import area_strain, smoothed
@@ -25,7 +26,8 @@ from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.maps.places import Places
 from meshmatch.outputs import folder_on_success, make_folder
 from meshmatch.progress import ProgressCallback
-from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.files import load_shape, save_upright
+from meshmatch.shapes.formats import gltf
 from meshmatch.shapes.formats.vtk import write_vtk, write_vtp
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import write_rows
@@ -143,10 +145,17 @@ def export(
     values = None if how.values is None else load_values(how.values, fits.template.shape)
     table = None if how.metadata is None else covariates(how.metadata, names, np.full(len(names), np.nan))
 
+    turns: dict[str, Floats | None] = {}
+
+    def stands_like(name: str) -> str:
+        return folder_of(name) if fits.sequence else name  # frames as the first of them
+
     def plain() -> Iterator[tuple[str, Shape]]:
         for number, name in enumerate(names):
             fit = fits.fit_of(name)
             facts.add(name, fit)
+            if how.place == "files" and Path(fits.files.get(name, "")).suffix.lower() not in gltf.SUFFIXES:
+                turns.setdefault(stands_like(name), turn_of_fit(fit))
             yield name, mesh_of(fit, how.place)
             if progress is not None:
                 progress("exporting", name, (number + 1) / len(names))
@@ -184,7 +193,7 @@ def export(
                         folder / files[-1], shape, _motion(shape.verts, began, shape.faces)
                     )
                 else:
-                    save_shape(folder / files[-1], shape)
+                    save_upright(folder / files[-1], shape, turns.get(stands_like(name)))
             if fits.sequence and how.suffix == ".vtp":
                 files += _write_series(folder, names)
         if how.suffix in TABLES or table is not None:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from meshmatch import blender
-from meshmatch.arrays import Bool, Bools, Floats, as_numbers, off_torch
+from meshmatch.arrays import Bool, Bools, Float, Floats, as_numbers, off_torch
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import as_path, plain_text, replace_on_success
 from meshmatch.shapes import tables
@@ -247,6 +247,17 @@ def save_shape(path: str | Path, shape: ShapeLike) -> None:
         raise OptionError(f"a {suffix} file cannot hold faces", "choose .ply, .obj, .off, .stl or .glb")
     with replace_on_success(path) as temporary:
         _WRITERS[suffix](temporary, shape)
+
+
+def save_upright(path: Path, shape: Shape, turn: Float[Floats, "3 3"] | None) -> bool:
+    """`save_shape`; in a glb a node makes the turn, which lets the shape stand along y. Returns whether there is one."""
+    turned = path.suffix.lower() == ".glb" and turn is not None and not np.array_equal(turn, np.eye(3))
+    if turned:
+        with replace_on_success(path) as temporary:
+            temporary.write_bytes(gltf_out.glb_of(shape, turn))
+    else:
+        save_shape(path, shape)
+    return turned
 
 
 def as_scene(source: ShapeLike, shape: Shape) -> tuple[Path, bytes, bool]:

@@ -98,6 +98,25 @@ def test_registered_meshes_are_exported(fits: Path, run: Run, tmp_path: Path, su
         assert np.quantile(MappedMesh.of(file).query(shape.verts).distance, 0.9) < 0.005 * file.diagonal
 
 
+def test_what_is_exported_stands_upright_in_a_glb(fits: Path, run: Run, tmp_path: Path) -> None:
+    """If the file of the shape has no axes; the frames of a folder as the first of them."""
+    assert run("export", fits, "-o", tmp_path / "out", "--format", "glb").status == 0
+    own = Collection(fits).fit_of("climber")
+    assert own.up == "+z"
+    upright = own.points_in_file @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    np.testing.assert_allclose(load_shape(tmp_path / "out" / "climber.glb").verts, upright, atol=1e-5)
+    frames = all_climber(fits, "b", "left/f2", "left/f10", sequence=True)
+    frames = replace(
+        frames, files={"b": "b.glb"}, fit_of=lambda name: replace(own, up="-x") if name == "left/f10" else own
+    )
+    export(tmp_path / "frames", frames, Export(".glb"), None)
+    for name, verts in {"b": own.points_in_file, "left/f2": upright, "left/f10": upright}.items():
+        np.testing.assert_allclose(load_shape(tmp_path / "frames" / f"{name}.glb").verts, verts, atol=1e-5)
+    export(tmp_path / "template", frames, Export(".glb", "template"), None)
+    verts = load_shape(tmp_path / "template" / "b.glb").verts
+    np.testing.assert_allclose(verts, own.points * own.frame.scale, atol=1e-5)
+
+
 def test_shapes_of_folders_are_exported_into_folders(fits: Path, tmp_path: Path) -> None:
     """Frames of a sequence with ParaView's list of each folder."""
     given = all_climber(fits, "b", "left/f2", "left/f10", sequence=True)

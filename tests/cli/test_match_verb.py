@@ -3,6 +3,7 @@
 import json
 import signal
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,6 +16,7 @@ from meshmatch.errors import OutputError
 from meshmatch.maps.files import load_map
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 from tests.cli.conftest import FakeMatching, Run, fake_fit
@@ -104,6 +106,23 @@ def test_register_writes_the_template_in_the_frame_of_the_file(
     wanted = 2.0 * made.points + [10.0, 0, 0]
     assert np.allclose(fitted.verts[fitted.faces], wanted[made.faces])
     assert "good fit, up +y, front -z" in answer.err
+
+
+def test_register_stands_upright_in_a_glb(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
+    """By a node, where the shape's file has no axes; its vertices are in the frame of the file."""
+    stub.make_fit = partial(fake_fit, up="+z")
+    output = two[0].with_name("fitted.glb")
+    answer = run("register", two[0], "-o", output)
+    assert "a node turns the template upright, along y" in answer.err
+    wanted = 2.0 * fake_fit(load_shape(two[0])).points + [10.0, 0, 0]
+    np.testing.assert_allclose(load_shape(output).verts, wanted @ [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-5)
+    np.testing.assert_allclose(Document(output, output.read_bytes()).accessor(0), wanted, atol=1e-5)
+    save_shape(two[0].with_suffix(".glb"), load_shape(two[0]))
+    answer = run("register", two[0].with_suffix(".glb"), "-o", output)
+    assert answer.status == 0 and "a node turns" not in answer.err
+    np.testing.assert_allclose(load_shape(output).verts, wanted, atol=1e-5)
+    answer = run("register", two[0], "--onto", two[1], "-o", output)
+    assert f"a node turns {two[0].name} upright, along y" in answer.err
 
 
 def test_register_draws_the_template_over_the_shape(

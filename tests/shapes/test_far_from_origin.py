@@ -13,7 +13,7 @@ from meshmatch.errors import MeshmatchWarning, OutputError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.picture import Look
 from meshmatch.shapes.dressed_files import save_textured
-from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.files import load_shape, save_shape, save_upright
 from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.formats.gltf_out import center_of, write_morphs
 from meshmatch.shapes.shape import Shape
@@ -38,6 +38,11 @@ def test_a_glb_keeps_every_vertex_in_place(tmp_path: Path, sphere: Shape, place:
     np.testing.assert_allclose(load_shape(tmp_path / "a.glb").verts, shape.verts, rtol=0, atol=2e-7)
     scene = trimesh.load_scene(tmp_path / "a.glb")  # an independent reader that knows nodes
     np.testing.assert_allclose(scene.bounds.mean(axis=0), shape.bounds.mean(axis=0), rtol=0, atol=2e-7)
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    assert save_upright(tmp_path / "b.glb", shape, turn)
+    np.testing.assert_allclose(load_shape(tmp_path / "b.glb").verts, shape.verts @ turn.T, rtol=0, atol=2e-7)
+    assert not save_upright(tmp_path / "b.ply", shape, turn)
+    np.testing.assert_array_equal(load_shape(tmp_path / "b.ply").verts, shape.verts)
 
 
 def test_positions_that_were_single_stay_what_they_were(tmp_path: Path, sphere: Shape) -> None:

@@ -38,14 +38,14 @@ def write(path: Path, shape: Shape) -> None:
     path.write_bytes(glb_of(shape))
 
 
-def glb_of(shape: Shape) -> bytes:
-    """A mesh or a cloud; 32-bit floats, 32-bit indices, linear vertex colors."""
+def glb_of(shape: Shape, turn: Float[Floats, "3 3"] | None = None) -> bytes:
+    """A mesh or a cloud; 32-bit floats, 32-bit indices, linear vertex colors. Its node makes the turn."""
     attributes = {"POSITION": shape.verts}
     if not shape.is_cloud:
         attributes["NORMAL"] = smooth_normals(shape.verts, shape.faces)
     if shape.colors is not None:
         attributes["COLOR_0"] = light(shape.colors)
-    return _glb(shape.name, attributes, shape.faces)
+    return _glb(shape.name, attributes, shape.faces, turn=turn)
 
 
 def write_morphs(path: Path, shape: Shape, targets: Mapping[str, Float[Floats, "V 3"]]) -> None:
@@ -75,7 +75,11 @@ def center_of(verts: Float[Floats, "V 3"]) -> Float[Floats, " 3"]:
 
 
 def _glb(
-    name: str, attributes: dict[str, Floats], faces: Ints, moves: Mapping[str, dict[str, Floats]] | None = None
+    name: str,
+    attributes: dict[str, Floats],
+    faces: Ints,
+    moves: Mapping[str, dict[str, Floats]] | None = None,
+    turn: Float[Floats, "3 3"] | None = None,
 ) -> bytes:
     """Arrays one after the other, each at a multiple of four bytes, behind what describes them."""
     center = center_of(attributes["POSITION"])
@@ -110,7 +114,13 @@ def _glb(
     for k in places:
         accessors[k] |= {"min": arrays[k].min(0).tolist(), "max": arrays[k].max(0).tolist()}
     document = {"asset": {"version": "2.0", "generator": "meshmatch"}, "scene": 0, "scenes": [{"nodes": [0]}]}
-    node = {"mesh": 0, "name": name} | ({"translation": center.tolist()} if center.any() else {})
+    node: dict[str, Any] = {"mesh": 0, "name": name}
+    if turn is not None:
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = turn, turn @ center
+        node["matrix"] = matrix.T.ravel().tolist()
+    elif center.any():
+        node["translation"] = center.tolist()
     document |= {"nodes": [node], "meshes": [mesh]}
     document |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}]}
     text = json.dumps(document).encode()
