@@ -35,7 +35,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session", autouse=True)
 def kept_glb() -> Iterator[None]:
     """With MESHMATCH_KEEP_GLB=FOLDER, keep every glb that the package makes there, each once, for
-    `meshmatch.experiments.bench.viewers` to validate.
+    `meshmatch.experiments.bench.viewers.valid` to read.
     """
     if not (named := os.environ.get("MESHMATCH_KEEP_GLB")):
         yield
