@@ -19,7 +19,7 @@ from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.judge.calibration import DIRECT_BOTH_WAYS
 from meshmatch.fitting.judge.direct import judge_direct
 from meshmatch.fitting.judge.reasons import Reason, Verdict
-from meshmatch.fitting.one_way import DirectConfig, KnownPairs, Side, Tried, carried, finished, fitted
+from meshmatch.fitting.one_way import DirectConfig, KnownPairs, Side, Tried, carried, distinct, finished, fitted
 from meshmatch.fitting.search.intrinsic import ThinMesh
 from meshmatch.fitting.search.proposals import Proposal, differ
 from meshmatch.fitting.solve.regularity import Regularity
@@ -213,9 +213,9 @@ class _Search:
         return sorted((_BothWays(*each) for each in (*ways, *ways_back)), key=lambda each: each.energy)
 
     def _best(self, tried: list[Tried]) -> list[Tried]:
-        """The first few, and the guess, whose energy is asked for."""
-        count = self.source.config.returned
-        return tried[:count] + [each for each in tried[count:] if each.proposal.kind == "guess"]
+        """The best few that differ, and the guess, whose energy is asked for."""
+        best = distinct(tried, self.source.config.returned, self.source.config.unlike)
+        return best + [each for each in tried if each.proposal.kind == "guess" and each not in best]
 
     def _returned(self, tried: Sequence[Tried], report: Progress) -> list[Tried]:
         """The target fitted to the source by what takes the source to the target."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from operator import attrgetter
 from typing import Literal
 
 import numpy as np
@@ -242,12 +243,11 @@ def finished(
     report(0.0)
     found = parallel_map(lambda each: fit(each[0], fine.system.vectors_to(each[1]), config.third), begun)
     report(0.6)
-    best = sorted(range(len(found)), key=lambda k: found[k].energy)[: config.gliding]
-    glided = parallel_map(lambda k: fit(found[k].proposal, found[k].vectors, config.along), best)
-    for k, each in zip(best, glided, strict=True):
-        found[k] = min(found[k], each, key=lambda tried: tried.energy)
+    best = distinct(found, config.gliding, config.unlike)
+    glided = parallel_map(lambda each: fit(each.proposal, each.vectors, config.along), best)
     report(1.0)
-    return found
+    better = {id(each): min(each, other, key=attrgetter("energy")) for each, other in zip(best, glided, strict=True)}
+    return [better.get(id(each), each) for each in found]
 
 
 def fitted(own: Side, onto: Side, guess: KnownPairs | None, report: Progress) -> list[Tried]:
@@ -291,10 +291,10 @@ def _screened(
 
     fewer, few = samples.first(config.fewer), samples.first(config.few)
     first = parallel_map(lambda each: fit(each, fewer, level.begun(each), config.first), proposals)
-    better = _distinct(first, config.better, config.unlike)
+    better = distinct(first, config.better, config.unlike)
     pairs = neighbours(few)
     tried = parallel_map(lambda each: fit(each.proposal, few, each.vectors, config.second, pairs), better)
-    return _distinct(tried, config.best, config.unlike)
+    return distinct(tried, config.best, config.unlike)
 
 
 def carried(
@@ -306,7 +306,7 @@ def carried(
     return np.asarray((weights[..., None] * values[near]).sum(1) / weights.sum(1, keepdims=True))
 
 
-def _distinct(tried: list[Tried], count: int, unlike: float) -> list[Tried]:
+def distinct(tried: Sequence[Tried], count: int, unlike: float) -> list[Tried]:
     """The best of the fits, no two of which are alike."""
     kept: list[Tried] = []
     for each in sorted(tried, key=lambda each: each.energy):

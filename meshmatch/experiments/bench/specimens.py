@@ -59,7 +59,8 @@ from meshmatch.training.recipes import recipe_for
 from meshmatch.training.train import train
 
 SIDED = ("femurs", "hearts", "knees", "molars")
-SETS = (*SIDED, "leaves", "bust", "bird")
+BY_KEYPOINTS = ("bust", "bird", "fish", "chair")
+SETS = (*SIDED, "leaves", *BY_KEYPOINTS)
 PAIRS = "pairs"
 METHODS = (NO_MODEL, "own", PAIRS, "meshmonk", "pyclarcs")
 _OTHERS = METHODS[3:]
@@ -174,8 +175,8 @@ def load(name: str, data: Path, count: int, seed: int) -> Specimens:
     """A set of so many specimens, if it has as many."""
     rng = np.random.default_rng([seed, SETS.index(name)])
     mirrored = [name in SIDED and k % 3 == 2 for k in range(max(count, 100))]
-    if name in ("bust", "bird"):
-        folder = data / "shrec07" / name
+    if name in BY_KEYPOINTS:
+        folder = any_shapes.folder_of(name, data)
         names = runner.spread(any_shapes.shapes_of(folder), count)
         points = {each: any_shapes.keypoints_of(folder, each) for each in names}
         shapes = {each: load_shape(folder / f"{each}.ply") for each in names}
