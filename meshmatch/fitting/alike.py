@@ -62,7 +62,7 @@ def match_alike(
     smaller, larger = sorted((source, target), key=lambda shape: shape.area)
     part = may_show_part(smaller, config) and _longest_rim(smaller) > _RIM
     whole, other = (larger, smaller) if part else (source, target)
-    if not part and min(apart(source, target, config.seed)) > _ALIKE:
+    if not part and min(found.apart or apart(source, target, config.seed)) > _ALIKE:
         return found
     report = Progress(progress, other.name).stage("fits of shapes that stand alike")
     report(0.0)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.judge.calibration import DIRECT_BOTH_WAYS
 from meshmatch.fitting.judge.direct import judge_direct
 from meshmatch.fitting.judge.reasons import Reason, Verdict
-from meshmatch.fitting.one_way import DirectConfig, KnownPairs, Side, Tried, carried, distinct, finished, fitted
+from meshmatch.fitting.one_way import DirectConfig, KnownPairs, Side, Tried, carried, distinct, finished, fitted, glided
 from meshmatch.fitting.search.intrinsic import ThinMesh
 from meshmatch.fitting.search.proposals import Proposal, differ
 from meshmatch.fitting.solve.regularity import Regularity
@@ -31,7 +32,7 @@ from meshmatch.models.registry import NO_MODEL
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.sides import mirrored, nearer_mirrored
+from meshmatch.templates.sides import apart, mirrored
 from meshmatch.threads import parallel_map
 
 # Share of vertices by which a map differs from a guess, or from the same map found from the other side, if it is much the
@@ -74,7 +75,8 @@ class DirectMatch:
     registered to. ``tried`` are what the fits that were compared in the end began from, and their energies, best first;
     ``leads`` how much higher the energies of those are that differ from the best one, and ``over_guess`` that of the
     guess, if there was one: 0 where it is much the same map. Where the energies are means of both directions, ``one_way`` is
-    what the first of them alone would have given.
+    what the first of them alone would have given. ``apart`` is how far apart a rigid motion leaves the shapes, and the
+    source and the mirror image of the target (units of sqrt(area)), if that was asked.
     """
 
     source: Fit
@@ -84,6 +86,7 @@ class DirectMatch:
     leads: tuple[float, ...] = ()
     over_guess: float = np.inf
     one_way: DirectMatch | None = None
+    apart: tuple[float, float] | None = None
 
     @property
     def energy(self) -> float:
@@ -153,15 +156,16 @@ def match_either_side(
     began, report = time.monotonic(), Progress(progress, source.name)
     search = _Search.of(source, target, config, known, guess)
     there = search.one_way(report.stage("", 0.0, 0.3))
-    nearer = nearer_mirrored(source, target, config.seed)
+    distances = apart(source, target, config.seed)
+    nearer = float(np.log(distances[0] / distances[1]))
     if nearer < (_MAYBE_MIRRORED if there[0].features.likeness < _UNLIKE else _MIRRORED):
-        return search.matched(there, report, began)
+        return replace(search.matched(there, report, began), apart=distances)
     known, guess = (pairs and (pairs[0], MIRROR.apply(pairs[1])) for pairs in (known, guess))
     image = _Search.of(source, mirrored(target), config, known, guess)
     to_image = image.one_way(report.stage("", 0.3, 0.6))
     if to_image[0].energy > _SHARE * there[0].energy:
-        return search.matched(there, report, began)
-    return _of_mirror_image(image.matched(to_image, report, began), target)
+        return replace(search.matched(there, report, began), apart=distances)
+    return replace(_of_mirror_image(image.matched(to_image, report, began), target), apart=distances)
 
 
 def _of_mirror_image(found: DirectMatch, target: Shape) -> DirectMatch:
@@ -208,9 +212,14 @@ class _Search:
         reverse = _Search(self.target, self.source, self.guess and self.guess[::-1])
         there, back = self._best(there), self._best(reverse.one_way(report.between(0.0, 0.7)))
         report = report.named("fits both ways")
-        ways = zip(there, self._returned(there, report.between(0.7, 0.85)), strict=True)
-        ways_back = zip(reverse._returned(back, report.between(0.85, 1.0)), back, strict=True)
-        return sorted((_BothWays(*each) for each in (*ways, *ways_back)), key=lambda each: each.energy)
+        ways = zip(there, self._returned(there, report.between(0.7, 0.8)), strict=True)
+        ways_back = zip(reverse._returned(back, report.between(0.8, 0.9)), back, strict=True)
+        found = sorted((_BothWays(*each) for each in (*ways, *ways_back)), key=attrgetter("energy"))
+        best = distinct(found, self.source.config.gliding, _SAME)
+        there = glided(self.source, self.target, [each.there for each in best], report.between(0.9, 0.95))
+        back = glided(self.target, self.source, [each.back for each in best], report.between(0.95, 1.0))
+        further = [_BothWays(*each) for each in zip(there, back, strict=True)]
+        return sorted([*further, *(each for each in found if each not in best)], key=attrgetter("energy"))
 
     def _best(self, tried: list[Tried]) -> list[Tried]:
         """The best few that differ, and the guess, whose energy is asked for."""

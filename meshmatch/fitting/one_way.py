@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import attrgetter
-from typing import Literal
+from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 
@@ -176,12 +176,13 @@ _LIMBS_ONTO = Schedule(steps=8, prior=(3e-2, 3e-3), damping=1e-6)
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """Node vectors of one proposal, where they take the vertices, and how well."""
+    """Node vectors of one proposal, where they take the vertices, and how well; whether they went on along the surface."""
 
     proposal: Proposal
     vectors: Float[Floats, "K 3"]
     moved: Float[Floats, "V 3"]
     features: DirectFeatures
+    glided: bool = False
 
     @property
     def energy(self) -> float:
@@ -232,22 +233,34 @@ def finished(
     own: Side, onto: Side, begun: Sequence[tuple[Proposal, Float[Floats, "V 3"]]], report: Progress
 ) -> list[Tried]:
     """The fine mesh of one shape fitted to another from where its vertices (V, 3) may belong, for each proposal."""
-    fine, samples, near, config = own.fine, onto.samples, onto.neighbours, own.config
+    report(0.0)
+    _ = own.fine, onto.neighbours
+    vectors_to = own.fine.system.vectors_to
+    found = parallel_map(lambda each: _fine(own, onto, each[0], vectors_to(each[1]), own.config.third), begun)
+    report(1.0)
+    return found
 
-    def fit(proposal: Proposal, vectors: Float[Floats, "K 3"], how: NodeRefineConfig) -> Tried:
-        vectors = fine.refined(samples, vectors, how)
-        return Tried(
-            proposal, vectors, fine.system.moved(vectors), fine.features(onto.fine_mesh, samples, vectors, near)
-        )
+
+def glided(own: Side, onto: Side, tried: Sequence[Tried], report: Progress) -> list[Tried]:
+    """Fine fits that go on along the surface, if they have not; each as it was where that does not lower its energy."""
+
+    def further(each: Tried) -> Tried:
+        if each.glided:
+            return each
+        found = _fine(own, onto, each.proposal, each.vectors, own.config.along)
+        return replace(min(each, found, key=attrgetter("energy")), glided=True)
 
     report(0.0)
-    found = parallel_map(lambda each: fit(each[0], fine.system.vectors_to(each[1]), config.third), begun)
-    report(0.6)
-    best = distinct(found, config.gliding, config.unlike)
-    glided = parallel_map(lambda each: fit(each.proposal, each.vectors, config.along), best)
+    found = parallel_map(further, tried)
     report(1.0)
-    better = {id(each): min(each, other, key=attrgetter("energy")) for each, other in zip(best, glided, strict=True)}
-    return [better.get(id(each), each) for each in found]
+    return found
+
+
+def _fine(own: Side, onto: Side, proposal: Proposal, vectors: Float[Floats, "K 3"], how: NodeRefineConfig) -> Tried:
+    fine, samples = own.fine, onto.samples
+    vectors = fine.refined(samples, vectors, how)
+    features = fine.features(onto.fine_mesh, samples, vectors, onto.neighbours)
+    return Tried(proposal, vectors, fine.system.moved(vectors), features)
 
 
 def fitted(own: Side, onto: Side, guess: KnownPairs | None, report: Progress) -> list[Tried]:
@@ -262,15 +275,32 @@ def fitted(own: Side, onto: Side, guess: KnownPairs | None, report: Progress) ->
     if guess is not None and all(each.proposal.kind != "guess" for each in tried):  # its energy is asked for
         goals.append((proposals[-1], verts + carried(verts, rested, proposals[-1].points - rested)))
     report = report.named("fits of the best guesses").between(0.8, 1.0)
-    return sorted(finished(own, onto, goals, report), key=lambda each: each.energy)
+    found = finished(own, onto, goals, report.between(0.0, 0.6))
+    best = distinct(found, config.gliding, config.unlike)
+    rest = [each for each in found if each not in best]
+    return sorted([*glided(own, onto, best, report.between(0.6, 1.0)), *rest], key=attrgetter("energy"))
 
 
 def _proposals(source: Side, target: Side, report: Progress) -> list[Proposal]:
-    found = rigid_proposals(source.thin, target.thin)
-    for number, make in enumerate((extremity_proposals, spectral_proposals)):
-        found += make(source.intrinsic, target.intrinsic)
-        report((number + 1) / 2)
-    return found
+    """Guesses of all kinds; what all fits need is made beside them."""
+
+    def levels() -> list[Proposal]:
+        _ = source.coarse, source.fine, target.neighbours
+        return []
+
+    def intrinsic() -> list[Proposal]:
+        return [
+            *extremity_proposals(source.intrinsic, target.intrinsic),
+            *spectral_proposals(source.intrinsic, target.intrinsic),
+        ]
+
+    def rigid() -> list[Proposal]:
+        return rigid_proposals(source.thin, target.thin)
+
+    report(0.0)
+    bent, moved, _ = parallel_map(lambda make: make(), (intrinsic, rigid, levels))
+    report(1.0)
+    return [*moved, *bent]
 
 
 def _screened(
@@ -306,10 +336,21 @@ def carried(
     return np.asarray((weights[..., None] * values[near]).sum(1) / weights.sum(1, keepdims=True))
 
 
-def distinct(tried: Sequence[Tried], count: int, unlike: float) -> list[Tried]:
+class _Fitted(Protocol):
+    @property
+    def energy(self) -> float: ...
+
+    @property
+    def moved(self) -> Float[Floats, "V 3"]: ...
+
+
+F = TypeVar("F", bound=_Fitted)
+
+
+def distinct(tried: Sequence[F], count: int, unlike: float) -> list[F]:
     """The best of the fits, no two of which are alike."""
-    kept: list[Tried] = []
-    for each in sorted(tried, key=lambda each: each.energy):
+    kept: list[F] = []
+    for each in sorted(tried, key=attrgetter("energy")):
         if len(kept) < count and all(differ(each.moved, other.moved) > unlike for other in kept):
             kept.append(each)
     return kept

@@ -20,6 +20,7 @@ from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Scale, unit_frame
+from meshmatch.threads import parallel_map
 
 _COMPARED = 6  # shapes with which each is compared
 _SAMPLES = 300
@@ -82,16 +83,8 @@ def apart(source: Shape, target: Shape, seed: int) -> tuple[float, float]:
     """How far apart a source and a target lie, turned as they fit best, and a source and the mirror image of the target; in
     units of sqrt(area), normals included."""
     one, other = (_samples(shape, "area", [seed, number]) for number, shape in enumerate((source, target)))
-    same, image = (align(each, one, "rigid")[0].residual for each in (other, _image(other)))
+    same, image = parallel_map(lambda each: align(each, one, "rigid")[0].residual, (other, _image(other)))
     return same, image
-
-
-def nearer_mirrored(source: Shape, target: Shape, seed: int) -> float:
-    """How much nearer the mirror image of the target comes to the source than the target itself, both turned as they fit
-    best: the logarithm of the ratio of their distances.
-    """
-    same, image = apart(source, target, seed)
-    return float(np.log(same / image))
 
 
 def laid_mirrored(shape: Shape, seed: int) -> Shape:

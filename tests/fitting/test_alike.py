@@ -58,8 +58,9 @@ def test_what_stands_otherwise_and_clouds_are_left_as_they_are(monkeypatch: pyte
     found = match_either_side(RIGHT.shape, RIGHT.shape, replace(FAST, better=2, best=1))
     cloud = Shape(RIGHT.shape.verts, np.empty((0, 3), np.int64))
     assert match_alike(cloud, RIGHT.shape, found, FitConfig()) is found
-    monkeypatch.setattr(alike, "apart", lambda *_: (0.08, 0.07))
-    assert match_alike(RIGHT.shape, RIGHT.shape, found, FitConfig()) is found
+    for told in (replace(found, apart=(0.08, 0.07)), replace(found, apart=None)):
+        monkeypatch.setattr(alike, "apart", lambda *_: (0.07, 0.08))
+        assert match_alike(RIGHT.shape, RIGHT.shape, told, FitConfig()) is told
 
 
 def test_cracks_are_no_rim() -> None:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.fitting.direct import match_directly, match_either_side
 from meshmatch.fitting.fit import axis_name
 from meshmatch.fitting.judge.direct import DirectFeatures, judge_direct
-from meshmatch.fitting.one_way import DirectConfig, Side, finished
+from meshmatch.fitting.one_way import DirectConfig, Side, finished, glided
 from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh, shortest_tour
 from meshmatch.fitting.search.proposals import (
     Assignments,
@@ -27,7 +27,7 @@ from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.sides import mirrored, nearer_mirrored
+from meshmatch.templates.sides import apart, mirrored
 
 QUICK = DirectConfig(coarse=900, fine=1800, samples=2500, few=1000, fewer=600, better=6, best=3)
 # limbs of a creature: where they point, how long and how wide they are
@@ -251,7 +251,9 @@ def test_a_mirror_image_is_found_where_it_fits_clearly_better() -> None:
     turn = Rotation.from_euler("xyz", (70, 130, -40), degrees=True)
     plain = Shape(turn.apply(np.array(source.verts)), source.faces, "turned")
     target = mirrored(plain)
-    assert nearer_mirrored(source, plain, 0) < 0 < 0.5 < nearer_mirrored(source, target, 0)
+    for other, nearer in ((plain, False), (target, True)):
+        same, image = apart(source, other, 0)
+        assert (image < 0.6 * same) is nearer
     finer = replace(QUICK, fine=5000, samples=8000, better=4, best=2)
     found = match_either_side(source, target, finer, known=(source.verts[:3], target.verts[:3])).target
     assert found.frame.mirrored and np.array_equal(found.verts, target.verts)
@@ -325,17 +327,21 @@ def test_a_limb_glides_along_itself_until_its_end_is_at_the_end() -> None:
     rod = np.clip((way[:, 0] - 0.5) / 0.5, 0, 1)  # a ball with one long limb
     shape = frame_applied(Shape(way * [1, 1, 1] + rod[:, None] * [3.0, 0, 0], np.asarray(ball.faces), "club"))
 
-    def error(gliding: int) -> float:
-        config = replace(QUICK, fine=2400, samples=4000, gliding=gliding)
+    def errors() -> list[float]:
+        config = replace(QUICK, fine=2400, samples=4000)
         frame, thin = sqrt_area_frame(shape), ThinMesh.of(shape, config.coarse)
         side = Side(shape, frame, shape, thin, None, config)
         verts = side.fine_mesh.verts
         along = np.clip((verts[:, 0] - 0.1) / np.ptp(shape.verts[:, 0]), 0, 1)
         short = verts - 0.15 * np.sqrt(along)[:, None] * [1, 0, 0]
-        (found,) = finished(side, side, [(Proposal("guess", short), short)], Progress(None, "club"))
-        return float(np.linalg.norm(found.moved - verts, axis=1).mean())
+        report = Progress(None, "club")
+        found = finished(side, side, [(Proposal("guess", short), short)], report)
+        further = glided(side, side, found, report)
+        assert glided(side, side, further, report) == further  # once is enough
+        return [float(np.linalg.norm(each.moved - verts, axis=1).mean()) for (each,) in (found, further)]
 
-    assert error(gliding=1) < 0.6 * error(gliding=0)
+    before, after = errors()
+    assert after < 0.6 * before
 
 
 @pytest.mark.parametrize(("nearer", "alike", "asked"), [(0.1, 0.6, True), (0.1, 0.8, False), (0.01, 0.6, False)])
@@ -343,7 +349,7 @@ def test_a_palm_on_the_back_of_a_hand_asks_for_the_mirror_image(
     nearer: float, alike: float, asked: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = curled()
-    monkeypatch.setattr("meshmatch.fitting.direct.nearer_mirrored", lambda *_: nearer)
+    monkeypatch.setattr("meshmatch.fitting.direct.apart", lambda *_: (np.exp(nearer), 1.0))
     monkeypatch.setattr(ThinMesh, "likeness", lambda *_: alike)
     found = match_either_side(source, mirrored(source), replace(QUICK, better=4, best=2, both_ways="no"))
     assert found.target.frame.mirrored is asked

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from meshmatch.fitting.solve import banded
+from meshmatch.fitting.solve.banded import solved_band
 from meshmatch.fitting.solve.system import NodeSystem, _EveryPair, node_system
 from meshmatch.geometry.kernels import KERNELS
 from meshmatch.models.trained import TrainedModel
@@ -146,3 +148,25 @@ def test_the_system_of_a_model_is_built_once(model: TrainedModel) -> None:
     assert node_system(model) is node_system(model)
     assert len(node_system(model).gradient_points) == model.template.shape.V  # fewer than the most there may be
     assert len(np.unique(node_system(model).gradient_points)) == model.template.shape.V
+
+
+@pytest.mark.parametrize("exported", [True, False])
+def test_a_band_is_solved_as_the_whole_matrix_is(exported: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not exported:
+        monkeypatch.setattr(banded, "_DPBSV", None)
+    rng, N, above = np.random.default_rng(0), 30, 6
+    band = rng.normal(size=(N, above + 1))
+    band[:, 0] += 20
+    right, whole = rng.normal(size=N), np.zeros((N, N))
+    for i in range(N):
+        for k in range(min(above + 1, N - i)):
+            whole[i + k, i] = whole[i, i + k] = band[i, k]
+    np.testing.assert_allclose(solved_band(band.copy(), right.copy()), np.linalg.solve(whole, right), rtol=1e-10)
+    band[12, 0] = -50.0
+    with pytest.raises(np.linalg.LinAlgError):
+        solved_band(band, right)
+
+
+def test_scipy_exports_what_is_called() -> None:
+    """Where it does not any more, everything works, and two threads wait for one another."""
+    assert banded._DPBSV is not None

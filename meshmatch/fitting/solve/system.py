@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.linalg import solveh_banded
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.derived import derived
 from meshmatch.fields.shape_functions import ShapeFunctions
+from meshmatch.fitting.solve.banded import solved_band
 from meshmatch.fitting.solve.regularity import Regularity, Unfolding
 from meshmatch.geometry.frames import kabsch
 from meshmatch.geometry.oriented import OrientedPoints
@@ -150,9 +150,7 @@ class NodeSystem:
         wanted = (targets - np.eye(3)).transpose(0, 2, 1).reshape(-1, 3)
         right += prior_weight * (fixed.gradient.T @ wanted) + damping * current
         solved = np.empty((self.K, 3))
-        solved[fixed.order] = solveh_banded(
-            normal.T, right[fixed.order].reshape(-1), overwrite_ab=True, lower=True, check_finite=False
-        ).reshape(-1, 3)
+        solved[fixed.order] = solved_band(normal, right[fixed.order].reshape(-1)).reshape(-1, 3)
         return solved
 
 

@@ -1,0 +1,57 @@
+"""Symmetric positive definite band matrices, factored while other threads go on.
+
+SciPy's wrappers of LAPACK keep Python's lock, so that fits in two threads wait for one another. Here the function that SciPy
+exports for compiled code is called through ctypes, which gives the lock up. Where it is exported with other types, such as
+integers of 64 bits, SciPy's wrapper does.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+
+import numpy as np
+from scipy.linalg import cython_lapack, solveh_banded
+
+from meshmatch.arrays import Float, Floats
+
+_DOUBLE = "__pyx_t_5scipy_6linalg_13cython_lapack_d *"
+_SIGNATURE = f"void (char *, int *, int *, int *, {_DOUBLE}, int *, {_DOUBLE}, int *, int *)"
+
+
+def _exported() -> Callable[..., None] | None:
+    """LAPACK's dpbsv, if SciPy exports it with the types that are expected."""
+    exported = getattr(cython_lapack, "__pyx_capi__", {}).get("dpbsv")
+    if exported is None:
+        return None
+    name, pointer = ctypes.pythonapi.PyCapsule_GetName, ctypes.pythonapi.PyCapsule_GetPointer
+    name.restype, name.argtypes = ctypes.c_char_p, [ctypes.py_object]
+    pointer.restype, pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
+    signature = name(exported)
+    if signature != _SIGNATURE.encode():
+        return None
+    arguments = (ctypes.c_char_p, *[ctypes.c_void_p] * 8)
+    return ctypes.CFUNCTYPE(None, *arguments)(pointer(exported, signature))
+
+
+_DPBSV = _exported()
+
+
+def solved_band(band: Float[Floats, "N B"], right: Float[Floats, " N"]) -> Float[Floats, " N"]:
+    """Solve A x = b, with A[i + k, i] in ``band[i, k]``; both arrays are used up.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        A is not positive definite.
+    """
+    if _DPBSV is None:
+        return np.asarray(solveh_banded(band.T, right, overwrite_ab=True, lower=True, check_finite=False))
+    assert band.flags.c_contiguous and right.flags.c_contiguous and band.dtype == right.dtype == np.float64
+    assert band.shape[0] == len(right)
+    N, above, columns, rows, failed = map(ctypes.c_int, (len(band), band.shape[1] - 1, 1, band.shape[1], 0))
+    sizes = [ctypes.byref(each) for each in (N, above, columns, rows, N, failed)]
+    _DPBSV(b"L", *sizes[:3], band.ctypes.data, sizes[3], right.ctypes.data, *sizes[4:])
+    if failed.value:
+        raise np.linalg.LinAlgError(f"the leading block of {failed.value} rows is not positive definite")
+    return right
