@@ -28,7 +28,7 @@ from meshmatch.fitting.judge.features import compute_features
 from meshmatch.fitting.judge.reasons import Reason
 from meshmatch.fitting.judge.verdict import Judgement, judge
 from meshmatch.fitting.one_way import DirectConfig
-from meshmatch.fitting.search.predictor import one_way_residual
+from meshmatch.fitting.search.predictor import part_residual
 from meshmatch.fitting.search.task import take_samples
 from meshmatch.fitting.solve.blend import FieldPath
 from meshmatch.fitting.solve.driver import Problem, minimise
@@ -62,6 +62,8 @@ _SHRUNK = 0.93  # area of a mean of shapes that are posed, against theirs: 0.997
 _PART = 0.85  # so much of a whole's energy a part must have; 0.3 of a cut femur
 # Of a whole that stands as the template does: 0.36 to 0.55 of cut femurs, 0.56 and more of leaves of another size.
 _PART_OF_ALIKE = 0.55
+# As how far it counts, in units of sqrt(area), that a template, which is cut too, ends before the part.
+_BEYOND = 0.02
 _TURNS = 2  # of a part, and of its mirror image, that are tried
 _OTHER_SIDE = 0.86  # so much of the stretch a mirror image may need, to be meant: 0.48 to 0.83 of molars, 0.99 of birds
 _FEW, _FEW_STEPS = 4000, 12  # samples and steps by which two shapes that were matched are fitted anew, to choose
@@ -154,7 +156,7 @@ class _Task:
         vectors = viscous_vectors(self.system, samples, self.config, begin.vectors, self.partial)
         features = DirectFeatures.of(self.system, samples, vectors)
         if self.partial:
-            features = replace(features, residual=one_way_residual(self.system, samples, vectors))
+            features = replace(features, residual=part_residual(self.system, samples, vectors, _BEYOND))
         return _Fitted(begin, samples, vectors, features)
 
     def turns(self, side: Frame | None, how: Align = "rigid", keep: int = 1, most: float = np.inf) -> list[_Begin]:

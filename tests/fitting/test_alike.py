@@ -28,9 +28,9 @@ def fast(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(alike, "ViscousConfig", few)
 
 
-def cut(bone: Scanned, high: float) -> tuple[Shape, Bools]:
-    """What lies below a height of a bone's axis, and which vertices those are."""
-    kept = bone.directions[:, 2] < high
+def cut(bone: Scanned, high: float, way: float = 1.0) -> tuple[Shape, Bools]:
+    """What lies below a height of a bone's axis, or above it, and which vertices those are."""
+    kept = way * bone.directions[:, 2] < way * high
     faces = bone.shape.faces[kept[bone.shape.faces].all(1)]
     used = np.unique(faces)
     return Shape(bone.shape.verts[used], np.searchsorted(used, faces), "broken"), np.isin(np.arange(len(kept)), used)
@@ -83,3 +83,11 @@ def test_a_broken_one_is_a_part_of_a_whole_one(source_is_broken: bool) -> None:
     assert of_whole.template_hash == of_broken.template_hash and not of_whole.vectors.any()
     swapped = replace(seen, source=of_broken, target=of_whole)
     assert errors(swapped, LEFT, RIGHT, broken, kept).mean() < 4
+
+
+def test_two_broken_ones_share_what_both_have() -> None:
+    (low, kept), (upper, _) = cut(LEFT, 0.4), cut(RIGHT, -0.5, -1.0)
+    plain = match_either_side(low, upper, replace(FAST, better=2, best=1))
+    seen = match_alike(low, upper, plain, FitConfig())
+    shared = LEFT.directions[kept][:, 2] > -0.4
+    assert errors(seen, LEFT, RIGHT, low, kept)[shared].mean() < 5

@@ -138,9 +138,12 @@ def compute_features(
     gradient = system.deformation_gradient(vectors)
     stretches = log_stretch(gradient)
     flipped = (surface.normals[nearest] * local.normals).sum(1) < 0
+    unreached = gap > _REACH
+    if partial:  # nothing is known of what lies beyond a template that is cut
+        unreached &= ~system.rim[nearest]
     return FitFeatures(
         residual=residual,
-        uncovered_shape=float(weighted_mean(gap > _REACH, local.weights)),
+        uncovered_shape=float(weighted_mean(unreached, local.weights)),
         uncovered_template=0.0 if partial else uncovered_share(local, surface.points),
         discontinuous=discontinuous_share(
             system, neighbours(some, connected), some, vectors, shortening(system, gradient)

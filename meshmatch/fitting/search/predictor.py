@@ -256,6 +256,14 @@ def one_way_residual(
     return float(_back_residual(system.surface(vectors), samples, stride, cap))
 
 
+def part_residual(system: NodeSystem, samples: OrientedPoints, vectors: Float[Floats, "K 3"], beyond: float) -> float:
+    """About `one_way_residual`; samples that belong to the rim of the template, and so lie beyond it, count as ``beyond``,
+    however far they are."""
+    surface, some = system.surface(vectors), samples.rows(slice(None, None, 2))
+    distance, at = _capped_distances(surface.tree, some.points, some.normals, some.signed, np.inf)
+    return float(weighted_mean(np.where(system.rim[at], beyond, np.minimum(distance, 0.1)), some.weights))
+
+
 def ranking_residual(system: NodeSystem, samples: OrientedPoints, vectors: Float[Floats, "K 3"]) -> float:
     """About `one_way_residual`, of few samples: to every fourth vertex of the template, for its tree takes longest."""
     few = system.surface(vectors).rows(slice(None, None, _RANKING_STRIDE))

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.derived import derived
 from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.solve.banded import solved_band
@@ -70,6 +70,14 @@ class NodeSystem:
     @derived
     def gradient_points(self) -> Int[Ints, " G"]:
         return farthest_points(self.verts, self._gradient_count)
+
+    @property
+    @derived
+    def rim(self) -> Bool[Bools, " V"]:
+        """Which vertices of the template lie at an open boundary."""
+        found = np.zeros(len(self.verts), bool)
+        found[Shape(self.verts, self.faces).edges.open] = True
+        return found
 
     @property
     @derived

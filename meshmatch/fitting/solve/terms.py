@@ -44,7 +44,8 @@ class PairTerm:
     """Pairs of template vertices and samples, whose weights sum to about one and follow those of the samples.
 
     Where pairs are ``one_sided``, the samples show a part of the shape: template vertices without a partner are left to
-    the prior. Where they are "strictly" so, only samples look for partners, and nothing is drawn to the edge of a cut.
+    the prior. Where they are "strictly" so, only samples look for partners: nothing is drawn to the edge of a cut shape,
+    and what lies beyond the edge of a cut template has no partner.
     """
 
     samples: OrientedPoints  # core frame
@@ -123,6 +124,8 @@ def _nearest_pairs(
     to_template = feature_tree(features).query(with_normals(some.points, some.normals, config.pair_normals))[1]
     back = robust_weight(moved.take(to_template, 0) - some.points, scale) / len(some.points)
     back *= _row_sums(normals.take(to_template, 0) * some.normals) > config.normal_cosine
+    if one_sided == "strictly":
+        back *= ~system.rim[to_template]
     if samples.weights is not None and some.weights is not None:
         forward *= samples.weights[to_samples]
         back *= some.weights
