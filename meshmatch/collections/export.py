@@ -6,7 +6,7 @@ import csv
 import html
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Literal, get_args
@@ -28,6 +28,7 @@ from meshmatch.outputs import folder_on_success, make_folder
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import load_shape, save_upright
 from meshmatch.shapes.formats import gltf
+from meshmatch.shapes.formats.gltf_out import write_morphs
 from meshmatch.shapes.formats.vtk import write_vtk, write_vtp
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import write_rows
@@ -38,6 +39,8 @@ Place = Literal["files", "template"]
 """Where exported meshes lie: where their files have the shapes, or all with the axes of the template, about its center."""
 MESHES, TABLES = (".ply", ".vtp", ".vtk", ".obj", ".off", ".stl", ".glb"), (".csv", ".npz")
 ORIGINALS = (".vtp", ".vtk")
+_FRAMES = 400  # of one animated file: the weights of all frames are kept for each of them
+_RATE = 24.0  # frames a second, as Blender has them: so that each file is a frame there
 
 
 @dataclass(frozen=True)
@@ -196,6 +199,8 @@ def export(
                     save_upright(folder / files[-1], shape, turns.get(stands_like(name)))
             if fits.sequence and how.suffix == ".vtp":
                 files += _write_series(folder, names)
+            if fits.sequence and how.suffix == ".glb":
+                files += _write_clips(folder, names, how.cycle)
         if how.suffix in TABLES or table is not None:
             files.append("metadata.csv")
             facts.write(folder / files[-1], table)
@@ -305,6 +310,20 @@ def _write_series(folder: Path, names: Sequence[str]) -> list[str]:
         lines = ['<?xml version="1.0"?>', head, *rows, "</Collection></VTKFile>"]
         files.append(f"{where}/sequence.pvd".lstrip("/"))
         (folder / files[-1]).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return files
+
+
+def _write_clips(folder: Path, names: Sequence[str], cycle: bool) -> list[str]:
+    """The frames of each folder, in their order, as one mesh that moves; of what was written."""
+    files = []
+    for where, own in groupby(names, folder_of):
+        first, *others = (load_shape(folder / f"{name}.glb") for name in own)
+        if len(others) >= _FRAMES:
+            what = f"a .glb moves through {_FRAMES} frames at most, and there are {1 + len(others)}"
+            raise OptionError(what, "export them as .vtp, for ParaView")
+        files.append(f"{where}/sequence.glb".lstrip("/"))
+        targets = {each.name: each.verts for each in others}
+        write_morphs(folder / files[-1], replace(first, name=where or "sequence"), targets, _RATE, cycle)
     return files
 
 

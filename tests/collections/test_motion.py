@@ -14,6 +14,7 @@ from meshmatch.collections.sources import frame_times, in_sequences
 from meshmatch.errors import OptionError
 from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.formats.gltf import Document
 from tests.conftest import icosphere, some_fit
 
 BALL = icosphere(3)
@@ -129,6 +130,34 @@ def test_frames_are_exported_with_their_motion(tmp_path: Path) -> None:
     text = (tmp_path / "vtp" / "a" / "frame3.vtp").read_text()
     assert 'Name="displacement"' in text and 'Name="area_strain"' in text
     assert load_shape(tmp_path / "vtp" / "b" / "frame3.vtp").V == BALL.V
+
+
+@pytest.mark.parametrize("cycle", [False, True])
+def test_frames_are_exported_as_one_mesh_that_moves(tmp_path: Path, cycle: bool) -> None:
+    names = [*(f"a/frame{k}" for k in range(6)), *(f"b/frame{k}" for k in range(5))]
+    points = pulsing()[: len(names)]
+    files = export(tmp_path / "out", fits_of(points, names), Export(".glb", cycle=cycle), None)
+    assert files[-2:] == ["a/sequence.glb", "b/sequence.glb"]
+    data = (tmp_path / "out" / "a" / "sequence.glb").read_bytes()
+    document = Document(tmp_path, data)
+    (clip,) = document.json["animations"]
+    assert clip["channels"] == [{"sampler": 0, "target": {"node": 0, "path": "weights"}}]
+    times, weights = (document.accessor(clip["samplers"][0][each]) for each in ("input", "output"))
+    keys = 6 + cycle
+    np.testing.assert_allclose(times.ravel(), np.arange(keys) / 24, rtol=1e-6)
+    frames = [load_shape(tmp_path / "out" / "a" / f"frame{k}.glb").verts for k in range(6)]
+    moves = np.array(
+        [document.accessor(each["POSITION"]) for each in document.json["meshes"][0]["primitives"][0]["targets"]]
+    )
+    shown = frames[0] + np.einsum("tm,mvd->tvd", weights.reshape(keys, 5), moves)
+    np.testing.assert_allclose(shown, [*frames, frames[0]][:keys], atol=1e-5)
+
+
+def test_a_long_sequence_is_no_glb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("meshmatch.collections.export._FRAMES", 3)
+    with pytest.raises(OptionError, match="3 frames at most, and there are 4") as refused:
+        export(tmp_path / "out", fits_of(pulsing(0.0)[:4], [f"frame{k}" for k in range(4)]), Export(".glb"), None)
+    assert ".vtp" in refused.value.hint and not (tmp_path / "out").exists()
 
 
 def test_only_registered_meshes_in_their_files_places_are_smoothed() -> None:

@@ -39,7 +39,7 @@ from meshmatch.experiments.bench.methods import Method
 from meshmatch.fitting.alike import match_alike
 from meshmatch.fitting.direct import DirectMatch, match_either_side
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.judge.calibration import DirectCalibration
+from meshmatch.fitting.judge.calibration import DIRECT, DIRECT_BOTH_WAYS, DirectCalibration
 from meshmatch.fitting.judge.direct import judge_direct
 from meshmatch.fitting.one_way import DirectConfig
 from meshmatch.maps.vertex_map import VertexMap
@@ -175,9 +175,19 @@ def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[
         return _row(folder, pair, map_of_fits(fits, fits, 1)) | {"energy": found.energy, "leads": found.leads}
 
     shapes = clean[0].shape, clean[1].shape
-    found = match_alike(*shapes, match_either_side(*shapes, DirectConfig(seed=seed)), FitConfig(seed=seed))
-    best = row(found) | {"cpu": time.process_time() - began}
+    roughly = match_either_side(*shapes, DirectConfig(seed=seed))
+    found = match_alike(*shapes, roughly, FitConfig(seed=seed))
+    best = row(found) | {"cpu": time.process_time() - began, "finer": found.verdict != roughly.verdict}
     return best | {"one_way": found.one_way and row(found.one_way)}
+
+
+def judged(row: dict[str, Any]) -> dict[str, Any]:
+    """A pair with the verdict that the weights of now give it, unless a finer fit has its own: a work folder may be of a
+    run from which they were found."""
+    if "energy" not in row or row["finer"]:
+        return row
+    calibration = DIRECT_BOTH_WAYS if row["one_way"] else DIRECT
+    return {**row, "verdict": judge_direct(row["energy"], row["leads"], calibration)[0]}
 
 
 def _row(folder: Path, pair: tuple[str, str], mapped: VertexMap) -> dict[str, Any]:
@@ -329,7 +339,7 @@ def main(
         found[name] = []
         for pair in runner.track(pairs, name):
             row = runner.at_work(work, f"{name}-{'-'.join(pair)}", asked, partial(measure, folder, pair, model, seed))
-            found[name].append(row)
+            found[name].append(judged(row))
     everything = _all(found)
     rows = [*(row_of(name, some) for name, some in found.items()), row_of("all", everything)]
     if any(each["error"] != each["as_marked"] for each in everything):

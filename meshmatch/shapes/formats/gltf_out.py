@@ -48,15 +48,29 @@ def glb_of(shape: Shape, turn: Float[Floats, "3 3"] | None = None) -> bytes:
     return _glb(shape.name, attributes, shape.faces, turn=turn)
 
 
-def write_morphs(path: Path, shape: Shape, targets: Mapping[str, Float[Floats, "V 3"]]) -> None:
-    """A mesh with morph targets by name: where its vertices are when the target's weight is 1. All weights are 0."""
+def write_morphs(
+    path: Path,
+    shape: Shape,
+    targets: Mapping[str, Float[Floats, "V 3"]],
+    rate: float | None = None,
+    cycle: bool = False,
+) -> None:
+    """A mesh with morph targets by name: where its vertices are when the target's weight is 1. All weights are 0.
+
+    With a ``rate``, in frames a second, a clip goes from the shape through the targets, with ``cycle`` back to the shape.
+    """
     normals = smooth_normals(shape.verts, shape.faces)
     moves = {
         name: {"POSITION": verts - shape.verts, "NORMAL": smooth_normals(verts, shape.faces) - normals}
         for name, verts in targets.items()
     }
     attributes = {"POSITION": shape.verts, "NORMAL": normals}
-    path.write_bytes(_glb(shape.name, attributes, shape.faces, moves))
+    keys = None
+    if rate is not None:  # at each key one target, or none
+        weights = np.eye(len(targets) + 1)[:, 1:]
+        weights = np.concatenate([weights, weights[:1]]) if cycle else weights
+        keys = np.arange(len(weights)) / rate, weights
+    path.write_bytes(_glb(shape.name, attributes, shape.faces, moves, keys=keys))
 
 
 def center_of(verts: Float[Floats, "V 3"]) -> Float[Floats, " 3"]:
@@ -80,8 +94,12 @@ def _glb(
     faces: Ints,
     moves: Mapping[str, dict[str, Floats]] | None = None,
     turn: Float[Floats, "3 3"] | None = None,
+    keys: tuple[Float[Floats, " T"], Float[Floats, "T M"]] | None = None,
 ) -> bytes:
-    """Arrays one after the other, each at a multiple of four bytes, behind what describes them."""
+    """Arrays one after the other, each at a multiple of four bytes, behind what describes them.
+
+    ``keys`` are seconds, and the weights of all moves at each.
+    """
     center = center_of(attributes["POSITION"])
     attributes = attributes | {"POSITION": attributes["POSITION"] - center}
     arrays: list[NDArray[Any]] = [as_float32(values, ".glb") for values in attributes.values()]
@@ -98,6 +116,10 @@ def _glb(
         places.append(len(arrays))
         primitive["targets"].append({key: len(arrays) + k for k, key in enumerate(move)})
         arrays += [as_float32(values, ".glb") for values in move.values()]
+    drawn = len(arrays)
+    if keys is not None:
+        places.append(drawn)
+        arrays += [as_float32(values.reshape(-1, 1), ".glb") for values in keys]
     chunks = [values.tobytes() for values in arrays]
     padded = [chunk + b"\0" * (-len(chunk) % 4) for chunk in chunks]
     starts = np.cumsum([0, *map(len, padded)]).tolist()
@@ -108,7 +130,8 @@ def _glb(
     accessors: list[dict[str, Any]] = []
     for k, values in enumerate(arrays):
         whole = values.dtype.kind == "u"
-        views[k]["target"] = _INDICES if whole else _VERTICES
+        if k < drawn:
+            views[k]["target"] = _INDICES if whole else _VERTICES
         kinds = {"componentType": _UNSIGNED if whole else _FLOAT, "type": _TYPES[values.shape[1]]}
         accessors.append({"bufferView": k, **kinds, "count": len(values)})
     for k in places:
@@ -122,6 +145,10 @@ def _glb(
     elif center.any():
         node["translation"] = center.tolist()
     document |= {"nodes": [node], "meshes": [mesh]}
+    if keys is not None:
+        channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
+        sampler = {"input": drawn, "output": drawn + 1, "interpolation": "LINEAR"}
+        document["animations"] = [{"name": name or "sequence", "channels": [channel], "samplers": [sampler]}]
     document |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}]}
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
