@@ -43,6 +43,7 @@ KnownPairs = tuple[Float[Floats, "N 3"], Float[Floats, "N 3"]]
 """Positions on the source and on the target that belong together."""
 BothWays = Literal["no", "in doubt", "always"]
 _KNOWN_WEIGHT = 0.05  # of each known pair; all other pairs together have about 1
+_BEGUN = "features.energy_begun"
 _NEAR = 3  # vertices of the coarse mesh by which one of the fine mesh moves
 
 
@@ -321,10 +322,10 @@ def _screened(
 
     fewer, few = samples.first(config.fewer), samples.first(config.few)
     first = parallel_map(lambda each: fit(each, fewer, level.begun(each), config.first), proposals)
-    better = distinct(first, config.better, config.unlike)
+    better = distinct(first, config.better, config.unlike, _BEGUN)
     pairs = neighbours(few)
     tried = parallel_map(lambda each: fit(each.proposal, few, each.vectors, config.second, pairs), better)
-    return distinct(tried, config.best, config.unlike)
+    return distinct(tried, config.best, config.unlike, _BEGUN)
 
 
 def carried(
@@ -347,10 +348,10 @@ class _Fitted(Protocol):
 F = TypeVar("F", bound=_Fitted)
 
 
-def distinct(tried: Sequence[F], count: int, unlike: float) -> list[F]:
+def distinct(tried: Sequence[F], count: int, unlike: float, by: str = "energy") -> list[F]:
     """The best of the fits, no two of which are alike."""
     kept: list[F] = []
-    for each in sorted(tried, key=attrgetter("energy")):
+    for each in sorted(tried, key=attrgetter(by)):
         if len(kept) < count and all(differ(each.moved, other.moved) > unlike for other in kept):
             kept.append(each)
     return kept
