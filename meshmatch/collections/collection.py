@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from itertools import permutations
 from pathlib import Path
@@ -407,9 +407,11 @@ class Collection(FitsFolder):
                 mean = superimpose(shapes.points, shapes.faces)
         in_time = smooth or cycle
         sequence = in_time or bool(self._about()["sequence"])
-        files = files_of(self.store) if original or in_time or how.suffix == ".glb" else {}
+        files: dict[str, str] = {}
+        with nullcontext() if original or in_time else suppress(InputError):  # else they only say how a glb stands
+            files = files_of(self.store) if original or in_time or how.suffix == ".glb" else {}
         names = in_sequences(names) if sequence else names
-        times = frame_times({*files, *names}) if in_time else {}
+        times = frame_times({*files, *names}) if sequence else {}
         fits = Fits(names, self.fit_of, self.places_of, files, self.template, sequence, times)
         return Exported(
             tuple(export(output, fits, how, mean, self.progress)), len(names), fits.template.shape.V, left_out

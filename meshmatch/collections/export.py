@@ -20,7 +20,7 @@ from meshmatch.collections.motion import area_strain, smoothed
 from meshmatch.collections.registered import held
 from meshmatch.collections.sources import folder_of
 from meshmatch.collections.superimpose import Superimposed
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.maps.places import Places
@@ -39,7 +39,7 @@ Place = Literal["files", "template"]
 """Where exported meshes lie: where their files have the shapes, or all with the axes of the template, about its center."""
 MESHES, TABLES = (".ply", ".vtp", ".vtk", ".obj", ".off", ".stl", ".glb"), (".csv", ".npz")
 ORIGINALS = (".vtp", ".vtk")
-_FRAMES = 400  # of one animated file: the weights of all frames are kept for each of them
+_MOVING = 4_000_000  # vertices of all frames of one moving file: 0.7 GB while it is written
 _RATE = 24.0  # frames a second, as Blender has them: so that each file is a frame there
 
 
@@ -118,8 +118,7 @@ class Fits:
     """What is exported: names of shapes, and what gives the fit, the places and the file of each; the template of all.
 
     ``sequence``: shapes of a folder are frames; ``names`` are those of one folder after the other then, in natural order.
-    ``times`` are the places of all frames in their sequence, also of those that are not exported, where they are to be
-    smoothed.
+    ``times`` are the places of all frames in their sequence, also of those that are not exported.
     """
 
     names: Sequence[str]
@@ -157,8 +156,9 @@ def export(
         for number, name in enumerate(names):
             fit = fits.fit_of(name)
             facts.add(name, fit)
-            if how.place == "files" and Path(fits.files.get(name, "")).suffix.lower() not in gltf.SUFFIXES:
-                turns.setdefault(stands_like(name), turn_of_fit(fit))
+            if how.place == "files":
+                stands = Path(fits.files.get(name, "")).suffix.lower() in gltf.SUFFIXES
+                turns.setdefault(stands_like(name), None if stands else turn_of_fit(fit))
             yield name, mesh_of(fit, how.place)
             if progress is not None:
                 progress("exporting", name, (number + 1) / len(names))
@@ -200,7 +200,7 @@ def export(
             if fits.sequence and how.suffix == ".vtp":
                 files += _write_series(folder, names)
             if fits.sequence and how.suffix == ".glb":
-                files += _write_clips(folder, names, how.cycle)
+                files += _write_clips(folder, fits, how.cycle)
         if how.suffix in TABLES or table is not None:
             files.append("metadata.csv")
             facts.write(folder / files[-1], table)
@@ -313,17 +313,27 @@ def _write_series(folder: Path, names: Sequence[str]) -> list[str]:
     return files
 
 
-def _write_clips(folder: Path, names: Sequence[str], cycle: bool) -> list[str]:
-    """The frames of each folder, in their order, as one mesh that moves; of what was written."""
+def _write_clips(folder: Path, fits: Fits, cycle: bool) -> list[str]:
+    """The frames of each folder as one mesh that moves, at their times; of what was written."""
     files = []
-    for where, own in groupby(names, folder_of):
-        first, *others = (load_shape(folder / f"{name}.glb") for name in own)
-        if len(others) >= _FRAMES:
-            what = f"a .glb moves through {_FRAMES} frames at most, and there are {1 + len(others)}"
-            raise OptionError(what, "export them as .vtp, for ParaView")
-        files.append(f"{where}/sequence.glb".lstrip("/"))
-        targets = {each.name: each.verts for each in others}
-        write_morphs(folder / files[-1], replace(first, name=where or "sequence"), targets, _RATE, cycle)
+    for where, own in groupby(fits.names, folder_of):
+        names = list(own)
+        if len(names) < 2:
+            continue
+        if len(names) * fits.template.shape.V > _MOVING:
+            warn(f"{where or 'the sequence'} is too large for one moving .glb; ParaView plays the frames as .vtp")
+            continue
+        title = f"{where}/sequence".lstrip("/")
+        while title in fits.names:
+            title += "-"
+        files.append(f"{title}.glb")
+        first, *others = (load_shape(folder / f"{name}.glb") for name in names)
+        targets = {name.rpartition("/")[2]: each.verts for name, each in zip(names[1:], others, strict=True)}
+        times = [fits.times[name] for name in names]
+        if cycle:
+            times.append(times[0] + sum(folder_of(name) == where for name in fits.times))
+        seconds = (np.array(times) - times[0]) / _RATE
+        write_morphs(folder / files[-1], replace(first, name=where or "sequence"), targets, seconds)
     return files
 
 

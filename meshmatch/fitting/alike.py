@@ -9,8 +9,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from meshmatch.fitting.direct import MIRROR, DirectMatch
 from meshmatch.fitting.fit import Fit, axis_name
@@ -20,9 +18,9 @@ from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.fitting.without_model import fit_alike, template_of, viscous_system
 from meshmatch.geometry.frames import Frame, kabsch
-from meshmatch.geometry.triangles import edge_lengths
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.rims import RIM, rim_lengths
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import low_mesh
 from meshmatch.templates.sides import apart
@@ -31,7 +29,6 @@ from meshmatch.templates.template import Template
 # How near shapes that stand alike must come by a rigid motion, in units of sqrt(area): femurs, knees and molars come to 0.04
 # to 0.06, hearts and leaves up to 0.066; people, ants and fish to 0.069 and more.
 _ALIKE = 0.067
-_RIM = 0.3  # length of the longest boundary of a part at least, in units of sqrt(area); cracks of a mesh are shorter
 
 
 def match_alike(
@@ -60,7 +57,7 @@ def match_alike(
     if source.is_cloud or target.is_cloud:
         return found
     smaller, larger = sorted((source, target), key=lambda shape: shape.area)
-    part = may_show_part(smaller, config) and _longest_rim(smaller) > _RIM
+    part = may_show_part(smaller, config) and rim_lengths(smaller).max() > RIM
     whole, other = (larger, smaller) if part else (source, target)
     if not part and min(found.apart or apart(source, target, config.seed)) > _ALIKE:
         return found
@@ -84,14 +81,6 @@ def match_alike(
     fits = _at_rest(fit, template, whole, frame), _as_it_rests(fit, template)
     first, second = fits if whole is source else fits[::-1]
     return replace(found, source=first, target=second, system=viscous_system(template))
-
-
-def _longest_rim(shape: Shape) -> float:
-    """Length of the longest connected boundary of a mesh, in units of sqrt(area)."""
-    edges = shape.edges.open
-    graph = coo_matrix((np.ones(len(edges)), edges.T), (shape.V, shape.V))
-    rim = connected_components(graph, directed=False)[1][edges[:, 0]]
-    return float(np.bincount(rim, edge_lengths(shape.verts, edges), 1).max() / np.sqrt(shape.area))
 
 
 def _as_it_rests(fit: Fit, template: Template) -> Fit:

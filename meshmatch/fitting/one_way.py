@@ -77,8 +77,8 @@ class DirectConfig:
         the energies decide, and of the one that is taken, which may stretch more
     along : least squares that go on from the third of those with the lowest energies, and are kept where they lower it:
         samples hold vertices across the surface only, so that a limb glides along itself until its end is at an end
-    better, best, gliding, returned : how many proposals are fitted a second, and a third time, and glide, and how many of
-        each direction are continued in the other one
+    better, best, gliding, returned : how many proposals are fitted a second, and a third time, and glide, of one way and of
+        both, and how many of each direction are continued in the other one
     unlike : share of vertices by which these differ at least
     both_ways : when the target is fitted to the source as well; "in doubt" is where the one way is not good
     from_source : whether the source is to be the template both ways too, and not the one that fits the other better
@@ -235,7 +235,7 @@ def finished(
 ) -> list[Tried]:
     """The fine mesh of one shape fitted to another from where its vertices (V, 3) may belong, for each proposal."""
     report(0.0)
-    _ = own.fine, onto.neighbours
+    _ = own.fine, onto.neighbours, onto.fine_mesh.relief, onto.fine_mesh.tree  # once, and not by each thread
     vectors_to = own.fine.system.vectors_to
     found = parallel_map(lambda each: _fine(own, onto, each[0], vectors_to(each[1]), own.config.third), begun)
     report(1.0)
@@ -266,8 +266,9 @@ def _fine(own: Side, onto: Side, proposal: Proposal, vectors: Float[Floats, "K 3
 
 def fitted(own: Side, onto: Side, guess: KnownPairs | None, report: Progress) -> list[Tried]:
     """The best fits of one shape to another, best first; ``guess`` is one more proposal."""
-    config, rested, verts = own.config, own.thin.verts, own.fine.mesh.verts
+    config, rested = own.config, own.thin.verts
     proposals = _proposals(own, onto, report.named("guesses without a model").between(0.0, 0.4))
+    verts = own.fine.mesh.verts
     if guess is not None:
         proposals.append(Proposal("guess", carried(rested, *guess)))
     trying = report.named(f"fits of {len(proposals)} guesses").between(0.4, 0.8)
@@ -286,7 +287,7 @@ def _proposals(source: Side, target: Side, report: Progress) -> list[Proposal]:
     """Guesses of all kinds; what all fits need is made beside them."""
 
     def levels() -> list[Proposal]:
-        _ = source.coarse, source.fine, target.neighbours
+        _ = source.coarse, source.fine, target.neighbours, target.fine_mesh.relief, target.fine_mesh.tree
         return []
 
     def intrinsic() -> list[Proposal]:

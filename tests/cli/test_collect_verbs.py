@@ -13,6 +13,7 @@ import pytest
 
 from meshmatch.collections.collection import Collection
 from meshmatch.collections.export import Export, Fits, export
+from meshmatch.collections.sources import frame_times
 from meshmatch.collections.superimpose import Superimposed
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import vertex_areas
@@ -132,7 +133,7 @@ def all_climber(folder: Path, *names: str, sequence: bool = False) -> Fits:
     own = Collection(folder)
     fit, places = own.fit_of("climber"), own.places_of("climber")
     files = dict.fromkeys(names, str(SAMPLES / "climber.ply"))
-    return Fits(names, lambda name: fit, lambda name: places, files, own.template, sequence)
+    return Fits(names, lambda name: fit, lambda name: places, files, own.template, sequence, frame_times(names))
 
 
 def test_originals_are_exported_with_what_is_known_of_them(fits: Path, tmp_path: Path) -> None:

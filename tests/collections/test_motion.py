@@ -11,7 +11,7 @@ import pytest
 from meshmatch.collections.export import Export, Fits, export
 from meshmatch.collections.motion import area_strain, smoothed
 from meshmatch.collections.sources import frame_times, in_sequences
-from meshmatch.errors import OptionError
+from meshmatch.errors import MeshmatchWarning, OptionError
 from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.formats.gltf import Document
@@ -153,11 +153,16 @@ def test_frames_are_exported_as_one_mesh_that_moves(tmp_path: Path, cycle: bool)
     np.testing.assert_allclose(shown, [*frames, frames[0]][:keys], atol=1e-5)
 
 
-def test_a_long_sequence_is_no_glb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("meshmatch.collections.export._FRAMES", 3)
-    with pytest.raises(OptionError, match="3 frames at most, and there are 4") as refused:
-        export(tmp_path / "out", fits_of(pulsing(0.0)[:4], [f"frame{k}" for k in range(4)]), Export(".glb"), None)
-    assert ".vtp" in refused.value.hint and not (tmp_path / "out").exists()
+def test_a_long_sequence_and_a_single_frame_do_not_move(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ["a/sequence", "a/x", "b"]
+    fits = fits_of(pulsing()[:3], names)
+    assert export(tmp_path / "short", fits, Export(".glb"), None) == [
+        *(f"{name}.glb" for name in names),
+        "a/sequence-.glb",
+    ]
+    monkeypatch.setattr("meshmatch.collections.export._MOVING", 2 * BALL.V - 1)
+    with pytest.warns(MeshmatchWarning, match="a is too large"):
+        assert len(export(tmp_path / "long", fits, Export(".glb"), None)) == 3
 
 
 def test_only_registered_meshes_in_their_files_places_are_smoothed() -> None:

@@ -13,7 +13,9 @@ from meshmatch.fitting.alike import match_alike
 from meshmatch.fitting.direct import DirectMatch, match_either_side
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.solve.viscous import ViscousConfig
+from meshmatch.fitting.without_model import template_of, viscous_system
 from meshmatch.geometry.trees import cKDTree
+from meshmatch.shapes.rims import RIM, rim_lengths
 from meshmatch.shapes.shape import Shape
 from tests.fitting.test_direct import QUICK
 
@@ -65,10 +67,12 @@ def test_what_stands_otherwise_and_clouds_are_left_as_they_are(monkeypatch: pyte
 
 def test_cracks_are_no_rim() -> None:
     whole = RIGHT.shape
-    assert alike._longest_rim(whole) == 0
+    assert rim_lengths(whole).max() == 0
     cracked = Shape(whole.verts, np.delete(whole.faces, np.arange(0, whole.F, 40), 0))
     broken = cut(RIGHT, -0.1)[0]
-    assert 0 < alike._longest_rim(cracked) < alike._RIM < alike._longest_rim(broken)
+    assert 0 < rim_lengths(cracked).max() < RIM < rim_lengths(broken).max()
+    for shape, ends in ((cracked, False), (broken, True)):
+        assert viscous_system(template_of(shape, "t", ViscousConfig(nodes=300))).rim.any() == ends
 
 
 @pytest.mark.parametrize("source_is_broken", [True, False])

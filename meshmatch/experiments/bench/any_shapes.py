@@ -177,14 +177,14 @@ def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[
     shapes = clean[0].shape, clean[1].shape
     roughly = match_either_side(*shapes, DirectConfig(seed=seed))
     found = match_alike(*shapes, roughly, FitConfig(seed=seed))
-    best = row(found) | {"cpu": time.process_time() - began, "finer": found.verdict != roughly.verdict}
+    best = row(found) | {"cpu": time.process_time() - began, "finer": found.reasons != roughly.reasons}
     return best | {"one_way": found.one_way and row(found.one_way)}
 
 
 def judged(row: dict[str, Any]) -> dict[str, Any]:
     """A pair with the verdict that the weights of now give it, unless a finer fit has its own: a work folder may be of a
     run from which they were found."""
-    if "energy" not in row or row["finer"]:
+    if "energy" not in row or row.get("finer"):
         return row
     calibration = DIRECT_BOTH_WAYS if row["one_way"] else DIRECT
     return {**row, "verdict": judge_direct(row["energy"], row["leads"], calibration)[0]}

@@ -257,11 +257,16 @@ def one_way_residual(
 
 
 def part_residual(system: NodeSystem, samples: OrientedPoints, vectors: Float[Floats, "K 3"], beyond: float) -> float:
-    """About `one_way_residual`; samples that belong to the rim of the template, and so lie beyond it, count as ``beyond``,
-    however far they are."""
+    """As `one_way_residual`; but samples that belong to the rim of the template, and so lie beyond it, count as ``beyond``,
+    however far they are, unless they are more than half of all."""
+    if not system.rim.any():
+        return one_way_residual(system, samples, vectors)
     surface, some = system.surface(vectors), samples.rows(slice(None, None, 2))
     distance, at = _capped_distances(surface.tree, some.points, some.normals, some.signed, np.inf)
-    return float(weighted_mean(np.where(system.rim[at], beyond, np.minimum(distance, 0.1)), some.weights))
+    outside, distance = system.rim[at], np.minimum(distance, 0.1)
+    if outside.mean() <= 0.5:
+        distance[outside] = beyond
+    return float(weighted_mean(distance, some.weights))
 
 
 def ranking_residual(system: NodeSystem, samples: OrientedPoints, vectors: Float[Floats, "K 3"]) -> float:

@@ -21,12 +21,11 @@ _SIGNATURE = f"void (char *, int *, int *, int *, {_DOUBLE}, int *, {_DOUBLE}, i
 
 def _exported() -> Callable[..., None] | None:
     """LAPACK's dpbsv, if SciPy exports it with the types that are expected."""
-    exported = getattr(cython_lapack, "__pyx_capi__", {}).get("dpbsv")
-    if exported is None:
+    python, exported = getattr(ctypes, "pythonapi", None), getattr(cython_lapack, "__pyx_capi__", {}).get("dpbsv")
+    if python is None or exported is None:
         return None
-    name, pointer = ctypes.pythonapi.PyCapsule_GetName, ctypes.pythonapi.PyCapsule_GetPointer
-    name.restype, name.argtypes = ctypes.c_char_p, [ctypes.py_object]
-    pointer.restype, pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
+    name = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)(("PyCapsule_GetName", python))
+    pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(("PyCapsule_GetPointer", python))
     signature = name(exported)
     if signature != _SIGNATURE.encode():
         return None
@@ -47,8 +46,9 @@ def solved_band(band: Float[Floats, "N B"], right: Float[Floats, " N"]) -> Float
     """
     if _DPBSV is None:
         return np.asarray(solveh_banded(band.T, right, overwrite_ab=True, lower=True, check_finite=False))
-    assert band.flags.c_contiguous and right.flags.c_contiguous and band.dtype == right.dtype == np.float64
-    assert band.shape[0] == len(right)
+    for each in (band, right):  # LAPACK reads and writes where these lie
+        if not each.flags.c_contiguous or each.dtype != np.float64 or len(each) != len(band):
+            raise ValueError("a band and its right side are contiguous rows of 64-bit floats, equally many")
     N, above, columns, rows, failed = map(ctypes.c_int, (len(band), band.shape[1] - 1, 1, band.shape[1], 0))
     sizes = [ctypes.byref(each) for each in (N, above, columns, rows, N, failed)]
     _DPBSV(b"L", *sizes[:3], band.ctypes.data, sizes[3], right.ctypes.data, *sizes[4:])

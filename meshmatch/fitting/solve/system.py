@@ -28,6 +28,7 @@ from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import triangle_vectors
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.outside import without_hidden
+from meshmatch.shapes.rims import RIM, rim_lengths
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
 
@@ -74,10 +75,8 @@ class NodeSystem:
     @property
     @derived
     def rim(self) -> Bool[Bools, " V"]:
-        """Which vertices of the template lie at an open boundary."""
-        found = np.zeros(len(self.verts), bool)
-        found[Shape(self.verts, self.faces).edges.open] = True
-        return found
+        """Which vertices of the template lie where it ends; at cracks it does not."""
+        return rim_lengths(Shape(self.verts, self.faces)) > RIM
 
     @property
     @derived

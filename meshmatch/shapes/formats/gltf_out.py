@@ -49,15 +49,11 @@ def glb_of(shape: Shape, turn: Float[Floats, "3 3"] | None = None) -> bytes:
 
 
 def write_morphs(
-    path: Path,
-    shape: Shape,
-    targets: Mapping[str, Float[Floats, "V 3"]],
-    rate: float | None = None,
-    cycle: bool = False,
+    path: Path, shape: Shape, targets: Mapping[str, Float[Floats, "V 3"]], seconds: Float[Floats, " T"] | None = None
 ) -> None:
     """A mesh with morph targets by name: where its vertices are when the target's weight is 1. All weights are 0.
 
-    With a ``rate``, in frames a second, a clip goes from the shape through the targets, with ``cycle`` back to the shape.
+    With ``seconds`` a clip shows the shape at the first of these, and then each target; at one more the shape again.
     """
     normals = smooth_normals(shape.verts, shape.faces)
     moves = {
@@ -66,10 +62,9 @@ def write_morphs(
     }
     attributes = {"POSITION": shape.verts, "NORMAL": normals}
     keys = None
-    if rate is not None:  # at each key one target, or none
+    if seconds is not None:  # at each key one target, or none
         weights = np.eye(len(targets) + 1)[:, 1:]
-        weights = np.concatenate([weights, weights[:1]]) if cycle else weights
-        keys = np.arange(len(weights)) / rate, weights
+        keys = seconds, np.concatenate([weights, weights[:1]])[: len(seconds)]
     path.write_bytes(_glb(shape.name, attributes, shape.faces, moves, keys=keys))
 
 

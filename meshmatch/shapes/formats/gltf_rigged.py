@@ -231,20 +231,19 @@ def _lift(editor: Editor, document: Document) -> None:
     new = {number for number in skinned if "skin" not in document.nodes[number]}
     trees = {top: some for top, some in trees.items() if not new.isdisjoint(some)}  # others lay there with their skins
     lifted = {number for some in trees.values() for number in some}
-    place: dict[int, int] = {}
-    for number in sorted(lifted):
+    whole: set[int] = set()
+    for number in reversed(document.world):  # children before parents
         node = nodes[number]
-        if (
-            number in joints
-            or not lifted.issuperset(node.get("children", []))
-            or node.keys() & {"camera", "extensions"}
-        ):
-            held = {key: node.pop(key) for key in ("mesh", "skin", "weights") if key in node}
-            place[number] = editor.add("nodes", held | ({"name": node["name"]} if "name" in node else {}))
+        if number in lifted - joints and not node.keys() & {"camera", "extensions"}:
+            whole |= {number} if whole.issuperset(node.get("children", [])) else set()
+    place: dict[int, int] = {}
+    for number in sorted(lifted - whole):
+        node = nodes[number]
+        held = {key: node.pop(key) for key in ("mesh", "skin", "weights") if key in node}
+        place[number] = editor.add("nodes", held | ({"name": node["name"]} if "name" in node else {}))
     for target in clips:
-        if target["path"] == "weights":
-            target["node"] = place.get(target.get("node", -1), target.get("node"))
-    whole = lifted - place.keys()
+        if target["path"] == "weights" and target.get("node") in place:
+            target["node"] = place[target["node"]]
     for number in {parents[number] for number in whole if number in parents}:
         left = [child for child in nodes[number].pop("children") if child not in whole]
         nodes[number] |= {"children": left} if left else {}
