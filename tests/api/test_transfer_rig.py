@@ -190,6 +190,12 @@ def test_a_glb_stays_as_it_came(source: Path) -> None:
     assert np.array_equal(load_shape(out).faces, shape.faces)
 
 
+def camera_place(path: Path) -> np.ndarray:
+    document = Document(path, path.read_bytes())
+    document.scene()
+    return document.world[next(k for k, node in enumerate(document.nodes) if "camera" in node)]
+
+
 def test_meshes_that_move_something_else(source: Path) -> None:
     """A camera stays where its mesh was; a mesh that hangs from a mesh does not."""
     target = source.with_name("target.glb")
@@ -221,6 +227,13 @@ def test_meshes_that_move_something_else(source: Path) -> None:
     assert found["nodes"][1] == {key: nodes[1][key] for key in ("name", "scale", "camera")}
     assert found["nodes"][-1]["name"] == "left"
     assert [each["target"]["node"] for each in found["animations"][0]["channels"]] == [0, 1]  # of the camera
+    np.testing.assert_allclose(load_shape(out).verts, where, atol=1e-5)
+    nodes[2] |= {"camera": nodes[1].pop("camera")}  # below a mesh
+    write_document(target, document | {"cameras": [camera]}, *arrays)
+    stood = camera_place(target)
+    with pytest.warns(MeshmatchWarning, match="as a whole"):
+        out, _ = rigged(source, target)
+    np.testing.assert_allclose(camera_place(out), stood, atol=1e-9)
     np.testing.assert_allclose(load_shape(out).verts, where, atol=1e-5)
 
 
