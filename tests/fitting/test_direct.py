@@ -280,7 +280,7 @@ def test_known_pairs_settle_what_symmetry_leaves_open() -> None:
         box = box.subdivide()
     shape = Shape(np.asarray(box.vertices), np.asarray(box.faces), "box")
     plain = match_directly(shape, shape, QUICK)
-    assert min(plain.leads) < 0.003  # half turns are nearly as good
+    assert min(plain.leads) < 0.005  # half turns are nearly as good
     half = Rotation.from_euler("z", 180, degrees=True)
     corners = np.array(shape.verts[:8])
     known = corners, half.apply(corners)
