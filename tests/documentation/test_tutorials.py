@@ -67,7 +67,8 @@ def write_hero(folder: Path) -> None:
     uv = np.stack([x, 1 - y], axis=1)[body.faces]
     plain = folder / "plain.glb"
     save_textured(plain, Textured(body.verts, body.faces, uv), quarters(64))
-    weights = np.stack([np.clip(5 * y - 2, 0, 1), np.clip(2 - 5 * y, 0, 1)], axis=1)  # above and below the hips
+    above = np.clip(5 * y - 1.5, 0, 1)  # the hips
+    weights = np.stack([above, 1 - above], axis=1).astype(np.float32)
     turns = Rotation.from_rotvec(np.sin(np.linspace(0, 2 * np.pi, 9))[:, None] * [0.0, 1, 0]).as_quat()
     clip = Clip("walk", (Track(2, "rotation", np.linspace(0, 1, 9), turns, "LINEAR"),))
     hips = np.array([(low + high)[0] / 2, low[1] + 0.4 * (high - low)[1], (low + high)[2] / 2])
@@ -77,8 +78,8 @@ def write_hero(folder: Path) -> None:
     rig = Rig(names, parents, np.array([1, 2]), still, places, np.ones((3, 3)), (clip,))
     document = Document(plain, plain.read_bytes())
     seen = cKDTree(body.verts).query(load_shape(plain).verts)[1]
-    joints = np.tile(np.array([1, 0], np.int32), (len(seen), 1))
-    binding = Binding(rig, rig.worlds(), joints, weights[seen].astype(np.float32))
+    joints = np.where(weights[seen] > 0, [1, 0], 0).astype(np.int32)
+    binding = Binding(rig, rig.worlds(), joints, weights[seen])
     (folder / "hero.glb").write_bytes(rigged(document, binding)[0])
     plain.unlink()
     upper = ((y > 0.5) & (y < 0.8) & (np.abs(x - 0.5) < 0.2))[body.faces].all(axis=1)
