@@ -39,7 +39,7 @@ Place = Literal["files", "template"]
 """Where exported meshes lie: where their files have the shapes, or all with the axes of the template, about its center."""
 MESHES, TABLES = (".ply", ".vtp", ".vtk", ".obj", ".off", ".stl", ".glb"), (".csv", ".npz")
 ORIGINALS = (".vtp", ".vtk")
-_MOVING = 4_000_000  # vertices of all frames of one moving file: 0.7 GB while it is written
+_MOVING = 4_000_000  # vertices of all frames of one moving file, which are held while it is written
 _RATE = 24.0  # frames a second, as Blender has them: so that each file is a frame there
 
 
@@ -315,7 +315,7 @@ def _write_series(folder: Path, names: Sequence[str]) -> list[str]:
 
 def _write_clips(folder: Path, fits: Fits, cycle: bool) -> list[str]:
     """The frames of each folder as one mesh that moves, at their times; of what was written."""
-    files = []
+    files, taken, moments = [], set(fits.names), Counter(map(folder_of, fits.times))
     for where, own in groupby(fits.names, folder_of):
         names = list(own)
         if len(names) < 2:
@@ -324,14 +324,14 @@ def _write_clips(folder: Path, fits: Fits, cycle: bool) -> list[str]:
             warn(f"{where or 'the sequence'} is too large for one moving .glb; ParaView plays the frames as .vtp")
             continue
         title = f"{where}/sequence".lstrip("/")
-        while title in fits.names:
+        while title in taken:
             title += "-"
         files.append(f"{title}.glb")
         first, *others = (load_shape(folder / f"{name}.glb") for name in names)
         targets = {name.rpartition("/")[2]: each.verts for name, each in zip(names[1:], others, strict=True)}
         times = [fits.times[name] for name in names]
         if cycle:
-            times.append(times[0] + sum(folder_of(name) == where for name in fits.times))
+            times.append(times[0] + moments[where])
         seconds = (np.array(times) - times[0]) / _RATE
         write_morphs(folder / files[-1], replace(first, name=where or "sequence"), targets, seconds)
     return files

@@ -40,7 +40,7 @@ from meshmatch.threads import parallel_map
 _SAME = 0.1
 # How much nearer a mirror image must lie, after rigid motions, to be tried (0.2 to 0.3 of femurs, up to 0.12 of creatures in
 # other poses), or to be tried where the relief is as little alike as of a palm and the back of a hand (0.6 to 0.71; 0.8 of
-# two hands of one side); and what share of the energy its fit may have at most: 0.61 to 0.91 of hands, 1 of symmetric
+# two hands of one side); and what share of the energy its fit may have at most: 0.67 to 0.92 of hands, 1 of symmetric
 # shapes.
 _MIRRORED, _MAYBE_MIRRORED, _UNLIKE, _SHARE = 0.15, 0.03, 0.75, 0.93
 MIRROR = Frame(1.0, np.diag([-1.0, 1.0, 1.0]), np.zeros(3))
