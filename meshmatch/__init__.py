@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from meshmatch.api.results import MatchResult as MatchResult
     from meshmatch.api.results import Transferred as Transferred
     from meshmatch.api.results import evaluate as evaluate
+    from meshmatch.api.results import measure_distance as measure_distance
     from meshmatch.api.rig import RiggedResult as RiggedResult
     from meshmatch.api.rig import transfer_rig as transfer_rig
     from meshmatch.api.texture import TexturedResult as TexturedResult
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
     from meshmatch.implicit.training import train_implicit as train_implicit
     from meshmatch.maps.evaluate import Errors as Errors
     from meshmatch.maps.evaluate import Evaluation as Evaluation
+    from meshmatch.maps.evaluate import SurfaceDistance as SurfaceDistance
     from meshmatch.maps.files import load_map as load_map
     from meshmatch.maps.files import save_map as save_map
     from meshmatch.maps.functional import LaplacianBasis as LaplacianBasis
@@ -84,7 +86,7 @@ _NAMES = {
     "api.matcher": "Matcher",
     "api.matching": "match register",
     "api.pictures": "picture view",
-    "api.results": "ConfidenceRule MapPair MatchResult Transferred evaluate",
+    "api.results": "ConfidenceRule MapPair MatchResult Transferred evaluate measure_distance",
     "api.rig": "RiggedResult transfer_rig",
     "api.texture": "TexturedResult transfer_texture",
     "api.transfer": "find_maps transfer_colors transfer_labels transfer_landmarks transfer_values transfer_weights",
@@ -102,7 +104,7 @@ _NAMES = {
     "implicit.fit": "ImplicitFit",
     "implicit.model": "ImplicitModel load_implicit",
     "implicit.training": "train_implicit",
-    "maps.evaluate": "Errors Evaluation",
+    "maps.evaluate": "Errors Evaluation SurfaceDistance",
     "maps.files": "load_map save_map",
     "maps.functional": "LaplacianBasis laplacian_basis map_from_functional",
     "maps.vertex_map": "VertexMap",

@@ -14,20 +14,20 @@ from numpy.typing import ArrayLike
 
 from meshmatch.api.kinds import UnitName, error_unit
 from meshmatch.arrays import Brief, Float, Floats
-from meshmatch.errors import OptionError
+from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.build import build_map
-from meshmatch.maps.evaluate import CM, Evaluation, evaluate_map
+from meshmatch.maps.evaluate import CM, Evaluation, SurfaceDistance, evaluate_map
 from meshmatch.maps.files import load_map
 from meshmatch.maps.mapped_mesh import invert_map
-from meshmatch.maps.places import PlacedFit, Places
+from meshmatch.maps.places import PlacedFit, Places, surface_distance
 from meshmatch.maps.unfold import unfolded
 from meshmatch.maps.vertex_map import VertexMap, check_map
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.formats.gltf_rigged import Binding
 from meshmatch.shapes.moved_files import save_moved
-from meshmatch.shapes.repair import Repaired
+from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.low_confidence import LowConfidence
@@ -396,3 +396,48 @@ def evaluate(
         return evaluate_map(
             vertex_map, source, target, *known, backward=backward, unit=told, rng=rng, progress=progress
         )
+
+
+def measure_distance(
+    shape: ShapeLike, fitted: ShapeLike, *, one_way: bool = False, unit: UnitName = "auto"
+) -> SurfaceDistance:
+    """How far the surfaces of a shape and of what was fitted to it lie apart.
+
+    From every vertex of each to the nearest place of the other that faces the same way, each for the area around it; of a
+    cloud only from there.
+
+    Parameters
+    ----------
+    shape
+        As in `match`.
+    fitted
+        A mesh in the same frame and unit, such as ``fit.shape`` of `register`, `MatchResult.deformed_source` or
+        ``shape`` of a `WrapResult`.
+    one_way
+        Only from the shape, for it is a part (``fit.partial``).
+    unit
+        As in `evaluate`, of the shape.
+
+    Returns
+    -------
+    SurfaceDistance
+        Mean and largest distance; printed, they say it in words.
+
+    Raises
+    ------
+    MeshmatchError
+        A shape cannot be read or has no surface, or there is no such unit.
+
+    Examples
+    --------
+    >>> fit = meshmatch.register("templates/samples/climber.ply")
+    >>> print(meshmatch.measure_distance("templates/samples/climber.ply", fit.shape))
+    """
+    with thread_limit(1):
+        there, here = (repair(as_shape(each, what)).shape for each, what in ((shape, "shape"), (fitted, "fitted")))
+        if here.is_cloud:
+            raise InputError(f"{here.name or 'what was fitted'} has no faces", "a cloud can be the shape alone")
+        told = error_unit(unit, there)
+        times = 1.0 if told.name == "file" else told.factor / float(np.sqrt(here.area))
+        mean, most = surface_distance(there, here, one_way)
+        return SurfaceDistance(times * mean, times * most, told)

@@ -122,6 +122,12 @@ def register(
         compose_fit(loaded, fitted, None if how.implicit else fit.frame.turn).render(picture)
     console.say(*fit.notes)
     console.say(f"fitted the template of {fit.model} to {loaded.name}: {words.fit_words(fit)}")
+    apart: Json = {}
+    if isinstance(fit, meshmatch.Fit):
+        read = fit.repaired.shape if fit.repaired else loaded  # without parts that were left out
+        distance = meshmatch.measure_distance(read, fitted, one_way=fit.partial)
+        apart["distance"] = distance.as_dict()
+        console.say(str(distance))
     words.tell_verdict(console, fit.verdict, fit.reasons)
     if turned:
         console.say("note: a node turns the template upright, along y")
@@ -130,7 +136,8 @@ def register(
         console.say(f"drew {picture}: the template over the shape, and their distance")
     if run.json:
         record = {"output": output, "picture": picture, "vertices": fitted.V, "faces": fitted.F, "dense": dense}
-        print_json(record | how.record(fit) | words.fit_record(loaded.name, fit) | {"notes": list(fit.notes)})
+        record |= apart | how.record(fit)
+        print_json(record | words.fit_record(loaded.name, fit) | {"notes": list(fit.notes)})
 
 
 def _register_onto(
@@ -160,6 +167,10 @@ def _register_onto(
 
         compose_fit(b, moved, result.rotations[1], what=f"the mesh of {names[0]}").render(picture)
     words.tell_match(console, result, names)
+    parts = [isinstance(fit, meshmatch.Fit) and fit.partial for fit in (result.source_fit, result.target_fit)]
+    begins = (moved, b) if parts[0] and not b.is_cloud else (b, moved)  # from what is only a part
+    apart = meshmatch.measure_distance(*begins, one_way=any(parts))
+    console.say(str(apart))
     words.tell_verdict(console, found.verdict, found.reasons, "the registration")
     if turned:
         console.say(f"note: a node turns {names[0]} upright, along y")
@@ -169,7 +180,8 @@ def _register_onto(
     if run.json:
         fits = [words.fit_record(*each) for each in zip(names, (result.source_fit, result.target_fit), strict=True)]
         record: Json = {"output": output, "picture": picture, "onto": onto, "vertices": moved.V, "faces": moved.F}
-        record |= {"verdict": found.verdict, "reasons": found.reasons, "fits": fits, "notes": result.notes}
+        record |= {"distance": apart.as_dict(), "verdict": found.verdict, "reasons": found.reasons}
+        record |= {"fits": fits, "notes": result.notes}
         print_json(record | how.record(result.source_fit) | {"seconds": round(result.seconds, 3)})
 
 

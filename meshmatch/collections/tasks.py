@@ -71,7 +71,7 @@ def fit_alone(task: FitTask) -> Record:
         if setting.agrees:
             how = AgreeConfig.for_collection(setting.trained)
             samples = member_of(node_system(setting.trained), fit.repaired.shape, fit, setting.config, how).samples
-        distance, furthest = surface_distance(fit.repaired.shape, fit)
+        distance, furthest = surface_distance(fit.repaired.shape, fit.shape, fit.partial)
         record = Record(
             name=source.name,
             file=source.path,

@@ -72,6 +72,47 @@ CM = ErrorUnit("cm", CM_PER_UNIT, "cm", "cm, target scaled to 1.9 m² of skin", 
 X100 = ErrorUnit("x100", 100.0, "x 0.01 sqrt(area)", "hundredths of sqrt(area)", 100 * _LOST)
 
 
+@dataclass(frozen=True)
+class SurfaceDistance:
+    """How far two surfaces lie apart.
+
+    Attributes
+    ----------
+    mean
+        On average over both, in ``unit``.
+    most
+        At most, in ``unit``.
+    unit
+        What lengths are told in.
+
+    Examples
+    --------
+    >>> fit = meshmatch.register("templates/samples/climber.ply")
+    >>> apart = meshmatch.measure_distance("templates/samples/climber.ply", fit.shape, unit="file")
+    >>> print(apart.mean, apart.most)
+    """
+
+    mean: float
+    most: float
+    unit: ErrorUnit
+
+    def __str__(self) -> str:
+        """In words."""
+        name, length = self.unit.name, "" if self.unit.name == "file" else f" {self.unit.symbol}"
+        place = {"file": ", in the unit of the file", "cm": ", at 1.9 square metres of skin"}.get(name, "")
+        return f"surfaces lie {self.mean:.2g}{length} apart on average, {self.most:.2g} at most{place}"
+
+    def as_dict(self) -> dict[str, float | str]:
+        """Plain numbers, for a line of JSON.
+
+        Returns
+        -------
+        dict
+            ``mean`` and ``most`` in ``unit``, the name of an `ErrorUnit`.
+        """
+        return {"mean": self.mean, "most": self.most, "unit": self.unit.name}
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Errors(Brief, Pickled):
     """Errors of a map, one for each point whose truth is known.

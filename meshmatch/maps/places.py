@@ -187,19 +187,23 @@ class PlacedFit(Fit):
         return self.places.name
 
 
-def surface_distance(shape: Shape, fit: Fit) -> tuple[float, float]:
-    """How far a shape and its fitted template lie apart, on average over both surfaces and at most, in the unit of its file.
+def surface_distance(shape: Shape, fitted: Shape, one_way: bool = False) -> tuple[float, float]:
+    """How far two surfaces in one frame lie apart, on average over both and at most, in its unit: from every vertex of each
+    to the nearest place of the other that faces the same way.
 
-    Of a part, and of a cloud, only from there to the template.
+    Of a cloud, and with ``one_way`` of what is only a part of the fitted one, only from there.
     """
-    ways = [(closest_footpoints(shape, fit).distance, shape.vertex_areas)]
-    if not (fit.partial or shape.is_cloud):
-        points, normals = in_core_frame(shape, fit)
-        facing = vertex_normals(fit.points, fit.faces)
-        back = Surface(points, shape.faces, normals).query(fit.points, facing).distance
-        ways.append((back, vertex_areas(fit.points, fit.faces)))
+    scale = float(np.sqrt(fitted.area))
+    one, other = (Surface(each.verts / scale, each.faces, _facing(each)) for each in (shape, fitted))
+    ways = [(other.query(one.verts, _facing(shape)).distance, shape.vertex_areas)]
+    if not (one_way or shape.is_cloud):
+        ways.append((one.query(other.verts, _facing(fitted)).distance, fitted.vertex_areas))
     mean = np.mean([np.average(distance, weights=weights) for distance, weights in ways])
-    return fit.frame.scale * float(mean), fit.frame.scale * float(max(distance.max() for distance, _ in ways))
+    return scale * float(mean), scale * float(max(distance.max() for distance, _ in ways))
+
+
+def _facing(shape: Shape) -> Floats:
+    return np.zeros_like(shape.verts) if shape.is_cloud else shape.vertex_normals
 
 
 def heights(shape: Shape, fit: Fit, foot: Footpoints) -> Float[Floats, " V"]:

@@ -288,3 +288,23 @@ def test_pictures_and_pages_that_cannot_be(pair: tuple[Shape, Shape, VertexMap],
     with pytest.raises(OptionError, match="threads"):
         meshmatch.view(source, target, tmp_path / "a.html", found, threads=0)
     assert not list(tmp_path.iterdir())
+
+
+def test_distances_of_surfaces_are_in_the_unit_of_the_file(sphere: Shape) -> None:
+    """Two spheres 5 mm apart, in millimetres and turned inside; of a part and of a cloud only from there."""
+    one, other = (Shape(radius * sphere.verts, sphere.faces) for radius in (100.0, 105.0))
+    found = meshmatch.measure_distance(one, other)
+    assert found.mean == pytest.approx(5.0, rel=0.01) and found.most == pytest.approx(5.0, rel=0.01)
+    assert str(found) == "surfaces lie 5 apart on average, 5 at most, in the unit of the file"
+    as_person = meshmatch.measure_distance(one, other, unit="cm")
+    assert as_person.mean == pytest.approx(5.0 * 100 * np.sqrt(1.9 / other.area), rel=0.01)
+    assert str(as_person).endswith("at most, at 1.9 square metres of skin")
+    assert meshmatch.measure_distance(one, other, unit="x100").as_dict()["unit"] == "x100"
+    half = Shape(one.verts, one.faces[one.verts[one.faces].mean(1)[:, 0] > 0])
+    assert meshmatch.measure_distance(half, other).most > 50
+    for part in (meshmatch.measure_distance(half, other, one_way=True), meshmatch.measure_distance(half.verts, other)):
+        assert part.most == pytest.approx(5.0, rel=0.01)
+    with pytest.raises(InputError, match="no faces"):
+        meshmatch.measure_distance(one, other.verts)
+    with pytest.raises(OptionError, match="invalid unit"):
+        meshmatch.measure_distance(one, other, unit="mm")  # type: ignore[arg-type]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import meshmatch
 from meshmatch.api import matcher, matching
 from meshmatch.errors import OutputError
 from meshmatch.maps.files import load_map
@@ -106,6 +107,7 @@ def test_register_writes_the_template_in_the_frame_of_the_file(
     wanted = 2.0 * made.points + [10.0, 0, 0]
     assert np.allclose(fitted.verts[fitted.faces], wanted[made.faces])
     assert "good fit, up +y, front -z" in answer.err
+    assert f"{meshmatch.measure_distance(two[0], output)}\n" in answer.err
 
 
 def test_register_stands_upright_in_a_glb(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
@@ -150,6 +152,8 @@ def test_register_json(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> 
     record = json.loads(answer.out)
     assert answer.err == ""
     assert (record["shape"], record["verdict"], record["up"]) == ("a.ply", "good", "+y")
+    wanted = meshmatch.measure_distance(two[0], two[0].with_name("fitted.ply"))
+    assert record["distance"] == pytest.approx({"mean": wanted.mean, "most": wanted.most, "unit": "file"})
     assert record["output"] == str(two[0].with_name("fitted.ply"))
 
 
