@@ -13,7 +13,7 @@ import numpy as np
 from meshmatch.fitting.direct import MIRROR, DirectMatch
 from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fitter import may_show_part
+from meshmatch.fitting.fitter import cap_verdict, may_show_part
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.fitting.without_model import fit_alike, template_of, viscous_system
@@ -78,6 +78,8 @@ def match_alike(
     if as_found:
         moving = found.target if found.source.verdict == "good" else found.source
         fit = replace(fit, verdict=found.verdict, reasons=moving.reasons, trust=moving.trust)
+    else:
+        fit = cap_verdict(fit, [reason for reason in found.reasons if reason.code == "ambiguous"])
     fits = _at_rest(fit, template, whole, frame), _as_it_rests(fit, template)
     first, second = fits if whole is source else fits[::-1]
     return replace(found, source=first, target=second, system=viscous_system(template))

@@ -22,6 +22,7 @@ from meshmatch.fitting.judge.direct import judge_direct
 from meshmatch.fitting.judge.reasons import Reason, Verdict
 from meshmatch.fitting.one_way import DirectConfig, KnownPairs, Side, Tried, carried, distinct, finished, fitted, glided
 from meshmatch.fitting.search.intrinsic import ThinMesh
+from meshmatch.fitting.search.motions import turns_onto_itself
 from meshmatch.fitting.search.proposals import Proposal, differ
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.system import NodeSystem
@@ -75,7 +76,8 @@ class DirectMatch:
     registered to. ``tried`` are what the fits that were compared in the end began from, and their energies, best first;
     ``leads`` how much higher the energies of those are that differ from the best one, and ``over_guess`` that of the
     guess, if there was one: 0 where it is much the same map. Where the energies are means of both directions, ``one_way`` is
-    what the first of them alone would have given. ``apart`` is how far apart a rigid motion leaves the shapes, and the
+    what the first of them alone would have given. ``turns`` is by how many turns one of the shapes comes onto itself, which
+    makes so many maps equally good. ``apart`` is how far apart a rigid motion leaves the shapes, and the
     source and the mirror image of the target (units of sqrt(area)), if that was asked.
     """
 
@@ -86,6 +88,7 @@ class DirectMatch:
     leads: tuple[float, ...] = ()
     over_guess: float = np.inf
     one_way: DirectMatch | None = None
+    turns: int = 1
     apart: tuple[float, float] | None = None
 
     @property
@@ -240,14 +243,17 @@ class _Search:
         """The best of the fits as a match; both ways, if one way leaves doubt."""
         config, source, target = self.source.config, self.source, self.target
         leads = _leads(there, config.unlike)
-        found = self._match(source, target, there[0], there, leads, judge_direct(there[0].energy, leads))
-        if config.both_ways == "always" or (config.both_ways == "in doubt" and found.verdict != "good"):
+        turns = max(turns_onto_itself(each.thin, each.known and each.known[0]) for each in (source, target))
+        judged = judge_direct(there[0].energy, leads, turns=turns)
+        found = replace(self._match(source, target, there[0], there, leads, judged), turns=turns)
+        clear = judge_direct(there[0].energy, leads)[0] == "good"  # of turned shapes the other way knows no better
+        if config.both_ways == "always" or (config.both_ways == "in doubt" and not clear):
             both = self.both_ways(there, report.stage("", 0.6, 0.95))
             leads, best = _leads(both, _SAME), both[0]
-            judged = judge_direct(best.energy, leads, DIRECT_BOTH_WAYS)
+            judged = judge_direct(best.energy, leads, DIRECT_BOTH_WAYS, turns)
             backwards = not config.from_source and best.back.energy < best.there.energy
             own, other, chosen = (target, source, best.back) if backwards else (source, target, best.there)
-            found = replace(self._match(own, other, chosen, both, leads, judged), one_way=found)
+            found = replace(self._match(own, other, chosen, both, leads, judged), one_way=found, turns=turns)
         report.stage("matching without a model")(1.0)
         first, second = (replace(fit, seconds=time.monotonic() - began) for fit in (found.source, found.target))
         return replace(found, source=first, target=second)

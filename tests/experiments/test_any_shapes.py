@@ -83,13 +83,16 @@ def test_another_method_that_fails_is_counted_as_a_map_to_one_vertex(folder: Pat
 
 def test_a_row_counts_every_pair_and_names_the_worst() -> None:
     found = [
-        {"pair": "a to b", "error": 4.0, "verdict": "good", "cpu": 1.0},
-        {"pair": "b to a", "error": 20.0, "verdict": "good", "cpu": 3.0},
-        {"pair": "a to c", "error": 6.0, "verdict": "fair", "cpu": 2.0},
+        {"pair": "a to b", "error": 4.0, "verdict": "good", "ambiguous": False, "cpu": 1.0},
+        {"pair": "b to a", "error": 20.0, "verdict": "good", "ambiguous": False, "cpu": 3.0},
+        {"pair": "a to c", "error": 6.0, "verdict": "fair", "ambiguous": True, "cpu": 2.0},
     ]
     row = row_of("box", found)
     assert (row["pairs"], row["mean"], row["median"], row["worst"]) == (3, 10.0, 6.0, "b to a")
     assert row["under"] == pytest.approx(2 / 3) and (row["good"], row["good_over"]) == (2, 1)
+    lost = [{**found[0], "error": 21.0}, {**found[1], "error": 30.0, "verdict": "poor"}, {**found[2], "error": 40.0}]
+    assert (row["far_off"], row["told"]) == (0, 0)
+    assert [row_of("cup", lost)[name] for name in ("far_off", "told")] == [3, 2]
 
 
 def test_the_calibration_of_direct_maps_tells_right_from_wrong() -> None:
@@ -113,10 +116,11 @@ def test_verdicts_are_counted_by_weights_of_other_classes() -> None:
             "error": 3.0 if right else 30.0,
             "energy": rng.normal(0.03 if right else 0.06, 0.004),
             "leads": (rng.uniform(0.002, 0.01),),
+            "turns": 1,
         }
         for right in [True] * 30 + [False] * 20
     ]
-    odd = [{"error": 30.0, "energy": 0.02, "leads": (0.02,)}]  # looks right, and is wrong
+    odd = [{"error": 30.0, "energy": 0.02, "leads": (0.02,), "turns": 1}]  # looks right, and is wrong
     counts = any_shapes.held_out({"a": pairs[::2], "b": pairs[1::2], "odd": odd})
     assert (counts["pairs"], counts["right"]) == (51, 30)
     assert counts["good"] > counts["good_over"] == 1 and counts["right_not_poor"] >= 28

@@ -14,6 +14,7 @@ from meshmatch.fitting.fit import axis_name
 from meshmatch.fitting.judge.direct import DirectFeatures, judge_direct
 from meshmatch.fitting.one_way import DirectConfig, Side, finished, glided
 from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh, shortest_tour
+from meshmatch.fitting.search.motions import turns_onto_itself
 from meshmatch.fitting.search.proposals import (
     Assignments,
     Proposal,
@@ -166,6 +167,28 @@ def test_a_turned_copy_is_found_by_a_rigid_motion(thin: ThinMesh) -> None:
     assert best.kind == "rigid" and np.abs(best.points - copy.verts).max() < 0.02
 
 
+def around(radius: Any) -> ThinMesh:
+    """A turned piece whose radius may change with the height and the angle."""
+    piece = trimesh.creation.cylinder(0.5, 1.0, sections=64).subdivide_to_size(0.08)
+    x, y, z = np.asarray(piece.vertices).T
+    wide = radius(z, np.arctan2(y, x))
+    return ThinMesh.of(frame_applied(Shape(np.column_stack([x * wide, y * wide, z]), np.asarray(piece.faces))), 1800)
+
+
+def test_turns_that_bring_a_shape_onto_itself_are_counted(thin: ThinMesh) -> None:
+    assert turns_onto_itself(thin) == 1
+    assert turns_onto_itself(around(lambda z, _: 1 + 0.5 * z)) > 12  # a cup without a handle
+    assert turns_onto_itself(around(lambda z, angle: (1 + 0.5 * z) * (1 + 0.3 * np.cos(3 * angle)))) == 3
+    handle = around(lambda z, angle: (1 + 0.5 * z) * (1 + 0.8 * np.exp(-((angle / 0.3) ** 2))))
+    assert turns_onto_itself(handle) == 1
+
+
+def test_turns_that_move_known_positions_do_not_count() -> None:
+    prism = around(lambda z, angle: (1 + 0.5 * z) * (1 + 0.3 * np.cos(2 * angle)))
+    top, side = prism.verts[prism.verts[:, 2].argmax()] * [0, 0, 1], prism.verts[prism.verts[:, 0].argmax()]
+    assert [turns_onto_itself(prism, held) for held in (None, top[None], side[None])] == [2, 2, 1]
+
+
 def test_nodes_move_one_side_of_a_thin_sheet(thin: ThinMesh) -> None:
     sheet = trimesh.creation.box((1, 1, 0.01)).subdivide_loop(0)
     for _ in range(4):
@@ -217,6 +240,8 @@ def test_equal_fits_are_ambiguous_and_distant_ones_are_not() -> None:
     assert alone[0] == "good" and not alone[2]
     verdict, _, reasons = judge_direct(best.energy, [0.0, 0.0, 0.04])
     assert verdict == "fair" and reasons[0].code == "ambiguous" and "3 different" in reasons[0]
+    turned = judge_direct(best.energy, [], turns=4)
+    assert turned[0] == "fair" and turned[1] == alone[1] and "4 different" in turned[2][0]
     trusts = [judge_direct(energy, [])[1] for energy in (0.01, 0.03, 0.06, 0.1)]
     assert trusts == sorted(trusts, reverse=True)
     assert judge_direct(0.1, [])[0] == "poor"
@@ -281,6 +306,7 @@ def test_known_pairs_settle_what_symmetry_leaves_open() -> None:
     shape = Shape(np.asarray(box.vertices), np.asarray(box.faces), "box")
     plain = match_directly(shape, shape, QUICK)
     assert min(plain.leads) < 0.005  # half turns are nearly as good
+    assert any(reason.code == "ambiguous" for reason in plain.reasons)
     half = Rotation.from_euler("z", 180, degrees=True)
     corners = np.array(shape.verts[:8])
     known = corners, half.apply(corners)

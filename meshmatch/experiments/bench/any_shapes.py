@@ -7,7 +7,8 @@ its keypoints that most of its shapes have, and those that either shape of the p
 a leg. Of table 141 the points of two legs are exchanged against those of its top, unlike those of all other tables: they
 are put back, and a last row says what the mean is as they are marked.
 
-Bearings, cups and mechanical parts can turn in themselves, so that only their verdicts count.
+Bearings, cups and mechanical parts can turn in themselves, so that only their verdicts count: how many of those maps are
+told, as ambiguous or poor, whose error is over 20.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ CLASSES = (
 )
 TURNING = ("bearing", "cup", "mech")
 SHAPES = 6  # of each class
-OFF = 10.0
+OFF, FAR_OFF = 10.0, 20.0
 # Of the keypoints' spread: how far a symmetry may miss them, at most and on average; one of most shapes, and one of a shape.
 _ALIKE, _EXACTLY = (0.4, 0.2), (0.25, 0.08)
 # Points that a shape has in another order than its class; of each point which one it is.
@@ -62,6 +63,8 @@ _COLUMNS = {"class": "class", "pairs": "pairs:d", "mean": "mean:.1f", "median": 
 _COLUMNS |= {
     "good": "good:d",
     "good over 10": "good_over:d",
+    "over 20": "far_off:d",
+    "told": "told:d",
     "worst": "worst",
     "error": "worst_error:.1f",
     "CPU s": "cpu:.1f",
@@ -172,7 +175,11 @@ def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[
 
     def row(found: DirectMatch) -> dict[str, Any]:
         fits = replace(found.source, repaired=clean[0]), replace(found.target, repaired=clean[1])
-        return _row(folder, pair, map_of_fits(fits, fits, 1)) | {"energy": found.energy, "leads": found.leads}
+        return _row(folder, pair, map_of_fits(fits, fits, 1)) | {
+            "energy": found.energy,
+            "leads": found.leads,
+            "turns": found.turns,
+        }
 
     shapes = clean[0].shape, clean[1].shape
     roughly = match_either_side(*shapes, DirectConfig(seed=seed))
@@ -187,7 +194,8 @@ def judged(row: dict[str, Any]) -> dict[str, Any]:
     if "energy" not in row or row.get("finer"):
         return row
     calibration = DIRECT_BOTH_WAYS if row["one_way"] else DIRECT
-    return {**row, "verdict": judge_direct(row["energy"], row["leads"], calibration)[0]}
+    verdict, _, reasons = judge_direct(row["energy"], row["leads"], calibration, row["turns"])
+    return {**row, "verdict": verdict, "ambiguous": any(reason.code == "ambiguous" for reason in reasons)}
 
 
 def _row(folder: Path, pair: tuple[str, str], mapped: VertexMap) -> dict[str, Any]:
@@ -243,7 +251,7 @@ def held_out(found: _Found) -> dict[str, Any]:
         others = [row for other, some in found.items() if other != name for row in some]
         calibration = fitted_calibration(others)
         for row in own:
-            verdict = judge_direct(row["energy"], row["leads"], calibration)[0]
+            verdict = judge_direct(row["energy"], row["leads"], calibration, row["turns"])[0]
             right = row["error"] < OFF
             counts["pairs"] += 1
             counts["right"] += right
@@ -262,12 +270,16 @@ def row_of(name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The row of a class."""
     errors = np.array([each["error"] for each in found])
     good = np.array([each["verdict"] == "good" for each in found])
+    far_off = errors > FAR_OFF
+    told = far_off & np.array([each["ambiguous"] or each["verdict"] == "poor" for each in found])
     worst = int(errors.argmax())
     return {
         "class": name,
         **_summary(errors),
         "good": int(good.sum()),
         "good_over": int((good & (errors > OFF)).sum()),
+        "far_off": int(far_off.sum()),
+        "told": int(told.sum()),
         "worst": found[worst]["pair"],
         "worst_error": float(errors[worst]),
         "cpu": float(np.mean([each["cpu"] for each in found])),

@@ -75,13 +75,13 @@ class DirectFeatures:
 
 
 def judge_direct(
-    energy: float, leads: Sequence[float], calibration: DirectCalibration = DIRECT
+    energy: float, leads: Sequence[float], calibration: DirectCalibration = DIRECT, turns: int = 1
 ) -> tuple[Verdict, float, tuple[Reason, ...]]:
     """Verdict, trust (0..1) and reasons of the best fit; ``leads`` are how much higher the energies are of other fits, which
-    differ from it clearly."""
+    differ from it clearly, and ``turns`` by how many turns one of the shapes comes onto itself."""
     trust = float(1 / (1 + np.exp(-calibration.logit(energy, leads))))
     reasons = []
-    if equal := sum(each < _TIE for each in leads):
+    if equal := max(sum(each < _TIE for each in leads), turns - 1):
         count = f"{min(equal, _TOLD) + 1}{' or more' if equal > _TOLD else ''}"
         reasons.append(
             Reason("ambiguous", f"ambiguous: {count} different maps are equally good, as of a symmetric shape")

@@ -17,9 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh
+from meshmatch.fitting.search.motions import ClosestPoints, principal_axes
 from meshmatch.geometry.frames import kabsch
-from meshmatch.geometry.oriented import with_normals
-from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import triangle_vectors
 
 Kind = Literal["rigid", "affine", "spectral", "extremities", "guess"]
@@ -50,9 +49,6 @@ class ProposalSettings:
     rigid : rigid motions that are kept, each with an affine one
     closest_point_steps, affine_steps : steps of closest points of each
     turned : degrees by which two of them differ
-    normal_weight : of normals in the search for closest points
-    scale : of the robust weight of closest points
-    cap : distance from which on a point counts as far
     signs : eigenfunctions whose signs, and whose order, are tried in all ways
     compared : how many of these are refined to ``functions``, from ``first_functions``
     functions, first_functions, more : eigenfunctions of a map in the end and after the first steps, and how many are added
@@ -71,9 +67,6 @@ class ProposalSettings:
     closest_point_steps: int = 6
     affine_steps: int = 10
     turned: float = 20.0
-    normal_weight: float = 0.15
-    scale: float = 0.1
-    cap: float = 0.2
     signs: int = 5
     compared: int = 32
     first_functions: int = 14
@@ -96,10 +89,10 @@ SETTINGS = ProposalSettings()
 
 def rigid_proposals(source: ThinMesh, target: ThinMesh) -> list[Proposal]:
     """The best rigid motions from 48 starts by iterative closest points, and an affine one from each."""
-    middles = source.areas @ source.verts, target.areas @ target.verts
-    cloud = _Closest(source.verts - middles[0], source.normals, target.verts - middles[1], target.normals)
+    cloud = ClosestPoints(source, target)
+    middle = cloud.middles[1]
     turns = Rotation.create_group("O").as_matrix()
-    axes = [_principal_axes(mesh) for mesh in (source, target)]
+    axes = [principal_axes(mesh) for mesh in (source, target)]
     starts = [*turns, *(axes[1] @ turn @ axes[0].T for turn in turns)]
     found = [cloud.motion(start, np.zeros(3), SETTINGS.closest_point_steps) for start in starts]
     chosen: list[tuple[Floats, Floats]] = []
@@ -109,73 +102,11 @@ def rigid_proposals(source: ThinMesh, target: ThinMesh) -> list[Proposal]:
             chosen.append((turn, shift))
     proposals = []
     for motion in chosen[: SETTINGS.rigid]:
-        proposals.append(Proposal("rigid", cloud.moved(*motion)[0] + middles[1]))
+        proposals.append(Proposal("rigid", cloud.moved(*motion)[0] + middle))
         matrix, shift = cloud.motion(*motion, SETTINGS.affine_steps, affine=True)
         if np.linalg.det(matrix) > 0.1:
-            proposals.append(Proposal("affine", cloud.moved(matrix, shift)[0] + middles[1]))
+            proposals.append(Proposal("affine", cloud.moved(matrix, shift)[0] + middle))
     return proposals
-
-
-def _principal_axes(mesh: ThinMesh) -> Float[Floats, "3 3"]:
-    axes = np.linalg.eigh(np.cov(mesh.verts.T, aweights=mesh.areas))[1]
-    axes[:, 0] *= np.sign(np.linalg.det(axes))
-    return axes
-
-
-class _Closest:
-    """Iterative closest points between two thin meshes, both ways, with robust weights."""
-
-    _SOME = 200  # points of each mesh that look for their closest
-
-    def __init__(self, points: Floats, normals: Floats, onto: Floats, onto_normals: Floats) -> None:
-        self._points, self._normals, self._onto = points, normals, onto
-        self._features = with_normals(onto, onto_normals, SETTINGS.normal_weight)
-        self._tree = cKDTree(self._features)
-        self._few = np.linspace(0, len(points) - 1, min(self._SOME, len(points))).astype(np.int64)
-        self._few_onto = np.linspace(0, len(onto) - 1, min(self._SOME, len(onto))).astype(np.int64)
-
-    def moved(self, matrix: Float[Floats, "3 3"], shift: Float[Floats, " 3"]) -> tuple[Floats, Floats]:
-        """Points and unit normals under an affine motion."""
-        normals = self._normals @ np.linalg.inv(matrix)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        return self._points @ matrix.T + shift, normals
-
-    def _pairs(self, matrix: Floats, shift: Floats) -> tuple[Ints, Floats, Ints, Floats]:
-        features = with_normals(*self.moved(matrix, shift), SETTINGS.normal_weight)
-        there, forth = self._tree.query(features[self._few])
-        back, home = cKDTree(features).query(self._features[self._few_onto])
-        return forth, there, home, back
-
-    def residual(self, matrix: Floats, shift: Floats) -> float:
-        """Mean capped distance both ways, normals included."""
-        _, there, _, back = self._pairs(matrix, shift)
-        return float(np.minimum(there, SETTINGS.cap).mean() + np.minimum(back, SETTINGS.cap).mean())
-
-    def motion(self, matrix: Floats, shift: Floats, steps: int, affine: bool = False) -> tuple[Floats, Floats]:
-        """A rigid or an affine motion after some steps from another one."""
-        for _ in range(steps):
-            forth, _, home, _ = self._pairs(matrix, shift)
-            source = np.concatenate([self._points[self._few], self._points[home]])
-            goal = np.concatenate([self._onto[forth], self._onto[self._few_onto]])
-            off = np.square(source @ matrix.T + shift - goal).sum(1)
-            weights = 1 / np.square(1 + off / SETTINGS.scale**2)
-            if affine:
-                matrix, shift = _affine(source, goal, weights, matrix)
-            else:
-                pose = kabsch(source, goal, weights)
-                matrix, shift = pose.rotation, pose.center
-        return matrix, shift
-
-
-def _affine(source: Floats, goal: Floats, weights: Floats, near: Floats) -> tuple[Floats, Floats]:
-    """The affine motion of weighted least squares, held near the rotation in ``near`` where points do not say."""
-    U, _, Vh = np.linalg.svd(near)
-    lifted = np.hstack([source, np.ones((len(source), 1))])
-    held = np.diag([1e-3, 1e-3, 1e-3, 0]) * weights.sum()
-    wanted = np.vstack([(U @ Vh).T, np.zeros(3)])
-    weighted = weights[:, None] * lifted
-    found = np.linalg.solve(lifted.T @ weighted + held, weighted.T @ goal + held @ wanted)
-    return found[:3].T, found[3]
 
 
 def spectral_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
