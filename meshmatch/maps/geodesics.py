@@ -21,9 +21,10 @@ from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.shape import Shape
 
 CHUNK_BYTES = 64_000_000
-# Pairs that are near each other are searched for within so many edges first, then within twice as much, up to a share of the
-# shape's size; a path is taken to be at most so much longer than the straight line; of fewer pairs all is searched.
-_EDGES, _NEARBY, _DETOUR, _FEW = 1.5, 0.1, 1.2, 200
+# Pairs that are near each other are searched for within so many edges first, then so many times as far, up to a share of the
+# shape's size, in cells of so many edges at least; of fewer pairs all is searched.
+_EDGES, _WIDER, _NEARBY, _CELL, _FEW = 1.5, 2.0**0.5, 0.1, 18.0, 200
+_HUBS = 16  # all distances from which tell how near a pair can be
 # Distances from more vertices than these are bounded: 400 of a shape of 60,000 vertices. Bounds are so close to their mean.
 _MOST_DISTANCES, _CLOSE = 24_000_000, 0.03
 GEODESIC = "Dijkstra on edges and unfolded diagonals"
@@ -116,7 +117,7 @@ class GeodesicDistances:
         # An invalid vertex has a stand-in for a position: a path over it would cut through the body.
         self.graph = surface_graph(shape.verts, shape.faces[shape.valid_faces])
         self._verts = shape.verts
-        self._step = _EDGES * float(np.median(self.graph.data)) if self.graph.nnz else 0.0
+        self._edge = float(np.median(self.graph.data)) if self.graph.nnz else 0.0
 
     @property
     def V(self) -> int:
@@ -193,24 +194,27 @@ class GeodesicDistances:
         No edge of the graph is longer than its ends are apart, so a path of some length stays within that distance of its
         start: a box around is all that has to be searched.
         """
-        apart = np.linalg.norm(self._verts[a[left]] - self._verts[b[left]], axis=1)
         low, high = self._verts.min(axis=0), self._verts.max(axis=0)
-        reach, most = self._step, _NEARBY * float((high - low).max())
-        tree = cKDTree(self._verts) if len(left) > _FEW else None
-        while tree is not None and reach < most and len(left) > _FEW:
-            now = np.flatnonzero(apart * _DETOUR <= reach)
-            cells = np.floor((self._verts[a[left[now]]] - low) / reach).astype(np.int64)
+        reach, most = _EDGES * self._edge, _NEARBY * float((high - low).max())
+        if not (reach < most and len(left) > _FEW):
+            return
+        tree, least = cKDTree(self._verts), self._least(a[left], b[left])
+        while reach < most and len(left) > _FEW:
+            width = max(reach, _CELL * self._edge)
+            now = np.flatnonzero(least <= reach)
+            cells = np.floor((self._verts[a[left[now]]] - low) / width).astype(np.int64)
             order = np.lexsort(cells.T)
             changes = (np.diff(cells[order], axis=0) != 0).any(axis=1)
             found = np.zeros(len(left), bool)
             for group in np.split(now[order], np.flatnonzero(changes) + 1) if len(now) else ():
                 pairs = left[group]
-                center = low + (np.floor((self._verts[a[pairs[0]]] - low) / reach) + 0.5) * reach
-                nodes = np.sort(tree.query_ball_point(center, 1.5 * reach, p=np.inf))
+                center = low + (np.floor((self._verts[a[pairs[0]]] - low) / width) + 0.5) * width
+                nodes = np.sort(tree.query_ball_point(center, 0.5 * width + reach, p=np.inf))
                 part = self.graph[nodes][:, nodes]
-                starts, row = np.unique(a[pairs], return_inverse=True)
-                ends = np.searchsorted(nodes, b[pairs]).clip(max=len(nodes) - 1)
-                here = nodes[ends] == b[pairs]
+                begin, end = _fewer(a[pairs], b[pairs])
+                starts, row = np.unique(begin, return_inverse=True)
+                ends = np.searchsorted(nodes, end).clip(max=len(nodes) - 1)
+                here = nodes[ends] == end
                 size = max(1, CHUNK_BYTES // (8 * len(nodes)))
                 for first in range(0, len(starts), size):
                     some = np.searchsorted(nodes, starts[first : first + size])
@@ -220,6 +224,26 @@ class GeodesicDistances:
                     known = np.isfinite(values)
                     result[pairs[mine[known]]] = values[known] / self.unit
                     found[group[mine[known]]] = True
-            left, apart = left[~found], apart[~found]
-            reach *= 2.0
+            left, least = left[~found], least[~found]
+            reach *= _WIDER
             yield left
+
+    def _least(self, a: Int[Ints, " N"], b: Int[Ints, " N"]) -> Float[Floats, " N"]:
+        """What distances of pairs are at least, in the unit of the file: straight lines, and the triangle inequality over
+        hubs far from each other.
+        """
+        least = np.linalg.norm(self._verts[a] - self._verts[b], axis=1)
+        apart, hub = np.full(self.V, np.inf), int(a[0])
+        for _ in range(_HUBS):
+            row = self.rows(np.array([hub]))[0] * self.unit
+            least = np.maximum(least, np.abs(row[a] - row[b]))
+            apart = np.minimum(apart, row)
+            hub = int(apart.argmax())
+        return np.asarray(least)
+
+
+def _fewer(a: Int[Ints, " N"], b: Int[Ints, " N"]) -> tuple[Ints, Ints]:
+    """The vertices of pairs, first in each the one that is in more of them, so that few are first."""
+    often = [np.unique(ends, return_inverse=True, return_counts=True)[1:] for ends in (a, b)]
+    of_a, of_b = (count[number] for number, count in often)
+    return np.where(of_b > of_a, b, a), np.where(of_b > of_a, a, b)

