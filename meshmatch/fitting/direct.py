@@ -9,8 +9,9 @@ out are two fits of one template, as of a model: one shape as it is, and moved o
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from operator import attrgetter
 
 import numpy as np
@@ -158,17 +159,16 @@ def match_either_side(
     config = config or DirectConfig()
     began, report = time.monotonic(), Progress(progress, source.name)
     search = _Search.of(source, target, config, known, guess)
-    there = search.one_way(report.stage("", 0.0, 0.3))
-    distances = apart(source, target, config.seed)
-    nearer = float(np.log(distances[0] / distances[1]))
+    there = search.one_way(report.stage("", 0.0, 0.3), [lambda: search.apart])
+    nearer = float(np.log(search.apart[0] / search.apart[1]))
     if nearer < (_MAYBE_MIRRORED if there[0].features.likeness < _UNLIKE else _MIRRORED):
-        return replace(search.matched(there, report, began), apart=distances)
+        return replace(search.matched(there, report, began), apart=search.apart)
     known, guess = (pairs and (pairs[0], MIRROR.apply(pairs[1])) for pairs in (known, guess))
     image = _Search.of(source, mirrored(target), config, known, guess)
     to_image = image.one_way(report.stage("", 0.3, 0.6))
     if to_image[0].energy > _SHARE * there[0].energy:
-        return replace(search.matched(there, report, began), apart=distances)
-    return replace(_of_mirror_image(image.matched(to_image, report, began), target), apart=distances)
+        return replace(search.matched(there, report, began), apart=search.apart)
+    return replace(_of_mirror_image(image.matched(to_image, report, began), target), apart=search.apart)
 
 
 def _of_mirror_image(found: DirectMatch, target: Shape) -> DirectMatch:
@@ -205,9 +205,14 @@ class _Search:
         second = Side(target, frames[1], shapes[1], thin[1], known and known[::-1], config)
         return cls(first, second, guess)
 
-    def one_way(self, report: Progress) -> list[Tried]:
-        """The best fits of the source to the target, best first."""
-        return fitted(self.source, self.target, self.guess, report)
+    @cached_property
+    def apart(self) -> tuple[float, float]:
+        """How far apart a rigid motion leaves the shapes, and the source and the mirror image of the target."""
+        return apart(self.source.original, self.target.original, self.source.config.seed)
+
+    def one_way(self, report: Progress, meanwhile: Sequence[Callable[[], object]] = ()) -> list[Tried]:
+        """The best fits of the source to the target, best first; see `fitted`."""
+        return fitted(self.source, self.target, self.guess, report, meanwhile)
 
     def both_ways(self, there: list[Tried], report: Progress) -> list[_BothWays]:
         """The best fits of the source to the target, and of the target to the source, each continued the other way; best

@@ -6,11 +6,11 @@ and the best of these on more nodes. Their energies say which is right.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from operator import attrgetter
-from typing import Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 
@@ -170,6 +170,20 @@ class Level:
         problem = Problem(system=self.system, terms=terms, schedule=config.schedule)
         return minimise(problem, prior or self.rigid, vectors)
 
+    def tried(
+        self,
+        onto: ThinMesh,
+        samples: OrientedPoints,
+        proposal: Proposal,
+        vectors: Float[Floats, "K 3"],
+        how: NodeRefineConfig,
+        pairs: Pairs | None = None,
+    ) -> Tried:
+        """A proposal, refined from node vectors, and how well that fits."""
+        vectors = self.refined(samples, vectors, how)
+        features = self.features(onto, samples, vectors, pairs)
+        return Tried(proposal, vectors, self.system.moved(vectors), features)
+
 
 _ONTO = Schedule(steps=6, prior=(3e-2, 1e-3), scale=(1.0, 0.3), damping=1e-6)
 _LIMBS_ONTO = Schedule(steps=8, prior=(3e-2, 3e-3), damping=1e-6)
@@ -258,24 +272,23 @@ def glided(own: Side, onto: Side, tried: Sequence[Tried], report: Progress) -> l
 
 
 def _fine(own: Side, onto: Side, proposal: Proposal, vectors: Float[Floats, "K 3"], how: NodeRefineConfig) -> Tried:
-    fine, samples = own.fine, onto.samples
-    vectors = fine.refined(samples, vectors, how)
-    features = fine.features(onto.fine_mesh, samples, vectors, onto.neighbours)
-    return Tried(proposal, vectors, fine.system.moved(vectors), features)
+    return own.fine.tried(onto.fine_mesh, onto.samples, proposal, vectors, how, onto.neighbours)
 
 
-def fitted(own: Side, onto: Side, guess: KnownPairs | None, report: Progress) -> list[Tried]:
-    """The best fits of one shape to another, best first; ``guess`` is one more proposal."""
+def fitted(
+    own: Side, onto: Side, guess: KnownPairs | None, report: Progress, meanwhile: Sequence[Callable[[], object]] = ()
+) -> list[Tried]:
+    """The best fits of one shape to another, best first; ``guess`` is one more proposal. What is to be done ``meanwhile`` is
+    called where a thread would wait."""
     config, rested = own.config, own.thin.verts
-    proposals = _proposals(own, onto, report.named("guesses without a model").between(0.0, 0.4))
+    guesses = [] if guess is None else [Proposal("guess", carried(rested, *guess))]
+    begun = _begun(own, onto, guesses, report.named("guesses without a model").between(0.0, 0.6), meanwhile)
+    tried = _better(own, onto, begun, report.named("fits of the better guesses").between(0.6, 0.8))
     verts = own.fine.mesh.verts
-    if guess is not None:
-        proposals.append(Proposal("guess", carried(rested, *guess)))
-    trying = report.named(f"fits of {len(proposals)} guesses").between(0.4, 0.8)
-    tried = _screened(own.coarse, onto, proposals, config, trying)
     goals = [(each.proposal, verts + carried(verts, rested, each.moved - rested)) for each in tried]
-    if guess is not None and all(each.proposal.kind != "guess" for each in tried):  # its energy is asked for
-        goals.append((proposals[-1], verts + carried(verts, rested, proposals[-1].points - rested)))
+    for each in guesses:  # its energy is asked for
+        if all(other.proposal is not each for other in tried):
+            goals.append((each, verts + carried(verts, rested, each.points - rested)))
     report = report.named("fits of the best guesses").between(0.8, 1.0)
     found = finished(own, onto, goals, report.between(0.0, 0.6))
     best = distinct(found, config.gliding, config.unlike)
@@ -283,50 +296,53 @@ def fitted(own: Side, onto: Side, guess: KnownPairs | None, report: Progress) ->
     return sorted([*glided(own, onto, best, report.between(0.6, 1.0)), *rest], key=attrgetter("energy"))
 
 
-def _proposals(source: Side, target: Side, report: Progress) -> list[Proposal]:
-    """Guesses of all kinds; what all fits need is made beside them."""
+def _begun(
+    own: Side, onto: Side, guesses: list[Proposal], report: Progress, meanwhile: Sequence[Callable[[], object]]
+) -> list[Tried]:
+    """Guesses of all kinds, fitted on few nodes for a few steps.
 
-    def levels() -> list[Proposal]:
-        _ = source.coarse, source.fine, target.neighbours, target.fine_mesh.relief, target.fine_mesh.tree
-        return []
+    To know lengths along the surface takes long, and keeps Python's lock. So the fits of rigid guesses, what later fits
+    need, and what else is to be done are done beside that.
+    """
+    level, samples = own.coarse, onto.samples.first(own.config.fewer)
+    _ = onto.thin.relief, onto.thin.tree  # once, and not by each thread
 
-    def intrinsic() -> list[Proposal]:
-        return [
-            *extremity_proposals(source.intrinsic, target.intrinsic),
-            *spectral_proposals(source.intrinsic, target.intrinsic),
-        ]
+    def bent() -> list[Proposal]:
+        pair = own.intrinsic, onto.intrinsic
+        return [*extremity_proposals(*pair), *spectral_proposals(*pair)]
 
-    def rigid() -> list[Proposal]:
-        return rigid_proposals(source.thin, target.thin)
+    def next_level() -> None:
+        _ = own.fine, onto.neighbours, onto.fine_mesh.relief, onto.fine_mesh.tree
+
+    def tried(proposal: Proposal) -> Tried:
+        return level.tried(onto.thin, samples, proposal, level.begun(proposal), own.config.first)
 
     report(0.0)
-    bent, moved, _ = parallel_map(lambda make: make(), (intrinsic, rigid, levels))
+    moved = rigid_proposals(own.thin, onto.thin)
+    fits = [partial(tried, each) for each in moved]
+    others, *done = parallel_map(_called, (bent, *fits, next_level, *meanwhile))
+    report(0.6)
+    found = [*done[: len(moved)], *parallel_map(tried, [*others, *guesses])]
     report(1.0)
-    return [*moved, *bent]
+    return found
 
 
-def _screened(
-    level: Level, onto: Side, proposals: list[Proposal], config: DirectConfig, report: Progress
-) -> list[Tried]:
-    """Proposals fitted on few nodes: all for a few steps, then those that look better; the best, no two alike."""
-    done, samples = 0, onto.samples
+def _called(function: Callable[[], Any]) -> Any:
+    return function()
 
-    def fit(
-        proposal: Proposal, some: OrientedPoints, vectors: Floats, how: NodeRefineConfig, pairs: Pairs | None = None
-    ) -> Tried:
-        nonlocal done
-        vectors = level.refined(some, vectors, how)
-        features = level.features(onto.thin, some, vectors, pairs)
-        done += 1
-        report(min(done / (len(proposals) + config.better), 1.0))
-        return Tried(proposal, vectors, level.system.moved(vectors), features)
 
-    fewer, few = samples.first(config.fewer), samples.first(config.few)
-    first = parallel_map(lambda each: fit(each, fewer, level.begun(each), config.first), proposals)
-    better = distinct(first, config.better, config.unlike, _BEGUN)
-    pairs = neighbours(few)
-    tried = parallel_map(lambda each: fit(each.proposal, few, each.vectors, config.second, pairs), better)
-    return distinct(tried, config.best, config.unlike, _BEGUN)
+def _better(own: Side, onto: Side, begun: list[Tried], report: Progress) -> list[Tried]:
+    """Those that look better, fitted on few nodes for more steps; the best, no two alike."""
+    config, samples = own.config, onto.samples.first(own.config.few)
+    pairs = neighbours(samples)
+
+    def tried(each: Tried) -> Tried:
+        return own.coarse.tried(onto.thin, samples, each.proposal, each.vectors, config.second, pairs)
+
+    report(0.0)
+    found = parallel_map(tried, distinct(begun, config.better, config.unlike, _BEGUN))
+    report(1.0)
+    return distinct(found, config.best, config.unlike, _BEGUN)
 
 
 def carried(

@@ -23,6 +23,7 @@ from meshmatch.maps.folds import known_normals, normals_at
 from meshmatch.maps.footpoints import Footpoints, reassign_islands
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import parallel_map
 
 # All set by hand; lengths in units of sqrt(area).
 # Distance to the image at which confidence is 1/e = 0.37, as in maps.
@@ -40,6 +41,7 @@ _STRETCH, _SLACK = 3.0, 0.02
 _CLASSES = 12
 # Queries at a time; how many triangles are tried first, and at most.
 _CHUNK, _FIRST, _MAX_TRIED = 8192, 12, 512
+_LEAST = 256  # queries of one of several threads
 # Rounds in which islands of an inverse are searched again.
 _ROUNDS = 2
 # Of the source vertices that meet on a target vertex, those with this share of the highest confidence count.
@@ -133,23 +135,27 @@ class MappedMesh:
         for low in range(0, N, _CHUNK):
             some = np.arange(low, min(low + _CHUNK, N))
             attempt(some, nearest[some])
-        easy = np.argsort(best, kind="stable")  # those near the image together: their searches reach less far
-        for low in range(0, N, _CHUNK):
+
+        def search(rows: Ints) -> None:
             for tree, which, largest in self._trees:
-                rows, done, ask = easy[low : low + _CHUNK], 0, min(_FIRST, len(which))
-                while len(rows):
-                    reach = (np.sqrt(best[rows].max()) + largest) * (1 + 1e-9)
-                    found = tree.query(points[rows], ask, distance_upper_bound=reach, workers=workers)
-                    distance, close = (each.reshape(len(rows), -1) for each in found)
+                asking, done, ask = rows, 0, min(_FIRST, len(which))
+                while len(asking):
+                    reach = (np.sqrt(best[asking].max()) + largest) * (1 + 1e-9)
+                    found = tree.query(points[asking], ask, distance_upper_bound=reach)
+                    distance, close = (each.reshape(len(asking), -1) for each in found)
                     row, column = np.nonzero(np.isfinite(distance[:, done:]))
                     items = which[close[row, column + done]]
                     lower = np.maximum(distance[row, column + done] - self._radius[items], 0.0)
-                    worth = lower**2 <= best[rows[row]]
-                    attempt(rows[row[worth]], items[worth])
+                    worth = lower**2 <= best[asking[row]]
+                    attempt(asking[row[worth]], items[worth])
                     if ask >= min(len(which), _MAX_TRIED):
                         break
-                    rows = rows[np.maximum(distance[:, -1] - largest, 0.0) ** 2 <= best[rows]]
+                    asking = asking[np.maximum(distance[:, -1] - largest, 0.0) ** 2 <= best[asking]]
                     done, ask = ask, min(3 * ask, len(which), _MAX_TRIED)
+
+        easy = np.argsort(best, kind="stable")  # those near the image together: their searches reach less far
+        size = min(_CHUNK, max(_LEAST, -(-N // (4 * workers)))) if workers > 1 else _CHUNK
+        parallel_map(search, [easy[low : low + size] for low in range(0, N, size)], threads=workers)
         return item, weights
 
     def _costs(self, points: Floats, normals: Floats, items: Ints) -> tuple[Floats, Floats]:

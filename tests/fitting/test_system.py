@@ -70,6 +70,16 @@ def test_the_solution_is_that_of_dense_least_squares(system: NodeSystem, seed: i
     assert np.allclose(problem.solve(system), wanted, atol=1e-8)
 
 
+def test_weights_of_no_direction_are_solved_as_any_other(system: NodeSystem) -> None:
+    problem = Problem(system)
+    problem.roots = np.abs(problem.roots[:, :1, :1]) * np.eye(3)
+    problem.weights = np.square(problem.roots[:, 0, 0])[:, None] * np.array([1.0, 0, 0, 1, 0, 1])
+    problem.pulls = problem.weights[:, :1] * problem.places
+    matrix, right = problem.rows(system)
+    wanted = np.linalg.lstsq(matrix, right, rcond=None)[0].reshape(-1, 3)
+    assert np.allclose(problem.solve(system), wanted, atol=1e-8)
+
+
 def test_products_too_many_to_be_kept_are_formed_anew(
     model: TrainedModel, system: NodeSystem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -164,6 +174,8 @@ def test_a_band_is_solved_as_the_whole_matrix_is(exported: bool, monkeypatch: py
         for k in range(min(above + 1, N - i)):
             whole[i + k, i] = whole[i, i + k] = band[i, k]
     np.testing.assert_allclose(solved_band(band.copy(), right.copy()), np.linalg.solve(whole, right), rtol=1e-10)
+    rows = rng.normal(size=(3, N))
+    np.testing.assert_allclose(solved_band(band.copy(), rows.copy()), np.linalg.solve(whole, rows.T).T, rtol=1e-9)
     band[12, 0] = -50.0
     with pytest.raises(np.linalg.LinAlgError):
         solved_band(band, right)

@@ -30,9 +30,12 @@ def test_more_points_than_one_portion_are_each_answered(monkeypatch: pytest.Monk
     points = np.random.default_rng(2).normal(size=(500, 3))
     whole = MappedMesh.of(sphere).query(points)
     monkeypatch.setattr("meshmatch.maps.mapped_mesh._CHUNK", 37)
+    monkeypatch.setattr("meshmatch.maps.mapped_mesh._LEAST", 11)
     parts = MappedMesh.of(sphere).query(points)
-    assert np.array_equal(whole.face, parts.face)
-    assert np.array_equal(whole.barycentric, parts.barycentric)
+    shared = MappedMesh.of(sphere).query(points, workers=3)
+    for each in (parts, shared):
+        assert np.array_equal(whole.face, each.face)
+        assert np.array_equal(whole.barycentric, each.barycentric)
 
 
 def test_confidence_falls_with_the_distance(sphere: Shape) -> None:

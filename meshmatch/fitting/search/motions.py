@@ -8,13 +8,14 @@ from scipy.spatial.transform import Rotation
 from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.fitting.search.intrinsic import ThinMesh
 from meshmatch.geometry.frames import kabsch
-from meshmatch.geometry.oriented import with_normals
+from meshmatch.geometry.oriented import feature_tree, with_normals
 from meshmatch.geometry.trees import cKDTree
 
 # Of normals in the search for closest points; then, in units of sqrt(area), the scale of their robust weight, and the
 # distance from which on a point counts as far. Set by hand on 30 pairs of 15 kinds of shapes.
 _NORMAL_WEIGHT, _SCALE, _CAP = 0.15, 0.1, 0.2
 _SOME = 200  # points of each mesh that look for their closest
+_LEAF = 64  # points are asked from far away: larger leaves of a tree than usual take half the time
 # A shape is the same after a turn that leaves it so near, both ways and normals included (vertices of 2,400 triangles are
 # never nearer than about 0.02), and takes a share of `_MOVED` of it `_APART` from where it was. Bearings come to 0.02 to
 # 0.04, tables to 0.03 to 0.05, pliers, which are turned over, to 0.048 to 0.058; of 90 shapes that have a front the nearest,
@@ -39,40 +40,51 @@ class ClosestPoints:
 
     def __init__(self, source: ThinMesh, target: ThinMesh) -> None:
         self.middles = source.areas @ source.verts, target.areas @ target.verts
-        points, onto = source.verts - self.middles[0], target.verts - self.middles[1]
-        self._points, self._normals, self._onto = points, source.normals, onto
-        self._features = with_normals(onto, target.normals, _NORMAL_WEIGHT)
-        self._tree = cKDTree(self._features)
-        self._few = np.linspace(0, len(points) - 1, min(_SOME, len(points))).astype(np.int64)
-        self._few_onto = np.linspace(0, len(onto) - 1, min(_SOME, len(onto))).astype(np.int64)
+        self._points, self._onto = source.verts - self.middles[0], target.verts - self.middles[1]
+        self._normals, self._onto_normals = source.normals, target.normals
+        self._some, self._some_onto = (
+            np.linspace(0, V - 1, min(_SOME, V)).astype(np.int64) for V in (len(self._points), len(self._onto))
+        )
+        self._tree = cKDTree(with_normals(self._points, self._normals, _NORMAL_WEIGHT), leafsize=_LEAF)
+        self._features_onto = with_normals(self._onto, self._onto_normals, _NORMAL_WEIGHT)
+        self._tree_onto = cKDTree(self._features_onto, leafsize=_LEAF)
 
-    def moved(self, matrix: Float[Floats, "3 3"], shift: Float[Floats, " 3"]) -> tuple[Floats, Floats]:
-        """Points and unit normals under an affine motion."""
-        normals = self._normals @ np.linalg.inv(matrix)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        return self._points @ matrix.T + shift, normals
-
-    def _pairs(self, matrix: Floats, shift: Floats) -> tuple[Ints, Floats, Ints, Floats]:
-        features = with_normals(*self.moved(matrix, shift), _NORMAL_WEIGHT)
-        there, forth = self._tree.query(features[self._few])
-        back, home = cKDTree(features).query(self._features[self._few_onto])
-        return forth, there, home, back
+    def moved(self, matrix: Floats, shift: Floats) -> Float[Floats, "V 3"]:
+        """The source's vertices under a motion, about the middle of the target."""
+        return np.asarray(self._points @ matrix.T + shift)
 
     def moves(self, matrix: Floats, shift: Floats) -> float:
-        """Share (0..1) of the source's points that a motion takes clearly elsewhere."""
-        return float((np.linalg.norm(self.moved(matrix, shift)[0] - self._points, axis=1) > _APART).mean())
+        """Share (0..1) of the source's vertices that a motion takes clearly elsewhere."""
+        return float((np.linalg.norm(self.moved(matrix, shift) - self._points, axis=1) > _APART).mean())
+
+    def _pairs(self, matrix: Floats, shift: Floats) -> tuple[Ints, Floats, Ints, Floats]:
+        """After a rigid motion, of some vertices of the source those of the target that are closest, and how far; and of
+        some of the target the same. These are moved back, so that no tree has to be made."""
+        own, onto = self._some, self._some_onto
+        there = with_normals(self._points[own] @ matrix.T + shift, self._normals[own] @ matrix.T, _NORMAL_WEIGHT)
+        back = with_normals((self._onto[onto] - shift) @ matrix, self._onto_normals[onto] @ matrix, _NORMAL_WEIGHT)
+        (far, forth), (far_back, home) = self._tree_onto.query(there), self._tree.query(back)
+        return forth, far, home, far_back
+
+    def _affine_pairs(self, matrix: Floats, shift: Floats) -> tuple[Ints, Ints]:
+        """Which vertices are closest after an affine motion."""
+        normals = self._normals @ np.linalg.inv(matrix)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        features = with_normals(self.moved(matrix, shift), normals, _NORMAL_WEIGHT)
+        forth = self._tree_onto.query(features[self._some])[1]
+        return forth, feature_tree(features).query(self._features_onto[self._some_onto])[1]
 
     def residual(self, matrix: Floats, shift: Floats) -> float:
-        """Mean capped distance both ways, normals included."""
+        """Mean capped distance both ways, normals included, after a rigid motion."""
         _, there, _, back = self._pairs(matrix, shift)
         return float(np.minimum(there, _CAP).mean() + np.minimum(back, _CAP).mean())
 
     def motion(self, matrix: Floats, shift: Floats, steps: int, affine: bool = False) -> tuple[Floats, Floats]:
         """A rigid or an affine motion after some steps from another one."""
         for _ in range(steps):
-            forth, _, home, _ = self._pairs(matrix, shift)
-            source = np.concatenate([self._points[self._few], self._points[home]])
-            goal = np.concatenate([self._onto[forth], self._onto[self._few_onto]])
+            forth, home = self._affine_pairs(matrix, shift) if affine else self._pairs(matrix, shift)[::2]
+            source = np.concatenate([self._points[self._some], self._points[home]])
+            goal = np.concatenate([self._onto[forth], self._onto[self._some_onto]])
             off = np.square(source @ matrix.T + shift - goal).sum(1)
             weights = 1 / np.square(1 + off / _SCALE**2)
             if affine:

@@ -102,10 +102,10 @@ def rigid_proposals(source: ThinMesh, target: ThinMesh) -> list[Proposal]:
             chosen.append((turn, shift))
     proposals = []
     for motion in chosen[: SETTINGS.rigid]:
-        proposals.append(Proposal("rigid", cloud.moved(*motion)[0] + middle))
+        proposals.append(Proposal("rigid", cloud.moved(*motion) + middle))
         matrix, shift = cloud.motion(*motion, SETTINGS.affine_steps, affine=True)
         if np.linalg.det(matrix) > 0.1:
-            proposals.append(Proposal("affine", cloud.moved(matrix, shift)[0] + middle))
+            proposals.append(Proposal("affine", cloud.moved(matrix, shift) + middle))
     return proposals
 
 
@@ -116,20 +116,21 @@ def spectral_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
     last = min(SETTINGS.functions, own.shape[1], theirs.shape[1])
     first = min(SETTINGS.first_functions, last)
     count = min(SETTINGS.signs, first - 1)
-    found = []
+    begun = []
     for order in _near_orders(count):
         for signs in product((1.0, -1.0), repeat=count):
             C = np.zeros((count + 1, count + 1))
             C[0, 0] = 1.0
             C[np.arange(1, count + 1), 1 + np.array(order)] = signs
-            C, nearest = _zoomed(C, own, theirs, first, SETTINGS.more)
-            found.append((_distance_error(source, target, at, onto[nearest]), C))
-    found.sort(key=lambda each: each[0])
+            begun.append(C)
+    found, nearest = _zoomed(np.stack(begun), own, theirs, first, SETTINGS.more)
+    known, among = source.distances[np.ix_(at, at)], target.distances[np.ix_(onto, onto)]
+    errors = [_distance_error(known, among, each) for each in nearest]
+    best = np.argsort(errors, kind="stable")[: SETTINGS.compared]
     maps = []
-    for _, C in found[: SETTINGS.compared]:
-        C, _ = _zoomed(C, own, theirs, last, SETTINGS.more)
+    for C in _zoomed(found[best], own, theirs, last, SETTINGS.more)[0]:
         vertex = _nearest(source.functions[:, :last] @ C.T, target.functions[:, :last])
-        maps.append((_distance_error(source, target, at, vertex[at]), vertex))
+        maps.append((_distance_error(known, target.distances, vertex[at]), vertex))
     return _kept("spectral", source, target, maps)
 
 
@@ -141,25 +142,27 @@ def _near_orders(count: int) -> list[tuple[int, ...]]:
 
 
 def _zoomed(C: Floats, own: Floats, theirs: Floats, last: int, more: int) -> tuple[Floats, Ints]:
-    """ZoomOut: the map of a functional map gives one of more functions, until there are ``last``; and the nearest rows."""
-    size = len(C)
+    """ZoomOut: the map of each functional map (N, K, K) gives one of more functions, until there are ``last``; and the
+    nearest rows (N, L) to all of ``own`` (L, F) among ``theirs``."""
+    size = C.shape[1]
     while True:
-        nearest = _nearest(own[:, :size] @ C.T, theirs[:, :size])
+        turned = own[:, :size] @ C.transpose(0, 2, 1)
+        nearest = np.stack([_nearest(each, theirs[:, :size]) for each in turned])
         if size >= last:
             return C, nearest
         size = min(size + more, last)
-        C = np.asarray(np.linalg.lstsq(own[:, :size], theirs[nearest, :size], rcond=None)[0].T, np.float64)
+        C = (np.linalg.pinv(own[:, :size]) @ theirs[nearest, :size]).transpose(0, 2, 1)
 
 
 def _nearest(points: Floats, among: Floats) -> Ints:
     """The nearest row for each point, all compared with all: these spaces have too many dimensions for a tree."""
-    return np.asarray((points @ among.T - 0.5 * np.square(among).sum(1)).argmax(1))
+    lifted = np.column_stack([points, np.ones(len(points))])
+    return np.asarray((lifted @ np.column_stack([among, -0.5 * np.square(among).sum(1)]).T).argmax(1))
 
 
-def _distance_error(source: Intrinsic, target: Intrinsic, at: Ints, vertex: Ints) -> float:
-    """Mean change of the distances between landmarks ``at``, which go to ``vertex``."""
-    change = source.distances[np.ix_(at, at)] - target.distances[np.ix_(vertex, vertex)]
-    return float(np.abs(change).mean())
+def _distance_error(known: Float[Floats, "L L"], distances: Float[Floats, "U U"], vertex: Int[Ints, " L"]) -> float:
+    """Mean change of the distances that are known between landmarks, which go to some of those that lie so far apart."""
+    return float(np.abs(known - distances[np.ix_(vertex, vertex)]).mean())
 
 
 def _facing(source: Intrinsic, target: Intrinsic, vertex: Int[Ints, " V"]) -> float:

@@ -36,8 +36,8 @@ def _exported() -> Callable[..., None] | None:
 _DPBSV = _exported()
 
 
-def solved_band(band: Float[Floats, "N B"], right: Float[Floats, " N"]) -> Float[Floats, " N"]:
-    """Solve A x = b, with A[i + k, i] in ``band[i, k]``; both arrays are used up.
+def solved_band(band: Float[Floats, "N B"], right: Float[Floats, "*R N"]) -> Float[Floats, "*R N"]:
+    """Solve A x = b, with A[i + k, i] in ``band[i, k]``, for each row of ``right``; both arrays are used up.
 
     Raises
     ------
@@ -45,11 +45,14 @@ def solved_band(band: Float[Floats, "N B"], right: Float[Floats, " N"]) -> Float
         A is not positive definite.
     """
     if _DPBSV is None:
-        return np.asarray(solveh_banded(band.T, right, overwrite_ab=True, lower=True, check_finite=False))
+        return np.asarray(solveh_banded(band.T, right.T, overwrite_ab=True, lower=True, check_finite=False).T)
     for each in (band, right):  # LAPACK reads and writes where these lie
-        if not each.flags.c_contiguous or each.dtype != np.float64 or len(each) != len(band):
-            raise ValueError("a band and its right side are contiguous rows of 64-bit floats, equally many")
-    N, above, columns, rows, failed = map(ctypes.c_int, (len(band), band.shape[1] - 1, 1, band.shape[1], 0))
+        if not each.flags.c_contiguous or each.dtype != np.float64:
+            raise ValueError("a band and its right sides are contiguous 64-bit floats")
+    if right.shape[-1] != len(band) or right.ndim > 2:
+        raise ValueError(f"right sides of {right.shape} do not belong to a band of {len(band)} rows")
+    sides = len(right) if right.ndim == 2 else 1
+    N, above, columns, rows, failed = map(ctypes.c_int, (len(band), band.shape[1] - 1, sides, band.shape[1], 0))
     sizes = [ctypes.byref(each) for each in (N, above, columns, rows, N, failed)]
     _DPBSV(b"L", *sizes[:3], band.ctypes.data, sizes[3], right.ctypes.data, *sizes[4:])
     if failed.value:

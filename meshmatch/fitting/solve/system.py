@@ -146,19 +146,33 @@ class NodeSystem:
         ``prior_weight`` is w, and ``targets`` are the T_g.
         """
         fixed = self.equations
-        blocks = fixed.pairs @ weights  # pairs 6
-        blocks[:, _DIAGONAL] += prior_weight * fixed.gradient_pairs[:, None]
-        normal = np.zeros((3 * self.K, fixed.band + 1))
-        normal.reshape(-1)[fixed.place] = blocks[:, _BLOCK]
-        normal[:, 0] += damping
         (xx, xy, xz, yy, yz, zz), (x, y, z) = weights.T, self.verts.T
         full = np.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z], 1)
         right = self.phi.T @ (pulls - full)
         wanted = (targets - np.eye(3)).transpose(0, 2, 1).reshape(-1, 3)
         right += prior_weight * (fixed.gradient.T @ wanted) + damping * current
-        solved = np.empty((self.K, 3))
-        solved[fixed.order] = solved_band(normal, right[fixed.order].reshape(-1)).reshape(-1, 3)
+        right, solved = right[fixed.order], np.empty((self.K, 3))
+        if not (xy.any() or xz.any() or yz.any()) and (xx == yy).all() and (xx == zz).all():
+            solved[fixed.order] = self._solved_alike(weights[:, :1], prior_weight, damping, right)
+            return solved
+        blocks = fixed.pairs @ weights  # pairs 6
+        blocks[:, _DIAGONAL] += prior_weight * fixed.gradient_pairs[:, None]
+        normal = np.zeros((3 * self.K, fixed.band + 1))
+        normal.reshape(-1)[fixed.place] = blocks[:, _BLOCK]
+        normal[:, 0] += damping
+        solved[fixed.order] = solved_band(normal, right.reshape(-1)).reshape(-1, 3)
         return solved
+
+    def _solved_alike(
+        self, weights: Float[Floats, "V 1"], prior_weight: float, damping: float, right: Float[Floats, "K 3"]
+    ) -> Float[Floats, "K 3"]:
+        """Where every H_p is a multiple of the identity: x, y and z have the same matrix, of a third of the size."""
+        fixed = self.equations
+        normal = np.zeros((self.K, fixed.node_band + 1))
+        blocks = fixed.pairs @ weights
+        normal.reshape(-1)[fixed.node_place] = blocks[:, 0] + prior_weight * fixed.gradient_pairs
+        normal[:, 0] += damping
+        return solved_band(normal, np.ascontiguousarray(right.T)).T
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -171,6 +185,8 @@ class Equations:
     order: Int[Ints, " K"]  # of the nodes, in which those that meet are near one another
     band: int  # half width, see `_band_places`
     place: Int[Ints, "pairs 9"]
+    node_band: int  # the same of one unknown for each node
+    node_place: Int[Ints, " pairs"]
 
     @classmethod
     def of(cls, phi: Any, gradient: Any) -> Equations:
@@ -181,8 +197,18 @@ class Equations:
         order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(np.int64)
         met = gradient.T @ gradient
         summed = (met if isinstance(met, np.ndarray) else met.toarray())[row, column]
-        band, place = _band_places(row, column, np.argsort(order))
-        return cls(gradient=gradient, pairs=pairs, gradient_pairs=summed, order=order, band=band, place=place)
+        rank = np.argsort(order)
+        (band, place), (node_band, node_place) = (_band_places(row, column, rank, size) for size in (3, 1))
+        return cls(
+            gradient=gradient,
+            pairs=pairs,
+            gradient_pairs=summed,
+            order=order,
+            band=band,
+            place=place,
+            node_band=node_band,
+            node_place=node_place[:, 0],
+        )
 
 
 @derived
@@ -233,13 +259,13 @@ def _pair_products(phi: Any) -> tuple[Ints, Ints, Any]:
     return pairs // K, pairs % K, found
 
 
-def _band_places(row: Ints, column: Ints, rank: Int[Ints, " K"]) -> tuple[int, Int[Ints, "pairs 9"]]:
-    """Half width of the band of the 3 K unknowns, and where the 3 x 3 block of every pair lies in it (pairs, 9).
+def _band_places(row: Ints, column: Ints, rank: Int[Ints, " K"], size: int) -> tuple[int, Int[Ints, "pairs places"]]:
+    """Half width of the band of so many unknowns for each node, and where the block of every pair lies in it, row by row.
 
     The band is stored column by column, each from its diagonal down: entry (i, j), i >= j, lies at
     j (width + 1) + i - j. The block of a node with itself names its off-diagonal entries twice.
     """
-    a, b = np.divmod(np.arange(9), 3)
-    i, j = 3 * rank[row][:, None] + a, 3 * rank[column][:, None] + b
+    a, b = np.divmod(np.arange(size**2), size)
+    i, j = size * rank[row][:, None] + a, size * rank[column][:, None] + b
     width = int(np.abs(i - j).max())
     return width, np.minimum(i, j) * (width + 1) + np.abs(i - j)
