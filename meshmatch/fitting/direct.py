@@ -210,15 +210,17 @@ class _Search:
         """How far apart a rigid motion leaves the shapes, and the source and the mirror image of the target."""
         return apart(self.source.original, self.target.original, self.source.config.seed)
 
-    def one_way(self, report: Progress, meanwhile: Sequence[Callable[[], object]] = ()) -> list[Tried]:
+    def one_way(
+        self, report: Progress, meanwhile: Sequence[Callable[[], object]] = (), glide: bool = True
+    ) -> list[Tried]:
         """The best fits of the source to the target, best first; see `fitted`."""
-        return fitted(self.source, self.target, self.guess, report, meanwhile)
+        return fitted(self.source, self.target, self.guess, report, meanwhile, glide)
 
     def both_ways(self, there: list[Tried], report: Progress) -> list[_BothWays]:
         """The best fits of the source to the target, and of the target to the source, each continued the other way; best
         first."""
         reverse = _Search(self.target, self.source, self.guess and self.guess[::-1])
-        there, back = self._best(there), self._best(reverse.one_way(report.between(0.0, 0.7)))
+        there, back = self._best(there), self._best(reverse.one_way(report.between(0.0, 0.7), glide=False))
         report = report.named("fits both ways")
         ways = zip(there, self._returned(there, report.between(0.7, 0.8)), strict=True)
         ways_back = zip(reverse._returned(back, report.between(0.8, 0.9)), back, strict=True)

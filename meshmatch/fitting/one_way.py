@@ -100,7 +100,7 @@ class DirectConfig:
     better: int = 16
     best: int = 6
     gliding: int = 2
-    returned: int = 3
+    returned: int = 2
     unlike: float = 0.03
     both_ways: BothWays = "in doubt"
     from_source: bool = False
@@ -276,10 +276,15 @@ def _fine(own: Side, onto: Side, proposal: Proposal, vectors: Float[Floats, "K 3
 
 
 def fitted(
-    own: Side, onto: Side, guess: KnownPairs | None, report: Progress, meanwhile: Sequence[Callable[[], object]] = ()
+    own: Side,
+    onto: Side,
+    guess: KnownPairs | None,
+    report: Progress,
+    meanwhile: Sequence[Callable[[], object]] = (),
+    glide: bool = True,
 ) -> list[Tried]:
     """The best fits of one shape to another, best first; ``guess`` is one more proposal. What is to be done ``meanwhile`` is
-    called where a thread would wait."""
+    called where a thread would wait. Where the best do not ``glide``, this is left to the caller."""
     config, rested = own.config, own.thin.verts
     guesses = [] if guess is None else [Proposal("guess", carried(rested, *guess))]
     begun = _begun(own, onto, guesses, report.named("guesses without a model").between(0.0, 0.6), meanwhile)
@@ -291,7 +296,7 @@ def fitted(
             goals.append((each, verts + carried(verts, rested, each.points - rested)))
     report = report.named("fits of the best guesses").between(0.8, 1.0)
     found = finished(own, onto, goals, report.between(0.0, 0.6))
-    best = distinct(found, config.gliding, config.unlike)
+    best = distinct(found, config.gliding if glide else 0, config.unlike)
     rest = [each for each in found if each not in best]
     return sorted([*glided(own, onto, best, report.between(0.6, 1.0)), *rest], key=attrgetter("energy"))
 
