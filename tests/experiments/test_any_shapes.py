@@ -1,10 +1,12 @@
 """Errors of maps of any shapes: the best of a class's symmetries, from its file or from its keypoints."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from meshmatch.errors import InputError
 from meshmatch.experiments.bench import any_shapes
@@ -124,3 +126,23 @@ def test_verdicts_are_counted_by_weights_of_other_classes() -> None:
     counts = any_shapes.held_out({"a": pairs[::2], "b": pairs[1::2], "odd": odd})
     assert (counts["pairs"], counts["right"]) == (51, 30)
     assert counts["good"] > counts["good_over"] == 1 and counts["right_not_poor"] >= 28
+
+
+def test_the_worst_pair_of_each_class_is_drawn(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(any_shapes, "folder_of", lambda *_: folder)
+    asked = []
+
+    class Matcher:
+        def match(self, source: Shape, target: Shape) -> SimpleNamespace:
+            asked.append((source.name, target.name))
+            return SimpleNamespace(map=VertexMap.identity(source), rotations=(None, None))
+
+    rows = [{"class": f"box{k}", "worst": f"{k} to 4", "worst_error": 3.0} for k in (1, 2, 3, 1)]
+    any_shapes.draw_worst(rows, tmp_path / "worst.png", folder, Matcher())  # type: ignore[arg-type]
+    assert asked == [("1", "4"), ("2", "4"), ("3", "4"), ("1", "4")]
+    with Image.open(tmp_path / "worst.png") as sheet:
+        drawn = np.asarray(sheet.convert("RGB"))
+    height, width = 340, 480
+    assert drawn.shape == (2 * height, 3 * width, 3)
+    cells = [drawn[y : y + height, x : x + width] for y in (0, height) for x in (0, width, 2 * width)]
+    assert [len(np.unique(cell.reshape(-1, 3), axis=0)) > 50 for cell in cells] == [True] * 4 + [False] * 2

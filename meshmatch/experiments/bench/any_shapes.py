@@ -21,9 +21,11 @@ from datetime import date
 from functools import cache, partial
 from itertools import permutations
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import numpy as np
+from PIL import Image
 from scipy.optimize import linear_sum_assignment, minimize
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
@@ -45,6 +47,8 @@ from meshmatch.fitting.judge.direct import judge_direct
 from meshmatch.fitting.one_way import DirectConfig
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import NO_MODEL
+from meshmatch.render.compose import compose_match
+from meshmatch.render.picture import Look
 from meshmatch.shapes.files import load_shape
 from meshmatch.templates.make import edge_graph
 
@@ -55,6 +59,7 @@ CLASSES = (
 TURNING = ("bearing", "cup", "mech")
 SHAPES = 6  # of each class
 OFF, FAR_OFF = 10.0, 20.0
+_ACROSS, _SIZE = 3, (480, 340)  # pairs in a row of a picture, and pixels of each
 # Of the keypoints' spread: how far a symmetry may miss them, at most and on average; one of most shapes, and one of a shape.
 _ALIKE, _EXACTLY = (0.4, 0.2), (0.25, 0.08)
 # Points that a shape has in another order than its class; of each point which one it is.
@@ -220,6 +225,26 @@ def measure_by(method: Method, folder: Path, pair: tuple[str, str]) -> dict[str,
     return {"pair": " to ".join(pair), **errors_of(folder, pair, index), "failed": failed, "cpu": spent}
 
 
+def draw_worst(rows: Sequence[dict[str, Any]], path: Path, data: Path, matcher: Matcher) -> None:
+    """The worst pair of each class, matched again, in one picture: the same colors where the map says the same place."""
+    drawn = []
+    with TemporaryDirectory() as folder:
+        for row in runner.track(rows, "pictures"):
+            source, target = (
+                load_shape(folder_of(row["class"], data) / f"{name}.ply") for name in row["worst"].split(" to ")
+            )
+            result = matcher.match(source, target)
+            names = f"{row['class']} {row['worst']}", f"{row['worst_error']:.1f}, {result.map.verdict}"
+            shown = compose_match(source, target, result.map, result.rotations).named(names)
+            shown.render(Path(folder) / "pair.png", Look(size=_SIZE))
+            with Image.open(Path(folder) / "pair.png") as image:
+                drawn.append(image.convert("RGB"))
+    sheet = Image.new("RGB", (_ACROSS * _SIZE[0], -(-len(drawn) // _ACROSS) * _SIZE[1]), "white")
+    for number, each in enumerate(drawn):
+        sheet.paste(each, (number % _ACROSS * _SIZE[0], number // _ACROSS * _SIZE[1]))
+    sheet.save(path)
+
+
 _Found = Mapping[str, Sequence[dict[str, Any]]]  # pairs of each class
 
 
@@ -341,6 +366,7 @@ def main(
     fit: Annotated[bool, Option("--fit", help="also find the weights of verdicts")] = False,
     beside: Annotated[str, Option(help="methods of `bench.baselines` to measure too, with commas between them")] = "",
     limit_beside: Annotated[int, Option(min=1, help="pairs of each class that they are measured on")] = 12,
+    draw: Annotated[Path | None, Option(help="draw the worst pair of each class into this PNG")] = None,
 ) -> runner.Report:
     names = CLASSES if classes == "all" else runner.names_of(classes, (*CLASSES, *TURNING), "class")
     found: dict[str, list[dict[str, Any]]] = {}
@@ -365,5 +391,7 @@ def main(
         tables.append(
             runner.table(f"Beside other methods, {limit_beside} pairs of each class", record["beside"], _BESIDE)
         )
+    if draw is not None:
+        draw_worst(rows[: len(names)], draw, data, Matcher(model, FitConfig(seed=seed)))
     report = runner.Report(record, tables, notes)
     return _with_calibrations(report, found) if fit else report
