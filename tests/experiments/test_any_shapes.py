@@ -134,8 +134,8 @@ def test_the_worst_pair_of_each_class_is_drawn(folder: Path, tmp_path: Path, mon
 
     class Matcher:
         def match(self, source: Shape, target: Shape) -> SimpleNamespace:
-            asked.append((source.name, target.name))
-            return SimpleNamespace(map=VertexMap.identity(source), rotations=(None, None))
+            asked.append((source.name[0], target.name[0]))
+            return SimpleNamespace(map=VertexMap.between(source, target, range(source.V)), rotations=(None, None))
 
     rows = [{"class": f"box{k}", "worst": f"{k} to 4", "worst_error": 3.0} for k in (1, 2, 3, 1)]
     any_shapes.draw_worst(rows, tmp_path / "worst.png", folder, Matcher())  # type: ignore[arg-type]
