@@ -1,12 +1,13 @@
 """Charts side by side in a square image, as large as they fit.
 
-Each is put where it touches most of what is there, in the best of four turns; all places are tried at once by Fourier
+Each is put where most of what is there is close to it, in the best of four turns; all places are tried at once by Fourier
 transforms of images of what is taken. Crumbs are put on shelves first, in one block.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +23,16 @@ _GRID, _FINE = 256, 4  # texels of the image in which places are looked for; how
 _ALIKE = 1e-6  # what is closer is the same
 _MOVES = 4
 _LOOK = 64  # rows below a piece that are looked at, at once
-_SHUFFLED = 0.2
+_SHUFFLED = 0.35
 _MOST = 80  # charts that are moved one by one
 _ORDERS = 3  # that are compared
-_SHRINK = 0.99  # of lengths, each time that not all charts found room
+_SHRINK = 0.995  # of lengths, each time that not all charts found room
 _DENSE = 0.78  # of the image, that the charts and half of what is between them fill at the first try
-_LOW = 0.3  # how much it counts to lie low in the image, beside the share of the border that touches something
+_RINGS, _FADING = (
+    5,
+    0.7,
+)  # texels around a piece in which others count as close, each ring so much less than the one before
+_LOW = 0.3  # how much it counts to lie low in the image, beside the share of the rings that is taken
 _BETWEEN = 0.2  # of the image at most: what lies between crumbs
 
 
@@ -91,13 +96,15 @@ def packed(charts: list[Chart], padding: float, seed: int = 0) -> list[Float[Flo
 
 @dataclass(frozen=True, eq=False)
 class _Turned:
-    """A piece as an image, after quarter turns; with what is around it, without and with its rim; and how long that is."""
+    """A piece as an image, after quarter turns; with what must stay free around it; that with the rings, by what they count;
+    and what all rings count together.
+    """
 
     quarters: int
     image: Bools
     room: Bools
-    rim: Bools
-    edge: int
+    rings: NDArray[np.float32]
+    around: float
 
 
 class _Piece:
@@ -123,10 +130,14 @@ class _Piece:
         if self._known[:2] != (scale, apart):
             mask = self.mask(scale)
             grown = maximum_filter(np.pad(mask, apart), 2 * apart + 1) if apart else mask
-            rim = maximum_filter(np.pad(grown, 1), 3)
-            edge = int(rim.sum()) - int(grown.sum())
-            turned = ((np.rot90(mask, k), np.rot90(grown, k), np.rot90(rim, k)) for k in range(4))
-            self._known = scale, apart, [_Turned(k, *images, edge) for k, images in enumerate(turned)]
+            wider = np.pad(grown, _RINGS)
+            rings = wider.astype(np.float32)
+            for ring in range(_RINGS):
+                wider = maximum_filter(wider, 3)
+                rings[wider & (rings == 0)] = _FADING**ring
+            around = float(rings.sum()) - int(grown.sum())
+            turned = ((np.rot90(mask, k), np.rot90(grown, k), np.rot90(rings, k)) for k in range(4))
+            self._known = scale, apart, [_Turned(k, *images, around) for k, images in enumerate(turned)]
         return self._known[2]
 
     def mask(self, scale: float) -> Bools:
@@ -171,7 +182,7 @@ def _search(pieces: list[_Piece], padding: float, rng: np.random.Generator) -> t
     for k in range(_ORDERS):
         order = np.argsort(-longest * np.exp(rng.normal(0, _SHUFFLED if k else 0.0, len(pieces))), kind="stable")
         while (places := _placed(pieces, order, scale, padding)) is None and found is None:
-            scale *= _SHRINK**2
+            scale *= _SHRINK**4
         if places is None:
             continue
         while places is not None:
@@ -251,9 +262,9 @@ def _first(pieces: list[_Piece], padding: float) -> float:
 def _placed(pieces: list[_Piece], order: Ints, scale: float, padding: float) -> list[_Place] | None:
     """Places in this order; None if one finds none."""
     grid, apart = _GRID, int(np.ceil(padding * _GRID))
-    span = next_fast_len(grid + 2 * apart + 2, real=True)
-    taken = np.zeros((span, span), np.float32)  # behind what may lie before a piece: its rim
-    inside = taken[apart + 1 :, apart + 1 :]
+    span = next_fast_len(grid + 2 * apart + 2 * _RINGS, real=True)
+    taken = np.zeros((span, span), np.float32)  # behind what may lie before a piece: its rings
+    inside = taken[apart + _RINGS :, apart + _RINGS :]
     places: list[_Place | None] = [None] * len(pieces)
     for k in order.tolist():
         turns = pieces[k].turns(scale, apart)
@@ -266,16 +277,17 @@ def _placed(pieces: list[_Piece], order: Ints, scale: float, padding: float) -> 
             high, wide = turned.image.shape
             rows, columns = grid - high + 1, grid - wide + 1
             if turned.quarters < 2:
-                transforms.append([_transform(each, span) for each in (turned.room, turned.rim)])
-            room, rim = transforms[turned.quarters % 2]
-            free = _sums(known, room, turned.quarters, turned.room.shape, 1, rows, columns) < 0.5
+                transforms.append([_transform(each, span) for each in (turned.room, turned.rings)])
+            room, rings = transforms[turned.quarters % 2]
+            free = _sums(known, room, turned.quarters, turned.room.shape, _RINGS, rows, columns) < 0.5
             if not free.any():
                 continue
-            touched = _sums(known, rim, turned.quarters, turned.rim.shape, 0, rows, columns)
-            touched[[0, -1]] += wide
-            touched[:, [0, -1]] += high
+            close = _sums(known, rings, turned.quarters, turned.rings.shape, 0, rows, columns)
+            for ring in range(min(_RINGS, rows, columns)):  # the border of the image counts as taken
+                close[[ring, -1 - ring]] += wide * _FADING**ring
+                close[:, [ring, -1 - ring]] += high * _FADING**ring
             low = (np.arange(rows) + high) * (_LOW / grid)
-            score = np.where(free, touched / turned.edge - low[:, None], -np.inf)
+            score = np.where(free, close / turned.around - low[:, None], -np.inf)
             at = int(np.round(score, 4).argmax())
             if score.flat[at] > best + _ALIKE:
                 best, found = float(score.flat[at]), (turned, *divmod(at, score.shape[1]))
@@ -287,7 +299,7 @@ def _placed(pieces: list[_Piece], order: Ints, scale: float, padding: float) -> 
     return [place for place in places if place]
 
 
-def _transform(image: Bools, span: int) -> NDArray[np.complex64]:
+def _transform(image: NDArray[Any], span: int) -> NDArray[np.complex64]:
     """Of an image at the corner of an empty one."""
     rows = np.zeros((len(image), span), np.float32)
     rows[:, : image.shape[1]] = image
