@@ -13,6 +13,7 @@ __version__ = "0.3.0"
 if TYPE_CHECKING:
     from meshmatch.api.blend_shapes import BlendShapesResult as BlendShapesResult
     from meshmatch.api.blend_shapes import transfer_shapes as transfer_shapes
+    from meshmatch.api.calibration import calibrate as calibrate
     from meshmatch.api.fits import load_fit as load_fit
     from meshmatch.api.fits import save_fit as save_fit
     from meshmatch.api.garment import GarmentResult as GarmentResult
@@ -80,6 +81,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "api.blend_shapes": "BlendShapesResult transfer_shapes",
+    "api.calibration": "calibrate",
     "api.fits": "load_fit save_fit",
     "api.garment": "GarmentResult transfer_garment",
     "api.interpolation": "Interpolation InterpolationOptions interpolate",

@@ -1,5 +1,6 @@
 """``meshmatch train``: a model that is learned from shapes."""
 
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -9,11 +10,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from typer import Option
 
+import meshmatch
 from meshmatch.cli.options import Json, Options, Quiet, Seed, Threads, check_writable, grouped, optional, output_option
 from meshmatch.cli.words import Console, print_json
-from meshmatch.errors import OptionError, needs
+from meshmatch.errors import InputError, OptionError, needs
 from meshmatch.models.card import ModelCard
 from meshmatch.models.registry import NO_MODEL, read_any_card
+from meshmatch.progress import ProgressCallback
 from meshmatch.threads import set_threads
 
 if TYPE_CHECKING:
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
     from meshmatch.templates.prepared_folder import RegisteredShapes
     from meshmatch.training.loop import StepReport
 
+_FALLS = 0.99  # of the validation before
 _ENERGIES = ("volume", "arap", "blend")
 _IMPLICIT = (
     *("implicit", "preset", "shapes", "field", "rate", *_ENERGIES, "name", "category", "licence", "steps"),
@@ -181,10 +185,28 @@ def train(
 
     with console.progress() as progress:
         learn(resume=not how.fresh, progress=progress, report=report)
+        if first and how.shapes is not None and not how.implicit:
+            _calibrate(console, output, how.shapes, how.threads, progress)
     if first:
         if how.picture is not None:
             _draw(console, how.picture, reports)
-        _summary(console, output, steps, how.picture, json)
+        _summary(console, output, steps, reports, how.picture, json)
+
+
+def _calibrate(console: Console, output: Path, shapes: Path, threads: int, progress: ProgressCallback) -> None:
+    """Find what is usual of fits by a model that learned no correspondence."""
+    card = read_any_card(output)
+    if not isinstance(card, ModelCard) or card.correspondence:
+        return
+    try:
+        usual = meshmatch.calibrate(output, shapes, threads=threads, progress=progress).metrics["usual"]
+    except InputError as error:
+        console.say(f"note: what is usual of its fits is not known, and none will be good: {error.message}")
+        return
+    console.say(
+        f"fitted {usual['fits']} of the shapes: the template is stretched {math.exp(usual['stretch']):.2f}-fold, "
+        f"{100 * usual['residual']:.2g} % of sqrt(area) apart; other fits are judged beside that"
+    )
 
 
 def _left(reports: "list[StepReport]") -> str:
@@ -311,8 +333,14 @@ def _draw(console: Console, picture: Path, reports: "list[StepReport]") -> None:
     console.say(f"drew {picture}: the losses over the steps")
 
 
-def _summary(console: Console, output: Path, steps: int, picture: Path | None, json: bool) -> None:
+def _summary(
+    console: Console, output: Path, steps: int, reports: "list[StepReport]", picture: Path | None, json: bool
+) -> None:
     card = read_any_card(output)
+    if isinstance(card, ModelCard) and (distance := card.metrics.get("validation", {}).get("distance")):
+        before = [now.validation for now in reports if now.validation is not None and now.step < card.steps]
+        falls = f", {'still falling' if distance < _FALLS * before[-1] else 'no longer falling'}" if before else ""
+        console.say(f"off by {100 * distance:.2g} % of sqrt(area) on shapes that were not learned{falls}")
     console.say(
         f"wrote model {card.name}, learned from {card.data}, to {output} after step {card.steps}; use it with "
         f"--model {output}, or add it: meshmatch models add {output}"

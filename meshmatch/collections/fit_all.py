@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from meshmatch.arrays import Floats
-from meshmatch.collections.compare import FAIR, Usual, on_the_other_side
+from meshmatch.collections.compare import Compared, on_the_other_side
 from meshmatch.collections.setting import AGREEING, ALONE, FAILED, FIRST, Record, Setting, Source, digest_of
 from meshmatch.collections.settle import on_the_mean, save_text, settled
 from meshmatch.collections.sources import natural
@@ -33,6 +33,7 @@ from meshmatch.collections.tasks import (
 from meshmatch.collections.workers import Died, Item, Result, Workers
 from meshmatch.errors import InputError
 from meshmatch.fitting.solve.agreement import AgreeConfig, held_mean, log_stretch, stretch_of
+from meshmatch.fitting.usual import FAIR
 from meshmatch.maps.vertex_map import VERDICTS
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.progress import ProgressCallback
@@ -91,7 +92,7 @@ def fit_all(
     cut: dict[str, float] = {}
     if setting.model == NO_MODEL:
         first = _Run(setting, sources, crew, report).fit_alone(None, FIRST)
-        usual, others = Usual.of(first), on_the_other_side(first)
+        usual, others = Compared.of(first), on_the_other_side(first)
         cut = {} if usual is None else {each.name: usual.scale for each in first if usual.may_lack(each)}
         setting = on_the_mean(
             setting, [each.name for each in first if _believed(each, usual) and each.name not in others]
@@ -102,7 +103,7 @@ def fit_all(
     if not fitted:
         _write_table(setting.store, records)
         raise InputError(f"none of {len(records)} shapes could be fitted: {records[0].name}: {records[0].reasons}")
-    usual = None if setting.learned else Usual.of(records)
+    usual = None if setting.learned else Compared.of(records)
     agreeing = [number for number in fitted if _believed(records[number], usual)]
     parts = [f"{records[number].name} {records[number].digest} {records[number].verdict}" for number in fitted]
     how = AgreeConfig.for_collection(setting.trained) if setting.agrees else None
@@ -258,7 +259,7 @@ class _Run:
         return [Group(number, part, agreement) for number, part in enumerate(parts)]
 
     def last_tasks(
-        self, records: Mapping[int, Record], groups: Sequence[Group], usual: Usual | None
+        self, records: Mapping[int, Record], groups: Sequence[Group], usual: Compared | None
     ) -> dict[int, FinishTask]:
         """What finishes each fit; a digest of all that agree tells whether that was done before."""
         steps = AgreeConfig.for_collection(self.setting.trained).schedule.steps if groups else 0
@@ -315,7 +316,7 @@ def _finished(alone: Record, done: Finished) -> Record:
     return replace(known, verdict=done.verdict, trust=trust, reasons="; ".join(done.reasons))
 
 
-def _believed(record: Record, usual: Usual | None) -> bool:
+def _believed(record: Record, usual: Compared | None) -> bool:
     """Whether a fit is not poor, alone and among the others."""
     return record.verdict not in ("poor", FAILED) and (usual is None or usual.trust(record) >= FAIR)
 

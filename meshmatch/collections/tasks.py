@@ -18,7 +18,7 @@ import numpy as np
 from meshmatch.api.inputs import validated
 from meshmatch.api.kinds import other_kind
 from meshmatch.arrays import Float, Floats
-from meshmatch.collections.compare import Usual
+from meshmatch.collections.compare import Compared
 from meshmatch.collections.setting import AGREEING, ALONE, FITS, SUFFIX, Record, Setting, Source, digest_of
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError
@@ -210,7 +210,7 @@ class FinishTask:
     agreed_with: str  # a digest of all that took part
     group: Group | None = None
     step: int = 0
-    usual: Usual | None = None
+    usual: Compared | None = None
 
     @property
     def file(self) -> str:

@@ -20,6 +20,7 @@ from meshmatch.fitting.search.predictor import mirror_of
 from meshmatch.fitting.search.refinement import REFINEMENTS, fit_part, fit_whole
 from meshmatch.fitting.search.task import FitTask, Registration
 from meshmatch.fitting.solve.terms import Landmarks
+from meshmatch.fitting.usual import Usual
 from meshmatch.geometry.oriented import quick_tree
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.trained import TrainedModel
@@ -84,14 +85,13 @@ class Fitter:
             notes = (f"{shape.name}: taken for the mirror image of what {card.name} knows",)
         if others and _cost(found) > _SURE_SIDE * _cost(others[0][0]):
             doubts.append(Reason("side", SIDE_IN_DOUBT))
-        if not card.correspondence:
-            doubts.append(
-                Reason(
-                    "unsupervised",
-                    f"{card.name} was trained without correspondence: surfaces that lie close need not correspond",
-                )
-            )
         fit = replace(as_fit(found, partial, began), notes=notes)
+        usual = None if card.correspondence else Usual.of_card(card)
+        if usual is not None and fit.signs is not None:
+            fit = usual.judged(fit, fit.trust, fit.signs.stretch, fit.residual)
+        elif not card.correspondence:
+            learned = f"{card.name} was trained without correspondence: surfaces that lie close need not correspond"
+            doubts.append(Reason("unsupervised", learned))
         return cap_verdict(fit, doubts)
 
 

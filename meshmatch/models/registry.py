@@ -190,7 +190,7 @@ def load_once(name: str | Path, encoder: type | None = None) -> TrainedModel:
     """As `load_model`, but once in each process, and again if the model's files have changed since."""
     folder = locate_model(name)
     try:
-        changed = os.stat(folder / WEIGHTS).st_mtime_ns
+        changed = max(os.stat(folder / name).st_mtime_ns for name in (WEIGHTS, CARD))
     except OSError:
         changed = 0  # the reader says what is missing
     with _loading:

@@ -18,6 +18,7 @@ from meshmatch.collections.atlas import Projection
 from meshmatch.collections.groups import Comparison
 from meshmatch.collections.measures import Measures
 from meshmatch.fields import NodeField, node_field
+from meshmatch.models.card import ModelCard
 from meshmatch.templates.prepare import Prepared
 from meshmatch.transfer.label_files import Labels
 from meshmatch.transfer.landmarks import Landmarks
@@ -35,6 +36,7 @@ assert_type(matcher.map(fits[0], fits[1], agree=False), meshmatch.VertexMap)
 assert_type(meshmatch.register("a.ply"), meshmatch.Fit | meshmatch.ImplicitFit)
 meshmatch.save_fit("a.safetensors", fits[0])
 assert_type(meshmatch.load_fit("a.safetensors", "human"), meshmatch.Fit)
+assert_type(meshmatch.calibrate("my-model", ["a.ply", verts], threads=1), ModelCard)
 assert_type(meshmatch.evaluate(result, "a.ply", "b.ply"), meshmatch.Evaluation)
 assert_type(meshmatch.measure_distance("a.ply", fits[0].shape), meshmatch.SurfaceDistance)
 assert_type(meshmatch.transfer_values("a.ply", "b.ply", verts, result).data, Floats)

@@ -43,10 +43,11 @@ class Recorder:
         template, source, output, recipe, facts, resume, report, unseen, self.tensorboard = given
         told = {"template": template.name, "source": source, "output": output, "recipe": recipe, "resume": resume}
         self.called = told | vars(facts) | {"unseen": unseen}
-        report(StepReport(1, 2, 1e-3, 4.0, {"total": 0.5}))
+        report(StepReport(1, 2, 1e-3, 4.0, {"total": 0.5}, 0.04))
         report(StepReport(2, 2, 1e-3, 8.0, {"total": 0.25}, 0.0321))
         card = read_card(bundled_folder() / "models" / "human" / "card.json")
-        write_card(replace(card, name=facts.name, steps=2), Path(output) / "card.json")
+        metrics = {"validation": {"distance": 0.0321}}
+        write_card(replace(card, name=facts.name, steps=2, metrics=metrics), Path(output) / "card.json")
         return Path(output)
 
 
@@ -71,6 +72,7 @@ def test_defaults(run: Run, stub: Recorder, tmp_path: Path) -> None:
     assert called["start"] is None
     assert called["recipe"] == recipe_for()
     assert "step 2 of 2: total 0.25, validation 0.0321 (8 s)" in answer.err
+    assert "off by 3.2 % of sqrt(area) on shapes that were not learned, still falling" in answer.err
     assert f"meshmatch models add {tmp_path / 'mine'}" in answer.err
     assert "unfinished: step 2 of 13,000; the same command goes on" in answer.err
 
@@ -269,7 +271,12 @@ def test_the_losses_as_a_picture(run: Run, stub: Recorder, tmp_path: Path, monke
     picture = tmp_path / "mine" / "losses.png"  # in the folder that is made first
     answer = run("train", "-o", tmp_path / "mine", "--picture", picture, "--json")
     assert answer.status == 0, answer.err
-    assert drawn == {"path": picture, "steps": [1, 2], "terms": {"total": [0.5, 0.25]}, "validation": {2: 0.0321}}
+    assert drawn == {
+        "path": picture,
+        "steps": [1, 2],
+        "terms": {"total": [0.5, 0.25]},
+        "validation": {1: 0.04, 2: 0.0321},
+    }
     assert f"drew {picture}" in answer.err
     assert json.loads(answer.out)["picture"] == str(picture)
     drawn.clear()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from meshmatch.collections import setting
-from meshmatch.collections.compare import Usual, on_the_other_side
+from meshmatch.collections.compare import Compared, on_the_other_side
 from meshmatch.collections.setting import Record
 from meshmatch.collections.stores import Store
 from meshmatch.fitting.fit import Fit
@@ -30,8 +30,8 @@ def records(stretches: list[float], sides: list[float] | None = None) -> list[Re
 
 def test_what_is_stretched_as_the_others_is_good_and_what_stands_out_is_poor() -> None:
     some = records([0.2, 0.22, 0.18, 0.21, 0.19, 0.5, 1.2])
-    usual = Usual.of(some)
-    assert usual is not None and usual.stretch == pytest.approx(0.21)
+    usual = Compared.of(some)
+    assert usual is not None and usual.usual.stretch == pytest.approx(0.21)
     assert [usual.stands_out(each) for each in some] == [False] * 5 + [True] * 2
     ball = icosphere(1)
     fit = replace(some_fit(ball.verts, ball.faces), verdict="fair", reasons=(UNSURE,))
@@ -45,7 +45,7 @@ def test_what_is_stretched_as_the_others_is_good_and_what_stands_out_is_poor() -
 
 def test_more_of_a_residual_counts_and_what_a_fit_says_of_itself_stays() -> None:
     some = records([0.2] * 6)
-    usual = Usual.of(some)
+    usual = Compared.of(some)
     assert usual is not None
     ball = icosphere(1)
     fit = replace(some_fit(ball.verts, ball.faces), verdict="fair", reasons=(UNSURE,))
@@ -75,8 +75,8 @@ def test_only_a_shape_with_an_edge_may_be_a_part(tmp_path: Path, monkeypatch: py
 
 
 def test_of_few_and_of_fits_that_do_not_say_nothing_is_usual() -> None:
-    assert Usual.of(records([0.2] * 4)) is None
-    assert Usual.of(records([np.nan] * 9)) is None
+    assert Compared.of(records([0.2] * 4)) is None
+    assert Compared.of(records([np.nan] * 9)) is None
 
 
 def test_sides_are_taken_where_nearly_all_have_a_clear_one() -> None:
@@ -89,7 +89,7 @@ def test_sides_are_taken_where_nearly_all_have_a_clear_one() -> None:
 
 
 def test_only_a_side_that_is_worse_is_in_doubt() -> None:
-    usual, ball = Usual.of(records([0.2] * 6)), icosphere(1)
+    usual, ball = Compared.of(records([0.2] * 6)), icosphere(1)
     assert usual is not None
     fit = replace(some_fit(ball.verts, ball.faces), verdict="fair", reasons=(UNSURE,))
     judged = [usual.judged(fit, record) for record in records([0.2] * 3, [0.3, -0.03, -0.2])]

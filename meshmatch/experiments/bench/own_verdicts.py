@@ -6,7 +6,7 @@ fit is right if its maps to and from the sound specimens miss by less than a ten
 otherwise, as that of another shape always is.
 
 A row counts verdicts by weights that other collections gave: those of generated shapes, without its own; ``--fit`` prints
-what all generated ones give, as `meshmatch.collections.compare` keeps them. Beside them, "as they are", the verdicts that
+what all generated ones give, as `meshmatch.fitting.usual` keeps them. Beside them, "as they are", the verdicts that
 users see.
 """
 
@@ -26,12 +26,13 @@ from typer import Option
 
 from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.collections.collection import Collection
-from meshmatch.collections.compare import Usual, Weights
+from meshmatch.collections.compare import Compared
 from meshmatch.collections.setting import ALONE, SUFFIX, Record
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.specimens import SETS, SIDED, Specimens, collected, scanned, wholes
 from meshmatch.experiments.makers.molars_and_leaves import MAKERS, varied
 from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.usual import Weights
 from meshmatch.maps.fit_files import load_words, read_fit
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import make_folder
@@ -100,7 +101,7 @@ class Alone:
 
     fits: Mapping[str, Fit]
     records: Mapping[str, Record]
-    usual: Usual
+    usual: Compared
 
     @classmethod
     def read(cls, folder: Path) -> Alone:
@@ -108,20 +109,21 @@ class Alone:
         collection = Collection(folder)
         paths = {name: folder / ALONE / f"{name}{SUFFIX}" for name in collection.names}
         records = {name: Record.of(load_words(path)[1]["record"]) for name, path in paths.items()}
-        usual = Usual.of(list(records.values()))
+        usual = Compared.of(list(records.values()))
         assert usual is not None
         fits = {name: read_fit(path, collection.template).fit for name, path in paths.items()}
         return cls(fits, records, usual)
 
     def verdicts(self, weights: Weights) -> dict[str, str]:
         """What is said by other weights."""
-        usual = replace(self.usual, weights=weights)
+        usual = replace(self.usual, usual=replace(self.usual.usual, weights=weights))
         return {name: usual.judged(fit, self.records[name]).verdict for name, fit in self.fits.items()}
 
     def signs(self, rows: Sequence[Mapping[str, Any]]) -> tuple[Floats, Bools]:
         """What weights weigh (N, 2), and which fits are right (N,), where nothing else is said against a fit."""
         some = [row for row in rows if self.records[row["name"]].side >= 0 and self.fits[row["name"]].verdict != "poor"]
-        values = [self.usual.signs(self.records[row["name"]]) for row in some]
+        records = [self.records[row["name"]] for row in some]
+        values = [self.usual.usual.signs(each.stretch, each.residual) for each in records]
         return np.array(values).reshape(-1, 2), np.array([is_right(row) for row in some], bool)
 
 

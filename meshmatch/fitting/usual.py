@@ -1,0 +1,97 @@
+"""How far a fit is to be trusted, by what is usual of its kind.
+
+Where no model learned what corresponds, a fit that lies close may be wrong. The template is then stretched as no other
+shape of its kind stretches it: upside down, over the edge of a cut, or onto something else. What is usual, the others of its
+collection say, or those that a model learned from (its card); it costs nothing, and is in no unit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.judge.reasons import SIDE_IN_DOUBT, Reason, Verdict
+from meshmatch.models.card import ModelCard
+
+USUAL = "usual"
+"""Among the metrics of a card: what `Usual` has of fits of the shapes that the model learned from."""
+FEWEST = 5
+"""Fits, of which less say nothing about what is usual."""
+FAIR = 0.5
+"""Trust from which a fit is fair, as of two shapes without a model."""
+_GOOD = 0.9
+_ALONE = ("unsupervised", "doubt", "residual", "outlier")  # reasons of fits that no others, or fewer, are known of
+_WORSE = 0.1  # what is so much worse than its mirror image may be wrong, see `Fit.side`
+_STANDS_OUT = 1.5  # so many times what is usual is told
+
+
+@dataclass(frozen=True)
+class Weights:
+    """The logit of a right fit: ``offset``, less what the logarithms of stretch and residual over what is usual cost."""
+
+    offset: float
+    stretch: float
+    residual: float
+
+
+WEIGHTS = Weights(offset=3.1, stretch=2.4, residual=3.0)
+"""Set by hand, between right and wrong fits of three collections of femurs, some cut, warped, or other shapes in their
+place: right ones were stretched up to 2.5 times as much as usual, wrong ones 4.9 times and more."""
+
+
+@dataclass(frozen=True)
+class Usual:
+    """Medians of fits: how much the template is stretched, see `FitFeatures`, and how far it stays from the shapes (units of
+    sqrt(area)); and of ``whom`` they are.
+    """
+
+    stretch: float
+    residual: float
+    weights: Weights = WEIGHTS
+    whom: str = "the collection"
+
+    @classmethod
+    def of_card(cls, card: ModelCard) -> Usual | None:
+        """Of the shapes that a model learned from, where its card says it."""
+        known = card.metrics.get(USUAL, {})
+        stretch, residual = (known.get(name) for name in ("stretch", "residual"))
+        if not all(isinstance(each, float | int) and 0 < each < np.inf for each in (stretch, residual)):
+            return None
+        return cls(float(stretch), float(residual), whom=f"what {card.name} learned from")
+
+    def trust(self, likely: float, stretch: float, residual: float) -> float:
+        """Probability (0..1) that a fit is right, which alone is so ``likely``."""
+        own, (further, apart) = self.weights, self.signs(stretch, residual)
+        return float(likely / (1 + np.exp(own.stretch * further + own.residual * apart - own.offset)))
+
+    def signs(self, stretch: float, residual: float) -> tuple[float, float]:
+        """What is weighed: logarithms of how many times as much as usual both are, if it is more."""
+        further, apart = np.log(np.maximum([stretch / self.stretch, residual / self.residual], 1.0)).tolist()
+        return further, apart
+
+    def stands_out(self, stretch: float) -> bool:
+        """Whether the template had to stretch much more than usual."""
+        return stretch > _STANDS_OUT * self.stretch
+
+    def judged(self, fit: Fit, likely: float, stretch: float, residual: float) -> Fit:
+        """A fit with verdict, reasons and trust beside what is usual."""
+        trust = self.trust(likely, stretch, residual)
+        reasons = [reason for reason in fit.reasons if reason.code not in _ALONE]
+        if self.stands_out(stretch):
+            much = f"stretched or compressed {np.exp(stretch):.1f}-fold, {np.exp(self.stretch):.1f}-fold is usual"
+            reasons.insert(0, Reason("outlier", f"stands out of {self.whom}: the template had to be {much}"))
+        elif residual > _STANDS_OUT * self.residual:
+            apart = f"{100 * residual:.1f} % of sqrt(area) apart, {100 * self.residual:.1f} % is usual"
+            reasons.insert(0, Reason("outlier", f"stands out of {self.whom}: template and shape stay {apart}"))
+        if fit.side < -_WORSE:
+            reasons.append(Reason("side", SIDE_IN_DOUBT))
+        verdict: Verdict = "good"
+        if fit.verdict == "poor" or trust < FAIR:
+            verdict = "poor"
+        elif trust < _GOOD or reasons:
+            verdict = "fair"
+        if verdict != "good" and not reasons:
+            reasons = [Reason("doubt", f"{int(100 * trust)} % likely to be right, beside {self.whom}")]
+        return replace(fit, verdict=verdict, reasons=tuple(reasons), trust=trust)
