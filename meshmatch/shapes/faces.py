@@ -15,6 +15,7 @@ OUTLIER_SHARE = 0.02
 """A part with less than this share of the largest part's area is an outlier. This and the next two are set by hand."""
 _FAR = 0.25  # gap between two big parts, in diagonals of the largest, from which they count as apart
 _SHEET = 0.8  # a sheet's mean normal is so long: 0.5 of half a sphere, 0.64 of half a cylinder, 0.9 of leaves
+_SHORT = 1e-9  # of the median edge: an edge without length
 _NEAR = 0.05  # gap up to which a small part belongs to a shape that is made of small parts
 
 
@@ -34,6 +35,30 @@ def seams(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, " V
     place = np.flatnonzero(border & shared)
     own = np.arange(len(verts))
     own[place] = place[same_rows(verts[place])]
+    return own
+
+
+def collapsed(
+    verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], cross: Float[Floats, "F 3"], diagonal: float
+) -> Int[Ints, " V"]:
+    """The vertex to use instead of each: the first of all that edges without length join.
+
+    `cross` is the normal of each face, twice its area long. A closed surface stays closed, as it would not if the faces at
+    such edges were only dropped.
+    """
+    own = np.arange(len(verts))
+    thin = np.flatnonzero(squared_lengths(cross) <= (_SHORT * diagonal**2) ** 2)  # no edge is longer than the diagonal
+    if not len(thin):
+        return own
+    usual = np.median(squared_lengths(verts[faces[:, 1]] - verts[faces[:, 0]]))
+    edges = faces[thin][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    one, two = edges[squared_lengths(verts[edges[:, 1]] - verts[edges[:, 0]]) < _SHORT**2 * usual].T
+    while (differ := own[one] != own[two]).any():
+        one, two = one[differ], two[differ]
+        ends = own[one], own[two]
+        np.minimum.at(own, np.maximum(*ends), np.minimum(*ends))
+        while (further := own[own] != own).any():
+            own[further] = own[own[further]]
     return own
 
 

@@ -16,7 +16,7 @@ from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
 from meshmatch.shapes.denoise import without_noise
-from meshmatch.shapes.faces import duplicate_faces, find_parts, flat_faces, seams, turn_faces
+from meshmatch.shapes.faces import collapsed, duplicate_faces, find_parts, flat_faces, seams, turn_faces
 from meshmatch.shapes.shape import Shape
 
 NOT_TRUSTED = "left out, as was asked for (weight 0)"
@@ -28,13 +28,13 @@ class Repaired(Brief):
     """A shape that is fit for work, and how it relates to the one that it came from.
 
     All vertices of `shape` are valid and, in a mesh, used by a face; they are where they were, unless noise was smoothed.
-    `original_to_repaired` is the vertex that stands for each original one: itself, its twin at the same position, or if it
-    was dropped the nearest one. The nearest to a vertex without a position is a valid corner of one of its faces, or if
-    there is none the nearest in the file's order. `kept_vertex` and `kept_face` are the original vertex (increasing) or
-    face that each repaired one is; corners may be turned, or stand for twins. `notes` say what was found and done, a line
-    each; none for a shape that was fine. `far_parts` counts big parts that lie far from the largest one: perhaps two
-    objects in one file. They are kept. `left_out` are numbers of parts (`meshmatch.shapes.parts`) that were tried apart and
-    are no part of what is fitted.
+    `original_to_repaired` is the vertex that stands for each original one: itself, its twin at the same position, the other
+    end of an edge without length, or if it was dropped the nearest one. The nearest to a vertex without a position is a
+    valid corner of one of its faces, or if there is none the nearest in the file's order. `kept_vertex` and `kept_face` are
+    the original vertex (increasing) or face that each repaired one is; corners may be turned, or stand for twins. `notes`
+    say what was found and done, a line each; none for a shape that was fine. `far_parts` counts big parts that lie far from
+    the largest one: perhaps two objects in one file. They are kept. `left_out` are numbers of parts
+    (`meshmatch.shapes.parts`) that were tried apart and are no part of what is fitted.
     """
 
     shape: Shape
@@ -52,8 +52,8 @@ def repair(shape: Shape) -> Repaired:
 
     In this order: vertices without a position and the faces that touch them; faces, or points, of weight 0; vertices
     at exactly the same position are merged if they lie on an open edge (texture seams of obj and glTF files, every
-    corner of an stl; two layers that merely touch stay apart); faces without area; faces that occur twice (both of
-    them, where they are a flap of no volume on a closed surface); outlier parts (see
+    corner of an stl; two layers that merely touch stay apart); edges without length, which are collapsed; faces without
+    area; faces that occur twice (both of them, where they are a flap of no volume on a closed surface); outlier parts (see
     `meshmatch.shapes.faces.OUTLIER_SHARE`; unless together they are more than a tenth of the surface: then the shape
     is made of small parts, and only those far from the rest are outliers; never what joints move, such as the shells of
     a robot's fingers); vertices that no face uses. Then faces are turned so that neighbours agree and the shape is not
@@ -99,6 +99,12 @@ def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     if doubles:
         _note(notes, doubles, "vertex", "merged with another at the same position")
         faces = twin[faces]
+    stands = collapsed(shape.verts, faces, cross, shape.diagonal)
+    joined = int((stands != np.arange(shape.V)).sum())
+    if joined:
+        _note(notes, joined, "edge", "without length collapsed")
+        faces, twin = stands[faces], stands[twin]
+        cross = np.where((faces == faces[:, [1, 2, 0]]).any(axis=1)[:, None], 0.0, cross)
     flat = flat_faces(shape.verts, faces, cross, shape.diagonal)
     _note(notes, int(flat.sum()), "face", "without area dropped")
     faces, cross, which = _without(flat, faces, cross, which)

@@ -189,6 +189,40 @@ def test_sliver_without_height_is_dropped_at_any_scale(cube: Shape, scale: float
     assert done.shape.F == 13  # the thin one that has some height stays
 
 
+def edges_split_at_their_ends(ball: Shape, edges: int, apart: float) -> Shape:
+    """Some edges of a closed shape get a vertex beside their first end: two needles each."""
+    verts, faces, touched = [*ball.verts], [list(face) for face in ball.faces], set[int]()
+    for k, (a, b, c) in enumerate(ball.faces.tolist()):
+        other = next(j for j, face in enumerate(ball.faces.tolist()) if {a, b} <= {*face} and c not in face)
+        if len(verts) == ball.V + edges or touched & {*ball.faces[k], *ball.faces[other]}:
+            continue
+        touched |= {*ball.faces[k], *ball.faces[other]}
+        d, m = next(v for v in ball.faces[other] if v not in (a, b)), len(verts)
+        verts.append(ball.verts[a] + apart * (ball.verts[b] - ball.verts[a]))
+        faces[k], faces[other] = [m, b, c], [b, m, d]
+        faces += [[a, m, c], [m, a, d]]
+    return Shape(verts, faces)
+
+
+@pytest.mark.parametrize("apart", [0.0, 1e-14])
+def test_edges_without_length_are_collapsed_and_the_surface_stays_closed(apart: float) -> None:
+    ball = icosphere(2)
+    given = edges_split_at_their_ends(ball, 9, apart)
+    assert is_watertight(given.faces)
+    assert given.V == ball.V + 9
+    done = repair(given)
+    assert (done.shape.V, done.shape.F) == (ball.V, ball.F)
+    assert is_watertight(done.shape.faces)
+    assert done.notes == ("9 edges without length collapsed", "18 faces without area dropped")
+    check_answers(given, done)
+
+
+def test_a_vertex_far_away_does_not_make_all_edges_short() -> None:
+    ball = icosphere(2)
+    given = Shape(np.vstack([ball.verts, [[1e12, 0, 0]]]), np.vstack([ball.faces, [[0, 1, ball.V]]]))
+    assert repair(given).shape.V >= ball.V
+
+
 def test_seams_are_merged_and_every_copy_answered(tmp_path: Path, torus: Shape) -> None:
     save_shape(tmp_path / "t.stl", torus)
     soup = load_shape(tmp_path / "t.stl")
