@@ -26,6 +26,9 @@ from meshmatch.shapes.tables import read_by_suffix
 _IN_MEMORY = 256 * 2**20  # bytes; more are kept in a temporary file
 _TELLING, _UNLIKE = 8, 6.0  # shapes; deviations, by the median absolute one
 _LINE = 200  # bytes of memory for a line
+_ONE_A_LINE = (
+    "write one name a line; of a table of specimens, --metadata TABLE --model 'shape ~ COLUMN' compares groups"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,14 +127,14 @@ def read_group(path: str | Path, shapes: Registered) -> list[str]:
     def read(path: Path) -> list[str]:
         return read_text(path, _LINE).splitlines()
 
-    for line in read_by_suffix(path, {".txt": read, ".csv": read}, "names of shapes", "write one name a line"):
+    for line in read_by_suffix(path, {".txt": read, ".csv": read}, "names of shapes", _ONE_A_LINE):
         word = line.strip()
         if not word:
             continue
         meant = [name for name in (word, os.path.splitext(word)[0]) if name in known or name in shapes.left_out]
         if not meant:
             close = get_close_matches(word, shapes.names, n=1)
-            hint = f"did you mean {close[0]}?" if close else "write one name a line"
+            hint = f"did you mean {close[0]}?" if close else _ONE_A_LINE
             raise InputError(f"{Path(path).name}: there is no shape called {word}", hint)
         if meant[0] in known:
             found.append(meant[0])

@@ -76,8 +76,9 @@ def test_a_group_is_a_list_of_names(tmp_path: Path) -> None:
         read_group(file, shapes)
     assert refused.value.hint == "did you mean é c?"
     file.write_text("/\n")
-    with pytest.raises(InputError, match="no shape called /"):
+    with pytest.raises(InputError, match="no shape called /") as refused:
         read_group(file, shapes)
+    assert "--metadata TABLE" in (refused.value.hint or "")
     with pytest.raises(InputError):
         read_group(tmp_path / "gone.txt", shapes)
 
