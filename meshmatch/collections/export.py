@@ -22,6 +22,7 @@ from meshmatch.collections.sources import folder_of
 from meshmatch.collections.superimpose import Superimposed
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.inscribed import inscribed_diameters
 from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.maps.places import Places
 from meshmatch.outputs import folder_on_success, make_folder
@@ -188,7 +189,7 @@ def export(
                 make_folder((folder / files[-1]).parent)
                 if how.original:
                     shape = _original(fits.files.get(name), fits.places_of(name))
-                    arrays = _on_original(fits, name, mean, values)
+                    arrays = _on_original(fits, name, shape, mean, values)
                     (write_vtp if how.suffix == ".vtp" else write_vtk)(folder / files[-1], shape, arrays)
                 elif moves and how.suffix in ORIGINALS:
                     began = first.setdefault(folder_of(name), shape).verts
@@ -275,9 +276,11 @@ def _original(file: str | None, places: Places) -> Shape:
     return shape
 
 
-def _on_original(fits: Fits, name: str, mean: Superimposed | None, values: Values | None) -> dict[str, np.ndarray]:
-    """Numbers at the vertices of a shape's file: how far each lies from the mean, in the file's axes and unit; parts of the
-    template; other values of it.
+def _on_original(
+    fits: Fits, name: str, shape: Shape, mean: Superimposed | None, values: Values | None
+) -> dict[str, np.ndarray]:
+    """Numbers at the vertices of a shape's file: how far each lies from the mean, in the file's axes and unit; how thick a
+    mesh is; parts of the template; other values of it.
     """
     fit, template = fits.fit_of(name), fits.template
     foot = fits.places_of(name).on(template.shape)
@@ -289,6 +292,8 @@ def _on_original(fits: Fits, name: str, mean: Superimposed | None, values: Value
         outwards = np.einsum("vi,vi->v", moved, vertex_normals(there, fit.faces))
         carried = foot.values(fit.faces, np.column_stack([outwards, moved @ fit.frame.rotation]))
         arrays |= {"distance_to_mean": carried[:, 0], "displacement": carried[:, 1:]}
+    if not shape.is_cloud:
+        arrays["thickness"] = inscribed_diameters(shape.verts, shape.faces[shape.valid_faces])
     if len(template.label_names) > 1:
         arrays["label"] = template.labels[foot.vertex]
     if values is not None:

@@ -147,18 +147,19 @@ def test_originals_are_exported_with_what_is_known_of_them(fits: Path, tmp_path:
     export(tmp_path / "out", given, Export(original=True, values=tmp_path / "heights.npy"), mean)
     np.testing.assert_array_equal(load_shape(tmp_path / "out" / "a.vtp").verts, file.verts)
     arrays = vtp_arrays(tmp_path / "out" / "a.vtp")
-    assert set(arrays) == {"distance_to_mean", "displacement", "label", "value_0"}
+    assert set(arrays) == {"distance_to_mean", "displacement", "thickness", "label", "value_0"}
     assert np.median(arrays["distance_to_mean"]) == pytest.approx(away, rel=0.05)
     outwards = np.einsum("vi,vi->v", arrays["displacement"].reshape(-1, 3), file.vertex_normals)
     assert np.median(outwards) == pytest.approx(away, rel=0.1)
     assert np.quantile(np.abs(arrays["value_0"] - file.verts[:, 1]), 0.9) < 0.01 * file.diagonal
     assert len(np.unique(arrays["label"])) > 3
+    assert 0.01 * file.diagonal < np.median(arrays["thickness"]) < 0.2 * file.diagonal
 
 
 def test_originals_of_the_verb(fits: Path, run: Run, tmp_path: Path) -> None:
     answer = run("export", fits, "-o", tmp_path / "out", "--original", "--json")
     assert json.loads(answer.out)["files"] == ["climber.vtp", "dancer.vtp"], answer.err
-    assert set(vtp_arrays(tmp_path / "out" / "climber.vtp")) == {"label"}  # two shapes have no mean
+    assert set(vtp_arrays(tmp_path / "out" / "climber.vtp")) == {"thickness", "label"}  # two shapes have no mean
     for words, told in {
         ("--values", "v.npy"): "values go with the original meshes",
         ("--original", "--format", "csv"): "original meshes are not exported as .csv",
