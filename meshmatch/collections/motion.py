@@ -1,9 +1,11 @@
 """The frames of a sequence, smoothed in time, and how they move.
 
-Fits of frames lie on their surfaces, but slide along them, each in its own way. The path of every vertex is smoothed:
-least squares with a penalty on second differences (Whittaker 1923). Its weight is the one that best predicts frames that are
-left out, by generalised cross-validation (Craven and Wahba, Numerische Mathematik 31, 1979). Then each vertex is put back
-onto the surface of its frame: how that moves was measured, and stays as it is.
+Fits of frames lie on their surfaces, but slide along them, each in its own way. Paths are smoothed by least squares with a
+penalty on second differences (Whittaker 1923), whose weight is the one that best predicts frames that are left out, by
+generalised cross-validation (Craven and Wahba, Numerische Mathematik 31, 1979). The motion is a sum of principal
+components, and each has a weight of its own: a beat stands out of the noise, and needs little. From the first component on
+that may as well move evenly, the rest is taken for noise. Then each vertex is put back onto the surface of its frame: how
+that moves was measured, and stays as it is.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from meshmatch.maps.footpoints import Surface
 
 LEAST, MOST = 5, 2000
 """Frames of a sequence that can be smoothed."""
-_WEIGHTS = 10.0 ** np.arange(-3, 6.1, 0.25)  # of second differences: the best of them is taken
+_WEIGHTS = 10.0 ** np.arange(-4, 7.1, 0.25)  # of second differences, from hardly any to an even motion
+_NONE = 1e-12  # of the energy of a motion: a component that has less is rounding
 _ASKED = 1500  # vertices that are asked which is best
 
 
@@ -63,14 +66,22 @@ def _best_filter(paths: Float[Floats, "T N"], known: Bool[Bools, " M"], cycle: b
         once = np.roll(np.eye(len(known)), 1, axis=1) - np.eye(len(known))
         second = once.T @ once
     rough, count = second.T @ second, len(paths)
-    best, least = np.eye(count), np.inf
-    for weight in _WEIGHTS:
-        smooth = np.linalg.inv(np.diag(known.astype(float)) + weight * rough)[np.ix_(known, known)]
-        left = 1 - np.trace(smooth) / count
-        error = float(np.square(paths - smooth @ paths).mean()) / left**2
-        if error < least:
-            best, least = smooth, error
-    return best
+    some, others = rough[known], rough[~known]  # what is missing moves freely
+    rough = some[:, known] - some[:, ~known] @ np.linalg.solve(others[:, ~known], others[:, known])
+    eigenvalues, vectors = np.linalg.eigh(rough)
+    kept = 1 / (1 + np.outer(_WEIGHTS, np.maximum(eigenvalues, 0.0)))  # of each eigenvector, by each weight
+    left = np.square(1 - kept.mean(axis=1))
+    found = mean = np.full((count, count), 1 / count)
+    moved, rest = paths - mean @ paths, np.eye(count) - mean
+    energies, components = np.linalg.eigh(moved @ moved.T)
+    for component in components.T[energies > _NONE * energies[-1]][::-1]:
+        own = vectors.T @ component
+        best = int((np.square((1 - kept) * own).sum(axis=1) / left).argmin())
+        if best == len(kept) - 1:
+            break
+        found = found + np.outer(vectors @ (kept[best] * own), component)
+        rest = rest - np.outer(component, component)
+    return np.asarray(found + (vectors * kept[-1]) @ vectors.T @ rest)
 
 
 def _onto(

@@ -48,6 +48,17 @@ def test_paths_are_as_smooth_as_the_true_ones_and_nearer_to_them(cycle: bool) ->
     assert np.allclose(np.linalg.norm(found - middle[:, None], axis=2), radius[:, None], rtol=0.02)  # on the surfaces
 
 
+def test_a_short_motion_is_no_noise() -> None:
+    """A ball that jerks to the side and back within three frames, and slides at random."""
+    aside = np.exp(-(((np.arange(FRAMES) - 8) / 1.5) ** 2))[:, None, None] * [1.0, 0, 0]
+    rng = np.random.default_rng(4)
+    slid = BALL.verts + 0.05 * rng.standard_normal((FRAMES, *BALL.verts.shape))
+    points, true = slid / np.linalg.norm(slid, axis=2, keepdims=True) + aside, BALL.verts + aside
+    found = np.array(list(smoothed(points, BALL.faces, range(FRAMES))))
+    before, after = (np.linalg.norm(some - true, axis=2).mean() for some in (points, found))
+    assert after < 0.6 * before and rough(found) < 1.3 * rough(true)
+
+
 def test_what_is_smooth_stays_as_it_is() -> None:
     true = pulsing()
     assert np.abs(np.array(list(smoothed(true, BALL.faces, range(FRAMES), True))) - true).max() < 0.02
