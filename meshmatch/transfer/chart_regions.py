@@ -41,7 +41,7 @@ _HANGING = 10  # rounds of joining what does not hang together
 _RINGS = 4  # of triangles around it
 _HANDED_ON = 6  # rounds in which this is done
 _SHARED = 0.25  # of the smaller border of two regions, that joining them removes at least
-_TEXELS = 128, 512  # of the copy and of the surface, across a region that must not cover itself
+_TEXELS = 96, 256  # of the copy and of the surface, across a region that must not cover itself
 _FACING = 0.02  # of sqrt(area), that a normal counts as when the nearest triangle is looked for
 # Of triangles that are laid out: times all and so many more at most, and what an attempt costs beside its own.
 _EFFORT, _ALWAYS, _OVERHEAD = 8, 200_000, 300
