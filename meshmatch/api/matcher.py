@@ -439,7 +439,7 @@ class Matcher:
                 here, config = clean[number], configs[number]
                 found = begun[number].fit or Fitter(self.model, config, report).fit(here.shape)
                 best = (found, here) if begun[number].tried else self._best(found, here, config, report)
-            return self._finished(*best, configs[number])
+            return self._finer(self._finished(*best, configs[number]))
 
         with thread_limit(inner):  # after an error, or Ctrl-C, the other fits end at their next report
             return parallel_map(one, range(len(clean)), threads=threads, stop=stop)
@@ -469,8 +469,17 @@ class Matcher:
                 raise OptionError(wrong, f"fit the shape with the model {self.model.card.name}")
         config = config or replace(self.config, seed=fits[0].seed)
         shapes = [shape_of(fit).shape for fit in fits]
-        first, second = agreed_fits(self.model, shapes, list(fits), config, known, threads=self.threads)
+        agreed = agreed_fits(self.model, shapes, list(fits), config, known, threads=self.threads)
+        first, second = agreed if known else [self._finer(fit) for fit in agreed]
         return first, second
+
+    def _finer(self, fit: Fit) -> Fit:
+        """A fit that knows its shape; with more nodes, where no correspondence was learned that these could lose."""
+        if self.model.card.correspondence:
+            return fit
+        from meshmatch.fitting.alike import finer
+
+        return finer(self.model, shape_of(fit).shape, fit)
 
 
 def _both_whole(clean: Sequence[Repaired], fits: Sequence[Fit]) -> bool:

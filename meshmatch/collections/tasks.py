@@ -23,6 +23,7 @@ from meshmatch.collections.setting import AGREEING, ALONE, FITS, SUFFIX, Record,
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.fitting.agree import member_of, with_vectors
+from meshmatch.fitting.alike import finer
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree_step, log_stretch
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.system import node_system
@@ -264,6 +265,8 @@ def _finish(task: FinishTask) -> None:
         vectors = load_array(setting.store, task.group.file(task.step))[task.group.names.index(name)]
         system = node_system(setting.trained)
         fit = with_vectors(system, before, system.unfolded(vectors))
+    if setting.model != NO_MODEL:
+        fit = finer(setting.trained, part.shape, fit)
     places = Places.of(part, fit, before if task.group is not None else None)
     words = {"digest": task.digest, "agreed_with": task.agreed_with}
     with setting.store.writing(task.file) as path:

@@ -1,5 +1,7 @@
 """Two shapes that stand alike, such as two femurs, or of which one is a part of the other, matched more finely.
 
+The same of a shape and the template of a model of its kind.
+
 A search without a model (`meshmatch.fitting.direct`) allows for any pose, so its fits have few nodes, and are held along the
 surface. Specimens of one kind need less freedom, and the whole of a broken bone is larger than what is left of it.
 """
@@ -10,19 +12,21 @@ from dataclasses import replace
 
 import numpy as np
 
+from meshmatch.derived import derived
 from meshmatch.fitting.direct import MIRROR, DirectMatch
 from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import cap_verdict, may_show_part
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.viscous import ViscousConfig
-from meshmatch.fitting.without_model import fit_alike, template_of, viscous_system
+from meshmatch.fitting.without_model import fit_alike, fit_near, template_of, viscous_system
 from meshmatch.geometry.frames import Frame, kabsch
+from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.rims import RIM, rim_lengths
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.make import low_mesh
+from meshmatch.templates.make import NodeConfig, low_mesh, make_template
 from meshmatch.templates.sides import apart
 from meshmatch.templates.template import Template
 
@@ -83,6 +87,40 @@ def match_alike(
     fits = _at_rest(fit, template, whole, frame), _as_it_rests(fit, template)
     first, second = fits if whole is source else fits[::-1]
     return replace(found, source=first, target=second, system=viscous_system(template))
+
+
+def finer(model: TrainedModel, shape: Shape, fit: Fit) -> Fit:
+    """A fit of a model that learned a kind without correspondence, made finer where the shape stands as the template does.
+
+    Its points move, to where a template with more nodes may stretch to; all else, node vectors and verdict included, is as
+    it was. The same where the model learned correspondence, of a cloud or a part, and of a poor fit.
+
+    Parameters
+    ----------
+    model
+        Of the fit.
+    shape
+        The repaired shape.
+    fit
+        Of the model's template to it.
+
+    Returns
+    -------
+    Fit
+        Of the same template.
+    """
+    if model.card.correspondence or shape.is_cloud or fit.partial or fit.verdict == "poor" or not model.has_nodes:
+        return fit
+    found = fit_near(_with_more_nodes(model.template), shape, fit, ViscousConfig(seed=fit.seed))
+    return fit if found is None else replace(fit, points=fit.frame.apply(found.points_in_file))
+
+
+@derived
+def _with_more_nodes(template: Template) -> Template:
+    """The same vertices, with nodes as fits without a model have them."""
+    config, shape = ViscousConfig(), template.shape
+    nodes = NodeConfig("uniform", config.nodes, config.radius, 0.01, seed=config.seed)
+    return make_template(shape, template.name, nodes, low=(np.arange(shape.V), np.asarray(shape.faces)))
 
 
 def _as_it_rests(fit: Fit, template: Template) -> Fit:

@@ -283,6 +283,14 @@ def fit_without_model(
     return (_Judged.of(part_task, part) if part.energy < clearly * found.energy else as_whole).fit(lead, began)
 
 
+def fit_near(template: Template, shape: Shape, start: Fit, config: ViscousConfig) -> Fit | None:
+    """Fit a template to a repaired shape that stands as it does, from where a fit of another template of the same vertices
+    has it; None where the shape stands otherwise."""
+    began, task = time.monotonic(), _Task(template, shape, config)
+    found = task.fitted(task.near(start))
+    return _Judged.of(task, found).fit(start.side, began) if found.alike else None
+
+
 def fit_alike(
     template: Template,
     shape: Shape,

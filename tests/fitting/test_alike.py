@@ -9,14 +9,19 @@ import pytest
 from meshmatch.arrays import Bools, Floats
 from meshmatch.experiments.makers.bones import Scanned, draw_bones, scan
 from meshmatch.fitting import alike
-from meshmatch.fitting.alike import match_alike
+from meshmatch.fitting.alike import finer, match_alike
 from meshmatch.fitting.direct import DirectMatch, match_either_side
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fitter import Fitter
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.fitting.without_model import template_of, viscous_system
+from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.trees import cKDTree
+from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.rims import RIM, rim_lengths
 from meshmatch.shapes.shape import Shape
+from tests.fitting.eggs import egg_model, gentle_vectors
 from tests.fitting.test_direct import QUICK
 
 FAST = replace(QUICK, both_ways="no")
@@ -95,3 +100,22 @@ def test_two_broken_ones_share_what_both_have() -> None:
     seen = match_alike(low, upper, plain, FitConfig())
     shared = LEFT.directions[kept][:, 2] > -0.4
     assert errors(seen, LEFT, RIGHT, low, kept)[shared].mean() < 5
+
+
+def test_a_model_that_learned_no_correspondence_gets_finer_points() -> None:
+    known = egg_model()
+    model = TrainedModel(replace(known.card, correspondence=False), known.template, known.inference)
+    system, vectors = node_system(model), gentle_vectors(model)
+    points = system.moved(vectors)
+    bump = 0.08 * np.exp(-np.square(points - points[points[:, 0].argmax()]).sum(1) / 0.02)
+    shape = Shape(points + bump[:, None] * system.normals(points), model.template.shape.faces)
+    fit = replace(Fitter(model).fit(shape), points=points, vectors=vectors, verdict="fair", frame=Frame.identity())
+    found = finer(model, shape, fit)
+    off, better = (np.linalg.norm(each.points_in_file - shape.verts, axis=1).mean() for each in (fit, found))
+    assert better < 0.6 * off
+    assert found.vectors is fit.vectors and (found.verdict, found.template_hash) == (fit.verdict, fit.template_hash)
+    for one, other in ((known, fit), (model, replace(fit, partial=True)), (model, replace(fit, verdict="poor"))):
+        assert finer(one, shape, other) is other
+    assert finer(model, Shape(shape.verts, np.empty((0, 3), np.int64)), fit) is fit
+    tall = Shape(shape.verts * [1, 4, 1], shape.faces)  # it does not stand as an egg does
+    assert finer(model, tall, fit) is fit
