@@ -92,13 +92,15 @@ def fit_all(
     cut: dict[str, float] = {}
     if setting.model == NO_MODEL:
         first = _Run(setting, sources, crew, report).fit_alone(None, FIRST)
-        usual, others = Compared.of(first), on_the_other_side(first)
-        cut = {} if usual is None else {each.name: usual.scale for each in first if usual.may_lack(each)}
+        cut, others = _perhaps_cut(first), on_the_other_side(first)
+        usual = Compared.of(first)
         setting = on_the_mean(
             setting, [each.name for each in first if _believed(each, usual) and each.name not in others]
         )
     run = _Run(setting, sources, crew, report)
     records = run.fit_alone(tell if setting.learned else None, others=others, cut=cut)
+    if not (setting.learned or setting.model == NO_MODEL) and (cut := _perhaps_cut(records)):
+        records = run.fit_alone(None, cut=cut)
     fitted = [number for number, record in enumerate(records) if record.fitted]
     if not fitted:
         _write_table(setting.store, records)
@@ -122,6 +124,12 @@ def fit_all(
     setting.store.remove(AGREEING)
     _write_table(setting.store, records)
     return Fitted(tuple(records), len(agreeing) if groups else 0, setting.model)
+
+
+def _perhaps_cut(records: Sequence[Record]) -> dict[str, float]:
+    """Names of shapes that may be parts, and the sqrt(area) of a whole one."""
+    usual = Compared.of(records)
+    return {} if usual is None else {each.name: usual.scale for each in records if usual.may_lack(each)}
 
 
 def fit_other_kinds(

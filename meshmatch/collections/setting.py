@@ -13,6 +13,7 @@ from meshmatch.api.inputs import as_model, validated
 from meshmatch.api.matcher import Matcher
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError
+from meshmatch.fitting.alike import as_part
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import may_show_part
@@ -157,8 +158,8 @@ class Setting:
             return read_fit(path, self.template)
 
     def fit(self, shape: Shape, last: Fit | None = None, other_side: bool = False, whole: float | None = None) -> Fit:
-        """Fit one shape; a frame of a sequence from the last one's fit. Without a model perhaps as the other side than the
-        first template's fit took it for, or as a part of shapes of that sqrt(area), if it has an edge.
+        """Fit one shape; a frame of a sequence from the last one's fit; or as a part of shapes of that sqrt(area), if it has
+        an edge. Without a model perhaps as the other side than the first template's fit took it for.
         """
         if self.model == NO_MODEL:
             part, begun, mirror = validated(shape), self._begun(shape.name), self.config.mirror != "no"
@@ -168,6 +169,12 @@ class Setting:
                     self.template, part.shape, start=begun, mirror=mirror, other_side=other_side, whole=whole
                 )
             return replace(found, repaired=part)
+        if whole is not None:
+            part = validated(shape)
+            with thread_limit(1):
+                cut = may_show_part(part.shape, self.config) and as_part(self.trained, part.shape, whole, self.config)
+            if cut:
+                return replace(cut, repaired=part)
         matcher = Matcher(self.trained, self.config, 1)
         return matcher.fit(shape) if last is None else matcher.follow(shape, last)
 

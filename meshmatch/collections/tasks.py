@@ -261,13 +261,14 @@ def _finish(task: FinishTask) -> None:
     if task.usual is not None:
         before = task.usual.judged(before, Record.of(alone.words["record"]))
     fit = before
-    if task.group is not None:
+    cut = before.partial and not setting.learned  # that fit has more nodes than can agree
+    if task.group is not None and not cut:
         vectors = load_array(setting.store, task.group.file(task.step))[task.group.names.index(name)]
         system = node_system(setting.trained)
         fit = with_vectors(system, before, system.unfolded(vectors))
     if setting.model != NO_MODEL:
         fit = finer(setting.trained, part.shape, fit)
-    places = Places.of(part, fit, before if task.group is not None else None)
+    places = Places.of(part, fit, before if task.group is not None and not cut else None)
     words = {"digest": task.digest, "agreed_with": task.agreed_with}
     with setting.store.writing(task.file) as path:
         write_fit(path, PlacedFit.of(fit, places), words=words)

@@ -18,8 +18,9 @@ from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import cap_verdict, may_show_part
 from meshmatch.fitting.solve.regularity import Regularity
+from meshmatch.fitting.solve.system import node_system
 from meshmatch.fitting.solve.viscous import ViscousConfig
-from meshmatch.fitting.without_model import fit_alike, fit_near, template_of, viscous_system
+from meshmatch.fitting.without_model import fit_alike, fit_near, fit_without_model, template_of, viscous_system
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
@@ -113,6 +114,39 @@ def finer(model: TrainedModel, shape: Shape, fit: Fit) -> Fit:
         return fit
     found = fit_near(_with_more_nodes(model.template), shape, fit, ViscousConfig(seed=fit.seed))
     return fit if found is None else replace(fit, points=fit.frame.apply(found.points_in_file))
+
+
+def as_part(model: TrainedModel, shape: Shape, whole: float, config: FitConfig) -> Fit | None:
+    """A fit of the template of a model that learned a kind without correspondence to a repaired shape that is cut.
+
+    Parameters
+    ----------
+    model
+        Of the kind.
+    shape
+        A mesh that is open.
+    whole
+        The sqrt(area) of a whole shape, in the unit of the file.
+    config
+        Whether mirror images are looked for, and the seed.
+
+    Returns
+    -------
+    Fit
+        As a part, fair at best; None where it is better seen as a whole.
+    """
+    template, viscous = _with_more_nodes(model.template), ViscousConfig(seed=config.seed)
+    found = fit_without_model(template, shape, viscous, mirror=config.mirror != "no", whole=whole)
+    if not found.partial:
+        return None
+    return replace(
+        found,
+        model=model.card.name,
+        template_hash=model.template.hash,
+        resting=np.asarray(model.template.shape.verts),
+        faces=np.asarray(model.template.shape.faces),
+        vectors=node_system(model).vectors_to(found.points),
+    )
 
 
 @derived

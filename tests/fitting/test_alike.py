@@ -9,7 +9,7 @@ import pytest
 from meshmatch.arrays import Bools, Floats
 from meshmatch.experiments.makers.bones import Scanned, draw_bones, scan
 from meshmatch.fitting import alike
-from meshmatch.fitting.alike import finer, match_alike
+from meshmatch.fitting.alike import as_part, finer, match_alike
 from meshmatch.fitting.direct import DirectMatch, match_either_side
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
@@ -119,3 +119,21 @@ def test_a_model_that_learned_no_correspondence_gets_finer_points() -> None:
     assert finer(model, Shape(shape.verts, np.empty((0, 3), np.int64)), fit) is fit
     tall = Shape(shape.verts * [1, 4, 1], shape.faces)  # it does not stand as an egg does
     assert finer(model, tall, fit) is fit
+
+
+def test_what_is_cut_is_a_part_of_what_a_model_knows() -> None:
+    known = egg_model()
+    model = TrainedModel(replace(known.card, correspondence=False), known.template, known.inference)
+    whole = Shape(30 * node_system(model).moved(gentle_vectors(model, 0.01)), model.template.shape.faces)
+    size = float(np.sqrt(whole.area))
+    kept = whole.verts[:, 1] < np.quantile(whole.verts[:, 1], 0.6)
+    half = Shape(whole.verts, whole.faces[kept[whole.faces].all(1)])
+    used = np.unique(half.faces)
+    half = Shape(half.verts[used], np.searchsorted(used, half.faces))
+    fit = as_part(model, half, size, FitConfig(mirror="no"))
+    assert fit is not None and fit.partial
+    assert (fit.model, fit.template_hash, fit.vectors.shape) == ("egg", model.template.hash, (model.template.K, 3))
+    off = np.linalg.norm(fit.points_in_file[used] - half.verts, axis=1).mean()
+    assert off < 0.1 * size
+    assert cKDTree(fit.points_in_file).query(half.verts)[0].mean() < 0.01 * size
+    assert as_part(model, whole, size, FitConfig(mirror="no")) is None
