@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from operator import attrgetter
 
 import numpy as np
@@ -21,7 +21,18 @@ from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.judge.calibration import DIRECT_BOTH_WAYS
 from meshmatch.fitting.judge.direct import judge_direct
 from meshmatch.fitting.judge.reasons import Reason, Verdict
-from meshmatch.fitting.one_way import DirectConfig, KnownPairs, Side, Tried, carried, distinct, finished, fitted, glided
+from meshmatch.fitting.one_way import (
+    DirectConfig,
+    KnownPairs,
+    Side,
+    Tried,
+    call,
+    carried,
+    distinct,
+    finish,
+    fitted,
+    glide,
+)
 from meshmatch.fitting.search.intrinsic import ThinMesh
 from meshmatch.fitting.search.motions import turns_onto_itself
 from meshmatch.fitting.search.proposals import Proposal, differ
@@ -210,25 +221,28 @@ class _Search:
         """How far apart a rigid motion leaves the shapes, and the source and the mirror image of the target."""
         return apart(self.source.original, self.target.original, self.source.config.seed)
 
-    def one_way(
-        self, report: Progress, meanwhile: Sequence[Callable[[], object]] = (), glide: bool = True
-    ) -> list[Tried]:
+    def one_way(self, report: Progress, meanwhile: Sequence[Callable[[], object]] = ()) -> list[Tried]:
         """The best fits of the source to the target, best first; see `fitted`."""
-        return fitted(self.source, self.target, self.guess, report, meanwhile, glide)
+        return fitted(self.source, self.target, self.guess, report, meanwhile)
 
     def both_ways(self, there: list[Tried], report: Progress) -> list[_BothWays]:
         """The best fits of the source to the target, and of the target to the source, each continued the other way; best
         first."""
         reverse = _Search(self.target, self.source, self.guess and self.guess[::-1])
-        there, back = self._best(there), self._best(reverse.one_way(report.between(0.0, 0.7), glide=False))
+        there, back = self._best(there), self._best(reverse.one_way(report.between(0.0, 0.7)))
         report = report.named("fits both ways")
-        ways = zip(there, self._returned(there, report.between(0.7, 0.8)), strict=True)
-        ways_back = zip(reverse._returned(back, report.between(0.8, 0.9)), back, strict=True)
+        report(0.7)
+        returned = parallel_map(call, (*self._returned(there), *reverse._returned(back)))
+        ways = zip(there, returned, strict=False)
+        ways_back = zip(returned[len(there) :], back, strict=True)
         found = sorted((_BothWays(*each) for each in (*ways, *ways_back)), key=attrgetter("energy"))
+        report(0.9)
         best = distinct(found, self.source.config.gliding, _SAME)
-        there = glided(self.source, self.target, [each.there for each in best], report.between(0.9, 0.95))
-        back = glided(self.target, self.source, [each.back for each in best], report.between(0.95, 1.0))
-        further = [_BothWays(*each) for each in zip(there, back, strict=True)]
+        sides = (self.source, self.target), (self.target, self.source)
+        tasks = [partial(glide, *sides[back], (each.there, each.back)[back]) for back in (0, 1) for each in best]
+        moved = parallel_map(call, tasks)
+        report(1.0)
+        further = [_BothWays(*each) for each in zip(moved[: len(best)], moved[len(best) :], strict=True)]
         return sorted([*further, *(each for each in found if each not in best)], key=attrgetter("energy"))
 
     def _best(self, tried: list[Tried]) -> list[Tried]:
@@ -236,15 +250,16 @@ class _Search:
         best = distinct(tried, self.source.config.returned, self.source.config.unlike)
         return best + [each for each in tried if each.proposal.kind == "guess" and each not in best]
 
-    def _returned(self, tried: Sequence[Tried], report: Progress) -> list[Tried]:
-        """The target fitted to the source by what takes the source to the target."""
+    def _returned(self, tried: Sequence[Tried]) -> list[Callable[[], Tried]]:
+        """What fits the target to the source by what takes the source to the target."""
         own, other = self.source.fine, self.target.fine
         at = with_normals(other.mesh.verts, vertex_normals(other.mesh.verts, other.system.faces), _NORMALS)
-        begun = []
+        tasks: list[Callable[[], Tried]] = []
         for each in tried:
             moved = with_normals(each.moved, vertex_normals(each.moved, own.system.faces), _NORMALS)
-            begun.append((each.proposal, carried(at, moved, own.mesh.verts)))
-        return finished(self.target, self.source, begun, report)
+            goals = carried(at, moved, own.mesh.verts)
+            tasks.append(partial(finish, self.target, self.source, each.proposal, goals))
+        return tasks
 
     def matched(self, there: list[Tried], report: Progress, began: float) -> DirectMatch:
         """The best of the fits as a match; both ways, if one way leaves doubt."""

@@ -100,7 +100,7 @@ class DirectConfig:
     better: int = 16
     best: int = 6
     gliding: int = 2
-    returned: int = 2
+    returned: int = 3
     unlike: float = 0.03
     both_ways: BothWays = "in doubt"
     from_source: bool = False
@@ -250,25 +250,30 @@ def finished(
     """The fine mesh of one shape fitted to another from where its vertices (V, 3) may belong, for each proposal."""
     report(0.0)
     _ = own.fine, onto.neighbours, onto.fine_mesh.relief, onto.fine_mesh.tree  # once, and not by each thread
-    vectors_to = own.fine.system.vectors_to
-    found = parallel_map(lambda each: _fine(own, onto, each[0], vectors_to(each[1]), own.config.third), begun)
+    found = parallel_map(lambda each: finish(own, onto, *each), begun)
     report(1.0)
     return found
+
+
+def finish(own: Side, onto: Side, proposal: Proposal, goals: Float[Floats, "V 3"]) -> Tried:
+    """One of these fits."""
+    return _fine(own, onto, proposal, own.fine.system.vectors_to(goals), own.config.third)
 
 
 def glided(own: Side, onto: Side, tried: Sequence[Tried], report: Progress) -> list[Tried]:
     """Fine fits that go on along the surface, if they have not; each as it was where that does not lower its energy."""
-
-    def further(each: Tried) -> Tried:
-        if each.glided:
-            return each
-        found = _fine(own, onto, each.proposal, each.vectors, own.config.along)
-        return replace(min(each, found, key=attrgetter("energy")), glided=True)
-
     report(0.0)
-    found = parallel_map(further, tried)
+    found = parallel_map(lambda each: glide(own, onto, each), tried)
     report(1.0)
     return found
+
+
+def glide(own: Side, onto: Side, tried: Tried) -> Tried:
+    """One of these fits."""
+    if tried.glided:
+        return tried
+    found = _fine(own, onto, tried.proposal, tried.vectors, own.config.along)
+    return replace(min(tried, found, key=attrgetter("energy")), glided=True)
 
 
 def _fine(own: Side, onto: Side, proposal: Proposal, vectors: Float[Floats, "K 3"], how: NodeRefineConfig) -> Tried:
@@ -276,15 +281,10 @@ def _fine(own: Side, onto: Side, proposal: Proposal, vectors: Float[Floats, "K 3
 
 
 def fitted(
-    own: Side,
-    onto: Side,
-    guess: KnownPairs | None,
-    report: Progress,
-    meanwhile: Sequence[Callable[[], object]] = (),
-    glide: bool = True,
+    own: Side, onto: Side, guess: KnownPairs | None, report: Progress, meanwhile: Sequence[Callable[[], object]] = ()
 ) -> list[Tried]:
     """The best fits of one shape to another, best first; ``guess`` is one more proposal. What is to be done ``meanwhile`` is
-    called where a thread would wait. Where the best do not ``glide``, this is left to the caller."""
+    called where a thread would wait."""
     config, rested = own.config, own.thin.verts
     guesses = [] if guess is None else [Proposal("guess", carried(rested, *guess))]
     begun = _begun(own, onto, guesses, report.named("guesses without a model").between(0.0, 0.6), meanwhile)
@@ -296,7 +296,7 @@ def fitted(
             goals.append((each, verts + carried(verts, rested, each.points - rested)))
     report = report.named("fits of the best guesses").between(0.8, 1.0)
     found = finished(own, onto, goals, report.between(0.0, 0.6))
-    best = distinct(found, config.gliding if glide else 0, config.unlike)
+    best = distinct(found, config.gliding, config.unlike)
     rest = [each for each in found if each not in best]
     return sorted([*glided(own, onto, best, report.between(0.6, 1.0)), *rest], key=attrgetter("energy"))
 
@@ -325,14 +325,15 @@ def _begun(
     report(0.0)
     moved = rigid_proposals(own.thin, onto.thin)
     fits = [partial(tried, each) for each in moved]
-    others, *done = parallel_map(_called, (bent, *fits, next_level, *meanwhile))
+    others, *done = parallel_map(call, (bent, *fits, next_level, *meanwhile))
     report(0.6)
     found = [*done[: len(moved)], *parallel_map(tried, [*others, *guesses])]
     report(1.0)
     return found
 
 
-def _called(function: Callable[[], Any]) -> Any:
+def call(function: Callable[[], Any]) -> Any:
+    """What it returns; for work of several sorts beside each other."""
     return function()
 
 
