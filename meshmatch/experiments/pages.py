@@ -28,7 +28,7 @@ from meshmatch.errors import InputError
 from meshmatch.experiments import runner
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGES = ("results.md", "paper.md", "rigs.md", "collections.md")
+PAGES = ("results.md", "method.md", "paper.md", "rigs.md", "collections.md", "categories.md")
 _BLOCK = re.compile(r"(<!-- (results|summary)([^>]*?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 _COLUMNS = ("mean", "median", "lost", "flips", "pairs")
 _SHOWN_AS = {"not testable at this length": "undecided"}  # cells of the files that a page shows in a word

@@ -20,7 +20,7 @@ OF_ROOMS = {
     f"meshmatch.experiments.{room}": f"meshmatch.experiments.{room}.{module}"
     for room, module in (("bench", "accuracy"), ("bench.viewers", "__main__"), ("hostile", "campaign"))
 }
-GUIDES = {"collections.md"}  # whose paths are those of users
+GUIDES = {"categories.md", "collections.md", "method.md"}  # whose paths are those of users
 TEXTS = [(name, (DOCS / name).read_text(encoding="utf-8")) for name in pages.PAGES if name not in GUIDES]
 
 
