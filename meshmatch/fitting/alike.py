@@ -133,8 +133,10 @@ def as_part(model: TrainedModel, shape: Shape, whole: float, config: FitConfig) 
     Returns
     -------
     Fit
-        As a part, fair at best; None where it is better seen as a whole.
+        As a part, fair at best; None where it is better seen as a whole, and for a pointwise model.
     """
+    if not model.has_nodes:
+        return None
     template, viscous = _with_more_nodes(model.template), ViscousConfig(seed=config.seed)
     found = fit_without_model(template, shape, viscous, mirror=config.mirror != "no", whole=whole)
     if not found.partial:

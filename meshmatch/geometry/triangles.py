@@ -137,6 +137,18 @@ def closest_on_triangles(
     return result
 
 
+def together(count: int, one: Int[Ints, " N"], two: Int[Ints, " N"]) -> Int[Ints, " count"]:
+    """The least of all that hang together, for each; of so few at a time sparse graphs cost more."""
+    least = np.arange(count)
+    while (differ := least[one] != least[two]).any():
+        one, two = one[differ], two[differ]
+        ends = least[one], least[two]
+        np.minimum.at(least, np.maximum(*ends), np.minimum(*ends))
+        while (further := least[least] != least).any():
+            least[further] = least[least[further]]
+    return least
+
+
 def same_rows(rows: Float[Floats, "N D"] | Int[Ints, "N D"]) -> Int[Ints, " N"]:
     """(N,) for each row the first row that is equal to it: itself where it is the first. 0.0 equals -0.0."""
     own = np.arange(len(rows))

@@ -9,7 +9,7 @@ import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry import triangles
-from meshmatch.geometry.triangles import Edges, edge_keys, same_rows, squared_lengths
+from meshmatch.geometry.triangles import Edges, edge_keys, same_rows, squared_lengths, together
 
 OUTLIER_SHARE = 0.02
 """A part with less than this share of the largest part's area is an outlier. This and the next two are set by hand."""
@@ -46,20 +46,13 @@ def collapsed(
     `cross` is the normal of each face, twice its area long. A closed surface stays closed, as it would not if the faces at
     such edges were only dropped.
     """
-    own = np.arange(len(verts))
     thin = np.flatnonzero(squared_lengths(cross) <= (_SHORT * diagonal**2) ** 2)  # no edge is longer than the diagonal
     if not len(thin):
-        return own
+        return np.arange(len(verts))
     usual = np.median(squared_lengths(verts[faces[:, 1]] - verts[faces[:, 0]]))
     edges = faces[thin][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     one, two = edges[squared_lengths(verts[edges[:, 1]] - verts[edges[:, 0]]) < _SHORT**2 * usual].T
-    while (differ := own[one] != own[two]).any():
-        one, two = one[differ], two[differ]
-        ends = own[one], own[two]
-        np.minimum.at(own, np.maximum(*ends), np.minimum(*ends))
-        while (further := own[own] != own).any():
-            own[further] = own[own[further]]
-    return own
+    return together(len(verts), one, two)
 
 
 def flat_faces(

@@ -12,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
-from meshmatch.geometry.triangles import same_rows, triangle_areas, unit
+from meshmatch.geometry.triangles import same_rows, together, triangle_areas, unit
 from meshmatch.transfer.texels import faces_on
 
 # All of these were set by hand.
@@ -125,7 +125,7 @@ def joined(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, "F
     one, two = _twins(same_rows(verts)[free])
     begin = [short[:, 0], free[one, 0], free[one, 1]]
     end = [short[:, 1], free[two, 1], free[two, 0]]
-    return _together(len(verts), np.concatenate(begin), np.concatenate(end))[faces]
+    return together(len(verts), np.concatenate(begin), np.concatenate(end))[faces]
 
 
 def across(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> tuple[Ints, Ints, Floats]:
@@ -164,21 +164,9 @@ def _welded(faces: Int[Ints, "F 3"]) -> tuple[Int[Ints, "F 3"], bool]:
     one, two = _twins(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
     corner = np.arange(3 * F)
     begin, end = corner, corner.reshape(F, 3)[:, [1, 2, 0]].ravel()
-    welded = _together(3 * F, np.concatenate([begin[one], end[one]]), np.concatenate([end[two], begin[two]]))
-    whole = not _together(F, one // 3, two // 3).any()
+    welded = together(3 * F, np.concatenate([begin[one], end[one]]), np.concatenate([end[two], begin[two]]))
+    whole = not together(F, one // 3, two // 3).any()
     return np.unique(welded, return_inverse=True)[1].reshape(F, 3), whole
-
-
-def _together(count: int, one: Int[Ints, " N"], two: Int[Ints, " N"]) -> Int[Ints, " count"]:
-    """The least of all that hang together, for each; of so few at a time sparse graphs cost more."""
-    least = np.arange(count)
-    while (differ := least[one] != least[two]).any():
-        one, two = one[differ], two[differ]
-        ends = least[one], least[two]
-        np.minimum.at(least, np.maximum(*ends), np.minimum(*ends))
-        while (further := least[least] != least).any():
-            least[further] = least[least[further]]
-    return least
 
 
 def _as_conformal(points: Floats, corners: Ints, flat: Floats, areas: Floats) -> Float[Floats, "M 2"]:

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Bools, Floats
 from meshmatch.experiments.makers.bones import Scanned, draw_bones, scan
 from meshmatch.fitting import alike
@@ -21,7 +22,7 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.rims import RIM, rim_lengths
 from meshmatch.shapes.shape import Shape
-from tests.fitting.eggs import egg_model, gentle_vectors
+from tests.fitting.eggs import bent_egg, egg_model, gentle_vectors
 from tests.fitting.test_direct import QUICK
 
 FAST = replace(QUICK, both_ways="no")
@@ -137,3 +138,16 @@ def test_what_is_cut_is_a_part_of_what_a_model_knows() -> None:
     assert off < 0.1 * size
     assert cKDTree(fit.points_in_file).query(half.verts)[0].mean() < 0.01 * size
     assert as_part(model, whole, size, FitConfig(mirror="no")) is None
+
+
+@pytest.mark.parametrize("correspondence", [True, False])
+def test_fits_and_maps_ask_for_finer_ones(correspondence: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = egg_model()
+    model = TrainedModel(replace(known.card, correspondence=correspondence), known.template, known.inference)
+    shape, asked = bent_egg(model), []
+    monkeypatch.setattr(alike, "finer", lambda _, part, fit: asked.append(part) or fit)
+    matcher = Matcher(model)
+    fit = matcher.fit(shape)
+    assert len(asked) == (0 if correspondence else 1)
+    matcher.map(fit, fit)
+    assert len(asked) == (0 if correspondence else 3)
