@@ -115,7 +115,7 @@ class Matcher:
     def model(self) -> TrainedModel:
         """The model; `OptionError` before the first shapes have decided."""
         if self._direct:
-            hint = "match two shapes, or fit a collection (`meshmatch fit --model none`); or name a model"
+            hint = "match two shapes (register --onto), fit a collection (meshmatch fit --model none), or name a model"
             raise OptionError("one shape alone has no fit without a model", hint)
         if self._model is None:
             raise OptionError("no model is chosen yet: the first shape decides", "fit a shape first, or name the model")

@@ -20,7 +20,7 @@ def trust(source: Shape, maps: MapPair) -> Float[Floats, " V"]:
 
 def turn_of_fit(fit: object) -> Float[Floats, "3 3"] | None:
     """The turn after which a shape stands along y, by its fit; None if that does not know how it stands."""
-    if not isinstance(fit, Fit):
+    if not isinstance(fit, Fit) or not fit.up:
         return None
     up = np.zeros(3)
     up["xyz".index(fit.up[1])] = -1.0 if fit.up[0] == "-" else 1.0

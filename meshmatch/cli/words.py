@@ -196,9 +196,9 @@ def why(reasons: Sequence[str]) -> str:
 
 def fit_words(fit: meshmatch.Fit | meshmatch.ImplicitFit) -> str:
     """The verdict, and the axes where a model knows them."""
-    if not isinstance(fit, meshmatch.Fit) or fit.model == NO_MODEL:
+    if not isinstance(fit, meshmatch.Fit) or fit.model == NO_MODEL or not fit.axes:
         return f"{fit.verdict} fit"
-    return f"{fit.verdict} fit, up {fit.up}, front {fit.front}"
+    return f"{fit.verdict} fit, {fit.axes}"
 
 
 def tell_match(console: Console, result: meshmatch.MatchResult, names: Sequence[str]) -> None:
@@ -219,7 +219,8 @@ def fit_record(name: str, fit: meshmatch.Fit | meshmatch.ImplicitFit) -> Json:
     record |= {"left_out_parts": fit.left_out[:_MOST_PARTS]} if fit.left_out else {}
     if fit.regularity is not None:
         record["regularity"] = {name: round(value, 5) for name, value in asdict(fit.regularity).items()}
-    return record | {"up": fit.up, "front": fit.front, "seconds": round(fit.seconds, 3), "seed": fit.seed}
+    record |= {"up": fit.up or None, "front": fit.front or None}
+    return record | {"seconds": round(fit.seconds, 3), "seed": fit.seed}
 
 
 def map_record(found: meshmatch.VertexMap, names: Sequence[str]) -> Json:

@@ -53,9 +53,9 @@ class Fit(Pickled):
     reasons
         Why it is not good.
     up
-        The axis of the file that the fit took for up, such as "+y".
+        The axis of the file that the fit took for up, such as "+y"; empty where the model does not know what is up.
     front
-        The axis of the file that the fit took for front, such as "-z".
+        The axis of the file that the fit took for front, such as "-z"; empty likewise.
     seconds
         Wall time of the fit.
     seed
@@ -120,18 +120,23 @@ class Fit(Pickled):
     def __repr__(self) -> str:
         name = f"{self.shape_name!r}, " if self.shape_name else ""
         part = ", part" if self.partial else ""
-        way = f"up {self.up}, front {self.front}"
-        return f"Fit({name}model {self.model!r}, {self.verdict}, trust {self.trust:.2f}, {way}{part})"
+        way = f", {self.axes}" if self.axes else ""
+        return f"Fit({name}model {self.model!r}, {self.verdict}, trust {self.trust:.2f}{way}{part})"
 
     def _repr_html_(self) -> str:
         rows = {
             "model": self.model + (", fitted to a part" if self.partial else ""),
             "verdict": "; ".join([self.verdict, *self.reasons]),
             "trust": f"{self.trust:.2f}",
-            "axes": f"up {self.up}, front {self.front}",
+            "axes": self.axes,
             "notes": "; ".join(self.notes),
         }
         return table_html(f"Fit: {self.shape_name or 'a shape'}", rows)
+
+    @property
+    def axes(self) -> str:
+        """Up and front in words; empty where the model does not know them."""
+        return f"up {self.up}, front {self.front}" if self.up else ""
 
     @cached_property
     def vertex_distance(self) -> Floats:
@@ -178,8 +183,18 @@ class Fit(Pickled):
             )
 
 
-def judged_fit(judged: Judgement, system: NodeSystem, frame: Frame, vectors: Float[Floats, "K 3"], **about: Any) -> Fit:
-    """The fit that has these node vectors in the core ``frame``, as it is judged; the other attributes as `Fit`."""
+def judged_fit(
+    judged: Judgement,
+    system: NodeSystem,
+    frame: Frame,
+    vectors: Float[Floats, "K 3"],
+    upright: bool = True,
+    **about: Any,
+) -> Fit:
+    """The fit that has these node vectors in the core ``frame``, as it is judged; the other attributes as `Fit`. Whether the
+    template is known to stand ``upright`` decides whether the fit says what is up.
+    """
+    up, front = (axis_name(frame.rotation[row]) if upright else "" for row in (1, 2))
     return Fit(
         frame=frame,
         points=system.moved(vectors),
@@ -191,8 +206,8 @@ def judged_fit(judged: Judgement, system: NodeSystem, frame: Frame, vectors: Flo
         trust=judged.trust,
         signs=judged.features,
         regularity=system.regularity(vectors),
-        up=axis_name(frame.rotation[1]),
-        front=axis_name(frame.rotation[2]),
+        up=up,
+        front=front,
         **about,
     )
 

@@ -25,6 +25,7 @@ from meshmatch.geometry.oriented import quick_tree
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
+from meshmatch.shapes.normalise import ALIGNS
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
@@ -168,11 +169,13 @@ def may_show_part(shape: Shape, config: FitConfig) -> bool:
 def as_fit(found: Registration, partial: bool, began: float) -> Fit:
     """The fit of a registration, judged."""
     task, best = found.task, found.candidate
+    aligned = task.model.card.frame["orientation"] in ALIGNS  # its template stands as some shape did
     return judged_fit(
         judge_registration(found, partial),
         task.system,
         found.core_frame,
         best.vectors,
+        upright=not aligned or task.config.up is not None or task.config.front is not None,
         template_hash=task.model.template.hash,
         residual=best.residual,
         verts=task.shape.verts,

@@ -374,6 +374,7 @@ class _Judged:
             task.system,
             frame,
             found.vectors,
+            upright=False,
             template_hash=task.template.hash,
             residual=found.features.residual,
             verts=task.shape.verts,

@@ -150,7 +150,7 @@ def test_a_matcher_without_a_model_needs_two_shapes(shapes: tuple[Shape, Shape])
     assert repr(matcher) == "Matcher('none')"
     with pytest.raises(OptionError, match="without a model") as caught:
         matcher.fit(shapes[0])
-    assert "match two shapes" in caught.value.hint
+    assert "match two shapes" in caught.value.hint and "--onto" in caught.value.hint
 
 
 @pytest.mark.usefixtures("quick")

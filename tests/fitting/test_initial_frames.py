@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from meshmatch.fitting.fit import axis_name
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.search.frames import aligned_frames, scan_frame
@@ -39,8 +40,11 @@ def test_a_given_orientation_is_taken_as_it_is() -> None:
     model = wanting("none")
     [only] = aligned_frames(model, scan_of(turned_template(model, [0, 0, 1.0]))) or []
     assert np.array_equal(only.rotation, np.eye(3)) and not only.center.any()
-    fit = Fitter(model, QUICK).fit(turned_template(model, [0, 0, 0.2]))
-    assert (fit.up, fit.front) == ("+y", "+z")
+    shape = turned_template(model, [0, 0, 0.2])
+    fit = Fitter(model, QUICK).fit(shape)
+    assert (axis_name(fit.frame.rotation[1]), axis_name(fit.frame.rotation[2])) == ("+y", "+z")
+    assert (fit.up, fit.front, fit.axes) == ("", "", "")  # its template stands as some shape did
+    assert Fitter(model, replace(QUICK, up="y")).fit(shape).axes == "up +y, front +z"
 
 
 @pytest.mark.parametrize(("orientation", "vector"), [("near", [0.2, 0.1, 0.1]), ("rigid", [0.5, 2.0, -1.0])])
