@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from meshmatch.collections.atlas import Atlas as Atlas
     from meshmatch.collections.collection import Collection as Collection
     from meshmatch.collections.measures import measure_atlas as measure_atlas
+    from meshmatch.collections.transfers import Transfers as Transfers
     from meshmatch.errors import MeshmatchError as MeshmatchError
     from meshmatch.errors import MeshmatchWarning as MeshmatchWarning
     from meshmatch.fitting.fit import Fit as Fit
@@ -97,6 +98,7 @@ _NAMES = {
     "collections.atlas": "Atlas",
     "collections.collection": "Collection",
     "collections.measures": "measure_atlas",
+    "collections.transfers": "Transfers",
     "errors": "MeshmatchError MeshmatchWarning",
     "fitting.fit": "Fit",
     "fitting.fit_config": "FitConfig",

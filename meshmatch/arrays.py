@@ -85,7 +85,7 @@ class Brief:
     """A dataclass (``repr=False``) that shows its arrays by their sizes: one line, whatever it holds."""
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({', '.join(map(self._shown, fields(self)))})"  # type: ignore[arg-type]
+        return f"{type(self).__name__}({', '.join(self._shown(each) for each in fields(self) if each.repr)})"  # type: ignore[arg-type]
 
     def _shown(self, field: Field[Any]) -> str:
         value = getattr(self, field.name)

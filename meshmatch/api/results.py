@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
@@ -23,6 +23,7 @@ from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.places import PlacedFit, Places, surface_distance
 from meshmatch.maps.unfold import unfolded
 from meshmatch.maps.vertex_map import VertexMap, check_map
+from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.formats.gltf_rigged import Binding
@@ -307,6 +308,8 @@ class Transferred(Brief, Generic[T]):
         How many values were not trusted, and what became of them.
     maps
         The maps that were followed.
+    writer
+        What `save` lets write the file: called with the path of a temporary one and with its own.
 
     Examples
     --------
@@ -319,6 +322,28 @@ class Transferred(Brief, Generic[T]):
     confidence: Float[Floats, " N"]
     low: LowConfidence
     maps: MapPair
+    writer: Callable[[Path, Path], None] = field(repr=False)
+
+    def save(self, path: str | Path) -> None:
+        """Write what arrived, in the format that the suffix names.
+
+        Parameters
+        ----------
+        path
+            Colors: .ply, .glb, .obj or .off (the target with them), .npy or .csv. Values: .npy or .csv; .ply, .vtp or .vtk
+            (the target with them). Labels: .npy, .csv, .txt, .json, or .ply (the target with them). Skin weights: .npz or
+            .json. Landmarks: .csv, .json, .pp, .fcsv, .mrk.json or .tps.
+
+        Raises
+        ------
+        OptionError
+            The suffix is another one.
+        OutputError
+            The file cannot be written.
+        """
+        path = as_path(path)
+        with replace_on_success(path) as temporary:
+            self.writer(temporary, path)
 
     def _repr_html_(self) -> str:
         from meshmatch.api.notebook import map_html

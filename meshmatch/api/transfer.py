@@ -6,6 +6,7 @@ Shapes and ``match`` are as in `find_maps`. `ConfidenceRule` says what is done w
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, get_args
@@ -15,23 +16,34 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
 from meshmatch.api.results import ConfidenceRule, MapPair, MatchResult, Transferred
+from meshmatch.api.upright import turn_upright
 from meshmatch.arrays import Floats, as_numbers, off_torch
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.colors import light, seen
+from meshmatch.shapes.dressed_files import tell_lost
 from meshmatch.shapes.files import ShapeLike, as_shape
+from meshmatch.shapes.formats import gltf
+from meshmatch.shapes.input_files import stem_of
 from meshmatch.shapes.landmark_files import Space, mesh_space
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.attributes import pull_directions, pull_face_labels, pull_labels, pull_values, pull_weights
 from meshmatch.transfer.bake import colors_of_vertices
-from meshmatch.transfer.label_files import Labels, On, labels_of, load_labels, named
-from meshmatch.transfer.landmarks import Landmarks, at_points, at_vertices, load_landmarks, push_landmarks
+from meshmatch.transfer.label_files import Labels, On, labels_of, load_labels, named, save_labels
+from meshmatch.transfer.landmarks import (
+    Landmarks,
+    at_points,
+    at_vertices,
+    load_landmarks,
+    push_landmarks,
+    save_landmarks,
+)
 from meshmatch.transfer.low_confidence import LowConfidence, replace_low_labels, replace_low_values, replace_low_weights
-from meshmatch.transfer.value_files import checked_colors, light_of
-from meshmatch.transfer.weight_files import SkinWeights, load_weights, weights_of
+from meshmatch.transfer.value_files import Values, checked_colors, light_of, save_colors, save_values
+from meshmatch.transfer.weight_files import SkinWeights, load_weights, save_weights, weights_of
 
 if TYPE_CHECKING:
     from meshmatch.api.matcher import Matcher
@@ -168,7 +180,12 @@ def transfer_values(
             found = pull_values(maps.backward, numbers)
         confidence = maps.backward.confidence.astype(np.float64)
         found, low = replace_low_values(found, confidence < rule.minimum, maps.target, blank, rule.fill)
-    return Transferred(found, confidence, low, maps)
+    write = partial(_write_values, found, maps.target)
+    return Transferred(found, confidence, low, maps, write)
+
+
+def _write_values(values: Floats, target: Shape, path: Path, final: Path) -> None:
+    save_values(path, Values(values), target)
 
 
 def transfer_colors(
@@ -226,7 +243,15 @@ def transfer_colors(
             found = colors_of_vertices(maps.source, colors, maps.target, maps.backward)
         confidence = maps.backward.confidence.astype(np.float64)
         found, low = replace_low_values(found, confidence < rule.minimum, maps.target, blank, rule.fill)
-    return Transferred(seen(found), confidence, low, maps)
+    colors, file = seen(found), Path(target) if isinstance(target, str | Path) else None
+    return Transferred(colors, confidence, low, maps, partial(_write_colors, colors, maps, file))
+
+
+def _write_colors(colors: Floats, maps: MapPair, file: Path | None, path: Path, final: Path) -> None:
+    along_y = Path(maps.source.name).suffix.lower() in gltf.SUFFIXES
+    turn = turn_upright(maps, along_y) if final.suffix.lower() == ".glb" else None
+    save_colors(path, maps.target, colors, file, turn)
+    tell_lost(file, final)
 
 
 def transfer_labels(
@@ -296,7 +321,12 @@ def transfer_labels(
             found = pull_labels(back, source, given.codes, of_face)
         doubted = confidence < rule.minimum
         found, low = replace_low_labels(found, doubted, target, blank is not None, rule.fill, kind == "faces")
-    return Transferred(named(found, given, kind, blank), confidence, low, maps)
+    labeled = named(found, given, kind, blank)
+    return Transferred(labeled, confidence, low, maps, partial(_write_labels, labeled, target))
+
+
+def _write_labels(labels: Labels, target: Shape, path: Path, final: Path) -> None:
+    save_labels(path, labels, target)
 
 
 def transfer_weights(
@@ -357,7 +387,12 @@ def transfer_weights(
         confidence = maps.backward.confidence.astype(np.float64)
         found = pull_weights(maps.backward, given.matrix, influences)
         found, low = replace_low_weights(found, confidence < rule.minimum, maps.target, rule.fill, influences)
-    return Transferred(SkinWeights(found, given.names), confidence, low, maps)
+    skin = SkinWeights(found, given.names)
+    return Transferred(skin, confidence, low, maps, partial(_write_weights, skin))
+
+
+def _write_weights(weights: SkinWeights, path: Path, final: Path) -> None:
+    save_weights(path, weights)
 
 
 def transfer_landmarks(
@@ -406,8 +441,14 @@ def transfer_landmarks(
     maps = find_maps(source, target, match)
     with thread_limit(1):
         found = push_landmarks(maps.forward, maps.source, maps.target, given)
-    low = int((found.confidence < rule.minimum).sum())
-    return Transferred(found, found.confidence, LowConfidence(len(found.names), low), maps)
+    low = LowConfidence(len(found.names), int((found.confidence < rule.minimum).sum()))
+    file = Path(target) if isinstance(target, str | Path) else None
+    return Transferred(found, found.confidence, low, maps, partial(_write_landmarks, found, maps.target, file))
+
+
+def _write_landmarks(landmarks: Landmarks, target: Shape, file: Path | None, path: Path, final: Path) -> None:
+    space = "" if file is None else mesh_space(file)
+    save_landmarks(path, landmarks, space or "LPS", final.name, stem_of(file or Path(target.name)))
 
 
 def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape, space: Space) -> Landmarks:

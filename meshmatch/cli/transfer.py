@@ -19,7 +19,7 @@ On = Literal["vertices", "faces"]
 
 
 @grouped
-@to_targets(".ply", ".glb", ".obj", ".off")
+@to_targets("transfer_colors")
 def transfer_color(
     *,
     source: Source,
@@ -47,9 +47,6 @@ def transfer_color(
     They are interpolated within the faces of SRC. The VALUE of --blank is a number, one number for each column
     (1,0,0), or a color (#ff0000).
     """
-    from meshmatch.api.upright import turn_upright
-    from meshmatch.shapes.dressed_files import tell_lost
-    from meshmatch.shapes.formats.gltf import SUFFIXES as GLTF_SUFFIXES
     from meshmatch.transfer import value_files
 
     if directions and values is None:
@@ -57,19 +54,18 @@ def transfer_color(
     transfer = Transfer(source, target, output, maps, run, picture)
     (value_files.check_color_suffix if values is None else value_files.check_values_suffix)(output)
     with transfer.outputs(values) as (temporary,):
-        a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
+        a = meshmatch.load_shape(source)
         given = None if values is None else value_files.load_values(values, a)
         here = value_files.light_of(a) if given is None else given.numbers
         columns = 1 if here.ndim == 1 else here.shape[1]
         rule = rules.rule(None if rules.blank is None else value_files.parse_blank(rules.blank, columns).tolist())
         if given is None:
-            result = meshmatch.transfer_colors(a, b, transfer, rule=rule)
-            turn = turn_upright(result.maps, source.suffix.lower() in GLTF_SUFFIXES)
-            value_files.save_colors(temporary, b, result.data, target, turn)
-            tell_lost(target, output)
+            result = meshmatch.transfer_colors(a, target, transfer, rule=rule)
+            result.writer(temporary, output)
         else:
-            result = meshmatch.transfer_values(a, b, given.numbers, transfer, directions=directions, rule=rule)
-            value_files.save_values(temporary, value_files.Values(result.data, given.names), b)
+            result = meshmatch.transfer_values(a, target, given.numbers, transfer, directions=directions, rule=rule)
+            value_files.save_values(temporary, value_files.Values(result.data, given.names), result.maps.target)
+    b = result.maps.target
     low = transfer.tell_low(result.low, rule.minimum)
     what = "colors" if given is None else f"{columns} number{'s' if columns > 1 else ''} each"
     transfer.console.say(f"wrote {output}: {what} for the {b.V} vertices of {transfer.names[1]}")
@@ -89,7 +85,7 @@ def transfer_color(
 
 
 @grouped
-@to_targets(".npy")
+@to_targets("transfer_labels")
 def transfer_labels(
     *,
     source: Source,
@@ -114,7 +110,7 @@ def transfer_labels(
     """
     import numpy as np
 
-    from meshmatch.transfer.label_files import check_labels_suffix, load_labels, save_labels
+    from meshmatch.transfer.label_files import check_labels_suffix, load_labels
 
     transfer = Transfer(source, target, output, maps, run, picture)
     rule = rules.rule(rules.blank)
@@ -124,7 +120,7 @@ def transfer_labels(
         given = load_labels(labels, a, on)
         result = meshmatch.transfer_labels(a, b, given, transfer, to=to, rule=rule)
         found = result.data
-        save_labels(temporary, found, b)
+        result.writer(temporary, output)
     low = transfer.tell_low(result.low, rule.minimum, found.on)
     used = len(np.unique(found.codes))
     transfer.console.say(
@@ -142,7 +138,7 @@ def transfer_labels(
 
 
 @grouped
-@to_targets(".npz")
+@to_targets("transfer_weights")
 def transfer_weights(
     *,
     source: Source,
@@ -165,7 +161,7 @@ def transfer_weights(
     import numpy as np
 
     from meshmatch.shapes.formats.gltf import SUFFIXES as GLTF_SUFFIXES
-    from meshmatch.transfer.weight_files import check_weights_suffix, load_weights, save_weights
+    from meshmatch.transfer.weight_files import check_weights_suffix, load_weights
 
     transfer = Transfer(source, target, output, maps, run, picture)
     rule = meshmatch.ConfidenceRule(min_confidence, fill)
@@ -177,7 +173,7 @@ def transfer_weights(
         given = load_weights(weights or source, a)
         result = meshmatch.transfer_weights(a, b, given, transfer, influences=influences, rule=rule)
         matrix = result.data.matrix
-        save_weights(temporary, result.data)
+        result.writer(temporary, output)
     low = transfer.tell_low(result.low, min_confidence)
     bare = int((np.diff(matrix.indptr) == 0).sum())
     if bare:
@@ -208,7 +204,7 @@ def _landmark_table(table: Path, given: Mapping[str, Any], source: str, written:
 
 
 @grouped
-@to_targets(".csv", gather=_landmark_table)
+@to_targets("transfer_landmarks", gather=_landmark_table)
 def transfer_landmarks(
     *,
     source: Source,
@@ -238,15 +234,14 @@ def transfer_landmarks(
     """
     import numpy as np
 
-    from meshmatch.shapes.input_files import stem_of
     from meshmatch.shapes.landmark_files import mesh_space
-    from meshmatch.transfer.landmarks import check_landmarks_suffix, load_landmarks, save_landmarks
+    from meshmatch.transfer.landmarks import check_landmarks_suffix, load_landmarks
 
     transfer = Transfer(source, target, output, maps, run, picture)
     console = transfer.console
     check_landmarks_suffix(output)
     with transfer.outputs(landmarks) as (temporary,):
-        a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
+        a = meshmatch.load_shape(source)
         given, furthest = load_landmarks(landmarks, a, mesh_space(source))
         for note in given.notes:
             console.warn(note)
@@ -255,9 +250,9 @@ def transfer_landmarks(
                 f"a landmark lies {furthest:.4g} from {a.name}, {100 * furthest / a.diagonal:.0f} % of its size: the "
                 "nearest point of the surface was taken"
             )
-        result = meshmatch.transfer_landmarks(a, b, given, transfer, rule=meshmatch.ConfidenceRule(min_confidence))
-        found = result.data
-        save_landmarks(temporary, found, mesh_space(target) or "LPS", output.name, stem_of(target))
+        result = meshmatch.transfer_landmarks(a, target, given, transfer, rule=meshmatch.ConfidenceRule(min_confidence))
+        found, b = result.data, result.maps.target
+        result.writer(temporary, output)
     low = np.flatnonzero(found.confidence < min_confidence)
     for k in low[:10].tolist():
         console.warn(f"landmark {found.names[k]} is uncertain: its confidence is {found.confidence[k]:.2f}")

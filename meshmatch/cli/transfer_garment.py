@@ -12,7 +12,7 @@ from meshmatch.cli.words import Json
 
 
 @grouped
-@to_targets("")
+@to_targets("transfer_garment")
 def transfer_garment(
     *,
     garment: Path = Argument(..., metavar="GARMENT", help="Mesh that sits on SRC: clothes, hair, a hat, shoes."),

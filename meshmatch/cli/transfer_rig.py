@@ -15,7 +15,7 @@ _NAMED = 8  # joints that a note lists
 
 
 @grouped
-@to_targets(".glb")
+@to_targets("transfer_rig")
 def transfer_rig(
     *,
     source: Source,

@@ -14,7 +14,7 @@ _NAMED = 8  # shapes that a warning lists
 
 
 @grouped
-@to_targets(".glb")
+@to_targets("transfer_shapes")
 def transfer_shapes(
     *,
     source: Source,

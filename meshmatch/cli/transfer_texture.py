@@ -37,7 +37,7 @@ class TextureOptions:
 
 
 @grouped
-@to_targets(".glb", ".obj")
+@to_targets("transfer_texture")
 def transfer_texture(
     *,
     source: Source,

@@ -28,7 +28,9 @@ _NAMED = 5  # of the files that are not read
 _PATTERN = "*?["
 
 
-def find_sources(shapes: str | Path | Sequence[str | Path], output: Store) -> tuple[list[Source], list[Record]]:
+def find_sources(
+    shapes: str | Path | Sequence[str | Path], output: Store | None = None
+) -> tuple[list[Source], list[Record]]:
     """The shapes of files, folders, patterns and URLs of folders, sorted by name; and what was left out, with the reason.
 
     A shape of a folder is called by its path in it, without the suffix; any other by its file's name. Left out, which is
@@ -38,7 +40,8 @@ def find_sources(shapes: str | Path | Sequence[str | Path], output: Store) -> tu
     `InputError` if there is nothing, or two shapes have one name.
     """
     given = [shapes] if isinstance(shapes, str | Path) else list(shapes)
-    if any(Store.of(each).location == output.location for each in given if is_url(each) or as_path(each).is_dir()):
+    folders = [Store.of(each) for each in given if is_url(each) or as_path(each).is_dir()]
+    if output is not None and output in folders:
         raise InputError(f"cannot fit {output.location} into itself", "choose another folder with --output")
     found: list[Source] = []
     left_out: list[Record] = []
@@ -83,13 +86,14 @@ def natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
-def _find(given: str | Path, output: Store, found: list[Source], left_out: list[Record]) -> None:
+def _find(given: str | Path, output: Store | None, found: list[Source], left_out: list[Record]) -> None:
     """Add the shapes of a file, a folder, a pattern or a URL, and what is left out of it."""
     path = None if is_url(given) else as_path(given)
     if path is None or path.is_dir():
         folder = Store.of(given)
         names = [PurePosixPath(name) for name in folder.names()]
-        inside = [file for file in names if not f"{folder.location}/{file}".startswith(f"{output.location}/")]
+        own = "" if output is None else f"{output.location}/"
+        inside = [file for file in names if not own or not f"{folder.location}/{file}".startswith(own)]
         _leave_out(
             folder.location, "files of unknown format", filter(_is_unknown, inside), left_out, f"{folder.location}/"
         )

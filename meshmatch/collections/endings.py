@@ -1,0 +1,73 @@
+"""What the files end in that a transfer writes for several targets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from meshmatch.errors import OptionError
+
+
+@dataclass(frozen=True)
+class Ending:
+    """A suffix, or that of the target where it is one of ``own``."""
+
+    suffix: str
+    own: tuple[str, ...] = ()
+
+    def __call__(self, file: Path) -> str:
+        return file.suffix.lower() if file.suffix.lower() in self.own else self.suffix
+
+
+USUAL = {
+    "transfer_colors": Ending(".ply", (".glb", ".obj", ".off")),
+    "transfer_values": Ending(".ply"),  # a shape's own file may not hold them
+    "transfer_labels": Ending(".npy"),
+    "transfer_weights": Ending(".npz"),
+    "transfer_landmarks": Ending(".csv"),
+    "transfer_rig": Ending(".glb"),
+    "transfer_shapes": Ending(".glb"),
+    "transfer_texture": Ending(".glb", (".obj",)),
+    "transfer_garment": Ending(""),  # as its garment
+}
+"""By the name of the function."""
+
+
+def ending_of(transfer: str, given: str | None, garment: Path | None, targets: Mapping[str, Path]) -> Ending:
+    """What the files of a transfer end in. `OptionError`, before any target, for what it cannot write, and for a function
+    that is not one of these if nothing is ``given``.
+    """
+    found = USUAL.get(transfer)
+    if given is not None:
+        found = Ending(f".{given.removeprefix('.')}")
+    elif found is None:
+        raise OptionError(f"what {transfer} writes is not known", "give the suffix of its files")
+    elif not found.suffix:
+        own = ".obj" if garment is None else garment.suffix.lower()
+        found = Ending(".glb" if own in (".gltf", ".vrm") else own)
+    for suffix, name in {found(file): name for name, file in reversed(list(targets.items()))}.items():
+        _check(transfer, f"{name.rpartition('/')[2]}{suffix}")
+    return found
+
+
+def _check(transfer: str, name: str) -> None:
+    from meshmatch.api import blend_shapes, rig
+    from meshmatch.shapes import files, textured_files
+    from meshmatch.transfer import label_files, landmarks, value_files, weight_files
+
+    if Path(name).name != name:
+        raise OptionError(f"{name}: --format is a suffix", "such as .glb")
+    checks: dict[str, Callable[[Path], object]] = {
+        "transfer_colors": value_files.check_color_suffix,
+        "transfer_values": value_files.check_values_suffix,
+        "transfer_labels": label_files.check_labels_suffix,
+        "transfer_weights": weight_files.check_weights_suffix,
+        "transfer_landmarks": landmarks.check_landmarks_suffix,
+        "transfer_rig": rig.check_rig_suffix,
+        "transfer_shapes": blend_shapes.check_suffix,
+        "transfer_texture": textured_files.check_textured,
+        "transfer_garment": files.check_suffix,
+    }
+    if transfer in checks:
+        checks[transfer](Path(name))
