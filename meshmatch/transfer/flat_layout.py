@@ -25,6 +25,7 @@ _SHORT = 1e-9  # of sqrt(area): an edge without length
 _UNTANGLED = 6  # rounds of moving corners between their neighbours where triangles are turned over
 _GRID = 1024  # texels across a piece on which it must not cover itself: at most,
 _FINE = 16  # and for each row of triangles
+_LONG = 600  # edges of a border whose crossings are looked for, each with each
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,7 @@ class Layout:
     @classmethod
     def of(cls, uv: Floats, corners: Ints, seen: Bools, least: int) -> Layout:
         """Faces in the plane, with what is wrong with them."""
-        return cls(uv, corners, seen, *_bad(uv[corners], corners, seen, least))
+        return cls(uv, corners, seen, *_bad(uv, corners, seen, least))
 
     def only(self, rows: Int[Ints, " K"], least: int) -> Layout:
         """Some of the faces, where they lie."""
@@ -92,10 +93,12 @@ def laid_flat(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], most: float,
     return Layout.of(uv, corners, own > _NOTHING * areas, least)
 
 
-def _bad(laid: Floats, corners: Ints, seen: Bools, least: int) -> tuple[Int[Ints, " K"], tuple[int, int] | None]:
+def _bad(uv: Floats, corners: Ints, seen: Bools, least: int) -> tuple[Int[Ints, " K"], tuple[int, int] | None]:
     """Faces that are seen and turned over; and of two that share a texel the one closer to the border. And such two."""
-    F = len(laid)
+    F, laid = len(corners), uv[corners]
     over, pair = (_signed(laid) <= 0) & seen, None
+    if not over.any() and _has_simple_border(uv, corners[seen]):
+        return np.empty(0, np.int64), None
     grid = int(np.clip(_FINE * np.sqrt(F), least, _GRID))
     low, high = laid.min(axis=(0, 1)), laid.max(axis=(0, 1))
     image = (0.01 + 0.98 * (laid - low) / (high - low).max()) * grid
@@ -112,6 +115,30 @@ def _bad(laid: Floats, corners: Ints, seen: Bools, least: int) -> tuple[Int[Ints
         if len(one):
             pair = int(one[len(one) // 2]), int(two[len(two) // 2])
     return np.flatnonzero(over), pair
+
+
+def _has_simple_border(uv: Floats, corners: Ints) -> bool:
+    """Whether the border of faces that are not turned over is seen at once not to cross itself: as many faces lie on a point
+    as its loops run around it, so that no two do where one loop runs around all others. False is no answer.
+    """
+    M = len(uv)
+    edges = corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    first, count = np.unique(np.sort(edges, axis=1) @ [M, 1], return_index=True, return_counts=True)[1:]
+    begin, end = edges[first[count == 1]].T
+    if not 3 <= len(begin) <= _LONG or count.max() > 2 or np.bincount(begin).max() > 1:  # several loops at one corner
+        return False
+    a, b = uv[begin], uv[end]
+    loop = together(M, begin, end)[begin]
+    if (np.bincount(loop, a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 0).sum() != 1:
+        return False
+    along, other = b - a, a[None] - a[:, None]
+    # On which side of each edge the others begin and end.
+    one = along[:, None, 0] * other[..., 1] - along[:, None, 1] * other[..., 0]
+    two = one + along[:, None, 0] * along[None, :, 1] - along[:, None, 1] * along[None, :, 0]
+    beside = (one > 0) == (two > 0)
+    meets = ~(beside | beside.T)
+    near = (begin[:, None] == end) | np.eye(len(begin), dtype=bool)
+    return not (meets & ~(near | near.T)).any()
 
 
 def joined(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, "F 3"]:

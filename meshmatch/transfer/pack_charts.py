@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import fft, ifft, irfft, next_fast_len, rfft, rfft2
-from scipy.ndimage import maximum_filter
+from scipy.ndimage import distance_transform_cdt, maximum_filter
 from scipy.spatial import ConvexHull, QhullError
 
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
@@ -26,12 +26,13 @@ _LOOK = 64  # rows below a piece that are looked at, at once
 _SHUFFLED = 0.35
 _MOST = 80  # charts that are moved one by one
 _ORDERS = 3  # that are compared
-_SHRINK = 0.995  # of lengths, each time that not all charts found room
+_SHRINK, _STEPS = 0.995, 4  # of lengths, in which the largest with room for all charts is looked for; of them at once
 _DENSE = 0.78  # of the image, that the charts and half of what is between them fill at the first try
 _RINGS, _FADING = (
     5,
     0.7,
 )  # texels around a piece in which others count as close, each ring so much less than the one before
+_COUNTS = np.array([1.0, *_FADING ** np.arange(_RINGS), 0.0], np.float32)  # so many texels further than others may be
 _LOW = 0.3  # how much it counts to lie low in the image, beside the share of the rings that is taken
 _BETWEEN = 0.2  # of the image at most: what lies between crumbs
 
@@ -129,12 +130,9 @@ class _Piece:
         """Its image in four turns; those of the last scale are kept."""
         if self._known[:2] != (scale, apart):
             mask = self.mask(scale)
-            grown = maximum_filter(np.pad(mask, apart), 2 * apart + 1) if apart else mask
-            wider = np.pad(grown, _RINGS)
-            rings = wider.astype(np.float32)
-            for ring in range(_RINGS):
-                wider = maximum_filter(wider, 3)
-                rings[wider & (rings == 0)] = _FADING**ring
+            away = distance_transform_cdt(~np.pad(mask, apart + _RINGS), "chessboard")
+            rings = _COUNTS[np.clip(away - apart, 0, _RINGS + 1)]
+            grown = away[_RINGS:-_RINGS, _RINGS:-_RINGS] <= apart
             around = float(rings.sum()) - int(grown.sum())
             turned = ((np.rot90(mask, k), np.rot90(grown, k), np.rot90(rings, k)) for k in range(4))
             self._known = scale, apart, [_Turned(k, *images, around) for k, images in enumerate(turned)]
@@ -181,14 +179,19 @@ def _search(pieces: list[_Piece], padding: float, rng: np.random.Generator) -> t
     scale, found = _first(pieces, padding), None
     for k in range(_ORDERS):
         order = np.argsort(-longest * np.exp(rng.normal(0, _SHUFFLED if k else 0.0, len(pieces))), kind="stable")
-        while (places := _placed(pieces, order, scale, padding)) is None and found is None:
-            scale *= _SHRINK**4
-        if places is None:
+        most, larger = np.inf, 0  # steps up that are too many, and that are not
+        while (last := _placed(pieces, order, scale, padding)) is None and found is None:
+            scale, most = scale * _SHRINK**_STEPS, _STEPS
+        if last is None:
             continue
-        while places is not None:
-            last = places
-            places = _placed(pieces, order, scale / _SHRINK, padding)
-            scale = scale if places is None else scale / _SHRINK
+        while most - larger > 1:
+            step = larger + 1 if np.isinf(most) else int(larger + most) // 2
+            places = _placed(pieces, order, scale / _SHRINK**step, padding)
+            if places is None:
+                most = step
+            else:
+                last, larger = places, step
+        scale /= _SHRINK**larger
         fine = _together(pieces, last, scale, padding)
         if found is None or scale / fine[0].grid > found[0] / found[1][0].grid:
             found = scale, fine

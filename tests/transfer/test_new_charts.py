@@ -6,7 +6,7 @@ import pytest
 from meshmatch.geometry.triangles import triangle_areas
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.chart_regions import chart_regions
-from meshmatch.transfer.flat_layout import laid_flat
+from meshmatch.transfer.flat_layout import Layout, laid_flat
 from meshmatch.transfer.new_charts import flat_areas, new_charts
 from meshmatch.transfer.pack_charts import Chart, packed, tightest
 from meshmatch.transfer.texels import faces_on
@@ -46,6 +46,46 @@ def test_what_cannot_lie_flat_is_told() -> None:
     uv[:, 0] = np.abs(uv[:, 0] - uv[:, 0].mean())  # folded in the middle
     folded = type(whole).of(uv, whole.corners, whole.seen, 512)
     assert len(folded.bad) > spiral.F / 3
+
+
+def strip(turns: float, wider: float, closed: bool = False, hole: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """A band around 0, counterclockwise, so much wider after each turn; its ends may be one."""
+    steps = int(40 * turns)
+    angle = 2 * np.pi * np.linspace(0, turns, steps, endpoint=not closed)
+    inner = hole + wider * angle / (2 * np.pi)
+    uv = np.concatenate([r[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1) for r in (inner, inner + 0.5)])
+    a = np.arange(steps if closed else steps - 1)
+    b, c, d = (a + 1) % steps, a + steps, (a + 1) % steps + steps
+    return uv, np.concatenate([np.stack([a, c, d], axis=1), np.stack([a, d, b], axis=1)])
+
+
+@pytest.mark.parametrize(
+    ("turns", "wider", "closed", "covered"),
+    [
+        (0.9, 0.0, False, False),
+        (1.2, 0.0, False, True),
+        (2.5, 0.6, False, False),  # a spiral beside itself
+        (2.5, 0.3, False, True),
+        (1.0, 0.0, True, False),  # a ring
+        (2.0, 0.0, True, True),  # a ring that goes round twice
+    ],
+)
+def test_what_lies_on_itself_is_found(turns: float, wider: float, closed: bool, covered: bool) -> None:
+    uv, corners = strip(turns, wider, closed)
+    layout = Layout.of(uv, corners, np.ones(len(corners), bool), 256)
+    assert bool(len(layout.bad)) == covered and (layout.pair is not None) == covered
+    image = (uv[corners] / np.abs(uv).max() + 1) * 512
+    assert bool(faces_on(image, 1024)[1]) == covered
+
+
+def test_two_pieces_on_one_another_are_found() -> None:
+    uv, corners = strip(1.0, 0.0, True)
+    disk, rest = strip(1.0, 0.0, True, 0.3)
+    for scale, covered in ((0.2, False), (1.5, True)):  # within its hole, and on it
+        both = Layout.of(
+            np.concatenate([uv, scale * disk]), np.concatenate([corners, rest + len(uv)]), np.ones(160, bool), 256
+        )
+        assert bool(len(both.bad)) == covered
 
 
 def test_a_smooth_surface_needs_few_charts(torus: Shape) -> None:
