@@ -40,6 +40,7 @@ from meshmatch.geometry.frames import Frame, RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.shapes.normalise import Align, align, sqrt_area_frame
+from meshmatch.shapes.rims import RimPoints, is_sheet
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, low_mesh, make_template
@@ -70,6 +71,7 @@ _FEW, _FEW_STEPS = 4000, 12  # samples and steps by which two shapes that were m
 # Of a whole: up to so many turns are fitted, whose samples stay up to so many times as far apart as those of the best one.
 # Ends of leaves are told by their fits alone (1.0 to 1.2); of femurs all others are 2 and more, of knees 1.3.
 _ALIKE_TURNS, _NEARLY = 4, 1.35
+_RIM_STEP = 0.01  # between points of a rim
 _LOST = 0.5  # trust of a search whose result is not believed
 _NOTHING = 0.01  # a smaller stretch is none
 _STRETCHED = 0.03  # weight of the stretch in an energy, beside the residual
@@ -147,13 +149,16 @@ class _Task:
         whole = None if size is None else replace(sqrt_area_frame(shape), scale=size)
         rng = np.random.default_rng(config.seed + 1)
         self._own, self._samples = take_samples(shape, config.samples, rng, whole)
+        sheets = not self.partial and self.system.is_sheet and is_sheet(shape)
+        self._rim = RimPoints.of(shape, _RIM_STEP) if sheets else None
         self._resting = sample_surface(template.shape, _ALIGNED_BY, np.random.default_rng(config.seed))
 
     def fitted(self, begin: _Begin) -> _Fitted:
         points = begin.frame.apply(self._own.undo(self._samples.points))
         normals = self._samples.normals @ self._own.rotation @ begin.frame.rotation.T
         samples = replace(self._samples, points=points, normals=normals).facing(self.system.surface(begin.vectors))
-        vectors = viscous_vectors(self.system, samples, self.config, begin.vectors, self.partial)
+        rim = None if self._rim is None else self._rim.in_frame(begin.frame)
+        vectors = viscous_vectors(self.system, samples, self.config, begin.vectors, self.partial, rim)
         features = DirectFeatures.of(self.system, samples, vectors)
         if self.partial:
             features = replace(features, residual=part_residual(self.system, samples, vectors, _BEYOND))

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.triangles import edge_lengths
 from meshmatch.shapes.shape import Shape
 
 RIM = 0.3  # length of the boundary of a part at least, in units of sqrt(area); cracks of a mesh are shorter
+SHEET = 3.5  # length of all rims of a sheet: a flat disc has 3.54, and nothing flat has less; a broken bone has 2.6
 
 
 def rim_lengths(shape: Shape) -> Float[Floats, " V"]:
@@ -20,3 +24,56 @@ def rim_lengths(shape: Shape) -> Float[Floats, " V"]:
     rim = connected_components(graph, directed=False)[1]
     lengths = np.bincount(rim[edges[:, 0]], edge_lengths(shape.verts, edges), shape.V)[rim]
     return np.asarray(lengths / np.sqrt(shape.area))
+
+
+def is_sheet(shape: Shape) -> bool:
+    """Whether a shape is an open sheet, such as a leaf, which ends where others of its kind do; a cut one need not."""
+    if shape.is_cloud:
+        return False
+    ends = shape.edges.open[rim_lengths(shape)[shape.edges.open[:, 0]] > RIM]
+    return bool(edge_lengths(shape.verts, ends).sum() > SHEET * np.sqrt(shape.area))
+
+
+def rim_corners(shape: Shape) -> Int[Ints, "E 3"]:
+    """Both ends of each edge of the rims of a mesh, and the third corner of its triangle; cracks are no rims."""
+    faces = np.asarray(shape.faces)
+    corners = np.concatenate([faces, faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]])
+    corners = corners[(rim_lengths(shape) > RIM)[corners[:, :2]].all(axis=1)]
+    keys = np.sort(corners[:, :2], axis=1) @ np.array([shape.V, 1])
+    first, faces_at = np.unique(keys, return_index=True, return_counts=True)[1:]
+    return np.asarray(corners[first[faces_at == 1]])
+
+
+def at_rim(
+    verts: Float[Floats, "V 3"], corners: Int[Ints, "E 3"]
+) -> tuple[Float[Floats, " E"], Float[Floats, "E 3"], Float[Floats, "E 3"]]:
+    """Length of each edge of a rim, and unit vectors that lead out of the surface there, and along the edge."""
+    a, b, c = verts[corners.T]
+    length = np.linalg.norm(b - a, axis=1)
+    along = (b - a) / np.maximum(length, 1e-300)[:, None]
+    out = (a - c) - ((a - c) * along).sum(axis=1, keepdims=True) * along
+    return length, out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300), along
+
+
+@dataclass(frozen=True, eq=False)
+class RimPoints:
+    """Points along the rims of a mesh, with unit vectors that lead out of the surface there, and along the rim."""
+
+    points: Float[Floats, "P 3"]
+    outward: Float[Floats, "P 3"]
+    along: Float[Floats, "P 3"]
+
+    @classmethod
+    def of(cls, shape: Shape, step: float) -> RimPoints:
+        """Points at most a ``step`` apart (units of sqrt(area)); none of a shape without a rim."""
+        corners = rim_corners(shape)
+        length, outward, along = at_rim(shape.verts, corners)
+        count = np.ceil(np.maximum(length / (step * np.sqrt(shape.area)), 1.0)).astype(np.int64)
+        edge = np.repeat(np.arange(len(corners)), count)
+        share = (np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[edge]
+        a, b, _ = shape.verts[corners[edge].T]
+        return cls(a + share[:, None] * (b - a), outward[edge], along[edge])
+
+    def in_frame(self, frame: Frame) -> RimPoints:
+        """The same through a frame."""
+        return RimPoints(frame.apply(self.points), self.outward @ frame.rotation.T, self.along @ frame.rotation.T)

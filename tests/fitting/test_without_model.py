@@ -8,18 +8,24 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import InputError
+from meshmatch.experiments.makers.molars_and_leaves import leaves
 from meshmatch.fitting import without_model
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.judge.direct import DirectFeatures
 from meshmatch.fitting.solve.system import NodeSystem
+from meshmatch.fitting.solve.terms import RimTerm
 from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.fitting.without_model import fit_without_model, mean_shape, template_of, viscous_system
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.trees import cKDTree
+from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.rims import RimPoints
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.sides import mirrored
 from meshmatch.templates.template import Template
 from tests.fitting.test_direct import QUICK, bent, creature
+from tests.shapes.test_rims import disc
 
 IDENTITY = Frame(1.0, np.eye(3), np.zeros(3))
 CONFIG = ViscousConfig(nodes=200, radius=0.2, samples=3000, back_points=1500)
@@ -117,3 +123,36 @@ def test_the_mean_of_poses_keeps_the_size_of_what_turns(template: Template) -> N
     straight = np.mean([fit.points for fit in fits], axis=0)
     lengths = [np.ptp(points[:, 1]) for points in (rest, mean, straight)]
     assert abs(lengths[1] / lengths[0] - 1) < 0.5 * abs(lengths[2] / lengths[0] - 1)
+
+
+def test_rims_of_open_sheets_lie_on_each_other() -> None:
+    """Leaves slide in their planes: their rims tell where they belong."""
+    made = leaves(2, 7, 900)
+    first, other = (Shape(verts, made.faces, "leaf") for verts in made.verts)
+    quick = replace(CONFIG, nodes=120, radius=0.25, samples=1500, back_points=1500)
+    template, errors = template_of(first, "leaf", quick), []
+    at = cKDTree(template.shape.verts).query(sqrt_area_frame(first).apply(first.verts))[1]
+    for width in (0.0, quick.rim_width):
+        task = without_model._Task(template, other, replace(quick, rim_width=width))
+        found = task.fitted(task.turns(None, "near")[0])
+        points = found.begin.frame.undo(task.system.moved(found.vectors))
+        errors.append(np.linalg.norm(points[at] - other.verts, axis=1).mean())
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_a_rim_is_held_on_a_rim_and_glides_along_it() -> None:
+    shape = disc(1.0)
+    system = viscous_system(template_of(shape, "disc", CONFIG))
+    rim = RimPoints.of(Shape(1.1 * system.verts, system.faces), 0.01)
+    weights, pulls = RimTerm(rim, 0.01, 0.1).quadratic(system, np.zeros((system.K, 3)), 1e3)
+    assert np.array_equal(weights.any(axis=1), system.rim)
+    at = np.flatnonzero(system.rim)
+    normal = weights[at][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    out = system.verts[at] / np.linalg.norm(system.verts[at], axis=1, keepdims=True)
+    along = np.cross(out, [0.0, 0.0, 1.0])
+    across = np.einsum("nij,ni,nj->n", normal, out, out)
+    assert np.einsum("nij,ni,nj->n", normal, along, along).max() < 0.02 * across.min()
+    length = 2 * np.pi / np.sqrt(np.pi)
+    assert across.sum() == pytest.approx(0.01 * length, rel=0.02)
+    wanted = np.einsum("nij,nj->ni", normal, 1.1 * system.verts[at])
+    assert np.abs(pulls[at] - wanted).max() < 0.02 * np.abs(wanted).max()

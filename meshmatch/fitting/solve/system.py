@@ -28,7 +28,7 @@ from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import triangle_vectors
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.outside import without_hidden
-from meshmatch.shapes.rims import RIM, rim_lengths
+from meshmatch.shapes.rims import RIM, is_sheet, rim_corners, rim_lengths
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
 
@@ -77,6 +77,18 @@ class NodeSystem:
     def rim(self) -> Bool[Bools, " V"]:
         """Which vertices of the template lie where it ends; at cracks it does not."""
         return rim_lengths(Shape(self.verts, self.faces)) > RIM
+
+    @property
+    @derived
+    def is_sheet(self) -> bool:
+        """Whether the template is an open sheet, such as a leaf."""
+        return is_sheet(Shape(self.verts, self.faces))
+
+    @property
+    @derived
+    def rim_corners(self) -> Int[Ints, "E 3"]:
+        """Edges of the template where it ends, see `meshmatch.shapes.rims.rim_corners`."""
+        return rim_corners(Shape(self.verts, self.faces))
 
     @property
     @derived

@@ -20,7 +20,9 @@ from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.oriented import OrientedPoints, feature_tree, with_normals
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import vertex_areas
+from meshmatch.shapes.rims import RimPoints, at_rim
 
+_SAME_SIDE = 0.2  # cosine of the angle between directions out of two rims that are paired
 _SHARERS = 16  # vertices of the template that share a point, at most
 
 Landmarks = tuple[Int[Ints, " N"], Float[Floats, "N 3"]]
@@ -89,6 +91,38 @@ class LandmarkTerm:
         np.add.at(weights, (at[:, None], np.array([0, 3, 5])), self.weight)
         np.add.at(pulls, at, self.weight * position)
         return weights, pulls
+
+
+@dataclass(frozen=True, eq=False)
+class RimTerm:
+    """Template and shape both end somewhere, and the rim of the one is held on that of the other, along which it may glide.
+
+    Pairs of a surface say nothing of that, for their partners lie in the plane in which a rim moves on.
+    """
+
+    rim: RimPoints  # of the shape, core frame
+    width: float  # a rim counts as much as a strip of the surface that is so wide
+    outward_weight: float  # of the directions out of the surface in the search for pairs
+
+    def quadratic(self, system: NodeSystem, vectors: Float[Floats, "K 3"], scale: float) -> Quadratic:
+        moved, rim, corners = system.moved(vectors), self.rim, system.rim_corners
+        length, out, _ = at_rim(moved, corners)
+        vertex, at = np.unique(corners[:, :2].T.ravel(), return_inverse=True)
+        lengths = np.bincount(at, np.tile(length / 2, 2))
+        outward = _sums(at, np.tile(out * length[:, None], (2, 1)).T, len(vertex))
+        outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-20)
+
+        own = with_normals(moved[vertex], outward, self.outward_weight)
+        theirs = with_normals(rim.points, rim.outward, self.outward_weight)
+        to_rim, to_template = cKDTree(theirs).query(own)[1], cKDTree(own).query(theirs)[1]
+        at = np.concatenate([np.arange(len(vertex)), to_template])
+        to = np.concatenate([to_rim, np.arange(len(theirs))])
+        share = np.concatenate([lengths, np.full(len(theirs), lengths.sum() / len(theirs))])
+        weight = 0.5 * self.width * share * robust_weight(moved[vertex[at]] - rim.points[to], scale)
+        weight *= _row_sums(outward[at] * rim.outward[to]) > _SAME_SIDE
+        across = np.concatenate([rim.outward[to], np.cross(rim.outward, rim.along)[to]])
+        point = np.tile(rim.points[to], (2, 1))
+        return _summed(np.tile(vertex[at], 2), point, across, np.tile(weight, 2), 0.0, len(moved))
 
 
 def terms_of(

@@ -16,15 +16,16 @@ from meshmatch.fitting.fit_config import Pairing, Schedule
 from meshmatch.fitting.solve.driver import Problem, minimise
 from meshmatch.fitting.solve.priors import ViscousGradient
 from meshmatch.fitting.solve.system import NodeSystem
-from meshmatch.fitting.solve.terms import terms_of
+from meshmatch.fitting.solve.terms import RimTerm, terms_of
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.shapes.rims import RimPoints
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViscousConfig(Pairing):
     """Nodes of a template, and the schedule of its fits; lengths in units of sqrt(area). Tuned on three hearts, ten
     femurs and generated knees; the last scale on nine femurs, ten hearts and generated
-    knees."""
+    knees; what concerns rims on other generated leaves than those of a benchmark."""
 
     nodes: int = 600
     radius: float = 0.085
@@ -36,6 +37,8 @@ class ViscousConfig(Pairing):
     point_share: float = 0.0003  # what is nearest says little of where a point belongs along the surface
     pair_normals: float = 0.012  # of normals in the search for pairs
     back_points: int = 8000
+    rim_width: float = 0.005  # see `RimTerm`
+    rim_outward: float = 0.1
     near: int = 5  # gradient points, itself included, whose gradients are averaged
     seed: int = 0
 
@@ -52,14 +55,15 @@ def viscous_vectors(
     config: ViscousConfig,
     start: Float[Floats, "K 3"] | None = None,
     partial: bool = False,
+    rim: RimPoints | None = None,
 ) -> Float[Floats, "K 3"]:
     """Node vectors that move the template onto the shape of the samples, which may be a part of it, from ``start``, or from
-    where it rests.
+    where it rests. The rim of the template is held on the ``rim`` of the shape (core frame), if
+    one is given.
     """
     prior = ViscousGradient.over(system.verts[system.gradient_points], config.near)
-    problem = Problem(
-        system=system,
-        terms=terms_of(samples, config, one_sided="strictly" if partial else False),
-        schedule=config.schedule,
-    )
+    terms = terms_of(samples, config, one_sided="strictly" if partial else False)
+    if rim is not None:
+        terms.append(RimTerm(rim, config.rim_width, config.rim_outward))
+    problem = Problem(system=system, terms=terms, schedule=config.schedule)
     return minimise(problem, prior, np.zeros((system.K, 3)) if start is None else start)
