@@ -97,18 +97,19 @@ def draw_effect(
     found: Comparison | PlaceTests,
     turn: Float[Floats, "3 3"],
 ) -> None:
-    """A displacement of the mean along its normals, all of it and where it is more than chance, from where the strongest
-    effect is, and from behind.
+    """A displacement of the mean along its normals, all of it and where it is more than chance: from where it is largest
+    of what is more than chance, or where it is nearest to that, and from behind.
     """
     most = float(np.abs(along).max()) or 1.0
     step = nice_step(most, 4)
     most = step * np.ceil(most / step)
     scale = Scale.of(along, f"{name}: displacement outwards (unit of the files)", (-most, most))
-    front = _towards(mean, int(np.argmax(found.statistic)), turn)
+    sure = found.p_corrected <= LEVEL
+    front = _towards(mean, int(np.argmax(sure * np.abs(along) if sure.any() else found.statistic)), turn)
     shown = {
         "displacement": np.ones(len(along), bool),
         f"false discovery rate <= {LEVEL:g}": found.p_fdr <= LEVEL,
-        f"family-wise p <= {LEVEL:g}": found.p_corrected <= LEVEL,
+        f"family-wise p <= {LEVEL:g}": sure,
     }
     panels = []
     for label, kept in shown.items():

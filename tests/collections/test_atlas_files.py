@@ -155,19 +155,22 @@ def test_the_same_atlas_gives_the_same_bytes(
     assert not {"measures.csv", "measures.png", "groups.csv", "groups.vtp", "groups.png", "samples"} & set(first)
 
 
-def test_an_effect_is_seen_from_where_it_is(tmp_path: Path) -> None:
-    """A bump on the far side of a ball; the first panel shows it, and the last but one, the others are grey or blank."""
+@pytest.mark.parametrize(("statistic", "sure"), [(1.0, True), (-1.0, True), (1.0, False)])
+def test_an_effect_is_seen_from_where_it_is(tmp_path: Path, statistic: float, sure: bool) -> None:
+    """A bump on the far side of a ball; the first panel shows it, and the last but one if that is sure, the others are
+    grey or blank. Where the test is surest is another matter.
+    """
     ball = ellipsoids(1, splits=3, spread=np.zeros(3))
     mean = Shape(ball.points[0], ball.faces)
     away = np.array([-0.6, 0.0, -0.8])
     bump = np.exp(-20 * np.square(mean.verts / AXES - away).sum(axis=1))
-    p = np.where(bump > 0.5, 0.01, 1.0)
-    tested = PlaceTests(bump, p, p, np.ones_like(p), bump)
+    p = np.where(sure & (bump > 0.5), 0.01, 1.0)
+    tested = PlaceTests(statistic * bump, p, p, np.ones_like(p), bump)
     draw_effect(tmp_path / "a.png", mean, "bump", bump, tested, np.eye(3))
     with Image.open(tmp_path / "a.png") as image:
         pixels = np.asarray(image.convert("RGB"), int)[: image.height * 2 // 3]
     red = np.array_split(pixels[:, :, 0] - pixels[:, :, 2] > 80, 6, axis=1)
-    assert [bool(panel.sum() > 20) for panel in red] == [True, False, False, False, True, False]
+    assert [bool(panel.sum() > 20) for panel in red] == [True, False, False, False, sure, False]
 
 
 def test_no_charts_without_matplotlib(tmp_path: Path, atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
