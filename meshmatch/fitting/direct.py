@@ -18,9 +18,10 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.fitting.fit import Fit, axis_name
-from meshmatch.fitting.judge.calibration import DIRECT_BOTH_WAYS
-from meshmatch.fitting.judge.direct import judge_direct
-from meshmatch.fitting.judge.reasons import Reason, Verdict
+from meshmatch.fitting.fitter import cap_verdict
+from meshmatch.fitting.judge.calibration import DIRECT, DIRECT_BOTH_WAYS, DirectCalibration
+from meshmatch.fitting.judge.direct import DirectFeatures, judge_direct
+from meshmatch.fitting.judge.reasons import SIDE_IN_DOUBT, Reason, Verdict
 from meshmatch.fitting.one_way import (
     DirectConfig,
     KnownPairs,
@@ -32,6 +33,7 @@ from meshmatch.fitting.one_way import (
     finish,
     fitted,
     glide,
+    lightened,
 )
 from meshmatch.fitting.search.intrinsic import ThinMesh
 from meshmatch.fitting.search.motions import turns_onto_itself
@@ -53,9 +55,13 @@ from meshmatch.threads import parallel_map
 _SAME = 0.1
 # How much nearer a mirror image must lie, after rigid motions, to be tried (0.2 to 0.3 of femurs, up to 0.12 of creatures in
 # other poses), or to be tried where the relief is as little alike as of a palm and the back of a hand (0.6 to 0.71; 0.8 of
-# two hands of one side); and what share of the energy its fit may have at most: 0.67 to 0.92 of hands, 1 of symmetric
-# shapes.
+# two hands of one side). What share of the energy its fit may have at most: 0.64 to 0.97 of hands, 1 of symmetric shapes;
+# and, of shapes that a rigid motion brings no nearer than so, what share of the relief may be unlike: 0.24 to 0.92 of
+# hands, mostly less than 0.6, and 0.5 to 1 of animals, mostly more than 0.75.
 _MIRRORED, _MAYBE_MIRRORED, _UNLIKE, _SHARE = 0.15, 0.03, 0.75, 0.93
+_POSED, _SHARE_UNLIKE = 0.07, 0.6
+CLEARLY = 0.003
+"""How much lower the energy must be of a map that leaves doubt, for it to replace what a model found."""
 MIRROR = Frame(1.0, np.diag([-1.0, 1.0, 1.0]), np.zeros(3))
 _NORMALS = 0.1  # of unit normals beside positions, where vertices look for what was moved near them
 
@@ -87,10 +93,10 @@ class DirectMatch:
     ``system`` moves the template by node vectors: where that is the source, the same for every shape that one source is
     registered to. ``tried`` are what the fits that were compared in the end began from, and their energies, best first;
     ``leads`` how much higher the energies of those are that differ from the best one, and ``over_guess`` that of the
-    guess, if there was one: 0 where it is much the same map. Where the energies are means of both directions, ``one_way`` is
-    what the first of them alone would have given. ``turns`` is by how many turns one of the shapes comes onto itself, which
-    makes so many maps equally good. ``apart`` is how far apart a rigid motion leaves the shapes, and the
-    source and the mirror image of the target (units of sqrt(area)), if that was asked.
+    guess, if there was one: 0 where it is much the same map. ``turns`` is by how many turns one of the shapes comes onto
+    itself, which makes so many maps equally good. ``apart`` is how far apart a rigid motion leaves the shapes, and the
+    source and the mirror image of the target (units of sqrt(area)), if that was asked. Where the energies are means of both
+    directions, ``before`` is what the first of them alone would have given.
     """
 
     source: Fit
@@ -99,13 +105,17 @@ class DirectMatch:
     system: NodeSystem
     leads: tuple[float, ...] = ()
     over_guess: float = np.inf
-    one_way: DirectMatch | None = None
+    earlier: Callable[[], DirectMatch] | None = None
     turns: int = 1
     apart: tuple[float, float] | None = None
 
     @property
     def energy(self) -> float:
         return self.tried[0][1]
+
+    @property
+    def before(self) -> DirectMatch | None:
+        return None if self.earlier is None else self.earlier()
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
@@ -179,17 +189,34 @@ def match_either_side(
     to_image = image.one_way(report.stage("", 0.3, 0.6))
     if to_image[0].energy > _SHARE * there[0].energy:
         return replace(search.matched(there, report, began), apart=search.apart)
+    if not _alike(there[0].features, to_image[0].features, min(search.apart)):
+        return replace(_side_in_doubt(search.matched(there, report, began)), apart=search.apart)
     return replace(_of_mirror_image(image.matched(to_image, report, began), target), apart=search.apart)
+
+
+def _alike(plain: DirectFeatures, image: DirectFeatures, apart: float) -> bool:
+    """Whether the mirror image is meant, if it fits better. A creature in another pose may have less to bend onto the mirror
+    image of a target, whose other leg is in front; there the relief must say so too.
+    """
+    return apart < _POSED or 1.0 - image.likeness < _SHARE_UNLIKE * (1.0 - plain.likeness)
+
+
+def _side_in_doubt(found: DirectMatch) -> DirectMatch:
+    """A match whose sides may be exchanged."""
+    doubt = [Reason("side", SIDE_IN_DOUBT)]
+    if found.source.vectors.any():
+        return replace(found, source=cap_verdict(found.source, doubt))
+    return replace(found, target=cap_verdict(found.target, doubt))
 
 
 def _of_mirror_image(found: DirectMatch, target: Shape) -> DirectMatch:
     """A match to the mirror image of a target as one to the target: its fit says that it is mirrored."""
-    frame = MIRROR.compose(found.target.frame)
+    frame, earlier = MIRROR.compose(found.target.frame), found.earlier
     up, front = (axis_name(frame.rotation[row]) for row in (1, 2))
     return replace(
         found,
         target=replace(found.target, frame=frame, verts=target.verts, up=up, front=front),
-        one_way=found.one_way and _of_mirror_image(found.one_way, target),
+        earlier=None if earlier is None else lambda: _of_mirror_image(earlier(), target),
     )
 
 
@@ -210,10 +237,11 @@ class _Search:
         shapes = [
             Shape(frame.apply(each.verts), each.faces) for frame, each in zip(frames, (source, target), strict=True)
         ]
-        thin = parallel_map(ThinMesh.of, shapes, [config.coarse] * 2)
+        light = parallel_map(lightened, shapes)
+        thin = parallel_map(ThinMesh.of, light, [config.coarse] * 2)
         known, guess = (pairs and (frames[0].apply(pairs[0]), frames[1].apply(pairs[1])) for pairs in (known, guess))
-        first = Side(source, frames[0], shapes[0], thin[0], known, config)
-        second = Side(target, frames[1], shapes[1], thin[1], known and known[::-1], config)
+        first = Side(source, frames[0], shapes[0], light[0], thin[0], known, config)
+        second = Side(target, frames[1], shapes[1], light[1], thin[1], known and known[::-1], config)
         return cls(first, second, guess)
 
     @cached_property
@@ -235,7 +263,7 @@ class _Search:
         returned = parallel_map(call, (*self._returned(there), *reverse._returned(back)))
         ways = zip(there, returned, strict=False)
         ways_back = zip(returned[len(there) :], back, strict=True)
-        found = sorted((_BothWays(*each) for each in (*ways, *ways_back)), key=attrgetter("energy"))
+        found = [_BothWays(*each) for each in (*ways, *ways_back)]
         report(0.9)
         best = distinct(found, self.source.config.gliding, _SAME)
         sides = (self.source, self.target), (self.target, self.source)
@@ -262,39 +290,38 @@ class _Search:
         return tasks
 
     def matched(self, there: list[Tried], report: Progress, began: float) -> DirectMatch:
-        """The best of the fits as a match; both ways, if one way leaves doubt."""
-        config, source, target = self.source.config, self.source, self.target
-        leads = _leads(there, config.unlike)
+        """The best of the fits as a match; of both ways, if one way leaves doubt."""
+        how, source, target = self.source.config.both_ways, self.source, self.target
         turns = max(turns_onto_itself(each.thin, each.known and each.known[0]) for each in (source, target))
-        judged = judge_direct(there[0].energy, leads, turns=turns)
-        found = replace(self._match(source, target, there[0], there, leads, judged), turns=turns)
-        clear = judge_direct(there[0].energy, leads)[0] == "good"  # of turned shapes the other way knows no better
-        if config.both_ways == "always" or (config.both_ways == "in doubt" and not clear):
+        found = _Judged(there, self.source.config.unlike, DIRECT, turns)
+        if how == "always" or (how == "in doubt" and not found.clear):
             both = self.both_ways(there, report.stage("", 0.6, 0.95))
-            leads, best = _leads(both, _SAME), both[0]
-            judged = judge_direct(best.energy, leads, DIRECT_BOTH_WAYS, turns)
-            backwards = not config.from_source and best.back.energy < best.there.energy
-            own, other, chosen = (target, source, best.back) if backwards else (source, target, best.there)
-            found = replace(self._match(own, other, chosen, both, leads, judged), one_way=found, turns=turns)
+            found = _Judged(both, _SAME, DIRECT_BOTH_WAYS, turns, found)
+        match = self._match(found)
         report.stage("matching without a model")(1.0)
-        first, second = (replace(fit, seconds=time.monotonic() - began) for fit in (found.source, found.target))
-        return replace(found, source=first, target=second)
+        first, second = (replace(fit, seconds=time.monotonic() - began) for fit in (match.source, match.target))
+        return replace(match, source=first, target=second)
 
-    def _match(
-        self,
-        own: Side,
-        other: Side,
-        chosen: Tried,
-        found: Sequence[Tried | _BothWays],
-        leads: tuple[float, ...],
-        judged: tuple[Verdict, float, tuple[Reason, ...]],
-    ) -> DirectMatch:
-        """The chosen fit, of one side to the other, refined to the end, beside those that were ``found``."""
+    def _match(self, judged: _Judged) -> DirectMatch:
+        """The best fit, refined to the end, beside those that were found."""
+        best, own, other = judged.found[0], self.source, self.target
+        chosen = best.there if isinstance(best, _BothWays) else best
+        if isinstance(best, _BothWays) and not own.config.from_source and best.back.energy < best.there.energy:
+            own, other, chosen = other, own, best.back
         vectors = own.fine.refined(other.samples, chosen.vectors, own.config.last, own.fine.viscous)
-        fits = _fits(own, other, vectors, chosen.features.residual, judged)
+        fits = _fits(own, other, vectors, chosen.features.residual, judged.judged)
         source, target = fits if own is self.source else fits[::-1]
-        tried = tuple((each.proposal.kind, each.energy) for each in found)
-        return DirectMatch(source, target, tried, own.fine.system, leads, self._over_guess(found))
+        earlier = None if judged.earlier is None else partial(self._match, judged.earlier)
+        return DirectMatch(
+            source,
+            target,
+            tuple((each.proposal.kind, each.energy) for each in judged.found),
+            own.fine.system,
+            judged.leads,
+            self._over_guess(judged.found),
+            earlier,
+            judged.turns,
+        )
 
     def _over_guess(self, found: Sequence[Tried | _BothWays]) -> float:
         """How much lower the energy of the best fit is than that of the guess."""
@@ -306,10 +333,31 @@ class _Search:
         return min(guessed, default=np.inf) - found[0].energy
 
 
-def _leads(found: Sequence[Tried | _BothWays], unlike: float) -> tuple[float, ...]:
-    """How much higher the energies of those are that differ from the first one, which has the lowest."""
-    best, *others = found
-    return tuple(each.energy - best.energy for each in others if differ(each.moved, best.moved) > unlike)
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    """Fits, the best one first, and what is said of it; those are alike that differ at ``unlike`` of the vertices, and
+    the ``earlier`` ones, of one direction, left doubt."""
+
+    found: Sequence[Tried | _BothWays]
+    unlike: float
+    calibration: DirectCalibration
+    turns: int
+    earlier: _Judged | None = None
+
+    @cached_property
+    def leads(self) -> tuple[float, ...]:
+        """How much higher the energies of those are that differ from the first one, which has the lowest."""
+        best, *others = self.found
+        return tuple(each.energy - best.energy for each in others if differ(each.moved, best.moved) > self.unlike)
+
+    @property
+    def judged(self) -> tuple[Verdict, float, tuple[Reason, ...]]:
+        return judge_direct(self.found[0].energy, self.leads, self.calibration, self.turns)
+
+    @property
+    def clear(self) -> bool:
+        """Whether the best is good; of turned shapes more fits know no better."""
+        return judge_direct(self.found[0].energy, self.leads, self.calibration)[0] == "good"
 
 
 def _fits(

@@ -39,6 +39,7 @@ from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map
 
+_HEAVY, _LIGHT = 60_000, 24_000  # triangles: a mesh with more is thinned to so many at once, which takes long
 KnownPairs = tuple[Float[Floats, "N 3"], Float[Floats, "N 3"]]
 """Positions on the source and on the target that belong together."""
 BothWays = Literal["no", "in doubt", "always"]
@@ -208,13 +209,15 @@ class Tried:
 class Side:
     """One of two shapes; what it needs to be fitted to the other one, and the other one to it.
 
-    ``frame`` is that of its file; all else is in units of sqrt(area). ``thin`` is the coarse mesh, and ``known`` are
-    positions (N, 3) on it, and (N, 3) on the other one.
+    ``frame`` is that of its file; all else is in units of sqrt(area). ``light`` is the shape, or one with fewer triangles
+    from which those that are fitted are thinned, ``thin`` the coarse one, and ``known`` are positions (N, 3) on it, and
+    (N, 3) on the other one.
     """
 
     original: Shape
     frame: Frame
     shape: Shape
+    light: Shape
     thin: ThinMesh
     known: KnownPairs | None
     config: DirectConfig
@@ -225,7 +228,7 @@ class Side:
 
     @cached_property
     def fine_mesh(self) -> ThinMesh:
-        return ThinMesh.of(self.shape, self.config.fine)
+        return ThinMesh.of(self.light, self.config.fine)
 
     @cached_property
     def fine(self) -> Level:
@@ -242,6 +245,11 @@ class Side:
     @cached_property
     def neighbours(self) -> Pairs:
         return neighbours(self.samples)
+
+
+def lightened(shape: Shape) -> Shape:
+    """The shape, or one that is thinned faster."""
+    return ThinMesh.of(shape, _LIGHT).shape if shape.F > _HEAVY else shape
 
 
 def finished(

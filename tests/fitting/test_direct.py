@@ -25,6 +25,7 @@ from meshmatch.fitting.search.proposals import (
 from meshmatch.fitting.solve.driver import minimise
 from meshmatch.fitting.solve.surface_nodes import SurfaceNodes
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.progress import Progress
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
@@ -64,6 +65,11 @@ def bent(shape: Shape, turn: Rotation, size: float = 1.0) -> Shape:
     return Shape(size * turn.apply(verts), shape.faces, "bent")
 
 
+def thinned(shape: Shape, faces: int) -> Any:
+    """Which vertices of a shape are those of its thinned mesh."""
+    return cKDTree(shape.verts).query(ThinMesh.of(shape, faces).verts)[1]
+
+
 @pytest.fixture(scope="module")
 def pair() -> tuple[Shape, Shape]:
     source = creature(3)
@@ -101,7 +107,7 @@ def test_distances_bridge_separate_parts() -> None:
 def test_a_map_of_the_surface_is_among_the_proposals(make: Any, pair: tuple[Shape, Shape]) -> None:
     meshes = [ThinMesh.of(frame_applied(shape), 900) for shape in pair]
     found = make(*(Intrinsic(mesh) for mesh in meshes))
-    true = frame_applied(pair[1]).verts[meshes[0].kept]
+    true = frame_applied(pair[1]).verts[thinned(frame_applied(pair[0]), 900)]
     every = np.arange(len(true))
     errors = [
         np.linalg.norm(each.points - true[every if each.at is None else each.at], axis=1).mean() for each in found
@@ -116,7 +122,7 @@ def test_the_right_assignment_costs_least_and_a_mirror_image_costs_more(thin: Th
     for way in same.candidates():  # each way to compare
         assert way[0] == right
     assert min(same.candidates()[0], key=same.cost) == right and same.cost(right) < same.cost((0, 2, 1, 4, 3))
-    mirrored = ThinMesh(thin.kept, thin.verts * [-1, 1, 1], thin.faces[:, ::-1])  # as far apart, but turned over
+    mirrored = ThinMesh(thin.verts * [-1, 1, 1], thin.faces[:, ::-1])  # as far apart, but turned over
     assert Assignments(surface, Intrinsic(mirrored)).cost(right) > same.cost(right) + 0.02
 
 
@@ -162,7 +168,7 @@ def test_a_tour_is_the_shortest() -> None:
 
 def test_a_turned_copy_is_found_by_a_rigid_motion(thin: ThinMesh) -> None:
     turn = Rotation.from_euler("xyz", (100, 20, 200), degrees=True)
-    copy = ThinMesh(thin.kept, turn.apply(thin.verts), thin.faces)
+    copy = ThinMesh(turn.apply(thin.verts), thin.faces)
     best = rigid_proposals(thin, copy)[0]
     assert best.kind == "rigid" and np.abs(best.points - copy.verts).max() < 0.02
 
@@ -219,7 +225,7 @@ def test_relief_is_alike_where_a_bump_lies_on_a_bump() -> None:
         moved = OrientedPoints(turn.apply(with_nose.verts), turn.apply(with_nose.normals))
         likeness[degrees] = with_nose.likeness(with_nose, moved)
     assert likeness[0] == pytest.approx(1) and likeness[90] < 0.6
-    inside_out = ThinMesh(with_nose.kept, with_nose.verts, with_nose.faces[:, ::-1])
+    inside_out = ThinMesh(with_nose.verts, with_nose.faces[:, ::-1])
     assert with_nose.likeness(inside_out, OrientedPoints(with_nose.verts, -with_nose.normals)) == pytest.approx(1)
     assert np.allclose(with_nose.areas @ with_nose.relief, 0)
     flat = trimesh.creation.box((1, 1, 0)).subdivide().subdivide().subdivide()
@@ -252,7 +258,7 @@ def test_a_bent_turned_and_scaled_shape_is_found(pair: tuple[Shape, Shape]) -> N
     shown: list[float] = []
     found = match_directly(source, target, QUICK, progress=lambda stage, name, share: shown.append(share))
     assert found.target.frame.scale == pytest.approx(sqrt_area_frame(target).scale)
-    at = ThinMesh.of(frame_applied(source), QUICK.fine).kept
+    at = thinned(frame_applied(source), QUICK.fine)
     error = np.linalg.norm(found.target.points_in_file - target.verts[at], axis=1) / found.target.frame.scale
     assert error.mean() < 0.02 and found.target.verdict != "poor"
     assert np.allclose(found.source.points_in_file, source.verts[at])
@@ -283,7 +289,7 @@ def test_a_mirror_image_is_found_where_it_fits_clearly_better() -> None:
     found = match_either_side(source, target, finer, known=(source.verts[:3], target.verts[:3])).target
     assert found.frame.mirrored and np.array_equal(found.verts, target.verts)
     assert (found.up, found.front) == tuple(axis_name(found.frame.rotation[row]) for row in (1, 2))
-    at = ThinMesh.of(frame_applied(source), finer.fine).kept
+    at = thinned(frame_applied(source), finer.fine)
     error = np.linalg.norm(found.points_in_file - target.verts[at], axis=1) / np.sqrt(target.area)
     assert error.mean() < 0.02
 
@@ -296,7 +302,18 @@ def test_a_guess_is_much_the_same_as_what_is_found_or_its_energy_is_known(pair: 
         assert found.over_guess == 0 if right else found.over_guess > 0.01
     assert dict(found.tried)["guess"] == pytest.approx(found.energy + found.over_guess)
     both = match_directly(source, target, replace(QUICK, both_ways="always", returned=1), guess=(source.verts, goals))
-    assert both.one_way is not None and 0.01 < both.over_guess < np.inf
+    assert both.before is not None and 0.01 < both.over_guess < np.inf
+
+
+def test_a_heavy_mesh_is_matched_by_a_lighter_one(pair: tuple[Shape, Shape], monkeypatch: pytest.MonkeyPatch) -> None:
+    source, target = pair
+    monkeypatch.setattr("meshmatch.fitting.one_way._HEAVY", source.F - 1)
+    monkeypatch.setattr("meshmatch.fitting.one_way._LIGHT", source.F // 2)
+    found = match_directly(source, target, replace(QUICK, fine=source.F, both_ways="no"))
+    assert len(found.source.faces) == pytest.approx(source.F // 2, rel=0.05)
+    moved = found.target.points_in_file
+    at = cKDTree(source.verts).query(found.source.points_in_file)[1]
+    assert np.linalg.norm(moved - target.verts[at], axis=1).mean() < 0.05 * np.sqrt(target.area)
 
 
 def test_known_pairs_settle_what_symmetry_leaves_open() -> None:
@@ -311,7 +328,7 @@ def test_known_pairs_settle_what_symmetry_leaves_open() -> None:
     corners = np.array(shape.verts[:8])
     known = corners, half.apply(corners)
     found = match_directly(shape, shape, QUICK, known)
-    at = ThinMesh.of(frame_applied(shape), QUICK.fine).kept
+    at = thinned(frame_applied(shape), QUICK.fine)
     off = np.linalg.norm(found.target.points_in_file - half.apply(np.array(shape.verts[at])), axis=1)
     assert off.mean() < 0.03
     assert min(found.leads, default=np.inf) > 0.01 and not any(reason.code == "ambiguous" for reason in found.reasons)
@@ -339,7 +356,7 @@ def test_one_correspondence_is_found_from_either_side() -> None:
     first = Shape(np.asarray(box.vertices), np.asarray(box.faces), "box")
     second = Shape(first.verts * [1.05, 1.0, 0.97], first.faces, "longer box")
     there, back = match_directly(first, second, quick), match_directly(second, first, quick)
-    assert there.one_way is not None and back.one_way is not None
+    assert there.before is not None and back.before is not None
     assert there.energy == pytest.approx(back.energy, rel=1e-6)
     assert there.source.template_hash == back.source.template_hash  # the one that fits the other better
     backwards = (first, second) if np.any(there.source.vectors) else (second, first)
@@ -356,7 +373,7 @@ def test_a_limb_glides_along_itself_until_its_end_is_at_the_end() -> None:
     def errors() -> list[float]:
         config = replace(QUICK, fine=2400, samples=4000)
         frame, thin = sqrt_area_frame(shape), ThinMesh.of(shape, config.coarse)
-        side = Side(shape, frame, shape, thin, None, config)
+        side = Side(shape, frame, shape, shape, thin, None, config)
         verts = side.fine_mesh.verts
         along = np.clip((verts[:, 0] - 0.1) / np.ptp(shape.verts[:, 0]), 0, 1)
         short = verts - 0.15 * np.sqrt(along)[:, None] * [1, 0, 0]
@@ -370,12 +387,17 @@ def test_a_limb_glides_along_itself_until_its_end_is_at_the_end() -> None:
     assert after < 0.6 * before
 
 
-@pytest.mark.parametrize(("nearer", "alike", "asked"), [(0.1, 0.6, True), (0.1, 0.8, False), (0.01, 0.6, False)])
+@pytest.mark.parametrize(
+    ("nearer", "apart", "alike", "asked"),
+    [(0.1, 0.06, 0.6, True), (0.1, 0.06, 0.8, False), (0.01, 0.06, 0.6, False), (0.1, 0.09, 0.6, False)],
+)
 def test_a_palm_on_the_back_of_a_hand_asks_for_the_mirror_image(
-    nearer: float, alike: float, asked: bool, monkeypatch: pytest.MonkeyPatch
+    nearer: float, apart: float, alike: float, asked: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = curled()
-    monkeypatch.setattr("meshmatch.fitting.direct.apart", lambda *_: (np.exp(nearer), 1.0))
+    monkeypatch.setattr("meshmatch.fitting.direct.apart", lambda *_: (apart * np.exp(nearer), apart))
     monkeypatch.setattr(ThinMesh, "likeness", lambda *_: alike)
     found = match_either_side(source, mirrored(source), replace(QUICK, better=4, best=2, both_ways="no"))
     assert found.target.frame.mirrored is asked
+    doubt = any(reason.code == "side" for reason in found.reasons)
+    assert doubt == (apart == 0.09) and (not doubt or found.verdict != "good")  # it fits better, but is no more alike

@@ -184,13 +184,14 @@ def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[
             "energy": found.energy,
             "leads": found.leads,
             "turns": found.turns,
+            "side_in_doubt": any(reason.code == "side" for reason in found.reasons),
         }
 
     shapes = clean[0].shape, clean[1].shape
     roughly = match_either_side(*shapes, DirectConfig(seed=seed))
     found = match_alike(*shapes, roughly, FitConfig(seed=seed))
     best = row(found) | {"cpu": time.process_time() - began, "finer": found.reasons != roughly.reasons}
-    return best | {"one_way": found.one_way and row(found.one_way)}
+    return best | {"one_way": None if found.before is None else row(found.before)}
 
 
 def judged(row: dict[str, Any]) -> dict[str, Any]:
@@ -200,6 +201,8 @@ def judged(row: dict[str, Any]) -> dict[str, Any]:
         return row
     calibration = DIRECT_BOTH_WAYS if row["one_way"] else DIRECT
     verdict, _, reasons = judge_direct(row["energy"], row["leads"], calibration, row["turns"])
+    if verdict == "good" and row["side_in_doubt"]:
+        verdict = "fair"
     return {**row, "verdict": verdict, "ambiguous": any(reason.code == "ambiguous" for reason in reasons)}
 
 

@@ -39,15 +39,8 @@ _RINGS, _RING = (0.25, 0.5, 0.75), 0.03  # shares of the way where there are rin
 
 @dataclass(frozen=True, eq=False)
 class ThinMesh:
-    """A shape with about as many triangles as are asked, on some of its own vertices.
+    """A shape with about as many triangles as are asked, on some of its own vertices; in its frame."""
 
-    Attributes
-    ----------
-    kept : (V,) which vertices of the shape these are
-    verts, faces : the thinned mesh, in the frame of the shape
-    """
-
-    kept: Int[Ints, " V"]
     verts: Float[Floats, "V 3"]
     faces: Int[Ints, "F 3"]
 
@@ -60,8 +53,7 @@ class ThinMesh:
             cloud = Shape(shape.verts, np.empty((0, 3), np.int64), shape.name)
             kept, corners = triangulate_cloud(cloud, faces)
             used, renumbered = np.unique(corners, return_inverse=True)
-        kept = kept[used]
-        return cls(kept, np.asarray(shape.verts)[kept], renumbered.reshape(-1, 3).astype(np.int64))
+        return cls(np.asarray(shape.verts)[kept[used]], renumbered.reshape(-1, 3).astype(np.int64))
 
     @cached_property
     def shape(self) -> Shape:
