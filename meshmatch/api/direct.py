@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 _UNKNOWN = "no installed model knows these shapes: they were matched directly"
 _BETTER = "the model {} fits these shapes less well than they fit each other: they were matched directly"
-_CLEARLY = 0.003  # how much lower the energy must be of a map that is not good, for it to replace a model's
 _UNUSED = "up, front and partial have no meaning without a model, and were not used"
 
 
@@ -42,6 +41,7 @@ def match_without_model(
     `InputError` where a shape cannot be matched: large parts far apart, or a cloud that is no surface.
     """
     from meshmatch.fitting.alike import match_alike
+    from meshmatch.fitting.direct import CLEARLY
     from meshmatch.fitting.one_way import DirectConfig
 
     began, (source, target) = time.monotonic(), clean
@@ -55,7 +55,7 @@ def match_without_model(
             found = match_alike(source.shape, target.shape, found, configs[0], progress)
     fits = replace(found.source, repaired=source), replace(found.target, repaired=target)
     verdict = found.verdict
-    if guess is not None and verdict != "good" and (verdict == "poor" or found.over_guess < _CLEARLY):
+    if guess is not None and verdict != "good" and (verdict == "poor" or found.over_guess < CLEARLY):
         return guess
     with thread_limit(1):
         mapped = map_of_fits((fits[0], fits[1]), (fits[0], fits[1]), threads)

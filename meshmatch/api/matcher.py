@@ -470,16 +470,17 @@ class Matcher:
         config = config or replace(self.config, seed=fits[0].seed)
         shapes = [shape_of(fit).shape for fit in fits]
         agreed = agreed_fits(self.model, shapes, list(fits), config, known, threads=self.threads)
-        first, second = agreed if known else [self._finer(fit) for fit in agreed]
+        first, second = agreed if known else map(self._finer, agreed, fits)
         return first, second
 
-    def _finer(self, fit: Fit) -> Fit:
-        """A fit that knows its shape; with more nodes, where no correspondence was learned that these could lose."""
+    def _finer(self, fit: Fit, was: Fit | None = None) -> Fit:
+        """A fit that knows its shape, made finer where no correspondence was learned that this could lose; ``was`` is that
+        before it agreed with another one."""
         if self.model.card.correspondence:
             return fit
         from meshmatch.fitting.alike import finer
 
-        return finer(self.model, shape_of(fit).shape, fit)
+        return finer(self.model, shape_of(fit).shape, fit, was)
 
 
 def _both_whole(clean: Sequence[Repaired], fits: Sequence[Fit]) -> bool:

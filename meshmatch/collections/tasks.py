@@ -267,7 +267,8 @@ def _finish(task: FinishTask) -> None:
         system = node_system(setting.trained)
         fit = with_vectors(system, before, system.unfolded(vectors))
     if setting.model != NO_MODEL:
-        fit = finer(setting.trained, part.shape, fit)
+        agreed, fit = fit, finer(setting.trained, part.shape, fit)
+        before = replace(before, points=before.points + fit.points - agreed.points)  # what agreement moved
     places = Places.of(part, fit, before if task.group is not None and not cut else None)
     words = {"digest": task.digest, "agreed_with": task.agreed_with}
     with setting.store.writing(task.file) as path:

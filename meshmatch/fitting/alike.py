@@ -13,22 +13,25 @@ from dataclasses import replace
 import numpy as np
 
 from meshmatch.derived import derived
-from meshmatch.fitting.direct import MIRROR, DirectMatch
+from meshmatch.errors import InputError
+from meshmatch.fitting.direct import CLEARLY, MIRROR, DirectMatch, match_directly
 from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import cap_verdict, may_show_part
+from meshmatch.fitting.one_way import DirectConfig
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.fitting.without_model import fit_alike, fit_near, fit_without_model, template_of, viscous_system
 from meshmatch.geometry.frames import Frame, kabsch
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.rims import RIM, rim_lengths
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, low_mesh, make_template
-from meshmatch.templates.sides import apart
+from meshmatch.templates.sides import apart, mirrored
 from meshmatch.templates.template import Template
 
 # How near shapes that stand alike must come by a rigid motion, in units of sqrt(area): femurs, knees and molars come to 0.04
@@ -90,11 +93,12 @@ def match_alike(
     return replace(found, source=first, target=second, system=viscous_system(template))
 
 
-def finer(model: TrainedModel, shape: Shape, fit: Fit) -> Fit:
-    """A fit of a model that learned a kind without correspondence, made finer where the shape stands as the template does.
+def finer(model: TrainedModel, shape: Shape, fit: Fit, was: Fit | None = None) -> Fit:
+    """A fit of a model that learned a kind without correspondence, made finer.
 
-    Its points move, to where a template with more nodes may stretch to; all else, node vectors and verdict included, is as
-    it was. The same where the model learned correspondence, of a cloud or a part, and of a poor fit.
+    Where the shape stands as the template does, that is given more nodes, and may stretch. Elsewhere the template is
+    matched to it directly, with this fit as one of the guesses. The points of the fit move; all else, node vectors included,
+    is as it was. The same where the model learned correspondence, of a cloud or a part, and of a poor fit.
 
     Parameters
     ----------
@@ -104,6 +108,8 @@ def finer(model: TrainedModel, shape: Shape, fit: Fit) -> Fit:
         The repaired shape.
     fit
         Of the model's template to it.
+    was
+        The same before it agreed with others, if that has been made finer: then nothing is searched again.
 
     Returns
     -------
@@ -113,7 +119,29 @@ def finer(model: TrainedModel, shape: Shape, fit: Fit) -> Fit:
     if model.card.correspondence or shape.is_cloud or fit.partial or fit.verdict == "poor" or not model.has_nodes:
         return fit
     found = fit_near(_with_more_nodes(model.template), shape, fit, ViscousConfig(seed=fit.seed))
-    return fit if found is None else replace(fit, points=fit.frame.apply(found.points_in_file))
+    known = was if found is None else found
+    if known is None:
+        return _searched(model.template, shape, fit)
+    return replace(fit, points=fit.frame.apply(known.points_in_file))
+
+
+def _searched(template: Template, shape: Shape, fit: Fit) -> Fit:
+    """The fit with points where a search finds them; as it was where that finds others that are hardly better."""
+    rested, side = template.shape, MIRROR if fit.frame.mirrored else None
+    image, guess = shape, fit.points_in_file
+    if side is not None:
+        image, guess = mirrored(shape), side.apply(guess)
+    config = DirectConfig(fine=max(DirectConfig.fine, rested.F), from_source=True, seed=fit.seed)
+    try:
+        found = match_directly(rested, image, config, guess=(rested.verts, guess))
+    except InputError:  # no surface without its loose ends
+        return fit
+    if found.verdict == "poor" or 0 < found.over_guess < CLEARLY:
+        return fit
+    at = cKDTree(found.source.points_in_file).query(rested.verts)[1]
+    points = found.target.points_in_file[at]
+    moved = replace(fit, points=fit.frame.apply(points if side is None else side.apply(points)))
+    return moved if found.over_guess == 0 else cap_verdict(moved, found.reasons)
 
 
 def as_part(model: TrainedModel, shape: Shape, whole: float, config: FitConfig) -> Fit | None:

@@ -11,9 +11,12 @@ from meshmatch.arrays import Bools, Floats
 from meshmatch.experiments.makers.bones import Scanned, draw_bones, scan
 from meshmatch.fitting import alike
 from meshmatch.fitting.alike import as_part, finer, match_alike
-from meshmatch.fitting.direct import DirectMatch, match_either_side
+from meshmatch.fitting.direct import MIRROR, DirectMatch, match_either_side
+from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
+from meshmatch.fitting.judge.reasons import Reason, Verdict
+from meshmatch.fitting.one_way import DirectConfig, KnownPairs
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.fitting.without_model import template_of, viscous_system
@@ -118,8 +121,38 @@ def test_a_model_that_learned_no_correspondence_gets_finer_points() -> None:
     for one, other in ((known, fit), (model, replace(fit, partial=True)), (model, replace(fit, verdict="poor"))):
         assert finer(one, shape, other) is other
     assert finer(model, Shape(shape.verts, np.empty((0, 3), np.int64)), fit) is fit
-    tall = Shape(shape.verts * [1, 4, 1], shape.faces)  # it does not stand as an egg does
-    assert finer(model, tall, fit) is fit
+
+
+@pytest.mark.parametrize("mirrored", [True, False])
+@pytest.mark.parametrize(("verdict", "over"), [("good", 0.0), ("good", 0.01), ("good", 0.001), ("poor", 0.0)])
+def test_what_stands_otherwise_than_the_template_is_searched_once(
+    mirrored: bool, verdict: Verdict, over: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known, guesses = egg_model(), list[KnownPairs]()
+    model = TrainedModel(replace(known.card, correspondence=False), known.template, known.inference)
+    rested, faces = node_system(model).verts, model.template.shape.faces
+    plain = Fitter(model).fit(Shape(rested, faces))
+    places = rested * [1, 2.5, 1]
+    frame = MIRROR if mirrored else Frame.identity()
+    shape = Shape(frame.undo(places), faces[:, :: -1 if mirrored else 1])
+
+    def directly(template: Shape, image: Shape, config: DirectConfig, guess: KnownPairs) -> DirectMatch:
+        assert config.from_source and np.allclose(image.verts, places)  # of the side that the model found
+        guesses.append(guess)
+        order = np.random.default_rng(0).permutation(len(rested))
+        first = replace(plain, points=rested[order], frame=Frame.identity())
+        second = replace(first, points=places[order], verdict=verdict, reasons=(Reason("ambiguous", "two ways"),))
+        system = node_system(model)
+        return DirectMatch(first, second, (("guess", 0.02),), system, over_guess=over)
+
+    monkeypatch.setattr(alike, "match_directly", directly)
+    fit = replace(plain, points=places + np.array([0.0, 0.0, 0.04]), verdict="good", frame=frame)
+    found = finer(model, shape, fit)
+    assert np.allclose(guesses[0][1], fit.points) and found.vectors is fit.vectors
+    assert np.allclose(found.points, fit.points if verdict == "poor" or over == 0.001 else places)
+    assert found.verdict == ("fair" if over == 0.01 else "good")  # what is said of another map counts
+    agreed = finer(model, shape, replace(fit, points=rested), found)
+    assert np.allclose(agreed.points, found.points) and len(guesses) == 1
 
 
 def test_what_is_cut_is_a_part_of_what_a_model_knows() -> None:
@@ -144,10 +177,14 @@ def test_what_is_cut_is_a_part_of_what_a_model_knows() -> None:
 def test_fits_and_maps_ask_for_finer_ones(correspondence: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     known = egg_model()
     model = TrainedModel(replace(known.card, correspondence=correspondence), known.template, known.inference)
-    shape, asked = bent_egg(model), []
-    monkeypatch.setattr(alike, "finer", lambda _, part, fit: asked.append(part) or fit)
+    shape, asked = bent_egg(model), list[Fit | None]()
+
+    def asked_for(_: TrainedModel, part: Shape, fit: Fit, was: Fit | None) -> Fit:
+        asked.append(was)
+        return fit
+
+    monkeypatch.setattr(alike, "finer", asked_for)
     matcher = Matcher(model)
     fit = matcher.fit(shape)
-    assert len(asked) == (0 if correspondence else 1)
     matcher.map(fit, fit)
-    assert len(asked) == (0 if correspondence else 3)
+    assert asked == ([] if correspondence else [None, fit, fit])
