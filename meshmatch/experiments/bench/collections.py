@@ -24,12 +24,14 @@ from typing import Annotated, Any
 import numpy as np
 from typer import Option
 
+from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Int, Ints
 from meshmatch.collections.collection import Collection
 from meshmatch.errors import InputError
 from meshmatch.experiments import runner
+from meshmatch.experiments.bench.pairs import matched_directly
 from meshmatch.experiments.bench.scores import evaluate_set
-from meshmatch.experiments.bench.sets import Pair, Shapes, load_folder, load_set
+from meshmatch.experiments.bench.sets import Pair, Shapes, load_folder, load_set, ordered_pairs
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import NO_MODEL
 
@@ -46,7 +48,7 @@ COLUMNS |= {
     "largest process, GB": "largest_gb:.2f",
 }
 COLUMNS |= {"maps written, s": "maps_s:.1f", "a map, ms": "map_ms:.1f", "error": "error:.3f", "unit": "unit"}
-HEARTS = {"pairs": "pairs:d", "mean": "mean_x100:.2f", "worst pair": "worst_pair_x100:.2f"}
+HEARTS = {"maps": "how", "pairs": "pairs:d", "mean": "mean_x100:.2f", "worst pair": "worst_pair_x100:.2f"}
 HEARTS |= {"right chamber": "right_chamber:.1%", "along the normals": "across_x100:.2f"}
 
 
@@ -113,7 +115,7 @@ def measure(name: str, data: Path, work: Path, limit: int | None, model: str | N
         found[pair] = collection.map(*pair)
     each = (time.perf_counter() - began) / len(pairs)
     if name == HEART:
-        details = heart_errors(shapes, truth, found)
+        details = {"how": "of the collection", **heart_errors(shapes, truth, found)}
         error, unit = details["mean_x100"], "x100 of sqrt(area)"
     else:
         scores = evaluate_set(bench, {pair: one.index for pair, one in found.items()}, pairs=pairs, cache=work / "kept")
@@ -125,12 +127,20 @@ def measure(name: str, data: Path, work: Path, limit: int | None, model: str | N
     }
 
 
+def heart_pairs(data: Path, limit: int) -> dict[str, Any]:
+    """The same of pairs that are matched by themselves, without a model."""
+    shapes, truth = load_folder(data / HEART, TRUTH)
+    found = matched_directly(Matcher(NO_MODEL, threads=1), shapes, ordered_pairs(shapes, limit), HEART)
+    return {"how": "of pairs", **heart_errors(shapes, truth, {pair: each.map for pair, each in found.items()})}
+
+
 @runner.command
 def main(
     data: runner.Data = runner.DATA,
     sets: Annotated[str, Option(help=f"of {', '.join(SETS)}")] = ",".join(SETS),
     model: Annotated[str | None, Option(help="default: human, and none for hearts")] = None,
     limit_shapes: Annotated[int | None, Option(min=2, help="of each set, evenly spread; by default all")] = None,
+    pairs: Annotated[int, Option(min=0, help="of hearts that are also matched by themselves")] = 0,
     work: Annotated[Path | None, Option(help="keep fits and maps in this new folder")] = None,
 ) -> runner.Report:
     """Fit, agree and map whole sets."""
@@ -139,5 +149,7 @@ def main(
         rows = [measure(name, data, work or Path(folder), limit_shapes, model) for name in asked]
     title = f"Collections, {os.cpu_count()} cores, one thread a process"
     hearts = [row["details"] for row in rows if row["details"]]
+    if pairs:
+        hearts.append(heart_pairs(data, pairs))
     tables = [runner.table(title, rows, COLUMNS), *([runner.table("Hearts", hearts, HEARTS)] if hearts else [])]
-    return runner.Report({"rows": rows}, tables)
+    return runner.Report({"rows": rows, "hearts": hearts}, tables)
