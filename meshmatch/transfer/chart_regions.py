@@ -2,7 +2,8 @@
 
 On the copy, cells that face about one way are joined as long as they lie flat together and fill a rectangle well; each
 triangle of the surface then goes with the region of the coarse triangle beside it. What lies flat there only with too much
-stretch is halved. Nothing is tried without end: what is left when the effort is spent becomes charts of single polygons.
+stretch is halved. At last small charts are joined along hinges. Nothing is tried without end: what is left when the effort
+is spent becomes charts of single polygons.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from meshmatch.geometry.triangles import triangle_areas, triangle_vectors, unit
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.flat_layout import Layout, across, laid_flat
+from meshmatch.transfer.hinged_charts import Hinging
 from meshmatch.transfer.pack_charts import Chart, hull
 from meshmatch.transfer.whole_polygons import unfolded_polygon
 
@@ -107,7 +109,8 @@ def chart_regions(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], polygons
     first, number = np.unique(polygons, return_index=True, return_inverse=True)[1:]
     region = _hanging(surface, region[first][number])
     charts = _flat_parts(surface, region, _MORE, number)
-    return _Joining(surface, charts, _MORE, crumbs=True).charts()
+    charts = _Joining(surface, charts, _MORE, crumbs=True).charts()
+    return Hinging(surface.faces, surface.areas, charts, surface.texels).charts()
 
 
 def _coarse(verts: Floats, faces: Ints) -> tuple[Floats, Ints]:

@@ -149,7 +149,7 @@ def joined(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, "F
     short = edges[((verts[edges[:, 0]] - verts[edges[:, 1]]) ** 2).sum(axis=1) < _SHORT**2]
     number = same_rows(np.sort(edges, axis=1))
     free = edges[np.bincount(number)[number] == 1]
-    one, two = _twins(same_rows(verts)[free])
+    one, two = twins(same_rows(verts)[free])
     begin = [short[:, 0], free[one, 0], free[one, 1]]
     end = [short[:, 1], free[two, 1], free[two, 0]]
     return together(len(verts), np.concatenate(begin), np.concatenate(end))[faces]
@@ -158,7 +158,7 @@ def joined(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, "F
 def across(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> tuple[Ints, Ints, Floats]:
     """The two faces at each edge that two faces run along in opposite directions, and its length."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    one, two = _twins(edges)
+    one, two = twins(edges)
     return one // 3, two // 3, np.linalg.norm(verts[edges[one, 0]] - verts[edges[one, 1]], axis=1)
 
 
@@ -174,7 +174,7 @@ def apart(corners: Float[Floats, "F 3 3"]) -> Float[Floats, "F 3 2"]:
     return flat
 
 
-def _twins(edges: Int[Ints, "N 2"]) -> tuple[Ints, Ints]:
+def twins(edges: Int[Ints, "N 2"]) -> tuple[Ints, Ints]:
     """Rows that are the same edge in opposite directions, where there are two of it."""
     number = same_rows(np.sort(edges, axis=1))
     order = np.argsort(number, kind="stable")
@@ -188,7 +188,7 @@ def _twins(edges: Int[Ints, "N 2"]) -> tuple[Ints, Ints]:
 def _welded(faces: Int[Ints, "F 3"]) -> tuple[Int[Ints, "F 3"], bool]:
     """Corners numbered anew, those as one that faces with a common edge share; and whether the faces hang together."""
     F = len(faces)
-    one, two = _twins(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
+    one, two = twins(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
     corner = np.arange(3 * F)
     begin, end = corner, corner.reshape(F, 3)[:, [1, 2, 0]].ravel()
     welded = together(3 * F, np.concatenate([begin[one], end[one]]), np.concatenate([end[two], begin[two]]))

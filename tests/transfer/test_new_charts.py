@@ -117,6 +117,26 @@ def test_loose_triangles_end_soon() -> None:
     assert faces_on(uv * 4096, 4096)[1] == 0
 
 
+def test_small_closed_pieces_are_unfolded() -> None:
+    """Boxes of one kind, each of which needs two charts or more where all of their common border must stay closed."""
+    box = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([[a, b, c] for a, b, c, d in sides for a, b, c in ((a, b, c), (a, c, d))])
+    rng = np.random.default_rng(0)
+    verts = np.concatenate([box * rng.uniform(0.5, 1.5, 3) + [3.0 * k, 0, 0] for k in range(300)])
+    faces = np.concatenate([faces + 8 * k for k in range(300)])
+    verts = scaled(Shape(verts, faces))
+    charts = chart_regions(verts, faces, np.arange(len(faces)) // 2)
+    assert len(charts) < 450
+    assert np.array_equal(np.sort(np.concatenate([chart.members for chart in charts])), np.arange(len(faces)))
+    for chart in charts:
+        laid = chart.uv[chart.corners]
+        one, two = laid[:, 1] - laid[:, 0], laid[:, 2] - laid[:, 0]
+        assert (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0] > 0).all()
+        image = (laid - laid.min(axis=(0, 1))) / np.ptp(laid, axis=(0, 1)).max()
+        assert faces_on(image * 512, 512)[1] == 0
+
+
 def test_packed_rectangles_are_apart() -> None:
     rng = np.random.default_rng(1)
     corners = np.array([[0, 1, 2], [0, 2, 3]])
