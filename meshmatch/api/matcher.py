@@ -439,7 +439,7 @@ class Matcher:
                 here, config = clean[number], configs[number]
                 found = begun[number].fit or Fitter(self.model, config, report).fit(here.shape)
                 best = (found, here) if begun[number].tried else self._best(found, here, config, report)
-            return self._finer(self._finished(*best, configs[number]))
+            return self._finer(self._finished(*best, configs[number]), progress=report)
 
         with thread_limit(inner):  # after an error, or Ctrl-C, the other fits end at their next report
             return parallel_map(one, range(len(clean)), threads=threads, stop=stop)
@@ -473,14 +473,14 @@ class Matcher:
         first, second = agreed if known else map(self._finer, agreed, fits)
         return first, second
 
-    def _finer(self, fit: Fit, was: Fit | None = None) -> Fit:
+    def _finer(self, fit: Fit, was: Fit | None = None, progress: ProgressCallback | None = None) -> Fit:
         """A fit that knows its shape, made finer where no correspondence was learned that this could lose; ``was`` is that
         before it agreed with another one."""
         if self.model.card.correspondence:
             return fit
         from meshmatch.fitting.alike import finer
 
-        return finer(self.model, shape_of(fit).shape, fit, was)
+        return finer(self.model, shape_of(fit).shape, fit, was, progress)
 
 
 def _both_whole(clean: Sequence[Repaired], fits: Sequence[Fit]) -> bool:

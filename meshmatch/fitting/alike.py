@@ -93,7 +93,9 @@ def match_alike(
     return replace(found, source=first, target=second, system=viscous_system(template))
 
 
-def finer(model: TrainedModel, shape: Shape, fit: Fit, was: Fit | None = None) -> Fit:
+def finer(
+    model: TrainedModel, shape: Shape, fit: Fit, was: Fit | None = None, progress: ProgressCallback | None = None
+) -> Fit:
     """A fit of a model that learned a kind without correspondence, made finer.
 
     Where the shape stands as the template does, that is given more nodes, and may stretch. Elsewhere the template is
@@ -110,6 +112,8 @@ def finer(model: TrainedModel, shape: Shape, fit: Fit, was: Fit | None = None) -
         Of the model's template to it.
     was
         The same before it agreed with others, if that has been made finer: then nothing is searched again.
+    progress
+        As of `match_directly`, of what is searched.
 
     Returns
     -------
@@ -121,19 +125,20 @@ def finer(model: TrainedModel, shape: Shape, fit: Fit, was: Fit | None = None) -
     found = fit_near(_with_more_nodes(model.template), shape, fit, ViscousConfig(seed=fit.seed))
     known = was if found is None else found
     if known is None:
-        return _searched(model.template, shape, fit)
+        return _searched(model.template, shape, fit, progress)
     return replace(fit, points=fit.frame.apply(known.points_in_file))
 
 
-def _searched(template: Template, shape: Shape, fit: Fit) -> Fit:
+def _searched(template: Template, shape: Shape, fit: Fit, progress: ProgressCallback | None) -> Fit:
     """The fit with points where a search finds them; as it was where that finds others that are hardly better."""
-    rested, side = template.shape, MIRROR if fit.frame.mirrored else None
+    rested = Shape(template.shape.verts, template.shape.faces, shape.name)  # the name is what progress tells
+    side = MIRROR if fit.frame.mirrored else None
     image, guess = shape, fit.points_in_file
     if side is not None:
         image, guess = mirrored(shape), side.apply(guess)
     config = DirectConfig(fine=max(DirectConfig.fine, rested.F), from_source=True, seed=fit.seed)
     try:
-        found = match_directly(rested, image, config, guess=(rested.verts, guess))
+        found = match_directly(rested, image, config, progress=progress, guess=(rested.verts, guess))
     except InputError:  # no surface without its loose ends
         return fit
     if found.verdict == "poor" or 0 < found.over_guess < CLEARLY:

@@ -23,6 +23,7 @@ from meshmatch.fitting.without_model import template_of, viscous_system
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.trained import TrainedModel
+from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.rims import RIM, rim_lengths
 from meshmatch.shapes.shape import Shape
 from tests.fitting.eggs import bent_egg, egg_model, gentle_vectors
@@ -134,9 +135,12 @@ def test_what_stands_otherwise_than_the_template_is_searched_once(
     plain = Fitter(model).fit(Shape(rested, faces))
     places = rested * [1, 2.5, 1]
     frame = MIRROR if mirrored else Frame.identity()
-    shape = Shape(frame.undo(places), faces[:, :: -1 if mirrored else 1])
+    shape = Shape(frame.undo(places), faces[:, :: -1 if mirrored else 1], "tall")
 
-    def directly(template: Shape, image: Shape, config: DirectConfig, guess: KnownPairs) -> DirectMatch:
+    def directly(
+        template: Shape, image: Shape, config: DirectConfig, progress: ProgressCallback, guess: KnownPairs
+    ) -> DirectMatch:
+        progress("searching", template.name, 0.5)
         assert config.from_source and np.allclose(image.verts, places)  # of the side that the model found
         guesses.append(guess)
         order = np.random.default_rng(0).permutation(len(rested))
@@ -147,7 +151,9 @@ def test_what_stands_otherwise_than_the_template_is_searched_once(
 
     monkeypatch.setattr(alike, "match_directly", directly)
     fit = replace(plain, points=places + np.array([0.0, 0.0, 0.04]), verdict="good", frame=frame)
-    found = finer(model, shape, fit)
+    told = list[str]()
+    found = finer(model, shape, fit, progress=lambda stage, name, share: told.append(name))
+    assert told == [shape.name]
     assert np.allclose(guesses[0][1], fit.points) and found.vectors is fit.vectors
     assert np.allclose(found.points, fit.points if verdict == "poor" or over == 0.001 else places)
     assert found.verdict == ("fair" if over == 0.01 else "good")  # what is said of another map counts
@@ -179,7 +185,7 @@ def test_fits_and_maps_ask_for_finer_ones(correspondence: bool, monkeypatch: pyt
     model = TrainedModel(replace(known.card, correspondence=correspondence), known.template, known.inference)
     shape, asked = bent_egg(model), list[Fit | None]()
 
-    def asked_for(_: TrainedModel, part: Shape, fit: Fit, was: Fit | None) -> Fit:
+    def asked_for(_: TrainedModel, part: Shape, fit: Fit, was: Fit | None, progress: ProgressCallback | None) -> Fit:
         asked.append(was)
         return fit
 
