@@ -473,14 +473,14 @@ class Matcher:
         first, second = agreed if known else map(self._finer, agreed, fits)
         return first, second
 
-    def _finer(self, fit: Fit, was: Fit | None = None, progress: ProgressCallback | None = None) -> Fit:
-        """A fit that knows its shape, made finer where no correspondence was learned that this could lose; ``was`` is that
+    def _finer(self, fit: Fit, alone: Fit | None = None, progress: ProgressCallback | None = None) -> Fit:
+        """A fit that knows its shape, made finer where no correspondence was learned that this could lose; ``alone`` is that
         before it agreed with another one."""
         if self.model.card.correspondence:
             return fit
         from meshmatch.fitting.alike import finer
 
-        return finer(self.model, shape_of(fit).shape, fit, was, progress)
+        return finer(self.model, shape_of(fit).shape, fit, alone, progress)
 
 
 def _both_whole(clean: Sequence[Repaired], fits: Sequence[Fit]) -> bool:

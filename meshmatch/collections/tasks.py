@@ -267,7 +267,7 @@ def _finish(task: FinishTask) -> None:
         system = node_system(setting.trained)
         fit = with_vectors(system, before, system.unfolded(vectors))
     if setting.model != NO_MODEL:
-        agreed, fit = fit, finer(setting.trained, part.shape, fit)
+        agreed, fit = fit, finer(setting.trained, part.shape, fit, before)
         before = replace(before, points=before.points + fit.points - agreed.points)  # what agreement moved
     places = Places.of(part, fit, before if task.group is not None and not cut else None)
     words = {"digest": task.digest, "agreed_with": task.agreed_with}

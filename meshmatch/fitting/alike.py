@@ -8,16 +8,19 @@ surface. Specimens of one kind need less freedom, and the whole of a broken bone
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.derived import derived
 from meshmatch.errors import InputError
 from meshmatch.fitting.direct import CLEARLY, MIRROR, DirectMatch, match_directly
 from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import cap_verdict, may_show_part
+from meshmatch.fitting.judge.reasons import Reason
 from meshmatch.fitting.one_way import DirectConfig
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.system import node_system
@@ -94,7 +97,7 @@ def match_alike(
 
 
 def finer(
-    model: TrainedModel, shape: Shape, fit: Fit, was: Fit | None = None, progress: ProgressCallback | None = None
+    model: TrainedModel, shape: Shape, fit: Fit, alone: Fit | None = None, progress: ProgressCallback | None = None
 ) -> Fit:
     """A fit of a model that learned a kind without correspondence, made finer.
 
@@ -110,8 +113,8 @@ def finer(
         The repaired shape.
     fit
         Of the model's template to it.
-    was
-        The same before it agreed with others, if that has been made finer: then nothing is searched again.
+    alone
+        The same before it agreed with others, from which a search begins; or which has been made finer, and is taken.
     progress
         As of `match_directly`, of what is searched.
 
@@ -122,15 +125,21 @@ def finer(
     """
     if model.card.correspondence or shape.is_cloud or fit.partial or fit.verdict == "poor" or not model.has_nodes:
         return fit
-    found = fit_near(_with_more_nodes(model.template), shape, fit, ViscousConfig(seed=fit.seed))
-    known = was if found is None else found
-    if known is None:
-        return _searched(model.template, shape, fit, progress)
-    return replace(fit, points=fit.frame.apply(known.points_in_file))
+    near = fit_near(_with_more_nodes(model.template), shape, fit, ViscousConfig(seed=fit.seed))
+    if near is not None:
+        return replace(fit, points=fit.frame.apply(near.points_in_file))
+    alone = alone or fit
+    if not np.allclose(alone.points, node_system(model).moved(alone.vectors), atol=1e-6):
+        return replace(fit, points=fit.frame.apply(alone.points_in_file))
+    found = _searched(model.template, shape, alone, progress)
+    return fit if found is None else cap_verdict(replace(fit, points=fit.frame.apply(found[0])), found[1])
 
 
-def _searched(template: Template, shape: Shape, fit: Fit, progress: ProgressCallback | None) -> Fit:
-    """The fit with points where a search finds them; as it was where that finds others that are hardly better."""
+def _searched(
+    template: Template, shape: Shape, fit: Fit, progress: ProgressCallback | None
+) -> tuple[Float[Floats, "V 3"], Sequence[Reason]] | None:
+    """Where a search finds the template's vertices in the file, and what is to be said if it does so elsewhere than a fit;
+    None where that is hardly better."""
     rested = Shape(template.shape.verts, template.shape.faces, shape.name)  # the name is what progress tells
     side = MIRROR if fit.frame.mirrored else None
     image, guess = shape, fit.points_in_file
@@ -140,13 +149,11 @@ def _searched(template: Template, shape: Shape, fit: Fit, progress: ProgressCall
     try:
         found = match_directly(rested, image, config, progress=progress, guess=(rested.verts, guess))
     except InputError:  # no surface without its loose ends
-        return fit
+        return None
     if found.verdict == "poor" or 0 < found.over_guess < CLEARLY:
-        return fit
-    at = cKDTree(found.source.points_in_file).query(rested.verts)[1]
-    points = found.target.points_in_file[at]
-    moved = replace(fit, points=fit.frame.apply(points if side is None else side.apply(points)))
-    return moved if found.over_guess == 0 else cap_verdict(moved, found.reasons)
+        return None
+    points = found.target.points_in_file[cKDTree(found.source.points_in_file).query(rested.verts)[1]]
+    return points if side is None else side.apply(points), found.reasons if found.over_guess else ()
 
 
 def as_part(model: TrainedModel, shape: Shape, whole: float, config: FitConfig) -> Fit | None:

@@ -146,19 +146,26 @@ def test_what_stands_otherwise_than_the_template_is_searched_once(
         order = np.random.default_rng(0).permutation(len(rested))
         first = replace(plain, points=rested[order], frame=Frame.identity())
         second = replace(first, points=places[order], verdict=verdict, reasons=(Reason("ambiguous", "two ways"),))
-        system = node_system(model)
         return DirectMatch(first, second, (("guess", 0.02),), system, over_guess=over)
 
     monkeypatch.setattr(alike, "match_directly", directly)
-    fit = replace(plain, points=places + np.array([0.0, 0.0, 0.04]), verdict="good", frame=frame)
+    system = node_system(model)
+    vectors = system.vectors_to(places + np.array([0.0, 0.0, 0.04]))
+    fit = replace(plain, points=system.moved(vectors), vectors=vectors, verdict="good", frame=frame)
     told = list[str]()
-    found = finer(model, shape, fit, progress=lambda stage, name, share: told.append(name))
+
+    def report(stage: str, name: str, share: float) -> None:
+        told.append(name)
+
+    found = finer(model, shape, fit, progress=report)
     assert told == [shape.name]
     assert np.allclose(guesses[0][1], fit.points) and found.vectors is fit.vectors
-    assert np.allclose(found.points, fit.points if verdict == "poor" or over == 0.001 else places)
+    taken = verdict == "good" and over != 0.001
+    assert np.allclose(found.points, places if taken else fit.points)
     assert found.verdict == ("fair" if over == 0.01 else "good")  # what is said of another map counts
-    agreed = finer(model, shape, replace(fit, points=rested), found)
-    assert np.allclose(agreed.points, found.points) and len(guesses) == 1
+    agreed = finer(model, shape, replace(fit, points=rested), found, report)
+    assert np.allclose(agreed.points, places if taken else rested)
+    assert len(guesses) == (1 if taken else 2) and np.allclose(guesses[-1][1], fit.points)
 
 
 def test_what_is_cut_is_a_part_of_what_a_model_knows() -> None:
@@ -185,8 +192,8 @@ def test_fits_and_maps_ask_for_finer_ones(correspondence: bool, monkeypatch: pyt
     model = TrainedModel(replace(known.card, correspondence=correspondence), known.template, known.inference)
     shape, asked = bent_egg(model), list[Fit | None]()
 
-    def asked_for(_: TrainedModel, part: Shape, fit: Fit, was: Fit | None, progress: ProgressCallback | None) -> Fit:
-        asked.append(was)
+    def asked_for(_: TrainedModel, part: Shape, fit: Fit, alone: Fit | None, progress: ProgressCallback | None) -> Fit:
+        asked.append(alone)
         return fit
 
     monkeypatch.setattr(alike, "finer", asked_for)
