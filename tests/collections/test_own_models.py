@@ -38,7 +38,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_what_stands_out_may_be_cut_and_fits_are_made_finer(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[int, float]] = []
     monkeypatch.setattr(setting, "as_part", lambda model, shape, whole, config: asked.append((shape.V, whole)))
-    monkeypatch.setattr(tasks, "finer", lambda model, shape, fit: replace(fit, points=fit.points + shape.V))
+    monkeypatch.setattr(tasks, "finer", lambda model, shape, fit, alone: replace(fit, points=fit.points + shape.V))
     collection = Collection(folder / "fits", workers=1)
     made = collection.fit(folder / "eggs", model=str(folder / "model"), config=QUICK)
     assert asked == [(made.records[0].vertices, np.median([record.scale for record in made.records]))]

@@ -151,5 +151,6 @@ def main(
     hearts = [row["details"] for row in rows if row["details"]]
     if pairs:
         hearts.append(heart_pairs(data, pairs))
-    tables = [runner.table(title, rows, COLUMNS), *([runner.table("Hearts", hearts, HEARTS)] if hearts else [])]
+    some = ((title, rows, COLUMNS), ("Hearts", hearts, HEARTS))
+    tables = [runner.table(heading, each, columns) for heading, each, columns in some if each]
     return runner.Report({"rows": rows, "hearts": hearts}, tables)
