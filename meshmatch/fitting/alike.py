@@ -103,7 +103,8 @@ def finer(
 
     Where the shape stands as the template does, that is given more nodes, and may stretch. Elsewhere the template is
     matched to it directly, with this fit as one of the guesses; where another guess is clearly better, the fit is fair at
-    most. The points of the fit move; all else, node vectors included, is as it was. The same where the model learned correspondence, of a cloud or a part, and of a poor fit.
+    most. The points of the fit move; all else, node vectors included, is as it was. The same where the model learned
+    correspondence, of a cloud or a part, and of a poor fit.
 
     Parameters
     ----------
