@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from operator import attrgetter
 from typing import Any, Literal, Protocol, TypeVar
 
@@ -314,28 +314,29 @@ def _begun(
 ) -> list[Tried]:
     """Guesses of all kinds, fitted on few nodes for a few steps.
 
-    To know lengths along the surface takes long, and keeps Python's lock. So the fits of rigid guesses, what later fits
-    need, and what else is to be done are done beside that.
+    To know lengths along the surface takes long, and keeps Python's lock. So the rigid guesses and their fits, what later
+    fits need, and what else is to be done are done beside that.
     """
     level, samples = own.coarse, onto.samples.first(own.config.fewer)
-    _ = onto.thin.relief, onto.thin.tree  # once, and not by each thread
+    _ = onto.thin.relief, onto.thin.tree, own.thin.normals  # once, and not by each thread
+
+    def tried(proposal: Proposal) -> Tried:
+        return level.tried(onto.thin, samples, proposal, level.begun(proposal), own.config.first)
 
     def bent() -> list[Proposal]:
         pair = own.intrinsic, onto.intrinsic
         return [*extremity_proposals(*pair), *spectral_proposals(*pair)]
 
+    def rigid() -> list[Tried]:
+        return [tried(each) for each in rigid_proposals(own.thin, onto.thin)]
+
     def next_level() -> None:
         _ = own.fine, onto.neighbours, onto.fine_mesh.relief, onto.fine_mesh.tree
 
-    def tried(proposal: Proposal) -> Tried:
-        return level.tried(onto.thin, samples, proposal, level.begun(proposal), own.config.first)
-
     report(0.0)
-    moved = rigid_proposals(own.thin, onto.thin)
-    fits = [partial(tried, each) for each in moved]
-    others, *done = parallel_map(call, (bent, *fits, next_level, *meanwhile))
+    others, found, *_ = parallel_map(call, (bent, rigid, next_level, *meanwhile))
     report(0.6)
-    found = [*done[: len(moved)], *parallel_map(tried, [*others, *guesses])]
+    found = [*found, *parallel_map(tried, [*others, *guesses])]
     report(1.0)
     return found
 

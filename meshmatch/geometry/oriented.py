@@ -107,10 +107,10 @@ def nearest_unsigned(
 
 
 def with_normals(
-    points: Float[Floats, "P 3"], normals: Float[Floats, "P 3"], weight: float = NORMAL_WEIGHT
-) -> Float[Floats, "P 6"]:
+    points: Float[Floats, "... 3"], normals: Float[Floats, "... 3"], weight: float = NORMAL_WEIGHT
+) -> Float[Floats, "... 6"]:
     """Six-dimensional positions in which surfaces back to back are apart."""
-    return np.concatenate([points, weight * normals], 1)
+    return np.concatenate([points, weight * normals], -1)
 
 
 def feature_tree(features: Float[Floats, "P D"]) -> cKDTree:

@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Floats
 from meshmatch.errors import InputError
-from meshmatch.geometry.frames import Frame, RigidPose, kabsch
+from meshmatch.geometry.closest_points import ClosestPoints
+from meshmatch.geometry.frames import Frame, RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.shape import Shape
 
@@ -27,8 +28,6 @@ Mirroring = Literal["auto", "no"]
 """Whether the mirror image of a shape is tried too."""
 
 # Set by hand.
-_SCALE = 0.1  # of the robust weight, units of sqrt(area)
-_CAP = 0.2  # of a distance in the residual
 _CLEARLY = 0.9  # a turn must fit better than the given orientation by this factor
 _CLOSE = 15.0  # degrees: two alignments nearer than that are one
 # Standing people are 1.2 to 2.2 m tall; a unit fits if it makes that of the longest extent.
@@ -96,22 +95,29 @@ def align(shape: OrientedPoints, target: OrientedPoints, how: Align, keep: int =
     Both are centered, of one scale, their points in random order. "none" takes the orientation as it is, "near"
     improves it, "rigid" searches all orientations.
     """
-    coarse_shape, coarse_target = shape.thinned(200), target.thinned(300)
-    fine_shape, fine_target = shape.thinned(1200), target.thinned(1200)
-    if how == "none":
-        return [Alignment(RigidPose.identity(), residual(fine_shape, fine_target))]
-    given = _icp(fine_shape, fine_target, RigidPose.identity(), 25)
-    if how == "near":
-        return [given]
+    coarse = ClosestPoints(shape.thinned(200), target.thinned(300))
+    fine = ClosestPoints(shape.thinned(1200), target.thinned(1200))
+    as_it_is = RigidPose.identity()
+    if how != "rigid":
+        return _nearer(fine, [as_it_is], 25 if how == "near" else 0)
     # the 24 turns of a cube in the files' own axes, and in the principal axes of both
     turns = Rotation.create_group("O").as_matrix()
     own, theirs = _principal_axes(shape.points), _principal_axes(target.points)
     starts = [RigidPose(start, np.zeros(3)) for start in (*turns, *(own @ turn @ theirs.T for turn in turns))]
-    rough = sorted((_icp(coarse_shape, coarse_target, start, 6) for start in starts), key=attrgetter("residual"))
-    chosen = _distinct(rough)[: max(keep, 4)]
-    fine = sorted((_icp(fine_shape, fine_target, each.pose, 25) for each in chosen), key=attrgetter("residual"))
-    fine.insert(0 if fine[0].residual > _CLEARLY * given.residual else len(fine), given)
-    return _distinct(fine)[:keep]
+    chosen = _distinct(_best_first(_nearer(coarse, starts, 6)))[: max(keep, 4)]
+    given, *found = _nearer(fine, [as_it_is, *(each.pose for each in chosen)], 25)
+    found = _best_first(found)
+    found.insert(0 if found[0].residual > _CLEARLY * given.residual else len(found), given)
+    return _distinct(found)[:keep]
+
+
+def _nearer(points: ClosestPoints, poses: list[RigidPose], steps: int) -> list[Alignment]:
+    nearer = points.nearer(poses, steps)
+    return [Alignment(*each) for each in zip(nearer, points.residuals(nearer).tolist(), strict=True)]
+
+
+def _best_first(found: list[Alignment]) -> list[Alignment]:
+    return sorted(found, key=attrgetter("residual"))
 
 
 def _distinct(found: list[Alignment]) -> list[Alignment]:
@@ -125,26 +131,7 @@ def _distinct(found: list[Alignment]) -> list[Alignment]:
 
 def residual(shape: OrientedPoints, target: OrientedPoints) -> float:
     """Mean of the capped six-dimensional nearest distances, one way and back; of where both lie."""
-    forward = target.tree.query(shape.tree.data)[0]
-    back = shape.tree.query(target.tree.data)[0]
-    return float(0.5 * np.minimum(forward, _CAP).mean() + 0.5 * np.minimum(back, _CAP).mean())
-
-
-def _icp(shape: OrientedPoints, target: OrientedPoints, pose: RigidPose, steps: int) -> Alignment:
-    for _ in range(steps):
-        here = shape.to_local(pose)
-        to_target = target.tree.query(here.tree.data)[1]
-        to_shape = here.tree.query(target.tree.data)[1]
-        source = np.concatenate([target.points[to_target], target.points])
-        place = np.concatenate([here.points, here.points[to_shape]])
-        weights = 1.0 / np.square(1.0 + np.square(source - place).sum(1) / _SCALE**2)
-        weights[: len(here.points)] /= len(here.points)
-        weights[len(here.points) :] /= len(target.points)
-        step = kabsch(source, place, weights)
-        pose = pose @ step
-        if np.abs(step.rotation - np.eye(3)).max() < 1e-4 and np.abs(step.center).max() < 1e-4:
-            break
-    return Alignment(pose, residual(shape.to_local(pose), target))
+    return float(ClosestPoints(shape, target).residuals([RigidPose.identity()])[0])
 
 
 def _principal_axes(points: Floats) -> Floats:

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh
-from meshmatch.fitting.search.motions import ClosestPoints, principal_axes
-from meshmatch.geometry.frames import kabsch
+from meshmatch.fitting.search.motions import Motions, principal_axes
+from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.geometry.triangles import triangle_vectors
 
 Kind = Literal["rigid", "affine", "spectral", "extremities", "guess"]
@@ -89,23 +89,22 @@ SETTINGS = ProposalSettings()
 
 def rigid_proposals(source: ThinMesh, target: ThinMesh) -> list[Proposal]:
     """The best rigid motions from 48 starts by iterative closest points, and an affine one from each."""
-    cloud = ClosestPoints(source, target)
-    middle = cloud.middles[1]
+    motions = Motions(source, target)
+    middle = motions.middles[1]
     turns = Rotation.create_group("O").as_matrix()
     axes = [principal_axes(mesh) for mesh in (source, target)]
     starts = [*turns, *(axes[1] @ turn @ axes[0].T for turn in turns)]
-    found = [cloud.motion(start, np.zeros(3), SETTINGS.closest_point_steps) for start in starts]
-    chosen: list[tuple[Floats, Floats]] = []
-    limit = np.cos(np.radians(SETTINGS.turned))
-    for turn, shift in sorted(found, key=lambda motion: cloud.residual(*motion)):
-        if all((np.trace(turn.T @ other) - 1) / 2 < limit for other, _ in chosen):
-            chosen.append((turn, shift))
+    found = motions.rigid([RigidPose(start, np.zeros(3)) for start in starts], SETTINGS.closest_point_steps)
+    chosen: list[RigidPose] = []
+    for best in np.argsort(motions.residuals(found), kind="stable"):
+        if all(found[best].angle_to(other) > SETTINGS.turned for other in chosen):
+            chosen.append(found[best])
     proposals = []
     for motion in chosen[: SETTINGS.rigid]:
-        proposals.append(Proposal("rigid", cloud.moved(*motion) + middle))
-        matrix, shift = cloud.motion(*motion, SETTINGS.affine_steps, affine=True)
+        proposals.append(Proposal("rigid", motions.moved(motion.rotation, motion.center) + middle))
+        matrix, shift = motions.affine(motion, SETTINGS.affine_steps)
         if np.linalg.det(matrix) > 0.1:
-            proposals.append(Proposal("affine", cloud.moved(matrix, shift) + middle))
+            proposals.append(Proposal("affine", motions.moved(matrix, shift) + middle))
     return proposals
 
 
