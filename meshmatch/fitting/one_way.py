@@ -331,10 +331,10 @@ def _begun(
         return [tried(each) for each in rigid_proposals(own.thin, onto.thin)]
 
     def next_level() -> None:
-        _ = own.fine, onto.neighbours, onto.fine_mesh.relief, onto.fine_mesh.tree
+        _ = onto.neighbours, onto.fine_mesh.relief, onto.fine_mesh.tree
 
     report(0.0)
-    others, found, *_ = parallel_map(call, (bent, rigid, next_level, *meanwhile))
+    others, found, *_ = parallel_map(call, (bent, rigid, lambda: own.fine, *meanwhile, next_level))
     report(0.6)
     found = [*found, *parallel_map(tried, [*others, *guesses])]
     report(1.0)

@@ -123,7 +123,7 @@ def quick_tree(points: Float[Floats32, "P D"]) -> cKDTree:
     return cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=False)
 
 
-def nearest(points: Float[Floats32, "P 3"], queries: Float[Floats32, "Q 3"]) -> Int[Ints, " Q"]:
+def nearest(points: Float[Floats | Floats32, "P D"], queries: Float[Floats | Floats32, "Q D"]) -> Int[Ints, " Q"]:
     """Which of a few thousand points at most is nearest to each query, by comparing all with all.
 
     Faster than a tree, which is slow where queries are far away. All are compared in float32; where the two nearest differ

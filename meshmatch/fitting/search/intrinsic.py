@@ -5,6 +5,7 @@ Distances along the surface, eigenfunctions of the Laplacian, and extremities: t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -130,19 +131,33 @@ def _bridges(verts: Float[Floats, "V 3"], part: Int[Ints, " V"]) -> Int[Ints, "N
 class Intrinsic:
     """What does not change when a shape bends, on a thin mesh.
 
-    Lengths along the surface are shares of the ``diameter``.
+    Lengths along the surface are along edges, and shares of the ``diameter``: the longest from any of the `landmarks`. Those
+    between all vertices would take long, and keep Python's lock meanwhile.
     """
 
     mesh: ThinMesh
 
     @cached_property
-    def _lengths(self) -> Float[Floats, "V V"]:
-        return np.asarray(dijkstra(self.mesh.graph, directed=False))
+    def landmarks(self) -> Int[Ints, " L"]:
+        """Vertices that are evenly spread, and stand for all where that suffices."""
+        return farthest_points(self.mesh.verts, min(_LANDMARKS, len(self.mesh.verts)))
 
     @cached_property
-    def distances(self) -> Float[Floats, "V V"]:
-        """Between all vertices, along edges."""
-        return np.asarray(self._lengths / self._lengths.max())
+    def _from_landmarks(self) -> Float[Floats, "L V"]:
+        return np.asarray(dijkstra(self.mesh.graph, indices=self.landmarks))
+
+    @cached_property
+    def diameter(self) -> float:
+        return float(self._from_landmarks.max())
+
+    @cached_property
+    def among_landmarks(self) -> Float[Floats, "L L"]:
+        """Distances between them."""
+        return np.asarray(self._from_landmarks[:, self.landmarks] / self.diameter)
+
+    def distances_from(self, vertices: Int[Ints, " N"]) -> Float[Floats, "N V"]:
+        """From some vertices to all."""
+        return np.asarray(dijkstra(self.mesh.graph, indices=vertices) / self.diameter)
 
     @cached_property
     def functions(self) -> Float[Floats, "V K"]:
@@ -153,32 +168,43 @@ class Intrinsic:
         return np.asarray(eigsh(stiffness, min(_FUNCTIONS, V - 2), mass, sigma=-1e-8, v0=start)[1])
 
     @cached_property
-    def landmarks(self) -> Int[Ints, " L"]:
-        """Vertices that are evenly spread, and stand for all where that suffices."""
-        return farthest_points(self.mesh.verts, min(_LANDMARKS, len(self.mesh.verts)))
-
-    @cached_property
     def eccentricity(self) -> Float[Floats, " V"]:
-        """Mean distance from all of the surface: small in the middle, large at extremities."""
-        return self.distances @ self.mesh.areas
+        """Mean distance from all of the surface, by the landmarks: small in the middle, large at extremities."""
+        nearest = self._from_landmarks.argmin(0)
+        return np.bincount(nearest, self.mesh.areas, len(self.landmarks)) @ self._from_landmarks / self.diameter
 
     @cached_property
     def extremities(self) -> Int[Ints, " T"]:
         """The vertices furthest out, those first that stand out most: maxima of the eccentricity by their persistence."""
-        chosen: list[int] = []
-        for persistence, vertex in _persistent_maxima(self.eccentricity, self.mesh.graph):
-            if persistence < _PERSISTENCE or len(chosen) == _MOST:
-                break
-            if all(self.distances[vertex, other] > _APART for other in chosen):
-                chosen.append(vertex)
-        return np.array(chosen, np.int64)
+        maxima = _persistent_maxima(self.eccentricity, self.mesh.graph)
+        found = np.array([vertex for persistence, vertex in maxima if persistence >= _PERSISTENCE], np.int64)
+        apart, chosen = self.distances_from(found)[:, found] > _APART, list[int]()
+        for number in range(len(found)):
+            if len(chosen) < _MOST and apart[number, chosen].all():
+                chosen.append(number)
+        return found[chosen]
+
+    @cached_property
+    def from_extremities(self) -> Float[Floats, "T V"]:
+        """Distances from each extremity."""
+        return self.distances_from(self.extremities)
+
+    @cached_property
+    def from_middle(self) -> Float[Floats, " V"]:
+        """Distances from where the eccentricity is least."""
+        return self.distances_from(self.eccentricity.argmin(keepdims=True))[0]
 
     @cached_property
     def profiles(self) -> Float[Floats, "T R"]:
         """Share of the surface within growing distances of each extremity: a thin limb has little nearby."""
-        radii = np.linspace(0.05, 1, _PROFILE)
-        within = self.distances[self.extremities][:, :, None] < radii
+        within = self.from_extremities[:, :, None] < np.linspace(0.05, 1, _PROFILE)
         return np.asarray(np.einsum("tvr,v->tr", within.astype(np.float64), self.mesh.areas))
+
+    def _on_the_way(self, shares: Sequence[float]) -> Int[Ints, "S T"]:
+        """The vertex at each share of the way from the middle to each extremity."""
+        near, reach = self.from_middle, self.from_middle[self.extremities][:, None]
+        detour = near + self.from_extremities - reach  # (T, V), 0 on the way to each
+        return np.array([(np.abs(near - share * reach) + 2 * detour).argmin(1) for share in shares])
 
     @cached_property
     def spread(self) -> Float[Floats, "T T"]:
@@ -186,13 +212,12 @@ class Intrinsic:
         distances between points at the same shares of each way, whatever their lengths. The order of legs along a body, or
         of arms around it, is in these.
         """
-        ends, near = self.extremities, self.distances[int(self.eccentricity.argmin())]
-        detour = near + self.distances[ends] - near[ends][:, None]  # (T, V), 0 on the way to each
-        off = ~np.eye(len(ends), dtype=bool)
+        at = self._on_the_way(_SHARES)
+        rows = self.distances_from(at.ravel()).reshape(*at.shape, -1)
+        off = ~np.eye(at.shape[1], dtype=bool)
         spread = np.zeros(off.shape)
-        for share in _SHARES:
-            at = (np.abs(near - share * near[ends][:, None]) + 2 * detour).argmin(1)
-            apart = self.distances[np.ix_(at, at)]
+        for here, distances in zip(at, rows, strict=True):
+            apart = distances[:, here]
             low, high = apart[off].min(), apart[off].max()
             spread += np.where(off, (apart - low) / max(high - low, 1e-9), 0) / len(_SHARES)
         return spread
@@ -200,14 +225,15 @@ class Intrinsic:
     @cached_property
     def rings(self) -> list[list[Int[Ints, " N"]]]:
         """Of each limb, vertices around it: at some shares of the way from the middle, and at its end."""
-        ends, near, found = self.extremities, self.distances[int(self.eccentricity.argmin())], []
-        for end, detour in zip(ends, near + self.distances[ends] - near[ends][:, None], strict=True):
-            before, ring = self.distances[end], []
-            for share in _RINGS:
-                at = int((np.abs(near - share * near[end]) + 2 * detour).argmin())
-                close = _RING + 0.6 * min(before[at], 0.25)  # so that it is not the body beside the limb
-                ring.append(np.flatnonzero((np.abs(before - before[at]) < _RING) & (self.distances[at] < close)))
-            found.append([*ring, np.flatnonzero(before < _RING)])
+        at = self._on_the_way(_RINGS).T
+        rows, found = self.distances_from(at.ravel()).reshape(*at.shape, -1), []
+        for before, places, distances in zip(self.from_extremities, at, rows, strict=True):
+            # so close that it is not the body beside the limb
+            limb = (
+                (np.abs(before - before[place]) < _RING) & (away < _RING + 0.6 * min(before[place], 0.25))
+                for place, away in zip(places, distances, strict=True)
+            )
+            found.append([*map(np.flatnonzero, limb), np.flatnonzero(before < _RING)])
         return found
 
     @cached_property
@@ -226,9 +252,8 @@ class Intrinsic:
         """How far each extremity lies from the middle, and how far each vertex lies along the way there: from 0 in the
         middle, or on another limb, to 1 at the end, whatever the length of the limb (Gromov's product).
         """
-        middle, ends = int(self.eccentricity.argmin()), self.extremities
-        reach = self.distances[middle, ends]
-        along = 0.5 * (self.distances[middle][:, None] + reach - self.distances[:, ends])
+        reach = self.from_middle[self.extremities]
+        along = 0.5 * (self.from_middle[:, None] + reach - self.from_extremities.T)
         return reach, along / reach
 
 

@@ -123,13 +123,13 @@ def spectral_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
             C[np.arange(1, count + 1), 1 + np.array(order)] = signs
             begun.append(C)
     found, nearest = _zoomed(np.stack(begun), own, theirs, first, SETTINGS.more)
-    known, among = source.distances[np.ix_(at, at)], target.distances[np.ix_(onto, onto)]
+    known, among = source.among_landmarks, target.among_landmarks
     errors = [_distance_error(known, among, each) for each in nearest]
     best = np.argsort(errors, kind="stable")[: SETTINGS.compared]
     maps = []
-    for C in _zoomed(found[best], own, theirs, last, SETTINGS.more)[0]:
+    for C, near in zip(*_zoomed(found[best], own, theirs, last, SETTINGS.more), strict=True):
         vertex = _nearest(source.functions[:, :last] @ C.T, target.functions[:, :last])
-        maps.append((_distance_error(known, target.distances, vertex[at]), vertex))
+        maps.append((_distance_error(known, among, near), vertex))
     return _kept("spectral", source, target, maps)
 
 
@@ -159,9 +159,9 @@ def _nearest(points: Floats, among: Floats) -> Ints:
     return np.asarray((lifted @ np.column_stack([among, -0.5 * np.square(among).sum(1)]).T).argmax(1))
 
 
-def _distance_error(known: Float[Floats, "L L"], distances: Float[Floats, "U U"], vertex: Int[Ints, " L"]) -> float:
+def _distance_error(known: Float[Floats, "L L"], distances: Float[Floats, "U U"], nearest: Int[Ints, " L"]) -> float:
     """Mean change of the distances that are known between landmarks, which go to some of those that lie so far apart."""
-    return float(np.abs(known - distances[np.ix_(vertex, vertex)]).mean())
+    return float(np.abs(known - distances[np.ix_(nearest, nearest)]).mean())
 
 
 def _facing(source: Intrinsic, target: Intrinsic, vertex: Int[Ints, " V"]) -> float:
@@ -200,18 +200,17 @@ class Assignments:
         self._counts = len(ends), len(ends_to)
         profiles = np.abs(source.profiles[:, None] - target.profiles[None]).mean(2)
         single = 0.5 * (profiles + 0.3 * np.abs(reach[:, None] - reach_to))
-        apart = source.distances[np.ix_(ends, ends)], target.distances[np.ix_(ends_to, ends_to)]
+        apart = source.from_extremities[:, ends], target.from_extremities[:, ends_to]
         shared = along[ends] * reach, along_to[ends_to] * reach_to
         # Of i that goes to j, and of i, k that go to j, l; three ways to compare.
         of_lengths = 0.5 * _changes(*apart) + 2.0 * _changes(*shared)
         of_order = [0.2 * _changes(of(source.spread), of(target.spread)) for of in (np.asarray, _ranks)]
         self._costs = [(single, of_lengths), *((0.2 * single, each) for each in of_order)]
-        some = source.landmarks[::2]
         self._along = (
-            np.column_stack([along, source.eccentricity])[some],
-            np.column_stack([along_to, target.eccentricity]),
+            np.column_stack([along, source.eccentricity])[source.landmarks[::2]],
+            np.column_stack([along_to, target.eccentricity])[target.landmarks],
         )
-        self._apart = source.distances[np.ix_(some, some)]
+        self._apart = source.among_landmarks[::2, ::2], target.among_landmarks
         self._shares = reach / reach.sum(), reach_to / reach_to.sum()
 
     def candidates(self) -> list[list[Assignment]]:
@@ -269,8 +268,8 @@ class Assignments:
     def cost(self, assignment: Assignment) -> float:
         """How far an assignment is from an isometry that bends limbs, but little."""
         own, theirs = _pairs(assignment)
-        vertex = _nearest(self._along[0][:, [*own, -1]], self._along[1][:, [*theirs, -1]])
-        error = np.abs(self._apart - self._target.distances[np.ix_(vertex, vertex)]).mean()
+        nearest = _nearest(self._along[0][:, [*own, -1]], self._along[1][:, [*theirs, -1]])
+        error = _distance_error(*self._apart, nearest)
         joints, goals = self._joints(own, theirs)
         bent = np.sqrt(np.square(kabsch(joints, goals).to_world(joints) - goals).sum(1).mean())
         left = 2 - self._shares[0][own].sum() - self._shares[1][theirs].sum()
