@@ -20,7 +20,7 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fitter import cap_verdict
 from meshmatch.fitting.judge.calibration import DIRECT, DIRECT_BOTH_WAYS, DirectCalibration
-from meshmatch.fitting.judge.direct import DirectFeatures, judge_direct
+from meshmatch.fitting.judge.direct import LIKELY, DirectFeatures, judge_direct
 from meshmatch.fitting.judge.reasons import SIDE_IN_DOUBT, Reason, Verdict
 from meshmatch.fitting.one_way import (
     DirectConfig,
@@ -356,8 +356,8 @@ class _Judged:
 
     @property
     def clear(self) -> bool:
-        """Whether the best is good; of turned shapes more fits know no better."""
-        return judge_direct(self.found[0].energy, self.leads, self.calibration)[0] == "good"
+        """Whether the best is likely enough to be right; of ties and of turned shapes more fits know little more."""
+        return self.judged[1] >= LIKELY
 
 
 def _fits(

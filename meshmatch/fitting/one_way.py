@@ -81,7 +81,7 @@ class DirectConfig:
     better, best, gliding, returned : how many proposals are fitted a second, and a third time, and glide, of one way and of
         both, and how many of each direction are continued in the other one
     unlike : share of vertices by which these differ at least
-    both_ways : when the target is fitted to the source as well; "in doubt" is where the one way is not good
+    both_ways : when the target is fitted to the source as well; "in doubt" is where one way alone is not likely to be right
     from_source : whether the source is to be the template both ways too, and not the one that fits the other better
     seed : of all random numbers
     """

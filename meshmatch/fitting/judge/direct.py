@@ -23,7 +23,9 @@ from meshmatch.geometry.oriented import OrientedPoints
 # and of relief. Chosen on 94 of the 450 pairs of `experiments.bench.any_shapes`, those that are hard to tell, and on a dozen
 # that more weight of the stretch made wrong.
 _STRETCH, _BEGUN, _TORN, _UNLIKE = 0.06, 0.03, 0.2, 0.01
-_GOOD, _FAIR = 0.92, 0.5
+LIKELY = 0.9
+"""How likely (0..1) a map is to be right at least that is called good."""
+_FAIR = 0.5
 # Another fit whose energy is so little higher is as good; so many are told.
 _TIE, _TOLD = 0.0015, 9
 
@@ -86,7 +88,7 @@ def judge_direct(
         reasons.append(
             Reason("ambiguous", f"ambiguous: {count} different maps are equally good, as of a symmetric shape")
         )
-    if trust < _GOOD:
+    if trust < LIKELY:
         reasons.append(Reason("unsupervised", f"matched without a model: {int(100 * trust)} % likely to be right"))
     verdict: Verdict = "poor" if trust < _FAIR else "fair" if reasons else "good"
     return verdict, trust, tuple(reasons)
