@@ -6,8 +6,6 @@ take a step together: what they ask is asked at once, and NumPy is called a few 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
@@ -19,58 +17,56 @@ _SCALE, _CAP = 0.1, 0.2
 _STILL = 1e-4  # a step that changes no entry of a pose by more is the last one
 
 
-@dataclass(frozen=True, eq=False)
 class ClosestPoints:
     """Two sets of points, both about their middles; poses are those of the target: the shape is near ``to_world(target)``.
 
     Of both, points whose numbers are in ``asking`` look for their closest among all of the other; all of them without it.
     """
 
-    shape: OrientedPoints
-    target: OrientedPoints
-    asking: tuple[Int[Ints, " P"], Int[Ints, " Q"]] | None = None
-    _some: tuple[OrientedPoints, OrientedPoints] = field(init=False)
-    _asked: tuple[Float[Floats, "V 6"], Float[Floats, "W 6"]] = field(init=False)
+    def __init__(
+        self,
+        shape: OrientedPoints,
+        target: OrientedPoints,
+        asking: tuple[Int[Ints, " P"], Int[Ints, " Q"]] | None = None,
+    ) -> None:
+        self._shape, self._target = shape, target
+        self._features = shape.features, target.features
+        self._own, self._other = (shape, target) if asking is None else (shape.rows(asking[0]), target.rows(asking[1]))
 
-    def __post_init__(self) -> None:
-        both = self.shape, self.target
-        some = both if self.asking is None else tuple(a.rows(b) for a, b in zip(both, self.asking, strict=True))
-        object.__setattr__(self, "_some", some)
-        object.__setattr__(self, "_asked", tuple(each.features for each in both))
-
-    def _features(
+    def _asked(
         self, turns: Float[Floats, "N 3 3"], centers: Float[Floats, "N 3"]
     ) -> tuple[Float[Floats, "N P 6"], Float[Floats, "N Q 6"]]:
-        """Of what asks: points of the shape in each pose, and of the target in the world. So neither set that is asked is
-        ever moved."""
-        (own, other), back = self._some, turns.transpose(0, 2, 1)
+        """Points of the shape in each pose, and of the target in the world: what asks is moved, and not what is asked."""
+        (own, other), back = (self._own, self._other), turns.transpose(0, 2, 1)
         here = with_normals((own.points - centers[:, None]) @ turns, own.normals @ turns)
         return here, with_normals(other.points @ back + centers[:, None], other.normals @ back)
 
     def _closest(
         self, here: Float[Floats, "N P 6"], there: Float[Floats, "N Q 6"]
     ) -> tuple[Int[Ints, "N P"], Int[Ints, "N Q"]]:
-        pairs = (here, self._asked[1]), (there, self._asked[0])
-        return tuple(nearest(among, each.reshape(-1, 6)).reshape(each.shape[:2]) for each, among in pairs)
+        """Of points of the shape those of the target that are closest, and the other way around."""
+        to_target = nearest(self._features[1], here.reshape(-1, 6)).reshape(here.shape[:2])
+        return to_target, nearest(self._features[0], there.reshape(-1, 6)).reshape(there.shape[:2])
 
     def residuals(self, poses: list[RigidPose]) -> Float[Floats, " N"]:
         """Mean capped distance there and back in each pose, normals included."""
-        moved = self._features(*_stacked(poses))
-        found = zip(moved, self._closest(*moved), self._asked[::-1], strict=True)
-        far = (np.linalg.norm(each - among[at], axis=2) for each, at, among in found)
-        return np.asarray(sum(0.5 * np.minimum(each, _CAP).mean(1) for each in far))
+        here, there = self._asked(*_stacked(poses))
+        to_target, to_shape = self._closest(here, there)
+        far = np.linalg.norm(here - self._features[1][to_target], axis=2)
+        back = np.linalg.norm(there - self._features[0][to_shape], axis=2)
+        return np.asarray(0.5 * np.minimum(far, _CAP).mean(1) + 0.5 * np.minimum(back, _CAP).mean(1))
 
     def nearer(self, poses: list[RigidPose], steps: int) -> list[RigidPose]:
         """Poses after some steps from others, or fewer where they stand still before."""
         turns, centers = _stacked(poses)
-        going, (own, other) = np.arange(len(poses)), self._some
+        own, other, going = self._own, self._other, np.arange(len(poses))
         weight = np.repeat([1 / len(own.points), 1 / len(other.points)], [len(own.points), len(other.points)])
         for _ in range(steps):
             R, c = turns[going], centers[going]
-            to_target, to_shape = self._closest(*self._features(R, c))
+            to_target, to_shape = self._closest(*self._asked(R, c))
             here, there = (np.broadcast_to(each.points, (len(R), *each.points.shape)) for each in (own, other))
-            source = np.concatenate([self.target.points[to_target], there], 1)
-            place = (np.concatenate([here, self.shape.points[to_shape]], 1) - c[:, None]) @ R
+            source = np.concatenate([self._target.points[to_target], there], 1)
+            place = (np.concatenate([here, self._shape.points[to_shape]], 1) - c[:, None]) @ R
             off = np.square(source - place).sum(2)
             turn, shift = _motions(source, place, weight / np.square(1.0 + off / _SCALE**2))
             turns[going], centers[going] = R @ turn, (R @ shift[..., None])[..., 0] + c

@@ -83,7 +83,7 @@ class OrientedPoints:
         turned = np.where(back[:, None], -self.normals, self.normals)
         return replace(self, normals=turned, signed=True)
 
-    def rows(self, rows: slice | Bool[Bools, " P"]) -> OrientedPoints:
+    def rows(self, rows: slice | Bool[Bools, " P"] | Int[Ints, " N"]) -> OrientedPoints:
         """Some of the samples."""
         arrays = {field.name: getattr(self, field.name) for field in fields(self)}
         taken: dict[str, Any] = {name: array[rows] for name, array in arrays.items() if isinstance(array, np.ndarray)}

@@ -171,7 +171,8 @@ class Intrinsic:
     def eccentricity(self) -> Float[Floats, " V"]:
         """Mean distance from all of the surface, by the landmarks: small in the middle, large at extremities."""
         nearest = self._from_landmarks.argmin(0)
-        return np.bincount(nearest, self.mesh.areas, len(self.landmarks)) @ self._from_landmarks / self.diameter
+        around = np.bincount(nearest, self.mesh.areas, len(self.landmarks))
+        return np.asarray(around @ self._from_landmarks / self.diameter)
 
     @cached_property
     def extremities(self) -> Int[Ints, " T"]:
@@ -192,7 +193,7 @@ class Intrinsic:
     @cached_property
     def from_middle(self) -> Float[Floats, " V"]:
         """Distances from where the eccentricity is least."""
-        return self.distances_from(self.eccentricity.argmin(keepdims=True))[0]
+        return np.asarray(self.distances_from(np.array([self.eccentricity.argmin()]))[0])
 
     @cached_property
     def profiles(self) -> Float[Floats, "T R"]:
