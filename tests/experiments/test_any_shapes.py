@@ -11,8 +11,9 @@ from PIL import Image
 from meshmatch.errors import InputError
 from meshmatch.experiments.bench import any_shapes
 from meshmatch.experiments.bench.any_shapes import error_of, keypoints_of, row_of, symmetries
+from meshmatch.experiments.bench.methods import EarlierVersion
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 
 CORNERS = 8
@@ -146,3 +147,26 @@ def test_the_worst_pair_of_each_class_is_drawn(folder: Path, tmp_path: Path, mon
     assert drawn.shape == (2 * height, 3 * width, 3)
     cells = [drawn[y : y + height, x : x + width] for y in (0, height) for x in (0, width, 2 * width)]
     assert [len(np.unique(cell.reshape(-1, 3), axis=0)) > 50 for cell in cells] == [True] * 4 + [False] * 2
+
+
+def test_an_earlier_version_maps_by_its_own_commands(tmp_path: Path, folder: Path) -> None:
+    """One whose every map is the identity; and one that fails, whose words are told."""
+    package = tmp_path / "checkout/meshmatch"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    (package / "__main__.py").write_text(
+        "import sys, numpy as np, pathlib\n"
+        "words = sys.argv[1:]\n"
+        "assert words[-1] == '--quiet' and pathlib.Path('source.ply').exists() and pathlib.Path('target.ply').exists()\n"
+        "if words[0] == 'map':\n"
+        "    pathlib.Path('maps/source').mkdir(parents=True)\n"
+        "    np.save('maps/source/target.npy', np.arange(26))\n"
+    )
+    method = EarlierVersion(package.parent)
+    row = any_shapes.measure_by(method, folder, ("1", "2"))
+    assert row["error"] == 0 and not row["failed"] and row["cpu"] > 0
+    (package / "__main__.py").write_text("raise SystemExit('no model')")
+    shape = load_shape(folder / "1.ply")
+    with pytest.raises(InputError, match="fit gave up: no model"):
+        method.map(shape, None, shape, None)
+    assert any_shapes.measure_by(method, folder, ("1", "2"))["failed"]

@@ -13,6 +13,7 @@ told, as ambiguous or poor, whose error is over 20.
 
 from __future__ import annotations
 
+import os
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -37,8 +38,8 @@ from meshmatch.api.results import map_of_fits
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.baselines import METHODS, Choices
-from meshmatch.experiments.bench.methods import Method
+from meshmatch.experiments.bench.baselines import METHODS, Baseline, Choices
+from meshmatch.experiments.bench.methods import EarlierVersion, Method
 from meshmatch.fitting.alike import match_alike
 from meshmatch.fitting.direct import DirectMatch, match_either_side
 from meshmatch.fitting.fit_config import FitConfig
@@ -219,12 +220,12 @@ def _row(folder: Path, pair: tuple[str, str], mapped: VertexMap) -> dict[str, An
 def measure_by(method: Method, folder: Path, pair: tuple[str, str]) -> dict[str, Any]:
     """Error and cost of another method on one pair; where it fails, of the map of everything to the first vertex."""
     source, target = (load_shape(folder / f"{name}.ply") for name in pair)
-    began, failed = time.process_time(), False
+    began, failed = os.times(), False
     try:
         index = method.map(source, method.fit(source), target, method.fit(target)).index
     except InputError:
         index, failed = np.zeros(source.V, np.int64), True
-    spent = time.process_time() - began
+    spent = sum(os.times()[:4]) - sum(began[:4])  # of this process, and of those that it began
     return {"pair": " to ".join(pair), **errors_of(folder, pair, index), "failed": failed, "cpu": spent}
 
 
@@ -330,13 +331,16 @@ def _with_calibrations(report: runner.Report, found: _Found) -> runner.Report:
 
 
 def _beside(
-    found: _Found, methods: str, limit: int, data: Path, work: Path | None, seed: int
+    found: _Found, methods: str, earlier: Path | None, limit: int, data: Path, work: Path | None, seed: int
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """A row for each of some other methods on some pairs of each class, and for this one; and which could not run."""
     some = {name: runner.spread(rows, limit) for name, rows in found.items()}
     rows, missing = [{"method": "ours", "failed": 0, **_beside_row(_all(some))}], []
-    for name in runner.names_of(methods, METHODS, "method"):
-        (baseline,) = METHODS[name](Choices(seed=seed))
+    others = {name: METHODS[name](Choices(seed=seed))[0] for name in runner.names_of(methods, METHODS, "method")}
+    if earlier is not None:
+        label = f"fit --model none of {runner.commit(earlier)}"
+        others["earlier"] = Baseline("earlier", label, EarlierVersion(earlier))
+    for name, baseline in others.items():
         if baseline.method is None:
             missing.append(f"skipped: {baseline.label}: {baseline.missing}")
             continue
@@ -368,6 +372,9 @@ def main(
     work: runner.Work = None,
     fit: Annotated[bool, Option("--fit", help="also find the weights of verdicts")] = False,
     beside: Annotated[str, Option(help="methods of `bench.baselines` to measure too, with commas between them")] = "",
+    earlier: Annotated[
+        Path | None, Option(help="a checkout of an earlier version, to measure its `fit --model none`")
+    ] = None,
     limit_beside: Annotated[int, Option(min=1, help="pairs of each class that they are measured on")] = 12,
     draw: Annotated[Path | None, Option(help="draw the worst pair of each class into this PNG")] = None,
 ) -> runner.Report:
@@ -389,8 +396,8 @@ def main(
     tables = [runner.table("Keypoints, x100 of sqrt(area)", rows, _COLUMNS)]
     record: dict[str, Any] = {"rows": rows, "pairs": everything}
     notes = list[str]()
-    if beside:
-        record["beside"], notes = _beside(found, beside, limit_beside, data, work, seed)
+    if beside or earlier is not None:
+        record["beside"], notes = _beside(found, beside, earlier, limit_beside, data, work, seed)
         tables.append(
             runner.table(f"Beside other methods, {limit_beside} pairs of each class", record["beside"], _BESIDE)
         )

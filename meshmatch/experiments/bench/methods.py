@@ -8,11 +8,14 @@ that pair (`InputError`); a bug of ours stays a bug.
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -33,6 +36,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.normalise import align, sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
@@ -103,6 +107,35 @@ class DirectMethod:
     def map(self, source: Shape, source_fit: None, target: Shape, target_fit: None) -> VertexMap:
         """The map of two shapes that are registered to each other."""
         return Matcher(NO_MODEL, FitConfig(seed=self.seed), self.threads).match(source, target).map
+
+
+@dataclass(frozen=True)
+class EarlierVersion:
+    """`fit --model none` of both shapes and the map of these fits, as an earlier version did them: by its own commands, in a
+    checkout of it."""
+
+    checkout: Path
+
+    def fit(self, shape: Shape) -> None:
+        """Nothing."""
+
+    def map(self, source: Shape, source_fit: None, target: Shape, target_fit: None) -> VertexMap:
+        """Fit both, map."""
+        with TemporaryDirectory() as folder:
+            for name, shape in (("source", source), ("target", target)):
+                save_shape(Path(folder) / f"{name}.ply", shape)
+            self._run(folder, "fit", "source.ply", "target.ply", "--model", NO_MODEL, "--output", "fits", "--jobs", "1")
+            self._run(folder, "map", "fits", "--to", "target", "--output", "maps", "--format", ".npy")
+            index = np.load(Path(folder) / "maps/source/target.npy")
+        return VertexMap.between(source, target, index)
+
+    def _run(self, folder: str, *words: str) -> None:
+        """`InputError` with the last line of what the command says, if it fails."""
+        environment = {**os.environ, "PYTHONPATH": str(self.checkout.resolve())}
+        command = [sys.executable, "-m", "meshmatch", *words, "--quiet"]
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise InputError(f"{words[0]} gave up: {' '.join(done.stderr.split())[-200:]}")
 
 
 def in_frame(shape: Shape, frame: Frame) -> Shape:
