@@ -19,7 +19,6 @@ NORMAL_WEIGHT = 0.15
 _REACH = 0.5
 _GROUPS = 16  # of points whose nearest neighbours are about equally far
 _COMPARED = 65536  # distances at a time, which stay in a core's cache
-_ROUNDING = 1e-6  # of a few operations in float32, relative, with a margin
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,35 +117,25 @@ def feature_tree(features: Float[Floats, "P D"]) -> cKDTree:
     return cKDTree(features, leafsize=32, balanced_tree=False)
 
 
-def quick_tree(points: Float[Floats32, "P D"]) -> cKDTree:
+def quick_tree(points: Float[Floats | Floats32, "P D"]) -> cKDTree:
     """A tree that is asked a few times only, by points far and near: built quickly rather than balanced."""
     return cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=False)
 
 
 def nearest(points: Float[Floats | Floats32, "P D"], queries: Float[Floats | Floats32, "Q D"]) -> Int[Ints, " Q"]:
-    """Which of a few thousand points at most is nearest to each query, by comparing all with all.
+    """Which of a few thousand points at most is nearest to each query, by comparing all with all in float32.
 
-    Faster than a tree, which is slow where queries are far away. All are compared in float32; where the two nearest differ
-    by no more than its rounding, again in float64, so the answers are a tree's.
+    Faster than a tree, which is slow where queries are far away. Of points whose squared distances differ by less than
+    rounding, about a millionth of the largest, any may be taken.
     """
-    lengths = squared_lengths(points.astype(np.float64))
-    against = np.concatenate([-2.0 * points, lengths[:, None]], 1).T
-    lifted = np.concatenate([queries, np.ones((len(queries), 1))], 1)
-    longest = np.sqrt([lengths.max(), squared_lengths(queries.astype(np.float64)).max(initial=0.0)])
-    rounding = _ROUNDING * longest[0] * (longest[0] + 2 * longest[1])
-    rough_against, rough = np.ascontiguousarray(against, np.float32), lifted.astype(np.float32)
+    middle = points.mean(0)  # where numbers are small, they are exact
+    points, queries = (np.asarray(each - middle, np.float32) for each in (points, queries))
+    against = np.ascontiguousarray(np.concatenate([-2 * points, np.square(points).sum(1, keepdims=True)], 1).T)
+    lifted = np.concatenate([queries, np.ones((len(queries), 1), np.float32)], 1)
     rows = max(1, _COMPARED // len(points))
     compared = np.empty((rows, len(points)), np.float32)  # written again and again, rather than asked of the system
-    found, margin = np.empty(len(rough), np.int64), np.empty(len(rough), np.float32)
-    for low in range(0, len(rough), rows):
-        some = rough[low : low + rows]
-        which = np.matmul(some, rough_against, out=compared[: len(some)]).argmin(1)
-        at = np.arange(len(some)), which
-        first = compared[at]
-        compared[at] = np.inf
-        found[low : low + rows], margin[low : low + rows] = which, compared[: len(some)].min(1) - first
-    close = np.flatnonzero(margin <= rounding)
-    for low in range(0, len(close), rows):
-        again = close[low : low + rows]
-        found[again] = (lifted[again] @ against).argmin(1)
+    found = np.empty(len(lifted), np.int64)
+    for low in range(0, len(lifted), rows):
+        some = lifted[low : low + rows]
+        found[low : low + rows] = np.matmul(some, against, out=compared[: len(some)]).argmin(1)
     return found

@@ -83,11 +83,15 @@ def test_normals_without_a_sign_are_compared_both_ways() -> None:
 
 
 @pytest.mark.parametrize(("P", "Q"), [(1, 5), (300, 2000), (3000, 768)])
-def test_comparing_all_with_all_answers_as_a_tree_does(P: int, Q: int) -> None:
+@pytest.mark.parametrize("D", [3, 6])
+def test_comparing_all_with_all_answers_as_a_tree_does_up_to_rounding(P: int, Q: int, D: int) -> None:
     rng = np.random.default_rng(0)
-    points, queries = (rng.normal(size=(count, 3)).astype(np.float32) for count in (P, Q))
-    queries[::2] *= 9  # far away
-    assert (nearest(points, queries) == quick_tree(points).query(queries)[1]).all()
+    points, queries = (rng.normal(size=(count, D)) + 100 for count in (P, Q))
+    queries[::2] = 9 * (queries[::2] - 100) + 100  # far away
+    distance, expected = quick_tree(points).query(queries)
+    found = nearest(points, queries)
+    assert np.allclose(np.linalg.norm(points[found] - queries, axis=1), distance, rtol=1e-5)
+    assert (found != expected).mean() < 0.001
 
 
 @pytest.mark.parametrize("plant", [quick_tree, feature_tree])

@@ -208,20 +208,17 @@ class Predictor:
     def _readings(self, local: OrientedPoints, count: int, degrees: float) -> list[Floats]:
         """Node vectors (K, 3) read in tilted copies of samples, and as many in those of their mirror image."""
         tilts = Rotation.from_rotvec(np.radians(degrees) * self.rng.standard_normal((count, 3))).as_matrix()
-        found = self._tilted(local, tilts)
+        sides = [local]
         if self.mirror is not None:
-            mirrored = replace(local, points=self.mirror.points(local.points))
-            found += [self.mirror.vectors(vectors) for vectors in self._tilted(mirrored, tilts)]
-        return found
-
-    def _tilted(self, samples: OrientedPoints, tilts: Float[Floats, "N 3 3"]) -> list[Floats]:
-        """Node vectors (K, 3) predicted from tilted samples, turned back."""
+            sides.append(replace(local, points=self.mirror.points(local.points)))
         clouds = []
-        for number, tilt in enumerate(tilts):
-            size = _VARIANT_POINTS[number % len(_VARIANT_POINTS)]
-            clouds.append(samples.drawn(size, self.rng) @ tilt.T)
+        for samples in sides:
+            for number, tilt in enumerate(tilts):
+                size = _VARIANT_POINTS[number % len(_VARIANT_POINTS)]
+                clouds.append(samples.drawn(size, self.rng) @ tilt.T)
         found = list(self.network.predict(clouds)) if clouds else []
-        return [self.network.rotate_rows(vectors, tilt) for vectors, tilt in zip(found, tilts, strict=True)]
+        turned = [self.network.rotate_rows(vectors, tilts[k % count]) for k, vectors in enumerate(found)]
+        return turned[:count] + [self.mirror.vectors(vectors) for vectors in turned[count:] if self.mirror is not None]
 
 
 @derived

@@ -266,8 +266,8 @@ def _pair_products(phi: Any) -> tuple[Ints, Ints, Any]:
     met = np.zeros(K * K, bool)
     met[code] = True
     pairs, number = np.flatnonzero(met), np.cumsum(met, dtype=np.int32) - np.int32(1)
-    found = coo_matrix((np.concatenate(products), (number[code], where)), shape=(len(pairs), V)).tocsr()
-    found.sort_indices()
+    # By columns, with which the product takes half as long as by rows.
+    found = coo_matrix((np.concatenate(products), (number[code], where)), shape=(len(pairs), V)).tocsc()
     return pairs // K, pairs % K, found
 
 
