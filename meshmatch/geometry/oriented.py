@@ -11,7 +11,6 @@ import numpy as np
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
 from meshmatch.geometry.frames import Frame, RigidPose
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.geometry.triangles import squared_lengths
 
 # How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area). Set by hand.
 NORMAL_WEIGHT = 0.15
