@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from meshmatch.api.matching import register as register
     from meshmatch.api.pictures import picture as picture
     from meshmatch.api.pictures import view as view
+    from meshmatch.api.prepare import prepare as prepare
     from meshmatch.api.results import ConfidenceRule as ConfidenceRule
     from meshmatch.api.results import MapPair as MapPair
     from meshmatch.api.results import MatchResult as MatchResult
@@ -74,7 +75,6 @@ if TYPE_CHECKING:
     from meshmatch.shapes.files import load_shape as load_shape
     from meshmatch.shapes.files import save_shape as save_shape
     from meshmatch.shapes.shape import Shape as Shape
-    from meshmatch.templates.prepare import prepare as prepare
     from meshmatch.training.recipes import Recipe as Recipe
     from meshmatch.training.recipes import recipe_for as recipe_for
     from meshmatch.training.train import train as train
@@ -89,6 +89,7 @@ _NAMES = {
     "api.matcher": "Matcher",
     "api.matching": "match register",
     "api.pictures": "picture view",
+    "api.prepare": "prepare",
     "api.results": "ConfidenceRule MapPair MatchResult Transferred evaluate measure_distance",
     "api.rig": "RiggedResult transfer_rig",
     "api.texture": "TexturedResult transfer_texture",
@@ -116,7 +117,6 @@ _NAMES = {
     "models.trained": "TrainedModel",
     "shapes.files": "load_shape save_shape",
     "shapes.shape": "Shape",
-    "templates.prepare": "prepare",
     "training.recipes": "Recipe recipe_for",
     "training.train": "train",
     "transfer.bake": "BakeOptions",

@@ -232,7 +232,8 @@ class Matcher:
         clean = validated(as_shape(shape))
         with thread_limit(1):
             found = follow(Fitter(self.model, self.config), clean.shape, last)
-            return self._finished(*self._best(found, clean, self.config), self.config)
+            best = self._finished(*self._best(found, clean, self.config), self.config)
+            return self._finer(best, self.config, turned=False)
 
     def dense(self, fit: Fit) -> Shape:
         """The template at its full resolution on the shape of a fit.
@@ -439,7 +440,7 @@ class Matcher:
                 here, config = clean[number], configs[number]
                 found = begun[number].fit or Fitter(self.model, config, report).fit(here.shape)
                 best = (found, here) if begun[number].tried else self._best(found, here, config, report)
-            return self._finer(self._finished(*best, configs[number]), progress=report)
+            return self._finer(self._finished(*best, config), config, report)
 
         with thread_limit(inner):  # after an error, or Ctrl-C, the other fits end at their next report
             return parallel_map(one, range(len(clean)), threads=threads, stop=stop)
@@ -469,18 +470,24 @@ class Matcher:
                 raise OptionError(wrong, f"fit the shape with the model {self.model.card.name}")
         config = config or replace(self.config, seed=fits[0].seed)
         shapes = [shape_of(fit).shape for fit in fits]
+        done = [False, False]  # a finer fit would be lost by agreement
+        if not (known or self.model.card.correspondence):
+            from meshmatch.fitting.alike import is_finer
+
+            done = [is_finer(self.model, fit) for fit in fits]
+        if all(done):
+            return fits
         agreed = agreed_fits(self.model, shapes, list(fits), config, known, threads=self.threads)
-        first, second = agreed if known else map(self._finer, agreed, fits)
+        first, second = (fit if keep else other for fit, other, keep in zip(fits, agreed, done, strict=True))
         return first, second
 
-    def _finer(self, fit: Fit, alone: Fit | None = None, progress: ProgressCallback | None = None) -> Fit:
-        """A fit that knows its shape, made finer where no correspondence was learned that this could lose; ``alone`` is that
-        before it agreed with another one."""
+    def _finer(self, fit: Fit, config: FitConfig, progress: ProgressCallback | None = None, turned: bool = True) -> Fit:
+        """A fit that knows its shape, made finer where no correspondence was learned that this could lose."""
         if self.model.card.correspondence:
             return fit
         from meshmatch.fitting.alike import finer
 
-        return finer(self.model, shape_of(fit).shape, fit, alone, progress)
+        return finer(self.model, shape_of(fit).shape, fit, config, progress, turned)
 
 
 def _both_whole(clean: Sequence[Repaired], fits: Sequence[Fit]) -> bool:

@@ -82,11 +82,11 @@ def prepare(
     otherwise without it. Writes template.safetensors, a picture of the nodes (nodes.png) and, from a folder,
     shapes.safetensors, points.safetensors, normalised/ and prepared.json.
     """
+    from meshmatch.api.prepare import PrepareConfig
+    from meshmatch.api.prepare import prepare as prepare_shapes
     from meshmatch.render.compose import compose_shapes
     from meshmatch.shapes.tables import load_points
     from meshmatch.templates.make import NodeConfig
-    from meshmatch.templates.prepare import PrepareConfig
-    from meshmatch.templates.prepare import prepare as prepare_shapes
 
     console = Console(quiet)
     parts = None if how.labels is None else load_points(how.labels)

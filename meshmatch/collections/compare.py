@@ -9,11 +9,7 @@ import numpy as np
 
 from meshmatch.collections.setting import FAILED, Record
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.usual import FEWEST, WEIGHTS, Usual, Weights
-
-# Shapes have sides where so many of them have one that is clear, see `Fit.side`: 0.19 and more of molars, 0.17 of cut
-# femurs; of birds, which have none, up to 0.01, and of leaves half have less.
-_CLEAR, _MOST = 0.15, 0.8
+from meshmatch.fitting.usual import FEWEST, WEIGHTS, Usual, Weights, have_sides
 
 
 @dataclass(frozen=True)
@@ -56,7 +52,5 @@ def on_the_other_side(records: Sequence[Record]) -> set[str]:
     """Names of shapes that were fitted as they are, for their mirror images are not much better; but all the others show
     that shapes of this kind have sides.
     """
-    leads = np.array([each.side for each in records if each.verdict not in ("poor", FAILED)])
-    if len(leads) < FEWEST or (np.abs(leads) > _CLEAR).mean() < _MOST:
-        return set()
-    return {each.name for each in records if each.side < 0}
+    sided = have_sides([each.side for each in records if each.verdict not in ("poor", FAILED)])
+    return {each.name for each in records if sided and each.side < 0}

@@ -23,7 +23,7 @@ from meshmatch.collections.setting import AGREEING, ALONE, FITS, SUFFIX, Record,
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.fitting.agree import member_of, with_vectors
-from meshmatch.fitting.alike import finer
+from meshmatch.fitting.alike import is_finer
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree_step, log_stretch
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.system import node_system
@@ -72,6 +72,7 @@ def fit_alone(task: FitTask) -> Record:
         if setting.agrees:
             how = AgreeConfig.for_collection(setting.trained)
             samples = member_of(node_system(setting.trained), fit.repaired.shape, fit, setting.config, how).samples
+        doubted = setting.model == NO_MODEL or (fit.verdict == "poor" and not setting.learned)
         distance, furthest = surface_distance(fit.repaired.shape, fit.shape, fit.partial)
         record = Record(
             name=source.name,
@@ -84,7 +85,7 @@ def fit_alone(task: FitTask) -> Record:
             furthest=furthest,
             **regularity_words(fit.regularity),
             stretch=math.nan if fit.signs is None else fit.signs.stretch,
-            likely=fit.trust if fit.signs is None or setting.model == NO_MODEL else fit.signs.p_correct,
+            likely=fit.trust if fit.signs is None or doubted else fit.signs.p_correct,
             mirrored=int(fit.frame.mirrored),
             side=fit.side,
             scale=fit.frame.scale,
@@ -261,15 +262,12 @@ def _finish(task: FinishTask) -> None:
     if task.usual is not None:
         before = task.usual.judged(before, Record.of(alone.words["record"]))
     fit = before
-    cut = before.partial and not setting.learned  # that fit has more nodes than can agree
-    if task.group is not None and not cut:
-        vectors = load_array(setting.store, task.group.file(task.step))[task.group.names.index(name)]
+    group = None if not setting.learned and setting.agrees and is_finer(setting.trained, before) else task.group
+    if group is not None:
+        vectors = load_array(setting.store, group.file(task.step))[group.names.index(name)]
         system = node_system(setting.trained)
         fit = with_vectors(system, before, system.unfolded(vectors))
-    if setting.model != NO_MODEL:
-        agreed, fit = fit, finer(setting.trained, part.shape, fit, before)
-        before = replace(before, points=before.points + fit.points - agreed.points)  # what agreement moved
-    places = Places.of(part, fit, before if task.group is not None and not cut else None)
+    places = Places.of(part, fit, before if group is not None else None)
     words = {"digest": task.digest, "agreed_with": task.agreed_with}
     with setting.store.writing(task.file) as path:
         write_fit(path, PlacedFit.of(fit, places), words=words)

@@ -8,24 +8,29 @@ surface. Specimens of one kind need less freedom, and the whole of a broken bone
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats
 from meshmatch.derived import derived
 from meshmatch.errors import InputError
 from meshmatch.fitting.direct import CLEARLY, MIRROR, DirectMatch, match_directly
 from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fitter import cap_verdict, may_show_part
-from meshmatch.fitting.judge.reasons import Reason
+from meshmatch.fitting.fitter import cap_verdict, judged_of_kind, may_show_part, with_side
+from meshmatch.fitting.judge.reasons import SIDE_IN_DOUBT, Reason
 from meshmatch.fitting.one_way import DirectConfig
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.fitting.solve.viscous import ViscousConfig
-from meshmatch.fitting.without_model import fit_alike, fit_near, fit_without_model, template_of, viscous_system
+from meshmatch.fitting.without_model import (
+    fit_alike,
+    fit_near,
+    fit_otherwise,
+    fit_without_model,
+    template_of,
+    viscous_system,
+)
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.trained import TrainedModel
@@ -40,6 +45,7 @@ from meshmatch.templates.template import Template
 # How near shapes that stand alike must come by a rigid motion, in units of sqrt(area): femurs, knees and molars come to 0.04
 # to 0.06, hearts and leaves up to 0.066; people, ants and fish to 0.069 and more.
 _ALIKE = 0.067
+_CLEAR_SIDE = 0.05  # see `Fit.side`: 0.15 and more of molars
 
 
 def match_alike(
@@ -97,14 +103,19 @@ def match_alike(
 
 
 def finer(
-    model: TrainedModel, shape: Shape, fit: Fit, alone: Fit | None = None, progress: ProgressCallback | None = None
+    model: TrainedModel,
+    shape: Shape,
+    fit: Fit,
+    config: FitConfig,
+    progress: ProgressCallback | None = None,
+    turned: bool = True,
 ) -> Fit:
     """A fit of a model that learned a kind without correspondence, made finer.
 
-    Where the shape stands as the template does, that is given more nodes, and may stretch. Elsewhere the template is
-    matched to it directly, with this fit as one of the guesses; where another guess is clearly better, the fit is fair at
-    most. The points of the fit move; all else, node vectors included, is as it was. The same where the model learned
-    correspondence, of a cloud or a part, and of a poor fit.
+    Where the shape stands as the template does, in any turn, or mirrored, the template is given more nodes, and is judged
+    anew. Elsewhere it is matched to the shape directly, with this fit as one of the guesses; where another guess
+    is clearly better, the fit is fair at most. A poor fit of such a shape is not searched, and stays poor. All is as it was
+    where the model learned correspondence, and of a cloud or a part.
 
     Parameters
     ----------
@@ -114,33 +125,60 @@ def finer(
         The repaired shape.
     fit
         Of the model's template to it.
-    alone
-        The same before it agreed with others, from which a search begins; or which has been made finer, and is taken.
+    config
+        Whether mirror images are looked for.
     progress
         As of `match_directly`, of what is searched.
+    turned
+        Whether other turns than that of the fit are tried.
 
     Returns
     -------
     Fit
-        Of the same template.
+        Of the same template; its node vectors come near its points.
     """
-    if model.card.correspondence or shape.is_cloud or fit.partial or fit.verdict == "poor" or not model.has_nodes:
+    card = model.card
+    if card.correspondence or shape.is_cloud or fit.partial or not model.has_nodes:
         return fit
-    near = fit_near(_with_more_nodes(model.template), shape, fit, ViscousConfig(seed=fit.seed))
-    if near is not None:
-        return replace(fit, points=fit.frame.apply(near.points_in_file))
-    alone = alone or fit
-    if not np.allclose(alone.points, node_system(model).moved(alone.vectors), atol=1e-6):
-        return replace(fit, points=fit.frame.apply(alone.points_in_file))
-    found = _searched(model.template, shape, alone, progress)
-    return fit if found is None else cap_verdict(replace(fit, points=fit.frame.apply(found[0])), found[1])
+    viscous, both = ViscousConfig(seed=fit.seed), turned and (config.mirror or card.mirror) != "no"
+    near = fit_near(_with_more_nodes(model.template), shape, fit, viscous, turned, both, card.mirror != "no")
+    poor = near is None and fit.verdict == "poor"
+    doubts = [] if near is None or not both or near.side > _CLEAR_SIDE else [Reason("side", SIDE_IN_DOUBT)]
+    if near is None:
+        doubts = [reason for reason in fit.reasons if reason.code == "side"]
+        found = fit if poor else _searched(model.template, shape, fit, progress)
+        near, moved = fit_otherwise(_with_more_nodes(model.template), shape, found, viscous)
+        if moved:
+            near = replace(near, points=found.points)
+    made = cap_verdict(judged_of_kind(card, _as_of(model, near)), doubts)
+    if near.points is fit.points:  # it may yet agree with others
+        made = replace(made, vectors=fit.vectors)
+    if poor:
+        made = replace(made, verdict="poor", reasons=fit.reasons, trust=min(fit.trust, made.trust))
+    notes = with_side(fit.notes, shape.name, card, made.frame.mirrored)
+    return replace(made, repaired=fit.repaired, left_out=fit.left_out, notes=notes)
 
 
-def _searched(
-    template: Template, shape: Shape, fit: Fit, progress: ProgressCallback | None
-) -> tuple[Float[Floats, "V 3"], Sequence[Reason]] | None:
-    """Where a search finds the template's vertices in the file, and what is to be said if it does so elsewhere than a fit;
-    None where that is hardly better."""
+def is_finer(model: TrainedModel, fit: Fit) -> bool:
+    """Whether a fit was made finer than its node vectors are."""
+    return model.has_nodes and not np.allclose(fit.points, node_system(model).moved(fit.vectors), atol=1e-6)
+
+
+def _as_of(model: TrainedModel, fit: Fit) -> Fit:
+    """A fit of the same vertices with more nodes, as one of a model."""
+    return replace(
+        fit,
+        model=model.card.name,
+        template_hash=model.template.hash,
+        resting=np.asarray(model.template.shape.verts),
+        faces=np.asarray(model.template.shape.faces),
+        vectors=node_system(model).vectors_to(fit.points),
+    )
+
+
+def _searched(template: Template, shape: Shape, fit: Fit, progress: ProgressCallback | None) -> Fit:
+    """Where a search finds the template's vertices on a shape, with its trust and reasons; the fit itself where the search
+    finds nothing that is clearly better."""
     rested = Shape(template.shape.verts, template.shape.faces, shape.name)  # the name is what progress tells
     side = MIRROR if fit.frame.mirrored else None
     image, guess = shape, fit.points_in_file
@@ -150,11 +188,14 @@ def _searched(
     try:
         found = match_directly(rested, image, config, progress=progress, guess=(rested.verts, guess))
     except InputError:  # no surface without its loose ends
-        return None
+        return fit
     if found.verdict == "poor" or 0 < found.over_guess < CLEARLY:
-        return None
+        return fit
     points = found.target.points_in_file[cKDTree(found.source.points_in_file).query(rested.verts)[1]]
-    return points if side is None else side.apply(points), found.reasons if found.over_guess else ()
+    if side is not None:
+        points = side.apply(points)
+    reasons = found.reasons if found.over_guess else ()
+    return replace(fit, points=fit.frame.apply(points), trust=found.target.trust, reasons=reasons)
 
 
 def as_part(model: TrainedModel, shape: Shape, whole: float, config: FitConfig) -> Fit | None:
@@ -182,14 +223,7 @@ def as_part(model: TrainedModel, shape: Shape, whole: float, config: FitConfig) 
     found = fit_without_model(template, shape, viscous, mirror=config.mirror != "no", whole=whole)
     if not found.partial:
         return None
-    return replace(
-        found,
-        model=model.card.name,
-        template_hash=model.template.hash,
-        resting=np.asarray(model.template.shape.verts),
-        faces=np.asarray(model.template.shape.faces),
-        vectors=node_system(model).vectors_to(found.points),
-    )
+    return _as_of(model, found)
 
 
 @derived

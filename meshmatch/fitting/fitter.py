@@ -23,6 +23,7 @@ from meshmatch.fitting.solve.terms import Landmarks
 from meshmatch.fitting.usual import Usual
 from meshmatch.geometry.oriented import quick_tree
 from meshmatch.geometry.trees import cKDTree
+from meshmatch.models.card import ModelCard
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.normalise import ALIGNS
@@ -64,7 +65,6 @@ class Fitter:
         if landmarks is not None:
             check_landmarks(self.model)
         began, progress, card = time.monotonic(), Progress(self.progress, shape.name), self.model.card
-        notes: tuple[str, ...] = ()
         doubts: list[Reason] = []
         both = (self.config.mirror or card.mirror) != "no" and mirror_of(self.model) is None
         stretches = [progress.between(k / 2, (k + 1) / 2) for k in range(2)] if both else [progress]
@@ -82,18 +82,27 @@ class Fitter:
         (found, partial), *others = sorted(sides, key=lambda side: _cost(side[0]))
         if said and not partial:
             found = whole(self.config, found.core_frame.mirrored)
-        if found.core_frame.mirrored:
-            notes = (f"{shape.name}: taken for the mirror image of what {card.name} knows",)
+        notes = with_side((), shape.name, card, found.core_frame.mirrored)
         if others and _cost(found) > _SURE_SIDE * _cost(others[0][0]):
             doubts.append(Reason("side", SIDE_IN_DOUBT))
         fit = replace(as_fit(found, partial, began), notes=notes)
-        usual = None if card.correspondence else Usual.of_card(card)
-        if usual is not None and fit.signs is not None:
-            fit = usual.judged(fit, fit.trust, fit.signs.stretch, fit.residual)
-        elif not card.correspondence:
-            learned = f"{card.name} was trained without correspondence: surfaces that lie close need not correspond"
-            doubts.append(Reason("unsupervised", learned))
-        return cap_verdict(fit, doubts)
+        return cap_verdict(fit if card.correspondence else judged_of_kind(card, fit), doubts)
+
+
+def with_side(notes: Sequence[str], name: str, card: ModelCard, mirrored: bool) -> tuple[str, ...]:
+    """What is said of a fit, with whether its shape was taken for a mirror image."""
+    of_mirror_image = f"{name}: taken for the mirror image of what {card.name} knows"
+    return (*([of_mirror_image] if mirrored else []), *(note for note in notes if note != of_mirror_image))
+
+
+def judged_of_kind(card: ModelCard, fit: Fit) -> Fit:
+    """A fit of a model that learned a kind without correspondence: judged by what its card says is usual; fair at best where
+    it says nothing."""
+    usual = Usual.of_card(card)
+    if usual is not None and fit.signs is not None:
+        return usual.judged(fit, fit.trust, fit.signs.stretch, fit.residual)
+    learned = f"{card.name} was trained without correspondence: surfaces that lie close need not correspond"
+    return cap_verdict(fit, [Reason("unsupervised", learned)])
 
 
 def _cost(found: Registration) -> float:

@@ -67,7 +67,8 @@ _PART_OF_ALIKE = 0.55
 _BEYOND = 0.02
 _TURNS = 2  # of a part, and of its mirror image, that are tried
 _OTHER_SIDE = 0.86  # so much of the stretch a mirror image may need, to be meant: 0.48 to 0.83 of molars, 0.99 of birds
-_FEW, _FEW_STEPS = 4000, 12  # samples and steps by which two shapes that were matched are fitted anew, to choose
+_ANEW = 0.95  # so much of the energy another turn than a model's may have: 0.5 to 0.9 of leaves
+_FEW, _FEW_STEPS = 4000, 12  # samples and steps by which poses are chosen in less time
 # Of a whole: up to so many turns are fitted, whose samples stay up to so many times as far apart as those of the best one.
 # Ends of leaves are told by their fits alone (1.0 to 1.2); of femurs all others are 2 and more, of knees 1.3.
 _ALIKE_TURNS, _NEARLY = 4, 1.35
@@ -288,12 +289,72 @@ def fit_without_model(
     return (_Judged.of(part_task, part) if part.energy < clearly * found.energy else as_whole).fit(lead, began)
 
 
-def fit_near(template: Template, shape: Shape, start: Fit, config: ViscousConfig) -> Fit | None:
-    """Fit a template to a repaired shape that stands as it does, from where a fit of another template of the same vertices
-    has it; None where the shape stands otherwise."""
-    began, task = time.monotonic(), _Task(template, shape, config)
-    found = task.fitted(task.near(start))
-    return _Judged.of(task, found).fit(start.side, began) if found.alike else None
+def fit_near(
+    template: Template,
+    shape: Shape,
+    start: Fit,
+    config: ViscousConfig,
+    turned: bool = False,
+    mirror: bool = False,
+    sided: bool = False,
+) -> Fit | None:
+    """Fit a template to a repaired shape that stands as it does.
+
+    Parameters
+    ----------
+    start
+        A fit of another template of the same vertices, from whose pose this one begins.
+    turned, mirror
+        Whether other turns are tried, and those of the mirror image.
+    sided
+        Whether shapes are known to have sides: the one is meant for which the template stretches less.
+
+    Returns
+    -------
+    Fit
+        None where the shape stands otherwise.
+    """
+    began, quick = time.monotonic(), _Task(template, shape, _quick(config.seed))
+    own = MIRROR if start.frame.mirrored else None
+    best, lead = quick.fitted(quick.near(start)), 0.0
+    if turned:
+        best = _clearly_better(quick.best_turn(own), best, _ANEW)
+    if turned and mirror:
+        other = quick.best_turn(None if own is MIRROR else MIRROR)
+        lead = float(np.log(max(other.features.stretch, _NOTHING) / max(best.features.stretch, _NOTHING)))
+        certain = sided and best.alike and other.alike
+        if lead < 0 if certain else _clearly_better(other, best, _TURNED) is other:
+            best, lead = other, -lead
+    task = _Task(template, shape, config)
+    found = task.fitted(best.begin)
+    return _Judged.of(task, found).fit(lead, began) if found.alike else None
+
+
+def fit_otherwise(template: Template, shape: Shape, start: Fit, config: ViscousConfig) -> tuple[Fit, bool]:
+    """Fit a template to a repaired shape that stands otherwise than it does.
+
+    Parameters
+    ----------
+    start
+        Another template of the same vertices, where they belong on the shape, or may.
+
+    Returns
+    -------
+    Fit
+        From there; or of the template that is only turned, if that has less energy.
+    bool
+        Whether it is the former.
+    """
+    began, quick = time.monotonic(), _Task(template, shape, _quick(config.seed))
+    ambiguous = tuple(reason for reason in start.reasons if reason.code == "ambiguous")
+    vectors = quick.onto(np.arange(len(start.points)), start.points)
+    moved = quick.fitted(_Begin(start.frame, vectors, start.trust, ambiguous))
+    turned = quick.best_turn(MIRROR if start.frame.mirrored else None)
+    best = _clearly_better(moved, turned, 1.0 if start.trust >= _LOST else _SEARCHED)
+    if best.features.stretch > _FAR:
+        config = replace(ViscousConfig.choosing(), seed=config.seed)
+    task = _Task(template, shape, config)
+    return _Judged.of(task, task.fitted(best.begin)).fit(0.0, began), best is moved
 
 
 def fit_alike(
@@ -323,9 +384,7 @@ def fit_alike(
     None where the shape stands otherwise than the template.
     """
     began, config = time.monotonic(), config or ViscousConfig()
-    rough = ViscousConfig.choosing()
-    few = replace(rough, samples=_FEW, back_points=_FEW, schedule=replace(rough.schedule, steps=_FEW_STEPS))
-    few, sides = replace(few, seed=config.seed), (None, MIRROR) if mirror else (None,)
+    few, sides = _quick(config.seed), (None, MIRROR) if mirror else (None,)
     task, (resting, start) = _Task(template, shape, few), begun
     at = np.asarray(cKDTree(task.system.verts).query(resting)[1], np.int64)
     first = task.fitted(_Begin(start.frame, task.onto(at, start.points)))
@@ -347,6 +406,29 @@ def fit_alike(
         return None
     task = _Task(template, shape, config)
     return _Judged.of(task, task.fitted(best.begin)).fit(0.0, began), best is first
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """A shape beside a template that is only turned: the frame from its file to the template, how much that has to stretch,
+    and whether the shape stands as it does."""
+
+    frame: Frame
+    stretch: float
+    alike: bool
+
+
+def standing(template: Template, shape: Shape, seed: int) -> Standing:
+    """How a repaired shape stands to a template, by fits of those turns of it that lie near."""
+    best = _Task(template, shape, _quick(seed)).best_turn(None)
+    return Standing(best.begin.frame, max(best.features.stretch, _NOTHING), best.alike)
+
+
+def _quick(seed: int) -> ViscousConfig:
+    """To choose among poses in less time."""
+    stiff = ViscousConfig.choosing()
+    schedule = replace(stiff.schedule, steps=_FEW_STEPS)
+    return replace(stiff, samples=_FEW, back_points=_FEW, schedule=schedule, seed=seed)
 
 
 @dataclass(frozen=True, eq=False)

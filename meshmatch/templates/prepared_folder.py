@@ -8,7 +8,7 @@ on each of a folder's shapes, in one order.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any, TypeVar
@@ -134,13 +134,15 @@ def collect_samples(
     shapes: Sequence[Repaired],
     landmarks: Sequence[Float[Floats, "L 3"] | None],
     template_landmarks: Float[Floats, "L 3"] | None,
+    turns: Sequence[Float[Floats, "3 3"] | None],
     how: Align,
     scale: Scale,
     seed: int,
     progress: Progress,
 ) -> tuple[ShapeSamples, list[Frame], list[float]]:
     """Every shape in the template's frame, sampled; the frame of each (file to template), and its residual against the
-    template. A shape's landmarks are in its file's frame, NaN where missing; the template's in the template's.
+    template. ``turns`` are rotations from files to the template, where they are known. A shape's landmarks are in its
+    file's frame, NaN where missing; the template's in the template's.
     """
     target, radius = template_samples(template), template_radius(template)
     P = int(np.clip(_ALL_SAMPLES // len(shapes), _MIN_SAMPLES, _MAX_SAMPLES))
@@ -148,10 +150,11 @@ def collect_samples(
     places = np.zeros((0, 3)) if template_landmarks is None else template_landmarks
     points, normals, frames, residuals = [], [], [], []
     known = np.full((len(shapes), len(places), 3), np.nan, np.float32)
-    for number, (one, marks) in enumerate(zip(shapes, landmarks, strict=True)):
+    for number, (one, marks, turn) in enumerate(zip(shapes, landmarks, turns, strict=True)):
         frame = unit_frame(one.shape, scale, radius)
+        frame = frame if turn is None else replace(frame, rotation=turn)
         part = sample_surface(one.shape, P, rng).in_frame(frame)
-        best = align(part, target, how)[0]
+        best = align(part, target, how if turn is None else "near")[0]
         part = part.to_local(best.pose)
         points.append(part.points)
         normals.append(part.normals)

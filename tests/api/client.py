@@ -12,6 +12,7 @@ import numpy as np
 import meshmatch
 from meshmatch import FitConfig, Matcher
 from meshmatch.api.pictures import Page
+from meshmatch.api.prepare import Prepared
 from meshmatch.arrays import Floats
 from meshmatch.collections.asymmetry import Asymmetry
 from meshmatch.collections.atlas import Projection
@@ -19,7 +20,6 @@ from meshmatch.collections.groups import Comparison
 from meshmatch.collections.measures import Measures
 from meshmatch.fields import NodeField, node_field
 from meshmatch.models.card import ModelCard
-from meshmatch.templates.prepare import Prepared
 from meshmatch.transfer.label_files import Labels
 from meshmatch.transfer.landmarks import Landmarks
 from meshmatch.transfer.weight_files import SkinWeights

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from meshmatch.api.prepare import PrepareConfig
 from meshmatch.errors import InputError
 from meshmatch.render import compose
 from meshmatch.render.picture import Panel
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
-from meshmatch.templates.prepare import PrepareConfig
 from meshmatch.templates.template import load_template
 from tests.cli.conftest import Answer, Run
 
@@ -126,7 +126,7 @@ def test_options_reach_the_config(run: Run, folder: Path, tmp_path: Path, monkey
         heard.append(config)
         raise InputError("far enough")
 
-    monkeypatch.setattr("meshmatch.templates.prepare.prepare", stop)
+    monkeypatch.setattr("meshmatch.api.prepare.prepare", stop)
     words = "--strategy uniform --nodes 70 --radius 0.35 --grow-radii --seed 1 --faces 600 --decimate meshlab"
     words += " --template egg1 --align near --scale sphere --mirror no --landmarks .tip.npy"
     assert run("prepare", folder, "-o", tmp_path / "out").status == 1

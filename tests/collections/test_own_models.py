@@ -9,6 +9,7 @@ import pytest
 from meshmatch.api.upright import turn_of_fit
 from meshmatch.collections import compare, setting, tasks
 from meshmatch.collections.collection import Collection
+from meshmatch.fitting import alike
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
@@ -35,14 +36,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_what_stands_out_may_be_cut_and_fits_are_made_finer(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_stands_out_may_be_cut_and_finer_fits_stay(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[int, float]] = []
     monkeypatch.setattr(setting, "as_part", lambda model, shape, whole, config: asked.append((shape.V, whole)))
-    monkeypatch.setattr(tasks, "finer", lambda model, shape, fit, alone: replace(fit, points=fit.points + shape.V))
+    monkeypatch.setattr(alike, "finer", lambda model, shape, fit, *_: replace(fit, points=fit.points + shape.V))
     collection = Collection(folder / "fits", workers=1)
     made = collection.fit(folder / "eggs", model=str(folder / "model"), config=QUICK)
     assert asked == [(made.records[0].vertices, np.median([record.scale for record in made.records]))]
-    for record in made.records:
+    for record in made.records:  # which agreement would move elsewhere
         assert abs(collection.fit_of(record.name).points.mean() - record.vertices) < 1
         assert (record.up, record.front) == ("", "")
         assert turn_of_fit(collection.fit_of(record.name)) is None

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import meshmatch
+from meshmatch.api.prepare import PrepareConfig, prepare
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
-from meshmatch.templates.prepare import PrepareConfig, prepare
 from tests.fitting.eggs import bent_egg, egg_model, write_model
 from tests.training.test_run import SMALL
 

@@ -10,7 +10,7 @@ from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Bools, Floats
 from meshmatch.experiments.makers.bones import Scanned, draw_bones, scan
 from meshmatch.fitting import alike
-from meshmatch.fitting.alike import as_part, finer, match_alike
+from meshmatch.fitting.alike import as_part, finer, is_finer, match_alike
 from meshmatch.fitting.direct import MIRROR, DirectMatch, match_either_side
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
@@ -19,7 +19,7 @@ from meshmatch.fitting.judge.reasons import Reason, Verdict
 from meshmatch.fitting.one_way import DirectConfig, KnownPairs
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.fitting.solve.viscous import ViscousConfig
-from meshmatch.fitting.without_model import template_of, viscous_system
+from meshmatch.fitting.without_model import fit_near, fit_without_model, template_of, viscous_system
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.trained import TrainedModel
@@ -115,13 +115,17 @@ def test_a_model_that_learned_no_correspondence_gets_finer_points() -> None:
     bump = 0.08 * np.exp(-np.square(points - points[points[:, 0].argmax()]).sum(1) / 0.02)
     shape = Shape(points + bump[:, None] * system.normals(points), model.template.shape.faces)
     fit = replace(Fitter(model).fit(shape), points=points, vectors=vectors, verdict="fair", frame=Frame.identity())
-    found = finer(model, shape, fit)
+    found = finer(model, shape, fit, FitConfig(mirror="no"))
     off, better = (np.linalg.norm(each.points_in_file - shape.verts, axis=1).mean() for each in (fit, found))
     assert better < 0.6 * off
-    assert found.vectors is fit.vectors and (found.verdict, found.template_hash) == (fit.verdict, fit.template_hash)
-    for one, other in ((known, fit), (model, replace(fit, partial=True)), (model, replace(fit, verdict="poor"))):
-        assert finer(one, shape, other) is other
-    assert finer(model, Shape(shape.verts, np.empty((0, 3), np.int64)), fit) is fit
+    assert found.template_hash == fit.template_hash and is_finer(model, found) and not is_finer(model, fit)
+    assert np.linalg.norm(system.moved(found.vectors) - found.points, axis=1).mean() < 0.02
+    assert found.signs is not None and found.signs.stretch < 0.3
+    poor = replace(fit, verdict="poor")
+    assert finer(model, shape, poor, FitConfig(mirror="no")).verdict == found.verdict == "fair"  # judged anew
+    for one, other in ((known, fit), (model, replace(fit, partial=True))):
+        assert finer(one, shape, other, FitConfig()) is other
+    assert finer(model, Shape(shape.verts, np.empty((0, 3), np.int64)), fit, FitConfig()) is fit
 
 
 @pytest.mark.parametrize("mirrored", [True, False])
@@ -148,7 +152,11 @@ def test_what_stands_otherwise_than_the_template_is_searched_once(
         second = replace(first, points=places[order], verdict=verdict, reasons=(Reason("ambiguous", "two ways"),))
         return DirectMatch(first, second, (("guess", 0.02),), system, over_guess=over)
 
+    def moved(template: object, shape: Shape, start: Fit, config: object) -> tuple[Fit, bool]:
+        return replace(start, points=start.points + 1, residual=0.01), True  # what is judged, and no more
+
     monkeypatch.setattr(alike, "match_directly", directly)
+    monkeypatch.setattr(alike, "fit_otherwise", moved)
     system = node_system(model)
     vectors = system.vectors_to(places + np.array([0.0, 0.0, 0.04]))
     fit = replace(plain, points=system.moved(vectors), vectors=vectors, verdict="good", frame=frame)
@@ -157,15 +165,39 @@ def test_what_stands_otherwise_than_the_template_is_searched_once(
     def report(stage: str, name: str, share: float) -> None:
         told.append(name)
 
-    found = finer(model, shape, fit, progress=report)
-    assert told == [shape.name]
-    assert np.allclose(guesses[0][1], fit.points) and found.vectors is fit.vectors
+    found = finer(model, shape, fit, FitConfig(mirror="no"), report)
+    assert told == [shape.name] and len(guesses) == 1
+    assert np.allclose(guesses[0][1], fit.points)
     taken = verdict == "good" and over != 0.001
     assert np.allclose(found.points, places if taken else fit.points)
-    assert found.verdict == ("fair" if over == 0.01 else "good")  # what is said of another map counts
-    agreed = finer(model, shape, replace(fit, points=rested), found, report)
-    assert np.allclose(agreed.points, places if taken else rested)
-    assert len(guesses) == (1 if taken else 2) and np.allclose(guesses[-1][1], fit.points)
+    assert is_finer(model, found) == taken and (found.vectors is fit.vectors) == (not taken)
+    assert any(reason.code == "ambiguous" for reason in found.reasons) == (over == 0.01)
+    assert found.residual == 0.01
+
+
+def test_what_stands_otherwise_is_only_turned_where_a_search_finds_nothing_better(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = egg_model()
+    model = TrainedModel(replace(known.card, correspondence=False), known.template, known.inference)
+    system = node_system(model)
+    shape = Shape(system.verts * [1, 2.5, 1], model.template.shape.faces)
+    crumpled = system.verts @ np.diag([1.0, -1.0, 1.0]) * [2.5, 1, 1]
+    fit = replace(Fitter(model).fit(shape), points=crumpled, verdict="fair", frame=Frame.identity())
+    monkeypatch.setattr(alike, "_searched", lambda template, part, start, progress: start)
+    found = finer(model, shape, fit, FitConfig(mirror="no"))
+    assert cKDTree(found.points_in_file).query(shape.verts)[0].mean() < 0.1
+    assert not np.allclose(found.points, fit.points)
+
+
+@pytest.mark.parametrize(("turned", "sided"), [(True, True), (True, False), (False, True)])
+def test_the_side_is_that_for_which_the_template_stretches_less(turned: bool, sided: bool) -> None:
+    config = alike.ViscousConfig()
+    template = template_of(RIGHT.shape, "right", config)
+    wrong = fit_without_model(template, LEFT.shape, config, mirror=False)
+    found = fit_near(template, LEFT.shape, wrong, config, turned, mirror=True, sided=sided)
+    assert found is not None and not wrong.frame.mirrored
+    assert found.frame.mirrored == turned and (found.side > 0) == turned
 
 
 def test_what_is_cut_is_a_part_of_what_a_model_knows() -> None:
@@ -190,14 +222,16 @@ def test_what_is_cut_is_a_part_of_what_a_model_knows() -> None:
 def test_fits_and_maps_ask_for_finer_ones(correspondence: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     known = egg_model()
     model = TrainedModel(replace(known.card, correspondence=correspondence), known.template, known.inference)
-    shape, asked = bent_egg(model), list[Fit | None]()
+    shape, asked = bent_egg(model), list[object]()
 
-    def asked_for(_: TrainedModel, part: Shape, fit: Fit, alone: Fit | None, progress: ProgressCallback | None) -> Fit:
-        asked.append(alone)
-        return fit
+    def asked_for(_: TrainedModel, part: Shape, fit: Fit, config: FitConfig, *more: object) -> Fit:
+        asked.append(more[-1])
+        return replace(fit, points=fit.points + 0.01)
 
     monkeypatch.setattr(alike, "finer", asked_for)
     matcher = Matcher(model)
     fit = matcher.fit(shape)
-    matcher.map(fit, fit)
-    assert asked == ([] if correspondence else [None, fit, fit])
+    agreed = matcher.match(shape, shape).target_fit
+    assert np.allclose(agreed.points, fit.points) == (not correspondence)  # a finer fit is not lost by agreement
+    matcher.follow(shape, fit)
+    assert asked == ([] if correspondence else [True, True, True, False])

@@ -11,6 +11,7 @@ import torch
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
+from meshmatch.api.prepare import PrepareConfig, prepare
 from meshmatch.cli import main
 from meshmatch.errors import ModelError, OptionError
 from meshmatch.fields.shape_functions import FIELDS, ShapeFunctions
@@ -27,7 +28,6 @@ from meshmatch.models.registry import load_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.templates.make import NodeConfig
-from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.training import recipes
 from meshmatch.training.loop import TrainConfig, Trainer
 from meshmatch.training.losses import CorrespondenceLoss, held_out_error

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
+from meshmatch.api.prepare import PrepareConfig, Prepared, prepare
 from meshmatch.errors import InputError, OptionError, OutputError
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates import prepared_folder
 from meshmatch.templates.make import NodeConfig
-from meshmatch.templates.prepare import PrepareConfig, Prepared, prepare
 from meshmatch.templates.prepared_folder import frame_of, read_registered, read_samples
 from meshmatch.templates.template import load_template
 
@@ -178,7 +178,7 @@ def test_a_prepared_folder_is_replaced_whole_and_nothing_else_is(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as stopped, pytest.raises(KeyboardInterrupt):
-        stopped.setattr("meshmatch.templates.prepare.save_template", stop)
+        stopped.setattr("meshmatch.api.prepare.save_template", stop)
         prepared(folder, out, FEW)
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted({"out", folder.name})

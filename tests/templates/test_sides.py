@@ -1,16 +1,21 @@
 """Mirror images among the shapes of a folder."""
 
+import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
+from meshmatch.api.prepare import PrepareConfig, Prepared, prepare
+from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.progress import Progress
 from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.normalise import Mirroring
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.prepare import PrepareConfig, Prepared, prepare
+from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepared_folder import has_sides
 from meshmatch.templates.sides import mirrored, other_side
 from tests.conftest import icosphere
@@ -97,8 +102,44 @@ def test_the_side_is_that_of_a_named_template(
     hooks: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, template: str | Shape, odd: tuple[str, ...]
 ) -> None:
     """By its name in the folder, or a file of its own."""
-    monkeypatch.setattr("meshmatch.templates.prepare.other_side", lambda *_: np.array(LEFT))  # as the test above found
+    monkeypatch.setattr("meshmatch.api.prepare.other_side", lambda *_: np.array(LEFT))  # as the test above found
     if isinstance(template, Shape):
         save_shape(tmp_path / "another.ply", template)
         template = str(tmp_path / "another.ply")
     assert prepared(hooks, tmp_path / "made", template=template).mirrored == odd
+
+
+@pytest.fixture(scope="module")
+def turned_hooks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five hooks, three of them left, each turned in its own way."""
+    folder = tmp_path_factory.mktemp("turned")
+    for number in range(5):
+        save_shape(folder / f"{number}.ply", hook(number, number in (1, 2, 4)))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("template", "mirror", "odd"),
+    [
+        (None, "auto", ("0.ply", "3.ply")),
+        ("0", "auto", ("1.ply", "2.ply", "4.ply")),
+        pytest.param("0", "no", (), marks=pytest.mark.slow),
+    ],
+)
+def test_fits_tell_sides_and_turns(
+    turned_hooks: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    template: str | None,
+    mirror: Mirroring,
+    odd: tuple[str, ...],
+) -> None:
+    few = partial(ViscousConfig, nodes=200, radius=0.15, faces=600)
+    monkeypatch.setattr("meshmatch.api.prepare.ViscousConfig", few)
+    monkeypatch.setattr("meshmatch.fitting.without_model._FEW", 800)
+    monkeypatch.setattr("meshmatch.api.prepare.other_side", None)  # it is not asked
+    nodes = NodeConfig("uniform", 60, 0.35)
+    made = prepare(turned_hooks, tmp_path / "made", PrepareConfig(nodes, faces=500, template=template, mirror=mirror))
+    assert made.mirrored == odd
+    apart = json.loads((tmp_path / "made" / "prepared.json").read_text())["apart"]
+    assert max(apart) < 0.08 or mirror == "no"

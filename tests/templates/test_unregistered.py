@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from meshmatch.api.prepare import PrepareConfig, Prepared, prepare
 from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
-from meshmatch.templates.prepare import PrepareConfig, Prepared, prepare
 from meshmatch.templates.prepared_folder import find_landmarks, is_registered, medoid, read_landmarks, read_samples
 from meshmatch.templates.template import load_template, template_radius, unit_frame
 from tests.conftest import icosphere

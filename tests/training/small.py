@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from meshmatch.api.prepare import PrepareConfig, prepare
 from meshmatch.generators.generator import Source
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.deformer import Deformer
@@ -13,7 +14,6 @@ from meshmatch.models.network import NetworkConfig
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
-from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.template import Template
 from meshmatch.training.datasets import BatchDataset
 from meshmatch.training.losses import LossPoints

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from meshmatch.api.prepare import PrepareConfig, prepare
 from meshmatch.cli import main
 from meshmatch.experiments.makers.human_bodies import with_paper_nodes
 from meshmatch.fields.field import Field
@@ -18,7 +19,6 @@ from meshmatch.models.registry import load_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
 from meshmatch.templates.make import NodeConfig
-from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.templates.template import read_template, template_radius
 from meshmatch.training import recipes

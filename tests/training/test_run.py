@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from meshmatch.api.prepare import PrepareConfig, prepare
 from meshmatch.errors import InputError, ModelError, OptionError, OutputError, TemplateError
 from meshmatch.experiments.makers import human_bodies
 from meshmatch.fields.shape_functions import build_field
@@ -29,7 +30,6 @@ from meshmatch.models.registry import load_model, verify_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
-from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.prepared_folder import RegisteredShapes, read_registered
 from meshmatch.templates.template import Template, read_template
 from meshmatch.training.datasets import registered_source

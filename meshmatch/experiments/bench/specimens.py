@@ -35,6 +35,7 @@ from scipy.spatial.transform import Rotation
 from typer import Option
 
 from meshmatch.api.matcher import Matcher
+from meshmatch.api.prepare import PrepareConfig, prepare
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.collection import Collection
 from meshmatch.collections.setting import Record
@@ -54,7 +55,6 @@ from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
-from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.training.recipes import recipe_for
 from meshmatch.training.train import train
 

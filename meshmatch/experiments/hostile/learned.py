@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from trimesh.creation import icosphere
 
+from meshmatch.api.prepare import PrepareConfig, prepare
 from meshmatch.collections.collection import Collection
 from meshmatch.implicit.network import ImplicitConfig
 from meshmatch.implicit.samples import read_implicit_samples
@@ -29,7 +30,6 @@ from meshmatch.models.registry import CARD, TEMPLATE, WEIGHTS
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
-from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.prepared_folder import read_registered
 from meshmatch.templates.template import load_template
 from meshmatch.training.alone import CHECKPOINT

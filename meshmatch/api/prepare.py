@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.fitting.direct import MIRROR
+from meshmatch.fitting.solve.viscous import ViscousConfig
+from meshmatch.fitting.usual import FEWEST, have_sides
+from meshmatch.fitting.without_model import Standing, standing, template_of
 from meshmatch.outputs import as_path, folder_on_success, make_folder
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.decimate import Quality, decimate
@@ -25,12 +30,14 @@ from meshmatch.templates.make import LOW_FACES, NodeConfig, low_mesh, make_templ
 from meshmatch.templates.prepared_folder import MAX_RESIDUAL, find_landmarks
 from meshmatch.templates.sides import is_other_side, mirrored, other_side
 from meshmatch.templates.template import Scale, Template, save_arrays, save_template
+from meshmatch.threads import parallel_map
 
 MIN_FACES = 50
 MIN_POINTS = 100
 _ARRAYS = tuple(f"{name}.safetensors" for name in ("template", "points", "shapes"))
 _WRITTEN = (*_ARRAYS, "normalised", "prepared.json", "nodes.png")
 _MOST_SIDES = 200  # shapes among which sides are looked for: it takes a second or two a shape
+_MOST_ALIKE = 0.8  # so many stand as the template does, or none is turned as if they did; set by hand
 
 
 @dataclass(frozen=True)
@@ -148,8 +155,20 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
     notes: list[str] = []
     found, marks = _read_shapes(folder, config, notes, progress.between(0.0, 0.5))
     named = _named_template(folder, config, found)
-    flags = _mirror_some(found, marks, config, named, notes, progress.between(0.5, 0.6))
-    first, own = _template_shape(named, config, found, notes)
+    chosen, why = _chosen(named, config, found)
+    stood = _standing(chosen, config, found, progress.between(0.5, 0.6))
+    if stood is None:
+        flags = _other_side(found, config, named, progress.between(0.5, 0.6))
+        turns: list[Float[Floats, "3 3"] | None] = [None] * len(found)
+    else:
+        flags, turns = stood.turned(config.mirror != "no", others_than_most=named is None)
+    _mirror_some(found, marks, flags, notes)
+    if named is None and flags.any():  # of one side, another may lie nearest to all
+        chosen, why = _chosen(None, config, found)
+        turns = _turned_to(chosen, turns)
+    first, own = (found[chosen], chosen) if isinstance(chosen, int) else (chosen, None)
+    if named is None:
+        notes.append(f"template: {first.original.name}{why}")
     low = low_mesh(first.shape, config.faces, config.decimate)
     vertices = first.kept_vertex[low[0]]
     stack = prepared_folder.registered_stack(first, found, vertices, notes)
@@ -165,7 +184,7 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
         # the way from the template's file to its frame, read off two of its vertices' places
         template_marks = sqrt_area_frame(Shape(first.shape.verts[low[0]], low[1], name)).apply(template_marks)
     samples, frames, residuals = prepared_folder.collect_samples(
-        *(made, found, marks, template_marks, how, config.scale, config.nodes.seed), progress.between(0.6, 1.0)
+        *(made, found, marks, template_marks, turns, how, config.scale, config.nodes.seed), progress.between(0.6, 1.0)
     )
     if not registered and np.median(residuals) > MAX_RESIDUAL:
         far = f"aligned, they lie {100 * np.median(residuals):.0f} % of sqrt(area) apart"
@@ -224,18 +243,62 @@ def _read_shapes(
     return found, prepared_folder.in_one_order(known)
 
 
-def _mirror_some(
-    found: list[Repaired],
-    marks: list[Float[Floats, "L 3"] | None],
-    config: PrepareConfig,
-    named: Repaired | int | None,
-    notes: list[str],
-    progress: Progress,
-) -> list[bool]:
-    """Mirror the shapes that are of the other side than most, or than the ``named`` template (a shape, or the number of
-    one), in place, with their landmarks; which they are."""
+@dataclass(frozen=True, eq=False)
+class _Stood:
+    """How each shape, and its mirror image, stands to a template that is only turned."""
+
+    plain: Sequence[Standing]
+    image: Sequence[Standing]
+
+    def turned(
+        self, mirror: bool, others_than_most: bool
+    ) -> tuple[Bool[Bools, " N"], list[Float[Floats, "3 3"] | None]]:
+        """Which shapes are to be mirrored: those of the other side than the template, or than most; and then how each is
+        turned to the template, which may be among them. None where a shape stands otherwise."""
+        leads = np.log([other.stretch / one.stretch for one, other in zip(self.plain, self.image, strict=True)])
+        flags = (leads < 0) & (mirror and have_sides(leads.tolist()))
+        found = [other if flag else one for one, other, flag in zip(self.plain, self.image, flags, strict=True)]
+        turns = [each.frame.rotation if each.alike else None for each in found]
+        if others_than_most and flags.sum() > len(flags) / 2:
+            return ~flags, [None if turn is None else MIRROR.rotation @ turn @ MIRROR.rotation for turn in turns]
+        return flags, turns
+
+
+def _turned_to(chosen: int | Repaired, turns: list[Float[Floats, "3 3"] | None]) -> list[Float[Floats, "3 3"] | None]:
+    """Rotations of shapes to one of them, from those to another; none where its own is not known."""
+    own = turns[chosen] if isinstance(chosen, int) else None
+    return [None if own is None or each is None else own.T @ each for each in turns]
+
+
+def _standing(
+    chosen: int | Repaired, config: PrepareConfig, found: list[Repaired], progress: Progress
+) -> _Stood | None:
+    """How shapes stand to the template; None where they need not be turned, or stand otherwise."""
+    N = len(found)
+    whole = found[chosen].shape if isinstance(chosen, int) else chosen.shape
+    if config.align not in (None, "rigid") or whole.is_cloud or not FEWEST <= N <= _MOST_SIDES:
+        return None
+    if prepared_folder.same_faces(found[0], found):
+        return None
+    template, others = template_of(whole, whole.name, ViscousConfig()), 0
+    stood: list[list[Standing]] = []
+    for each in found:
+        sides = [each.shape, mirrored(each.shape)]
+        stood.append(parallel_map(lambda shape: standing(template, shape, config.nodes.seed), sides))
+        others += not any(side.alike for side in stood[-1])
+        if others > (1 - _MOST_ALIKE) * N:
+            return None
+        progress(len(stood) / N)
+    return _Stood([plain for plain, _ in stood], [image for _, image in stood])
+
+
+def _other_side(
+    found: list[Repaired], config: PrepareConfig, named: Repaired | int | None, progress: Progress
+) -> Bool[Bools, " N"]:
+    """Which shapes are of the other side than most, or than the ``named`` template (a shape, or the number of one), as they
+    lie."""
     if config.mirror == "no" or len(found) > _MOST_SIDES or prepared_folder.same_faces(found[0], found):
-        return [False] * len(found)
+        return np.zeros(len(found), bool)
     flags = other_side(found, config.scale, config.nodes.seed, progress)
     if flags.any() and named is not None:
         if isinstance(named, int):
@@ -244,6 +307,13 @@ def _mirror_some(
             one_side = [clean for clean, flag in zip(found, flags, strict=True) if not flag]
             other = is_other_side(named, one_side, config.scale, config.nodes.seed)
         flags = flags ^ other
+    return flags
+
+
+def _mirror_some(
+    found: list[Repaired], marks: list[Float[Floats, "L 3"] | None], flags: Bool[Bools, " N"], notes: list[str]
+) -> None:
+    """Mirror some shapes, in place, with their landmarks."""
     for number in np.flatnonzero(flags):
         found[number] = repair(mirrored(found[number].original))
         if (known := marks[number]) is not None:
@@ -252,8 +322,6 @@ def _mirror_some(
         names = [clean.original.name for clean, flag in zip(found, flags, strict=True) if flag]
         shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
         notes.append(f"{len(names)} of {len(found)} shapes are mirror images of the others, and were mirrored: {shown}")
-    turned: list[bool] = flags.tolist()
-    return turned
 
 
 def _template_file(path: Path) -> Repaired:
@@ -279,20 +347,15 @@ def _named_template(folder: Path, config: PrepareConfig, found: list[Repaired]) 
     return _template_file(path)
 
 
-def _template_shape(
-    named: Repaired | int | None, config: PrepareConfig, found: list[Repaired], notes: list[str]
-) -> tuple[Repaired, int | None]:
-    """The template's shape, and its number if it is one of those that were found."""
-    if isinstance(named, int):
-        return found[named], named
+def _chosen(named: Repaired | int | None, config: PrepareConfig, found: list[Repaired]) -> tuple[int | Repaired, str]:
+    """The template's shape, or its number if it is one of those that were found; and why it was chosen."""
     if named is not None:
-        return named, None
-    number, why = next((k for k, clean in enumerate(found) if not clean.shape.is_cloud), 0), ""
-    if len(found) > 1 and not prepared_folder.same_faces(found[number], found):
-        number = prepared_folder.medoid(found, config.align or "rigid", config.scale, config.nodes.seed)
-        why = ", which lies nearest to all others on average"
-    notes.append(f"template: {found[number].original.name}{why}")
-    return found[number], number
+        return named, ""
+    number = next((k for k, clean in enumerate(found) if not clean.shape.is_cloud), 0)
+    if len(found) == 1 or prepared_folder.same_faces(found[number], found):
+        return number, ""
+    number = prepared_folder.medoid(found, config.align or "rigid", config.scale, config.nodes.seed)
+    return number, ", which lies nearest to all others on average"
 
 
 def _template_landmarks(
