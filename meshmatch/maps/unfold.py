@@ -5,6 +5,10 @@ whose image is turned over or crushed, images are found whose deformation gradie
 that are sound (a Poisson equation, as in Sumner and Popovic, *Deformation transfer for triangle meshes*, 2004), and put back
 on the surface of the target. Ever wider surroundings move, until nothing is folded or the map tears; what does not become
 better stays as it was.
+
+Where the surface bends sharply, as in an armpit or between fingers, what is sound on one side says little about the other.
+What is still folded is smoothed there: each image moves to the mean of its neighbours, weighted by mean value coordinates
+of the source (Floater, *Mean value coordinates*, 2003), which are positive, and back to the surface.
 """
 
 from __future__ import annotations
@@ -12,7 +16,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.sparse import csr_array, eye_array
+from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
@@ -25,6 +29,7 @@ from meshmatch.shapes.shape import Shape
 
 # All set by hand on bodies of SCAPE, FAUST and SHREC'19.
 _RINGS = (1, 2, 2, 3)  # of triangles around a fold that move, round by round; more rounds gain little
+_SMOOTHED, _SWEEPS = (2, 4), 3  # the same of smoothing, and steps of each round; ten gain little more
 _STRETCH, _SLACK = 3.0, 0.02  # an edge whose image is longer, in units of sqrt(area), is where the map tears
 _THINNEST = 1e-3  # height over length: what is thinner has no area that its image could keep, and spoils the equations
 _STIFFEST = 50.0  # a sliver's sides count no more
@@ -38,9 +43,10 @@ def unfolded(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -
     if source.is_cloud or target.is_cloud or max(source.V, target.V) > _LARGEST:
         return found
     images = _Images(found, source, target, workers)
-    for rings in _RINGS:
-        if not images.relaid(rings):
-            break
+    for move, rounds in ((images.relaid, _RINGS), (images.smoothed, _SMOOTHED)):
+        for rings in rounds:
+            if not move(rings):
+                return images.map
     return images.map
 
 
@@ -74,17 +80,38 @@ class _Images:
 
     def relaid(self, rings: int) -> bool:
         """Lay out the surroundings of all folds anew, so many triangles wide; False where there is nothing to do."""
-        folded = (self.ratio < CRUSHED) & ~self.torn
-        if not 0 < self.areas[folded].sum() < _MOST * self.areas.sum():
-            return False
-        inside = self._dilated(self.faces[folded].ravel(), rings)
-        inside[self.faces[self.torn].ravel()] = False
-        rows = np.flatnonzero(inside)
-        near = np.flatnonzero(inside[self.faces].any(axis=1))
+        rows, near = self._around_folds(rings)
         laid = near[~self.torn[near] & np.isfinite(self.ratio[near])]
         if not len(rows) or not len(laid):
             return False
-        points, normals, found = self._on_surface(rows, self._solved(rows, laid))
+        self._take_better(rows, near, *self._on_surface(rows, self._solved(rows, laid), self.normals[rows]))
+        return True
+
+    def smoothed(self, rings: int) -> bool:
+        """Let them move to the mean of their neighbours instead."""
+        rows, near = self._around_folds(rings)
+        if not len(rows):
+            return False
+        means = self._means(rows, near)
+        points, normals = self.points, self.normals
+        for _ in range(_SWEEPS):
+            points, normals, found = self._on_surface(rows, means @ points, unit(means @ normals))
+        self._take_better(rows, near, points, normals, found)
+        return True
+
+    def _around_folds(self, rings: int) -> tuple[Ints, Ints]:
+        """The vertices so many triangles around folds, none where the map is sound or wrong; and the faces that move."""
+        folded = (self.ratio < CRUSHED) & ~self.torn
+        if not 0 < self.areas[folded].sum() < _MOST * self.areas.sum():
+            return np.empty(0, np.int64), np.empty(0, np.int64)
+        inside = self._dilated(self.faces[folded].ravel(), rings)
+        inside[self.faces[self.torn].ravel()] = False
+        return np.flatnonzero(inside), np.flatnonzero(inside[self.faces].any(axis=1))
+
+    def _take_better(
+        self, rows: Ints, near: Ints, points: Floats, normals: Floats, found: tuple[Ints, Ints, Floats]
+    ) -> None:
+        """Keep new images of these vertices where less of the faces around is folded."""
         ratio = area_ratios(points, normals, self.verts, self.faces[near])
         # each part that moved counts by itself
         number = np.full(len(self.verts), -1)
@@ -104,7 +131,6 @@ class _Images:
         self._take(rows[better], points, normals, (found[0][better], found[1][better], found[2][better]))
         changed = near[improved[of_face]]
         self.ratio[changed] = area_ratios(self.points, self.normals, self.verts, self.faces[changed])
-        return True
 
     def _dilated(self, vertices: Ints, rings: int) -> Bools:
         """(V,) these vertices, and those so many triangles around."""
@@ -169,11 +195,27 @@ class _Images:
         held = csr_array((value[~free], (first[~free], second[~free])), shape=(N, V)) @ self.points
         return np.asarray(splu(matrix.tocsc()).solve(right[rows] - held + _HOLD * self.points[rows]))
 
-    def _on_surface(self, rows: Ints, wanted: Floats) -> tuple[Floats, Floats, tuple[Ints, Ints, Floats]]:
-        """All points and normals, these rows put on the target's surface; and where on it they are."""
+    def _means(self, rows: Ints, near: Ints) -> csr_array:
+        """(N, V) from values of all vertices to the means around some; these faces hold their neighbours."""
+        V, entries = len(self.verts), []
+        for k in range(3):
+            corner, *others = (self.faces[near, (k + each) % 3] for each in range(3))
+            sides = [self.verts[each] - self.verts[corner] for each in others]
+            lengths = [np.maximum(np.sqrt(squared_lengths(each)), 1e-300) for each in sides]
+            half = 0.5 * np.arccos(np.clip(dot(*sides) / (lengths[0] * lengths[1]), -1, 1))
+            tangent = np.minimum(np.tan(half), _STIFFEST)
+            entries += [(corner, other, tangent / length) for other, length in zip(others, lengths, strict=True)]
+        first, second, weight = (np.concatenate(each) for each in zip(*entries, strict=True))
+        weights = csr_array((weight, (first, second)), shape=(V, V))[rows]
+        return csr_array(diags_array(1 / weights.sum(axis=1)) @ weights)
+
+    def _on_surface(
+        self, rows: Ints, wanted: Floats, facing: Floats
+    ) -> tuple[Floats, Floats, tuple[Ints, Ints, Floats]]:
+        """All points and normals, these rows put on the target's surface where it faces so; and where on it they are."""
         if self.surface is None:
             self.surface = MappedMesh.of(self.target)
-        foot = self.surface.query(wanted, self.side * self.normals[rows], self.workers)
+        foot = self.surface.query(wanted, self.side * facing, self.workers)
         points, normals = self.points.copy(), self.normals.copy()
         points[rows] = foot.values(self.target.faces, self.target.verts)
         normals[rows] = self.side * unit(foot.values(self.target.faces, self.target.vertex_normals))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import Delaunay
 from trimesh.creation import icosphere
 
 from meshmatch.arrays import Ints
@@ -109,8 +110,25 @@ def test_nothing_becomes_worse(seed: int) -> None:
 def test_what_does_not_become_better_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     source, target = ball(3), ball(3, 0.0)
     found = folded(source, target)
-    monkeypatch.setattr("meshmatch.maps.unfold._Images._solved", lambda images, rows, laid: np.zeros((len(rows), 3)))
+    monkeypatch.setattr(_Images, "_solved", lambda images, rows, laid: np.zeros((len(rows), 3)))
+    smoothed = Folds.of(unfolded(found, source, target), source, target)
+    assert smoothed == Folds(0.0, 0.0, pytest.approx(1.0, abs=0.15))  # what cannot be laid out is smoothed
+    monkeypatch.setattr(_Images, "_means", lambda images, rows, near: np.zeros((len(rows), source.V)))
     np.testing.assert_array_equal(unfolded(found, source, target).points(target), found.points(target))
+
+
+def test_means_of_neighbours_keep_what_is_flat() -> None:
+    """Mean value coordinates reproduce linear functions, of triangles of any shape."""
+    rng = np.random.default_rng(0)
+    inner = rng.uniform(0.1, 0.9, (30, 2))
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
+    places = np.concatenate([corners, inner])
+    flat = Shape(np.column_stack([places, np.zeros(len(places))]), Delaunay(places).simplices)
+    images, rows = _Images(VertexMap.identity(flat), flat, flat, 1), np.arange(4, len(places))
+    faces = np.arange(len(images.faces))
+    means = images._means(rows, faces)
+    assert means.data.min() > 0
+    np.testing.assert_allclose(means @ images.verts, images.verts[rows], atol=1e-9)
 
 
 def test_where_the_map_tears_nothing_is_laid_out() -> None:
@@ -162,5 +180,6 @@ def test_what_would_be_torn_from_its_surroundings_stays(monkeypatch: pytest.Monk
     places[:, 2] = disc.verts[:, 2]
     found = put(disc, disc, places)
     assert Folds.of(unfolded(found, disc, disc), disc, disc).crushed < Folds.of(found, disc, disc).crushed
+    monkeypatch.setattr("meshmatch.maps.unfold._SMOOTHED", ())
     monkeypatch.setattr(_Images, "_solved", lambda *each: solved(*each) - [0.4, 0, 0])  # without a fold, but far away
     np.testing.assert_array_equal(unfolded(found, disc, disc).points(disc), found.points(disc))
