@@ -106,6 +106,11 @@ def parallel_map(
     return [future.result() for future in futures]
 
 
+def parallel_calls(functions: Iterable[Callable[[], Any]]) -> list[Any]:
+    """What each function returns, as by `parallel_map`: for work of several sorts beside each other."""
+    return parallel_map(lambda function: function(), functions)
+
+
 def set_threads(count: int) -> None:
     """Use `count` threads in everything that this process computes.
 

@@ -51,7 +51,7 @@ def match_without_model(
     direct = DirectConfig(seed=configs[0].seed)
     found = _matched(source, target, configs[0], direct, threads, progress, known, by_model)
     if known is None and guess is None:
-        with thread_limit(1):
+        with thread_limit(1), worker_slot(threading.Semaphore(threads)):
             found = match_alike(source.shape, target.shape, found, configs[0], progress)
     fits = replace(found.source, repaired=source), replace(found.target, repaired=target)
     verdict = found.verdict

@@ -27,7 +27,6 @@ from meshmatch.fitting.one_way import (
     KnownPairs,
     Side,
     Tried,
-    call,
     carried,
     distinct,
     finish,
@@ -48,7 +47,7 @@ from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.sides import apart, mirrored
-from meshmatch.threads import parallel_map
+from meshmatch.threads import parallel_calls, parallel_map
 
 # Share of vertices by which a map differs from a guess, or from the same map found from the other side, if it is much the
 # same.
@@ -260,7 +259,7 @@ class _Search:
         there, back = self._best(there), self._best(reverse.one_way(report.between(0.0, 0.7)))
         report = report.named("fits both ways")
         report(0.7)
-        returned = parallel_map(call, (*self._returned(there), *reverse._returned(back)))
+        returned = parallel_calls((*self._returned(there), *reverse._returned(back)))
         ways = zip(there, returned, strict=False)
         ways_back = zip(returned[len(there) :], back, strict=True)
         found = [_BothWays(*each) for each in (*ways, *ways_back)]
@@ -268,7 +267,7 @@ class _Search:
         best = distinct(found, self.source.config.gliding, _SAME)
         sides = (self.source, self.target), (self.target, self.source)
         tasks = [partial(glide, *sides[back], (each.there, each.back)[back]) for back in (0, 1) for each in best]
-        moved = parallel_map(call, tasks)
+        moved = parallel_calls(tasks)
         report(1.0)
         further = [_BothWays(*each) for each in zip(moved[: len(best)], moved[len(best) :], strict=True)]
         return sorted([*further, *(each for each in found if each not in best)], key=attrgetter("energy"))

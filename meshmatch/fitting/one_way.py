@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import attrgetter
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 
@@ -37,7 +37,7 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.progress import Progress
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
-from meshmatch.threads import parallel_map
+from meshmatch.threads import parallel_calls, parallel_map
 
 _HEAVY, _LIGHT = 60_000, 24_000  # triangles: a mesh with more is thinned to so many at once, which takes long
 KnownPairs = tuple[Float[Floats, "N 3"], Float[Floats, "N 3"]]
@@ -334,16 +334,11 @@ def _begun(
         _ = onto.neighbours, onto.fine_mesh.relief, onto.fine_mesh.tree
 
     report(0.0)
-    others, found, *_ = parallel_map(call, (bent, rigid, lambda: own.fine, *meanwhile, next_level))
+    others, found, *_ = parallel_calls((bent, rigid, lambda: own.fine, *meanwhile, next_level))
     report(0.6)
     found = [*found, *parallel_map(tried, [*others, *guesses])]
     report(1.0)
     return found
-
-
-def call(function: Callable[[], Any]) -> Any:
-    """What it returns; for work of several sorts beside each other."""
-    return function()
 
 
 def _better(own: Side, onto: Side, begun: list[Tried], report: Progress) -> list[Tried]:

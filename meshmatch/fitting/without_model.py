@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import attrgetter
 
 import numpy as np
@@ -46,6 +47,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, low_mesh, make_template
 from meshmatch.templates.sides import mirrored
 from meshmatch.templates.template import Template
+from meshmatch.threads import parallel_calls, parallel_map
 
 _ALIGNED_BY = 2400  # samples
 # Where the template roughly belongs is all that is asked of a search.
@@ -226,7 +228,7 @@ class _Task:
         """The best fit of the shape, or of its mirror image, where the template is only turned. Far from its own form its
         stretch says little: the turn that lies closest is then as good a guess as any.
         """
-        closest, *others = map(self.fitted, self.turns(side, keep=_ALIKE_TURNS, most=_NEARLY))
+        closest, *others = parallel_map(self.fitted, self.turns(side, keep=_ALIKE_TURNS, most=_NEARLY))
         for other in others:
             closest = _clearly_better(other, closest, 1.0 if other.alike else _TURNED)
         return closest
@@ -234,7 +236,7 @@ class _Task:
     def best_part(self, sides: Sequence[Frame | None]) -> _Fitted:
         """The best fit of a part, of either side."""
         begins = [begin for side in sides for begin in self.turns(side, keep=_TURNS)]
-        return min((self.fitted(begin) for begin in begins), key=attrgetter("energy"))
+        return min(parallel_map(self.fitted, begins), key=attrgetter("energy"))
 
     def best_from(self, start: Fit) -> _Fitted:
         """The best fit from where another template of the same vertices was fitted."""
@@ -387,10 +389,10 @@ def fit_alike(
     few, sides = _quick(config.seed), (None, MIRROR) if mirror else (None,)
     task, (resting, start) = _Task(template, shape, few), begun
     at = np.asarray(cKDTree(task.system.verts).query(resting)[1], np.int64)
-    first = task.fitted(_Begin(start.frame, task.onto(at, start.points)))
+    as_found = partial(task.fitted, _Begin(start.frame, task.onto(at, start.points)))
+    first, *turns = parallel_calls((as_found, *(partial(task.best_turn, side) for side in sides)))
     best = first
-    for side in sides:
-        turned = task.best_turn(side)
+    for turned in turns:
         other = turned.begin.frame.mirrored != best.begin.frame.mirrored
         relaxed = (
             whole is None and other and turned.alike and turned.features.stretch < _OTHER_SIDE * best.features.stretch
