@@ -14,8 +14,9 @@ from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.direct import MIRROR
 from meshmatch.fitting.solve.viscous import ViscousConfig
-from meshmatch.fitting.usual import FEWEST, have_sides
-from meshmatch.fitting.without_model import Standing, standing, template_of
+from meshmatch.fitting.usual import FEWEST, believed, have_sides
+from meshmatch.fitting.without_model import Standing, fit_turned, mean_shape, standing, template_of, with_more_nodes
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.outputs import as_path, folder_on_success, make_folder
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.decimate import Quality, decimate
@@ -45,9 +46,9 @@ class PrepareConfig:
     """How shapes are prepared.
 
     The template is a shape of the folder, by its name, or any file; by default the first mesh where all are registered,
-    else the medoid: the shape that lies nearest to all others. Shapes are turned to it by `align`, by default "rigid";
-    of registered ones correspondence says whether they stand alike, which is "near"; of a hundred or more it is not
-    asked, which is "none".
+    else the medoid: the shape that lies nearest to all others; or, of five or more that stand alike, the mean of those
+    that the medoid was fitted to. Shapes are turned to it by `align`, by default "rigid"; of registered ones
+    correspondence says whether they stand alike, which is "near"; of a hundred or more it is not asked, which is "none".
     """
 
     nodes: NodeConfig = field(default_factory=lambda: NodeConfig(strategy="geodesic"))
@@ -167,8 +168,6 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
         chosen, why = _chosen(None, config, found)
         turns = _turned_to(chosen, turns)
     first, own = (found[chosen], chosen) if isinstance(chosen, int) else (chosen, None)
-    if named is None:
-        notes.append(f"template: {first.original.name}{why}")
     low = low_mesh(first.shape, config.faces, config.decimate)
     vertices = first.kept_vertex[low[0]]
     stack = prepared_folder.registered_stack(first, found, vertices, notes)
@@ -176,15 +175,21 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
     found_how = prepared_folder.rotation_range(stack, first.original.verts[vertices]) if registered else "rigid"
     how: Align = config.align or found_how
     name = folder.resolve().name
-    made = make_template(first.shape, name, config.nodes, low=low)
-    made = replace(made, source=f"{first.original.name} of {folder.name}")
+    made, source = make_template(first.shape, name, config.nodes, low=low), first.original.name
+    middle = stood is not None and named is None
+    if middle:
+        made, count = _in_the_middle(made, found, turns, config.nodes, progress.between(0.6, 0.8))
+        source = f"the mean of {count} shapes, on the vertices of {source}" if count else source
+    if named is None:
+        notes.append(f"template: {source}{why}")
+    made = replace(made, source=f"{source} of {folder.name}")
     template_marks = None
     if config.landmarks is not None:
         template_marks = _template_landmarks(first, None if own is None else marks[own], marks)
-        # the way from the template's file to its frame, read off two of its vertices' places
-        template_marks = sqrt_area_frame(Shape(first.shape.verts[low[0]], low[1], name)).apply(template_marks)
+        template_marks = made.shape.verts[cKDTree(first.shape.verts[low[0]]).query(template_marks)[1]]
     samples, frames, residuals = prepared_folder.collect_samples(
-        *(made, found, marks, template_marks, turns, how, config.scale, config.nodes.seed), progress.between(0.6, 1.0)
+        *(made, found, marks, template_marks, turns, how, config.scale, config.nodes.seed),
+        progress.between(0.8 if middle else 0.6, 1.0),
     )
     if not registered and np.median(residuals) > MAX_RESIDUAL:
         far = f"aligned, they lie {100 * np.median(residuals):.0f} % of sqrt(area) apart"
@@ -208,7 +213,7 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
     names = tuple(clean.original.name for clean in found)
     turned = tuple(name for name, flag in zip(names, flags, strict=True) if flag)
     words: dict[str, Any] = {"names": names, "registered": registered, "notes": notes, "template": made.hash}
-    words |= {"source": first.original.name, "align": how, "scale": config.scale, "mirrored": turned}
+    words |= {"source": source, "align": how, "scale": config.scale, "mirrored": turned}
     words["landmarks"] = samples.landmarks.shape[1]
     words["frames"] = [{"scale": f.scale, "rotation": f.rotation.tolist(), "center": f.center.tolist()} for f in frames]
     words |= {"apart": [round(residual, 5) for residual in residuals], "config": asdict(config.nodes)}
@@ -356,6 +361,29 @@ def _chosen(named: Repaired | int | None, config: PrepareConfig, found: list[Rep
         return number, ""
     number = prepared_folder.medoid(found, config.align or "rigid", config.scale, config.nodes.seed)
     return number, ", which lies nearest to all others on average"
+
+
+def _in_the_middle(
+    template: Template,
+    found: list[Repaired],
+    turns: list[Float[Floats, "3 3"] | None],
+    nodes: NodeConfig,
+    progress: Progress,
+) -> tuple[Template, int]:
+    """A template of the same vertices in the middle of the shapes that stand as it does, and of how many; the same where
+    none of them is fitted."""
+    viscous, fits = ViscousConfig(seed=nodes.seed), []
+    finer = with_more_nodes(template, viscous)
+    for number, (clean, turn) in enumerate(zip(found, turns, strict=True)):
+        if turn is not None:
+            fits.append(fit_turned(finer, clean.shape, turn, viscous))
+        progress((number + 1) / len(found))
+    sound = believed(fits)
+    if not sound:
+        return template, 0
+    mean = Shape(mean_shape(finer, sound), template.shape.faces)
+    low = np.arange(mean.V), np.asarray(mean.faces)
+    return make_template(mean, template.name, nodes, low=low), len(sound)
 
 
 def _template_landmarks(

@@ -9,7 +9,7 @@ import numpy as np
 
 from meshmatch.collections.setting import FAILED, Record
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.usual import FEWEST, WEIGHTS, Usual, Weights, have_sides
+from meshmatch.fitting.usual import WEIGHTS, Usual, Weights, have_sides
 
 
 @dataclass(frozen=True)
@@ -23,12 +23,8 @@ class Compared:
     def of(cls, records: Sequence[Record], weights: Weights = WEIGHTS) -> Compared | None:
         """None of few fits, or of those of a version that did not say."""
         some = [each for each in records if each.stretch > 0 and each.residual > 0]
-        if len(some) < FEWEST:
-            return None
-        stretch, residual, scale = (
-            float(np.median([getattr(each, name) for each in some])) for name in ("stretch", "residual", "scale")
-        )
-        return cls(Usual(stretch, residual, weights), scale)
+        usual = Usual.of([(each.stretch, each.residual) for each in some], weights)
+        return None if usual is None else cls(usual, float(np.median([each.scale for each in some])))
 
     def trust(self, record: Record) -> float:
         """Probability (0..1) that a fit is right."""

@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshmatch.derived import derived
 from meshmatch.errors import InputError
 from meshmatch.fitting.direct import CLEARLY, MIRROR, DirectMatch, match_directly
 from meshmatch.fitting.fit import Fit, axis_name
@@ -30,6 +29,7 @@ from meshmatch.fitting.without_model import (
     fit_without_model,
     template_of,
     viscous_system,
+    with_more_nodes,
 )
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.trees import cKDTree
@@ -38,7 +38,7 @@ from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.rims import RIM, rim_lengths
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.make import NodeConfig, low_mesh, make_template
+from meshmatch.templates.make import low_mesh
 from meshmatch.templates.sides import apart, mirrored
 from meshmatch.templates.template import Template
 
@@ -141,13 +141,13 @@ def finer(
     if card.correspondence or shape.is_cloud or fit.partial or not model.has_nodes:
         return fit
     viscous, both = ViscousConfig(seed=fit.seed), turned and (config.mirror or card.mirror) != "no"
-    near = fit_near(_with_more_nodes(model.template), shape, fit, viscous, turned, both, card.mirror != "no")
+    near = fit_near(with_more_nodes(model.template, viscous), shape, fit, viscous, turned, both, card.mirror != "no")
     poor = near is None and fit.verdict == "poor"
     doubts = [] if near is None or not both or near.side > _CLEAR_SIDE else [Reason("side", SIDE_IN_DOUBT)]
     if near is None:
         doubts = [reason for reason in fit.reasons if reason.code == "side"]
         found = fit if poor else _searched(model.template, shape, fit, progress)
-        near, moved = fit_otherwise(_with_more_nodes(model.template), shape, found, viscous)
+        near, moved = fit_otherwise(with_more_nodes(model.template, viscous), shape, found, viscous)
         if moved:
             near = replace(near, points=found.points)
     made = cap_verdict(judged_of_kind(card, _as_of(model, near)), doubts)
@@ -219,19 +219,12 @@ def as_part(model: TrainedModel, shape: Shape, whole: float, config: FitConfig) 
     """
     if not model.has_nodes:
         return None
-    template, viscous = _with_more_nodes(model.template), ViscousConfig(seed=config.seed)
+    viscous = ViscousConfig(seed=config.seed)
+    template = with_more_nodes(model.template, viscous)
     found = fit_without_model(template, shape, viscous, mirror=config.mirror != "no", whole=whole)
     if not found.partial:
         return None
     return _as_of(model, found)
-
-
-@derived
-def _with_more_nodes(template: Template) -> Template:
-    """The same vertices, with nodes as fits without a model have them."""
-    config, shape = ViscousConfig(), template.shape
-    nodes = NodeConfig("uniform", config.nodes, config.radius, 0.01, seed=config.seed)
-    return make_template(shape, template.name, nodes, low=(np.arange(shape.V), np.asarray(shape.faces)))
 
 
 def _as_it_rests(fit: Fit, template: Template) -> Fit:

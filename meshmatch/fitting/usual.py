@@ -38,6 +38,17 @@ def have_sides(leads: Sequence[float]) -> bool:
     return len(leads) >= FEWEST and bool((np.abs(leads) > _CLEAR).mean() >= _MOST)
 
 
+def believed(fits: Sequence[Fit]) -> list[Fit]:
+    """Those of fits of one kind, without a model, that are not poor, alone and among the others."""
+    usual = Usual.of([(fit.signs.stretch, fit.residual) for fit in fits if fit.signs is not None])
+    return [
+        fit
+        for fit in fits
+        if fit.verdict != "poor"
+        and (usual is None or fit.signs is None or usual.trust(fit.trust, fit.signs.stretch, fit.residual) >= FAIR)
+    ]
+
+
 @dataclass(frozen=True)
 class Weights:
     """The logit of a right fit: ``offset``, less what the logarithms of stretch and residual over what is usual cost."""
@@ -71,6 +82,14 @@ class Usual:
         if not all(isinstance(each, float | int) and 0 < each < np.inf for each in (stretch, residual)):
             return None
         return cls(float(stretch), float(residual), whom=f"what {card.name} learned from")
+
+    @classmethod
+    def of(cls, signs: Sequence[tuple[float, float]], weights: Weights = WEIGHTS) -> Usual | None:
+        """Of the stretches and residuals of fits; None of few."""
+        if len(signs) < FEWEST:
+            return None
+        stretch, residual = np.median(signs, axis=0).tolist()
+        return cls(stretch, residual, weights)
 
     def trust(self, likely: float, stretch: float, residual: float) -> float:
         """Probability (0..1) that a fit is right, which alone is so ``likely``."""

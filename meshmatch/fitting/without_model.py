@@ -88,6 +88,14 @@ def template_of(shape: Shape, name: str, config: ViscousConfig) -> Template:
 
 
 @derived
+def with_more_nodes(template: Template, config: ViscousConfig) -> Template:
+    """The same vertices, with nodes as fits without a model have them."""
+    shape = template.shape
+    nodes = NodeConfig("uniform", config.nodes, config.radius, 0.01, seed=config.seed)
+    return make_template(shape, template.name, nodes, low=(np.arange(shape.V), np.asarray(shape.faces)))
+
+
+@derived
 def viscous_system(template: Template) -> NodeSystem:
     """The least-squares system of a template without a model."""
     verts = template.shape.verts
@@ -197,13 +205,13 @@ class _Task:
         problem = Problem(system=self.system, terms=[LandmarkTerm((at, points), 1 / len(at))], schedule=_ONTO)
         return minimise(problem, prior, np.zeros((self.system.K, 3)))
 
-    def near(self, start: Fit) -> _Begin:
-        """The template as it rests, where a fit of another template of the same vertices has its shape."""
+    def near(self, frame: Frame) -> _Begin:
+        """The template as it rests, near to where another template of the same vertices had its shape, in its frame."""
         samples = self._samples.first(_ALIGNED_BY)
-        points = start.frame.apply(self._own.undo(samples.points))
-        normals = samples.normals @ self._own.rotation @ start.frame.rotation.T
+        points = frame.apply(self._own.undo(samples.points))
+        normals = samples.normals @ self._own.rotation @ frame.rotation.T
         pose: RigidPose = align(replace(samples, points=points, normals=normals), self._resting, "near")[0].pose
-        return _Begin(start.frame.compose(pose.frame), np.zeros((self.system.K, 3)))
+        return _Begin(frame.compose(pose.frame), np.zeros((self.system.K, 3)))
 
     def best(self, sides: Sequence[Frame | None]) -> tuple[_Fitted, float]:
         """The best fit of the shape; or of its mirror image, if that fits clearly better. And its `Fit.side`."""
@@ -240,7 +248,7 @@ class _Task:
 
     def best_from(self, start: Fit) -> _Fitted:
         """The best fit from where another template of the same vertices was fitted."""
-        found = self.fitted(self.near(start))
+        found = self.fitted(self.near(start.frame))
         if found.alike:
             return found
         ambiguous = tuple(reason for reason in start.reasons if reason.code == "ambiguous")
@@ -318,7 +326,7 @@ def fit_near(
     """
     began, quick = time.monotonic(), _Task(template, shape, _quick(config.seed))
     own = MIRROR if start.frame.mirrored else None
-    best, lead = quick.fitted(quick.near(start)), 0.0
+    best, lead = quick.fitted(quick.near(start.frame)), 0.0
     if turned:
         best = _clearly_better(quick.best_turn(own), best, _ANEW)
     if turned and mirror:
@@ -424,6 +432,13 @@ def standing(template: Template, shape: Shape, seed: int) -> Standing:
     """How a repaired shape stands to a template, by fits of those turns of it that lie near."""
     best = _Task(template, shape, _quick(seed)).best_turn(None)
     return Standing(best.begin.frame, max(best.features.stretch, _NOTHING), best.alike)
+
+
+def fit_turned(template: Template, shape: Shape, turn: Float[Floats, "3 3"], config: ViscousConfig) -> Fit:
+    """Fit a template to a repaired shape that stands as it does, turned by a rotation from its file to the template."""
+    began, task = time.monotonic(), _Task(template, shape, config)
+    begin = task.near(replace(sqrt_area_frame(shape), rotation=turn))
+    return _Judged.of(task, task.fitted(begin)).fit(0.0, began)
 
 
 def _quick(seed: int) -> ViscousConfig:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from meshmatch.api.upright import turn_of_fit
-from meshmatch.collections import compare, setting, tasks
+from meshmatch.collections import setting, tasks
 from meshmatch.collections.collection import Collection
-from meshmatch.fitting import alike
+from meshmatch.fitting import alike, usual
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
@@ -32,7 +32,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     save_shape(tmp_path / "eggs" / "whole.ply", whole)
     save_shape(tmp_path / "eggs" / "cut.ply", Shape(whole.verts[used], np.searchsorted(used, kept)))
     monkeypatch.setattr(tasks, "other_kind", lambda *_: None)  # it takes longer than all else
-    monkeypatch.setattr(compare, "FEWEST", 2)
+    monkeypatch.setattr(usual, "FEWEST", 2)
     return tmp_path
 
 

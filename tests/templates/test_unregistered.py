@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from meshmatch.api import prepare as preparing
 from meshmatch.api.prepare import PrepareConfig, Prepared, prepare
 from meshmatch.errors import InputError, OptionError
+from meshmatch.fitting.without_model import Standing
 from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.repair import repair
@@ -98,6 +100,38 @@ def test_landmarks_follow_their_shapes(made: tuple[Path, Path, Prepared]) -> Non
     assert np.linalg.norm(places[0] - places[1]) > 0.5  # the length of a pear
     assert np.linalg.norm(known[2:] - places, axis=2).max() < 0.25
     assert np.linalg.norm(known[1, 0] - places[0]) < 0.25
+
+
+@pytest.fixture
+def five(tmp_path: Path) -> Path:
+    """Pears that stand alike, turned, with their tips as landmarks; the typical one is shorter than the mean."""
+    folder = tmp_path / "five"
+    folder.mkdir()
+    for n, stretch in enumerate((0.95, 1.0, 1.0, 1.15, 1.3)):
+        shape = pear(2 + n % 2, stretch)
+        save_shape(folder / f"pear{n}.ply", Shape(10.0**n * shape.verts @ turn_of(n).T + n, shape.faces))
+        np.save(folder / f"pear{n}.tips.npy", [shape.verts[:, 1].argmax(), shape.verts[:, 1].argmin()])
+    return folder
+
+
+def test_of_shapes_that_stand_alike_the_template_is_the_mean(five: Path, tmp_path: Path) -> None:
+    made = prepared(five, tmp_path / "out", landmarks=".tips.npy")
+    assert made.notes[-1].startswith("template: the mean of 5 shapes, on the vertices of pear")
+    verts = made.template.shape.verts
+    long, wide, _ = np.ptp(
+        (verts - verts.mean(0)) @ np.linalg.svd(verts - verts.mean(0), full_matrices=False)[2].T, axis=0
+    )
+    assert long / wide == pytest.approx(1.5 * 1.08, rel=0.01)  # 1.5 of the typical one
+    samples = read_samples(tmp_path / "out", made.template)
+    assert np.linalg.norm(samples.landmarks - verts[samples.template_landmarks], axis=2).max() < 0.1
+
+
+def test_a_named_template_stays(five: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(preparing, "standing", lambda *_: Standing(Frame.identity(), 0.1, True))
+    made = prepared(five, tmp_path / "out", landmarks=".tips.npy", template="pear4")
+    assert made.template.source == "pear4.ply of five"
+    as_it_is = prepared(five, tmp_path / "out", landmarks=".tips.npy", template="pear4", align="none")
+    assert np.array_equal(made.template.shape.verts, as_it_is.template.shape.verts)
 
 
 def test_the_typical_shape_is_the_middle_one() -> None:
