@@ -41,6 +41,9 @@ class AtlasOptions:
         "largest), or its name in the template or in the files. each: every connected part alone, without their pose.",
     )
     poor: bool = Option(False, "--poor", help="Include shapes whose fit is poor.")
+    leave_out: list[str] | None = Option(
+        None, metavar="NAME", help="Leave out this shape, such as one that is cut; * and ? stand for any characters."
+    )
     groups: tuple[Path, Path] | None = Option(
         None, metavar="A.txt B.txt", help="Compare two groups: files with the names of their shapes, one per line."
     )
@@ -130,9 +133,9 @@ def atlas(
     how.check()
     check_outputs([Path(fits), *(how.groups or ()), *([how.metadata] if how.metadata else [])], output)
     console = Console(quiet)
-    with folder_on_success(output) as folder, _shapes(fits, how.poor) as shapes, thread_limit(threads):
-        for name, verdict in shapes.left_out.items():
-            console.warn(f"{name}: left out, for its fit is {verdict}")
+    with folder_on_success(output) as folder, _shapes(fits, how) as shapes, thread_limit(threads):
+        for name in (name for name, why in shapes.left_out.items() if why == "poor"):
+            console.warn(f"{name}: left out, for its fit is poor")
         made = shapes.atlas(modes=how.modes, scale=how.scale, robust=how.robust, align_by=how.align_by)
         _warn(console, made, how)
         found = _find(console, made, shapes, how)
@@ -147,7 +150,7 @@ def atlas(
         print_json({"output": output, "left_out": shapes.left_out, "cut": shapes.cut, "files": names} | about)
 
 
-def _shapes(fits: str, poor: bool) -> AbstractContextManager["Registered"]:
+def _shapes(fits: str, how: AtlasOptions) -> AbstractContextManager["Registered"]:
     """The shapes of a folder, whichever kind it is."""
     from meshmatch.collections.collection import Collection
     from meshmatch.collections.registered import registered_meshes
@@ -157,8 +160,8 @@ def _shapes(fits: str, poor: bool) -> AbstractContextManager["Registered"]:
     if not collection.store.remote and read_about(collection.store) is None:
         if not Path(fits).is_dir():
             raise OptionError(f"{fits} is not a folder", "give the folder that `meshmatch fit` made")
-        return registered_meshes(fits)
-    return collection.registered(poor)
+        return registered_meshes(fits, how.leave_out or ())
+    return collection.registered(how.poor, how.leave_out or ())
 
 
 def _warn(console: Console, made: Any, how: AtlasOptions) -> None:
@@ -172,7 +175,7 @@ def _warn(console: Console, made: Any, how: AtlasOptions) -> None:
         share = sum(made.scores[rows, 0] ** 2) / sum(made.scores[:, 0] ** 2)
         console.warn(
             f"{some([made.names[k] for k in rows])}: unlike the others, and {100 * share:.0f} % of mode 1: "
-            "cut, broken, mirrored or of another kind? Leave out what is, or try --robust"
+            "cut, broken, mirrored or of another kind? Leave out what is (--leave-out), or try --robust"
         )
 
 

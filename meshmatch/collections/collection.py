@@ -15,11 +15,11 @@ from meshmatch.api.results import MapPair
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.export import Export, Exported, Fits, Place, export
-from meshmatch.collections.fit_all import Fitted, elsewhere_words, files_of, fit_all, fit_other_kinds, with_left_out
+from meshmatch.collections.fit_all import Fitted, elsewhere_words, files_of, fit_all, fit_all_kinds, with_left_out
 from meshmatch.collections.folder import FitsFolder
 from meshmatch.collections.map_all import Pair, map_all
 from meshmatch.collections.named_parts import WHOLE, Masks, parts_of_template
-from meshmatch.collections.registered import Registered, held
+from meshmatch.collections.registered import Registered, held, matching
 from meshmatch.collections.setting import Record, Setting, forget, template_at
 from meshmatch.collections.settle import settled
 from meshmatch.collections.sources import find_sources, frame_times, in_sequences
@@ -133,8 +133,7 @@ class Collection(FitsFolder):
         with self.store.alone(), hired(self.workers) as crew:
             setting = settled(wish, sources)
             if model == AUTO:
-                made = fit_all(setting, sources, crew, agree, self.progress, _of_this_kind(tell))
-                made = fit_other_kinds(made, wish, sources, crew, agree, self.progress, tell)
+                made = fit_all_kinds(setting, wish, sources, crew, agree, self.progress, tell)
             else:
                 made = fit_all(setting, sources, crew, agree, self.progress, tell)
             made = with_left_out(made, self.store, left_out)
@@ -425,6 +424,7 @@ class Collection(FitsFolder):
         robust: bool = False,
         poor: bool = False,
         align_by: str = WHOLE,
+        leave_out: Sequence[str] = (),
     ) -> Atlas:
         """The mean and the modes of the fitted shapes.
 
@@ -437,27 +437,31 @@ class Collection(FitsFolder):
         robust
             As in `Atlas.of`.
         poor
-            Whether poor fits count.
+            As in `registered`.
         align_by
             What is superimposed: "whole" shapes, "each" connected part alone, or one part, whose number (the largest is "1")
             or name this is: of the template, or of a mesh in the files.
+        leave_out
+            As in `registered`.
 
         Returns
         -------
         Atlas
             Of all fits that count.
         """
-        with self.registered(poor) as shapes:
+        with self.registered(poor, leave_out) as shapes:
             return shapes.atlas(modes=modes, scale=scale, robust=robust, align_by=align_by)
 
     @contextmanager
-    def registered(self, poor: bool = False) -> Iterator[Registered]:
+    def registered(self, poor: bool = False, leave_out: Sequence[str] = ()) -> Iterator[Registered]:
         """The template on every shape, held in memory, or in a file until the block ends.
 
         Parameters
         ----------
         poor
             Whether poor fits count.
+        leave_out
+            Names of shapes that do not count; * and ? stand for any characters.
 
         Yields
         ------
@@ -467,13 +471,14 @@ class Collection(FitsFolder):
         Raises
         ------
         InputError
-            Fewer than three shapes are left.
+            Fewer than three shapes are left, or none is called so.
         """
         words = {name: self._words(name) for name in self._names_of_one_kind()}
-        out = {name: "poor" for name, about in words.items() if about["verdict"] == "poor" and not poor}
+        out = dict.fromkeys(sorted(matching(words, leave_out)), "asked")
+        out |= {name: "poor" for name, about in words.items() if about["verdict"] == "poor" and not poor}
         names = tuple(name for name in words if name not in out)
         if len(names) < 3:
-            also = f" and {len(out)} poor ones" if out else ""
+            also = f" and {len(out)} that are left out" if out else ""
             raise InputError(f"{self.store.location} holds {len(names)} fits{also}", "three or more are needed")
 
         def read(number: int) -> Float[Floats, "V 3"]:
@@ -493,8 +498,3 @@ class Collection(FitsFolder):
         where = self._elsewhere([name]).get(name)
         if where is not None:
             raise InputError(f"{name} is of another kind", f"its fit is in {where}: map there")
-
-
-def _of_this_kind(tell: Callable[[Record], None] | None) -> Callable[[Record], None] | None:
-    """Tells of shapes that are not of another kind: those are fitted again, and told then."""
-    return None if tell is None else lambda record: None if record.kind else tell(record)

@@ -28,7 +28,7 @@ class Compared:
 
     def trust(self, record: Record) -> float:
         """Probability (0..1) that a fit is right."""
-        return self.usual.trust(record.likely, record.stretch, record.residual)
+        return self.usual.trust(record.likely, record.stretch, record.residual, record.inverted)
 
     def stands_out(self, record: Record) -> bool:
         """Whether the template had to stretch much more than usual."""

@@ -132,7 +132,22 @@ def _perhaps_cut(records: Sequence[Record]) -> dict[str, float]:
     return {} if usual is None else {each.name: usual.scale for each in records if usual.may_lack(each)}
 
 
-def fit_other_kinds(
+def fit_all_kinds(
+    setting: Setting,
+    wish: Setting,
+    sources: Sequence[Source],
+    crew: Workers,
+    agree: bool = True,
+    progress: ProgressCallback | None = None,
+    tell: Callable[[Record], None] | None = None,
+) -> Fitted:
+    """Fit all shapes by the model that the first of them decided on, and those of another kind by theirs. ``wish`` is the
+    setting before that."""
+    made = fit_all(setting, sources, crew, agree, progress, _of_this_kind(tell))
+    return _fit_other_kinds(made, wish, sources, crew, agree, progress, tell)
+
+
+def _fit_other_kinds(
     made: Fitted,
     wish: Setting,
     sources: Sequence[Source],
@@ -169,6 +184,11 @@ def fit_other_kinds(
     if others:
         _write_table(wish.store, records)
     return replace(made, records=tuple(records), elsewhere=elsewhere)
+
+
+def _of_this_kind(tell: Callable[[Record], None] | None) -> Callable[[Record], None] | None:
+    """Tells of shapes that are not of another kind: those are fitted again, and told then."""
+    return None if tell is None else lambda record: None if record.kind else tell(record)
 
 
 def with_left_out(made: Fitted, store: Store, left_out: Sequence[Record]) -> Fitted:

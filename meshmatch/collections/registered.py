@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import fnmatch
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -35,8 +36,8 @@ _ONE_A_LINE = (
 class Registered:
     """S shapes with the same vertices and faces, and their names.
 
-    ``rotation`` leads into y up, z to the front, where it is known. ``left_out`` are names of shapes that are not to be
-    trusted, and why. ``template`` is the hash of the template, if they are fits. ``parts`` gives parts by name.
+    ``rotation`` leads into y up, z to the front, where it is known. ``left_out`` are names of shapes that do not count, and
+    why: "poor" or "asked". ``template`` is the hash of the template, if they are fits. ``parts`` gives parts by name.
     ``partial`` are names of fits to a part of a shape.
     """
 
@@ -60,7 +61,9 @@ class Registered:
         Warns of cut shapes among whole ones (`MeshmatchWarning`).
         """
         if self.cut:
-            warn(f"{some(self.cut)}: cut, among whole shapes, and what is missing was guessed: leave out what is cut")
+            warn(
+                f"{some(self.cut)}: cut, among whole shapes, what is missing was guessed: see --leave-out (`leave_out`)"
+            )
         groups = groups_of(Shape(self.points[0], self.faces), align_by, self.parts)
         return Atlas.of(
             self.points,
@@ -74,19 +77,35 @@ class Registered:
         )
 
 
+def matching(names: Iterable[str], patterns: Sequence[str]) -> set[str]:
+    """Names that match some patterns, in which * and ? stand for any characters; `InputError` for one that matches none."""
+    known, found = list(names), set[str]()
+    for pattern in patterns:
+        meant = fnmatch.filter(known, pattern) or fnmatch.filter(known, os.path.splitext(pattern)[0])
+        if not meant:
+            close = get_close_matches(pattern, known, n=1)
+            raise InputError(f"there is no shape called {pattern}", f"did you mean {(close or known)[0]}?")
+        found.update(meant)
+    return found
+
+
 @contextmanager
-def registered_meshes(folder: str | Path) -> Iterator[Registered]:
+def registered_meshes(folder: str | Path, leave_out: Sequence[str] = ()) -> Iterator[Registered]:
     """The meshes of a folder, by the names of their files without suffix; held in memory, or in a file until the block ends.
+    ``leave_out`` are names of some that do not count, as of `matching`.
 
     `InputError`: fewer than three meshes, two of one name, or meshes that do not share vertices and faces.
     """
     files = sorted(path for path in Path(folder).iterdir() if suffix_of(path) in PLAIN_SUFFIXES and path.is_file())
-    names = tuple(stem_of(path) for path in files)
-    if len(files) < 3:
-        raise InputError(f"{folder} holds {len(files)} meshes", "an atlas needs three or more, registered")
-    twice = next((name for name in names if names.count(name) > 1), None)
+    called = [stem_of(path) for path in files]
+    twice = next((name for name in called if called.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"{folder} holds two meshes called {twice}", "an atlas needs different names")
+    out = dict.fromkeys(sorted(matching(called, leave_out)), "asked")
+    names = tuple(name for name in called if name not in out)
+    files = [path for path, name in zip(files, called, strict=True) if name not in out]
+    if len(files) < 3:
+        raise InputError(f"{folder} holds {len(files)} meshes", "an atlas needs three or more, registered")
     first = load_shape(files[0])
     if first.is_cloud:
         raise InputError(f"{files[0].name} has no faces", "an atlas is made of meshes")
@@ -99,7 +118,7 @@ def registered_meshes(folder: str | Path) -> Iterator[Registered]:
         return shape.verts
 
     with held(len(files), first.V, read) as points:
-        yield Registered(points, first.faces, names, None, {}, parts=lambda: parts_of_file(files[0]))
+        yield Registered(points, first.faces, names, None, out, parts=lambda: parts_of_file(files[0]))
 
 
 @contextmanager

@@ -61,10 +61,12 @@ def test_a_folder_of_meshes_becomes_an_atlas(run: Run, shapes: Path, tmp_path: P
 
 def test_what_is_chosen_is_done(run: Run, shapes: Path, tmp_path: Path) -> None:
     output = tmp_path / "atlas"
-    answer = run("atlas", shapes, "-o", output, "--no-measures", "--robust", "--scale", "remove", "-q")
+    answer = run(
+        "atlas", shapes, "-o", output, "--no-measures", "--robust", "--scale", "remove", "-q", "--leave-out", "egg-0"
+    )
     assert (answer.status, answer.out, answer.err) == (0, "", "")
     found = Atlas.load(output)
-    assert found.robust
+    assert found.robust and found.names == tuple(f"egg-{k}" for k in range(1, 8))
     assert found.scale == "remove"
     assert not (output / "measures.csv").exists()
 

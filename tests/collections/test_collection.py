@@ -366,10 +366,12 @@ def test_poor_fits_are_left_out_of_an_atlas(
 ) -> None:
     folder = tmp_path / "fits"
     collection = with_turned(made[0], folder, verdict="poor")
-    with pytest.raises(InputError, match="holds 2 fits and 1 poor ones"):
+    with pytest.raises(InputError, match="holds 2 fits and 1 that are left out"):
         collection.atlas()
     with collection.registered(poor=True) as shapes:
         assert shapes.names == tuple(NAMES)
+    with pytest.raises(InputError, match="holds 1 fits and 2 that are left out"):
+        collection.atlas(leave_out=["danc*"])
     shutil.copy(folder / "fits" / "dancer.safetensors", folder / "fits" / "again.safetensors")
     output = tmp_path / "atlas"
     assert main(["atlas", str(folder), "-o", str(output), "-q", "--scale", "remove"]) == 0

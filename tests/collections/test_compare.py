@@ -13,6 +13,7 @@ from meshmatch.collections.stores import Store
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.reasons import Reason
+from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere, some_fit
@@ -41,6 +42,21 @@ def test_what_is_stretched_as_the_others_is_good_and_what_stands_out_is_poor() -
     assert "1.6-fold, 1.2-fold is usual" in judged[5].reasons[0]
     trust = [each.trust for each in judged]
     assert trust[0] > 0.9 > trust[5] > 0.5 > trust[6] > 0
+
+
+def test_what_is_folded_is_not_right_however_usual_that_is() -> None:
+    some = records([1.8] * 6)
+    usual = Compared.of(some)
+    assert usual is not None
+    ball = icosphere(1)
+    fit = replace(some_fit(ball.verts, ball.faces), verdict="fair", reasons=(UNSURE,))
+    verdicts = []
+    for inverted in (0.05, 0.07, 0.12, 0.2):
+        judged = usual.judged(replace(fit, regularity=Regularity(inverted)), some[0])
+        verdicts.append(judged.verdict)
+        assert usual.trust(replace(some[0], inverted=inverted)) == judged.trust
+    assert verdicts == ["good", "fair", "poor", "poor"]
+    assert usual.trust(some[0]) > 0.9  # of a version that did not say
 
 
 def test_more_of_a_residual_counts_and_what_a_fit_says_of_itself_stays() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch.collections.registered import Registered, held, read_group, registered_meshes, size_ratio
+from meshmatch.collections.registered import Registered, held, matching, read_group, registered_meshes, size_ratio
 from meshmatch.errors import InputError, MeshmatchWarning
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
@@ -29,6 +29,19 @@ def test_meshes_come_in_the_order_of_their_names(folder: Path) -> None:
         assert found.names == ("b0", "b1", "b2", "b3")
         assert np.array_equal(found.points, given.points[::-1])
         assert np.array_equal(found.faces, given.faces)
+
+
+def test_what_is_named_is_left_out(folder: Path) -> None:
+    given = ellipsoids(4, splits=1)
+    with registered_meshes(folder, ["b2.ply"]) as found:
+        assert (found.names, found.left_out) == (("b0", "b1", "b3"), {"b2": "asked"})
+        assert np.array_equal(found.points, given.points[[3, 2, 0]])
+        (folder / "group.txt").write_text("b1\nb2\n")
+        assert read_group(folder / "group.txt", found) == ["b1"]
+    assert matching(["cut-1", "cut-2", "b"], ["cut-*"]) == {"cut-1", "cut-2"}
+    with pytest.raises(InputError, match="no shape called b9") as caught, registered_meshes(folder, ["b9"]):
+        pass
+    assert caught.value.hint.startswith("did you mean b")
 
 
 def test_many_are_kept_in_a_file(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
