@@ -110,7 +110,7 @@ def chart_regions(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], polygons
     region = _hanging(surface, region[first][number])
     charts = _flat_parts(surface, region, _MORE, number)
     charts = _Joining(surface, charts, _MORE, crumbs=True).charts()
-    return Hinging(surface.faces, surface.areas, charts, surface.texels).charts()
+    return Hinging(surface.verts, surface.faces, charts, _MORE, surface.texels).charts()
 
 
 def _coarse(verts: Floats, faces: Ints) -> tuple[Floats, Ints]:

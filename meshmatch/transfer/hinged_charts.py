@@ -1,5 +1,7 @@
 """Charts joined along a part of their common border alone, as the sides of an unfolded box are: a closed piece, which cannot
 lie flat, becomes one chart instead of two. Both keep their form; only the corners along the hinge move.
+
+Where there are still many charts, pairs that both bend are laid flat again, cut along all of their border but the hinge.
 """
 
 from __future__ import annotations
@@ -12,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.geometry.triangles import together
-from meshmatch.transfer.flat_layout import Layout, twins
+from meshmatch.geometry.triangles import together, triangle_areas
+from meshmatch.transfer.flat_layout import Layout, laid_flat, twins
 from meshmatch.transfer.pack_charts import Chart, hull
 
 Complexes: TypeAlias = NDArray[np.complex128]
@@ -25,6 +27,10 @@ _OFF = 0.1  # of its length, by which an edge of the hinge may miss the one that
 _FILLED, _KEPT = 0.72, 0.95  # of the convex hull of both, at least; of what each fills of its own
 _ROUGH = 0.004  # both together may have any form if they are smaller
 _TRIED = 4  # hinges of two charts
+_MANY = 60  # charts: of more, some are laid flat again
+_AGAIN_FILLED, _AGAIN_KEPT, _AGAIN_ROUGH = 0.7, 0.9, 0.02  # the same limits for these
+_HINGES, _PARTS = 3, (1.0, 0.6, 0.35)  # borders of two charts that are tried, and how much of each
+_FEW, _LARGE = 2_500, 8_000  # triangles: of more, only whole borders are tried; of still more, none
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +63,12 @@ class _Edges:
 class Hinging:
     """Charts of a surface, the small of which are joined with others, those first that fill their common hull best."""
 
-    def __init__(self, faces: Int[Ints, "F 3"], areas: Float[Floats, " F"], charts: list[Chart], texels: int) -> None:
-        self.areas, self.texels, self.total = areas, texels, float(areas.sum())
+    def __init__(
+        self, verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], charts: list[Chart], most: float, texels: int
+    ) -> None:
+        areas = triangle_areas(verts, faces)
+        self.verts, self.faces, self.most, self.texels, self.total = verts, faces, most, texels, float(areas.sum())
+        self.again = False  # whether charts are laid flat again
         self.own: dict[int, Chart] = dict(enumerate(charts))
         self.area = [float(areas[chart.members].sum()) / self.total for chart in charts]
         region, corner = np.empty(len(faces), np.int64), np.empty((len(faces), 3), np.int64)
@@ -79,26 +89,31 @@ class Hinging:
             if len(rows):
                 a, b = divmod(int(key[rows[0]]), len(charts))
                 self._share(a, b, _Edges(local[one[rows]], local[two[rows]][:, ::-1]))
-        self.waiting: list[tuple[float, int, int, Chart]] = []
+        self.waiting: list[tuple[float, int, int, Chart | None]] = []
 
     def _share(self, a: int, b: int, edges: _Edges) -> None:
         self.shared[a][b], self.shared[b][a] = edges, _Edges(edges.two[::-1, ::-1], edges.one[::-1, ::-1])
 
     def charts(self) -> list[Chart]:
         """What they become."""
-        if len(self.own) > _ENOUGH:
-            for one, others in self.shared.items():
-                for two in others:
-                    if one < two:
-                        self._wait(one, two)
-        while self.waiting and len(self.own) > _ENOUGH:
-            _, one, two, chart = heappop(self.waiting)
-            if one in self.own and two in self.own:
-                self._join(one, two, chart)
+        for self.again, enough in ((False, _ENOUGH), (True, _MANY)):
+            if len(self.own) > enough:
+                for one, others in self.shared.items():
+                    for two in others:
+                        if one < two:
+                            self._wait(one, two)
+            while self.waiting and len(self.own) > enough:
+                _, one, two, chart = heappop(self.waiting)
+                if one in self.own and two in self.own and (joined := chart or self._laid_again(one, two)):
+                    self._join(one, two, joined)
+            self.waiting = []
         return list(self.own.values())
 
     def _wait(self, one: int, two: int) -> None:
-        if min(self.area[one], self.area[two]) < _SMALL and (found := self._hinged(one, two)):
+        smaller = min(self.area[one], self.area[two])
+        if self.again:
+            heappush(self.waiting, (smaller, one, two, None))
+        elif smaller < _SMALL and (found := self._hinged(one, two)):
             heappush(self.waiting, (-found[0], one, two, found[1]))
 
     def _hinged(self, one: int, two: int) -> tuple[float, Chart] | None:
@@ -113,6 +128,26 @@ class Hinging:
                 layout = Layout.of(chart.uv, chart.corners, np.ones(len(chart.members), bool), self.texels)
                 best = best if len(layout.bad) else (filled, chart)
         return best
+
+    def _laid_again(self, one: int, two: int) -> Chart | None:
+        """Both laid flat as one chart, by the hinge with which that fills most of its hull."""
+        a, b = self.own[one], self.own[two]
+        if len(a.members) + len(b.members) > _LARGE:
+            return None
+        area, best = (self.area[one] + self.area[two]) * self.total, None
+        least = max(_AGAIN_FILLED, _AGAIN_KEPT * area / max(hull(a.uv) + hull(b.uv), 1e-300))
+        few = len(a.members) + len(b.members) <= _FEW
+        for hinge in _parts_of(a.uv, self.shared[one][two], _PARTS if few else _PARTS[:1]):
+            chart = _joined(a, b, hinge)
+            points = np.empty((len(chart.uv), 3))
+            points[chart.corners.ravel()] = self.verts[self.faces[chart.members].ravel()]
+            layout = laid_flat(points, chart.corners, self.most, self.texels)
+            if layout is None or len(layout.bad):
+                continue
+            filled = area / max(hull(layout.uv), 1e-300)
+            if (filled >= least or area <= _AGAIN_ROUGH * self.total) and (best is None or filled > best[0]):
+                best = filled, Chart(chart.members, layout.uv, layout.corners)
+        return best and best[1]
 
     def _join(self, one: int, two: int, joined: Chart) -> None:
         a, b = self.own[one], self.own[two]
@@ -158,6 +193,20 @@ def _hinges(a: Floats, b: Floats, edges: _Edges) -> list[_Edges]:
                 found.append((float(length[begin:end].sum()), _Edges(chain.one[begin:end], chain.two[begin:end])))
                 last = end
     return [hinge for _, hinge in sorted(found, key=lambda each: -each[0])[:_TRIED]]
+
+
+def _parts_of(a: Floats, edges: _Edges, parts: tuple[float, ...]) -> list[_Edges]:
+    """The longest parts of a common border, each as a whole and its beginning, middle and end."""
+    chains = edges.chains()
+    long = np.array([np.linalg.norm(a[chain.one[:, 0]] - a[chain.one[:, 1]], axis=1).sum() for chain in chains])
+    found = []
+    for k in np.argsort(-long, kind="stable")[:_HINGES].tolist():
+        count, ends = len(chains[k].one), set()
+        for part in parts:
+            some = int(np.ceil(part * count))
+            ends |= {(begin, begin + some) for begin in (0, (count - some) // 2, count - some)}
+        found += [_Edges(chains[k].one[begin:end], chains[k].two[begin:end]) for begin, end in sorted(ends)]
+    return found
 
 
 def _moved(p: Complexes, q: Complexes) -> tuple[complex, complex]:

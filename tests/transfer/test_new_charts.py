@@ -5,6 +5,7 @@ import pytest
 
 from meshmatch.geometry.triangles import triangle_areas
 from meshmatch.shapes.shape import Shape
+from meshmatch.transfer import hinged_charts
 from meshmatch.transfer.chart_regions import chart_regions
 from meshmatch.transfer.flat_layout import Layout, laid_flat
 from meshmatch.transfer.new_charts import flat_areas, new_charts
@@ -135,6 +136,36 @@ def test_small_closed_pieces_are_unfolded() -> None:
         assert (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0] > 0).all()
         image = (laid - laid.min(axis=(0, 1))) / np.ptp(laid, axis=(0, 1)).max()
         assert faces_on(image * 512, 512)[1] == 0
+
+
+def strand(bend: float, count: int = 12, around: int = 6) -> tuple[np.ndarray, np.ndarray]:
+    """A closed tube with pointed ends, bent by an angle."""
+    along, turn = np.linspace(0, 1, count + 1), 2 * np.pi * np.arange(around) / around
+    radius = (0.02 + 0.1 * np.sin(np.pi * along))[:, None]
+    away, angle = 1 / bend + radius * np.cos(turn), bend * along[:, None]
+    verts = np.stack([away * np.cos(angle), away * np.sin(angle), radius * np.sin(turn)], axis=2).reshape(-1, 3)
+    at = np.arange(len(verts)).reshape(count + 1, around)
+    a, b, c, d = (each.ravel() for each in (at[:-1], at[1:], np.roll(at, -1, 1)[1:], np.roll(at, -1, 1)[:-1]))
+    ends = [
+        [at[end, 0], at[end, k], at[end, k + 1]][:: 1 if end else -1] for end in (0, -1) for k in range(1, around - 1)
+    ]
+    return verts, np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1), np.array(ends)])
+
+
+def test_pairs_that_both_bend_are_laid_flat_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Strands of hair need two charts each where both keep their form: there are too many then."""
+    pieces = [strand(bend) for bend in np.linspace(1.0, 2.5, 40)]
+    verts = np.concatenate([verts + np.array([4.0 * k, 0, 0]) for k, (verts, _) in enumerate(pieces)])
+    faces = np.concatenate([faces + len(pieces[0][0]) * k for k, (_, faces) in enumerate(pieces)])
+    verts = scaled(Shape(verts, faces))
+    charts = chart_regions(verts, faces, np.arange(len(faces)))
+    assert len(charts) <= 60
+    assert np.array_equal(np.sort(np.concatenate([chart.members for chart in charts])), np.arange(len(faces)))
+    for chart in charts:
+        layout = Layout.of(chart.uv, chart.corners, np.ones(len(chart.members), bool), 512)
+        assert not len(layout.bad)
+    monkeypatch.setattr(hinged_charts, "_MANY", len(faces))
+    assert len(chart_regions(verts, faces, np.arange(len(faces)))) > 60
 
 
 def test_packed_rectangles_are_apart() -> None:
