@@ -1,6 +1,7 @@
 """The benchmark of rigs, on tubes matched by construction."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from meshmatch.api.matcher import Matcher
 from meshmatch.experiments.bench import rigs
+from meshmatch.experiments.bench.skinning import from_bones, in_motion, nearest_and_inpainted, skinned, volume
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from tests.transfer.rigs import write_tube
@@ -30,10 +32,48 @@ def test_a_folder_of_equal_tubes_has_no_error(
     assert "2 / 0 / 0" in capsys.readouterr().out
     (row,) = json.loads(out.read_text())["values"]["rows"]
     assert (row["same"], row["near_good"]) == (1.0, 1.0) and row["high_cm"] < 1e-3
-    row = rigs.row_of("tubes", [{"verdict": "good", "same": 1.0, "near": 1.0, "seconds": 1.0, "cm": [0.0, 1.0]}] * 2)
+    more = dict.fromkeys(("nearest", "inpainted", "volume", "volume_own", "further", "further_own"), 1.0) | {
+        "bone_cm": [0.5]
+    }
+    row = rigs.row_of(
+        "tubes", [{"verdict": "good", "same": 1.0, "near": 1.0, "seconds": 1.0, "cm": [0.0, 1.0]} | more] * 2
+    )
     assert (row["median_cm"], row["high_good_cm"], row["near_good"]) == (0.5, 1.0, 1.0)
     assert rigs.main(["--data", str(tmp_path), "--folders", "horses"]) == 1
     assert "*.glb files in" in capsys.readouterr().err
+
+
+def test_a_shape_that_moves(tmp_path: Path) -> None:
+    shape = write_tube(tmp_path / "a.glb")
+    one = rigs._Character(tmp_path / "a.glb")
+    still = replace(one.rig, clips=())
+    np.testing.assert_allclose(
+        skinned(shape.verts, one.weights.matrix, still, in_motion(still)), shape.verts, atol=1e-6
+    )
+    running = replace(one.rig, clips=tuple(replace(clip, name="Run") for clip in one.rig.clips))
+    sitting = replace(still, names=tuple("LowerLeg" if name == "knee" else name for name in still.names))
+    for rig in (running, sitting):
+        moved = skinned(shape.verts, one.weights.matrix, still, in_motion(rig))
+        hip = shape.verts[:, 1] < 0.7
+        np.testing.assert_allclose(moved[hip], shape.verts[hip], atol=1e-6)
+        assert np.abs(moved - shape.verts).max() > 0.3
+        assert 0.7 < volume(moved, shape) / volume(shape.verts, shape) < 1.0
+    assert volume(2 * shape.verts, shape) == pytest.approx(8 * volume(shape.verts, shape))
+    main = np.full(shape.V, one.weights.names.index("hip"))
+    away = from_bones(shape.verts, main, one.rig)
+    assert away[shape.verts[:, 1] < 0.9].max() <= 0.26 and away.max() > 0.9
+
+
+def test_other_ways_to_weights(tmp_path: Path) -> None:
+    shape = write_tube(tmp_path / "a.glb")
+    weights = rigs._Character(tmp_path / "a.glb").weights.matrix
+    for found in nearest_and_inpainted(shape, shape.verts, weights, shape):
+        np.testing.assert_allclose(found.toarray(), weights.toarray(), atol=1e-5)
+    band = np.abs(shape.verts[:, 1] - 1.0) < 0.15
+    away = shape.verts + np.outer(band, [0, 0, 5.0])
+    found = nearest_and_inpainted(shape, away, weights, shape)[1].toarray()
+    off = np.abs(found - weights.toarray()).max(axis=1)
+    assert off[~band].max() < 0.3 and off[band].max() < 0.2
 
 
 def test_neighbours_are_parents_children_and_siblings(tmp_path: Path) -> None:

@@ -1,50 +1,85 @@
 """Rigs from one character to another: joints and weights of characters that share the names of their bones.
 
-Every ordered pair of a folder of rigged glb files, as `transfer_rig` does it. The truth is the target's own rig: the share
+Every ordered pair of a folder of rigged files, as `transfer_rig` does it. The truth is the target's own rig: the share
 of its vertices whose main joint has the same name; or that of a parent, a child or a sibling; and how far joints that
-move vertices on both lie from where they belong, in centimetres with the target's longest side scaled to 1.8 m.
+move vertices on both lie from where they belong, in centimetres with the target's longest side scaled to 1.8 m. Beside it
+the neighbours that two other methods find, from the same alignment; and how far joints lie from the bones that meet at
+the true joint, which tells those that only sit further up or down. Then the target moves, in a clip of the source, or sits:
+how much of its volume stays, and the share of vertices that are over a centimetre further from the bone of their joint than
+at rest, by the new rig and by its own.
 """
 
 from __future__ import annotations
 
 import time
 from collections import Counter
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from typer import Option
 
 import meshmatch
 from meshmatch.api.matcher import Matcher
+from meshmatch.arrays import Floats
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.pairs import VERDICTS
 from meshmatch.experiments.bench.sets import ordered_pairs
+from meshmatch.experiments.bench.skinning import from_bones, in_motion, nearest_and_inpainted, skinned, volume
 from meshmatch.shapes.formats.gltf_rig import Rig, read_rig
+from meshmatch.shapes.input_files import read_bytes
+from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import most_votes
 from meshmatch.transfer.weight_files import SkinWeights, load_weights
 
 FOLDERS = "men,women,animals,dinosaurs,fish"
 HEIGHT = 180.0
+Names: TypeAlias = NDArray[np.str_]
+_PATTERNS = {"rocketbox": "*.fbx"}
+_FURTHER = 1.0  # cm
+_MEANS = "same", "near", "volume", "volume_own", "further", "further_own", "seconds"
 COLUMNS = {
     "folder": "folder", "pairs": "pairs:d", "good / fair / poor": "verdicts:>", "same joint": "same:.1%",
-    "or a neighbour": "near:.1%", "where good": "near_good:.1%", "joints median cm": "median_cm:.2f",
-    "95 %": "high_cm:.2f", "where good, median": "median_good_cm:.2f", "95 % ": "high_good_cm:.2f", "CPU s": "seconds:.1f",
+    "or a neighbour": "near:.1%", "where good": "near_good:.1%", "nearest point": "nearest_good:.1%",
+    "inpainting": "inpainted_good:.1%", "joints median cm": "median_cm:.2f", "95 %": "high_cm:.2f",
+    "where good, median": "median_good_cm:.2f", "95 % ": "high_good_cm:.2f", "CPU s": "seconds:.1f",
+}  # fmt: skip
+MOVED = {
+    "folder": "folder", "joints off the bone, median cm": "median_bone_cm:.2f", "95 %": "high_bone_cm:.2f",
+    "volume kept": "volume:.1%", "at least": "volume_least:.1%", "by its own rig": "volume_own:.1%",
+    "further from the bone": "further:.2%", "by its own rig ": "further_own:.2%",
 }  # fmt: skip
 
 
 class _Character:
     def __init__(self, path: Path) -> None:
         self.path, self.shape = path, meshmatch.load_shape(path)
-        self.rig: Rig = read_rig(path, path.read_bytes())
+        self.rig: Rig = read_rig(path, read_bytes(path))
         self.weights: SkinWeights = load_weights(path, self.shape)
         self.places = dict(zip(self.rig.names, self.rig.worlds()[:, :3, 3], strict=True))
         names, parents = self.rig.names, self.rig.parents.tolist()
         above = {name: names[parent] if parent >= 0 else "" for name, parent in zip(names, parents, strict=True)}
         self.near = {(a, b) for a in above for b in above if a == b or above[a] in (b, above[b]) or above[b] == a}
 
+    def off_the_bone(self, place: Floats, name: str) -> float:
+        """How far a place is from the bones that begin or end at a joint."""
+        names, parents = self.rig.names, self.rig.parents.tolist()
+        ends = [(names[parent], own) for own, parent in zip(names, parents, strict=True) if parent >= 0]
+        return min(
+            _from_segment(place, self.places[one], self.places[two])
+            for one, two in [*(pair for pair in ends if name in pair), (name, name)]
+        )
+
     def moving(self, weights: SkinWeights) -> set[str]:
         return {name for name, amount in zip(weights.names, weights.matrix.sum(axis=0), strict=True) if amount >= 3}
+
+
+def _from_segment(place: Floats, begin: Floats, end: Floats) -> float:
+    along = end - begin
+    share = float(np.clip((place - begin) @ along / max(float(along @ along), 1e-300), 0.0, 1.0))
+    return float(np.linalg.norm(begin + share * along - place))
 
 
 def measured(source: _Character, target: _Character, matcher: Matcher) -> dict[str, Any]:
@@ -52,15 +87,46 @@ def measured(source: _Character, target: _Character, matcher: Matcher) -> dict[s
     began = time.process_time()
     made = meshmatch.transfer_rig(source.path, target.path, matcher)
     seconds = time.process_time() - began
-    mine, true = (np.array([*each.names, ""])[most_votes(each.matrix)] for each in (made.weights, target.weights))
+    true = _main(target.weights)
+    mine = _main(made.weights)
     same = mine == true
-    near = np.array([pair in target.near for pair in zip(mine.tolist(), true.tolist(), strict=True)])
+    aligned = made.maps.forward.points(target.shape)
+    others = nearest_and_inpainted(source.shape, aligned, source.weights.matrix, target.shape)
+    near, nearest, inpainted = (
+        float(np.mean([pair in target.near for pair in zip(names.tolist(), true.tolist(), strict=True)]))
+        for names in (mine, *(_main(SkinWeights(each, source.weights.names)) for each in others))
+    )
     carried = dict(zip(made.rig.names, made.rig.worlds()[:, :3, 3], strict=True))
     common = sorted(source.moving(source.weights) & target.moving(target.weights))
     unit = HEIGHT / float(np.ptp(target.shape.bounds, axis=0).max())
     off = [unit * float(np.linalg.norm(carried[name] - target.places[name])) for name in common]
-    row = {"source": source.path.stem, "target": target.path.stem, "verdict": made.maps.forward.verdict}
-    return row | {"same": float(same.mean()), "near": float(near.mean()), "cm": off, "seconds": seconds}
+    beside = [unit * target.off_the_bone(carried[name], name) for name in common]
+    row: dict[str, Any] = {"source": source.path.stem, "target": target.path.stem, "verdict": made.maps.forward.verdict}
+    row |= {
+        "same": float(same.mean()),
+        "near": near,
+        "nearest": nearest,
+        "inpainted": inpainted,
+        "cm": off,
+        "bone_cm": beside,
+        "joints": common,
+    }
+    row["volume"], row["further"] = _moved(target.shape, made.weights, made.rig, unit)
+    row["volume_own"], row["further_own"] = _moved(target.shape, target.weights, target.rig, unit)
+    return row | {"seconds": seconds}
+
+
+def _main(weights: SkinWeights) -> Names:
+    """The name of each vertex's main joint."""
+    return np.array([*weights.names, ""])[most_votes(weights.matrix)]
+
+
+def _moved(shape: Shape, weights: SkinWeights, rig: Rig, unit: float) -> tuple[float, float]:
+    """In motion: the share of the volume that is left, and of the vertices that are further from their bones."""
+    posed, main = in_motion(rig), most_votes(weights.matrix)
+    verts = skinned(shape.verts, weights.matrix, rig, posed)
+    away = from_bones(verts, main, posed) - from_bones(shape.verts, main, rig)
+    return volume(verts, shape) / volume(shape.verts, shape), float((unit * away > _FURTHER).mean())
 
 
 def row_of(folder: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -69,11 +135,12 @@ def row_of(folder: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
     verdicts = Counter(row["verdict"] for row in rows)
     found: dict[str, Any] = {"folder": folder, "pairs": len(rows)}
     found["verdicts"] = " / ".join(str(verdicts[word]) for word in VERDICTS)
-    found |= {key: float(np.mean([row[key] for row in rows])) for key in ("same", "near", "seconds")}
+    found |= {key: float(np.mean([row[key] for row in rows])) for key in _MEANS}
+    found["volume_least"] = min(row["volume"] for row in rows)
     if good:
-        found["near_good"] = float(np.mean([row["near"] for row in good]))
-    for ending, some in (("", rows), ("_good", good)):
-        if joints := [cm for row in some for cm in row["cm"]]:
+        found |= {f"{key}_good": float(np.mean([row[key] for row in good])) for key in ("near", "nearest", "inpainted")}
+    for ending, key, some in (("", "cm", rows), ("_good", "cm", good), ("_bone", "bone_cm", rows)):
+        if joints := [cm for row in some for cm in row[key]]:
             found |= {
                 f"median{ending}_cm": float(np.median(joints)),
                 f"high{ending}_cm": float(np.percentile(joints, 95)),
@@ -83,16 +150,22 @@ def row_of(folder: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 @runner.command
 def main(
-    folders: Annotated[str, Option(help="folders of rigged .glb files in DATA/rigs")] = FOLDERS,
+    folders: Annotated[str, Option(help="folders of rigged files in DATA/rigs")] = FOLDERS,
     data: runner.Data = runner.DATA,
     limit_pairs: runner.LimitPairs = None,
+    work: runner.Work = None,
     threads: runner.Threads = 1,
 ) -> runner.Report:
     rows, each = [], {}
     for folder in folders.split(","):
-        files = runner.files_in(data / "rigs" / folder, "*.glb", 2)
+        files = runner.files_in(data / "rigs" / folder, _PATTERNS.get(folder, "*.glb"), 2)
         cast, matcher = {file.stem: _Character(file) for file in files}, Matcher(threads=threads)
         pairs = runner.spread(ordered_pairs(cast), limit_pairs)
-        each[folder] = [measured(cast[a], cast[b], matcher) for a, b in runner.track(pairs, folder)]
+        each[folder] = [
+            runner.at_work(work, f"{folder}-{a}-{b}", {}, partial(measured, cast[a], cast[b], matcher))
+            for a, b in runner.track(pairs, folder)
+        ]
         rows.append(row_of(folder, each[folder]))
-    return runner.Report({"rows": rows, "each": each}, [runner.table("Rigs", rows, COLUMNS)])
+    return runner.Report(
+        {"rows": rows, "each": each}, [runner.table("Rigs", rows, COLUMNS), runner.table("In motion", rows, MOVED)]
+    )
