@@ -71,8 +71,8 @@ def test_other_ways_to_weights(tmp_path: Path) -> None:
         np.testing.assert_allclose(found.toarray(), weights.toarray(), atol=1e-5)
     band = np.abs(shape.verts[:, 1] - 1.0) < 0.15
     away = shape.verts + np.outer(band, [0, 0, 5.0])
-    found = nearest_and_inpainted(shape, away, weights, shape)[1].toarray()
-    off = np.abs(found - weights.toarray()).max(axis=1)
+    inpainted = nearest_and_inpainted(shape, away, weights, shape)[1].toarray()
+    off = np.abs(inpainted - weights.toarray()).max(axis=1)
     assert off[~band].max() < 0.3 and off[band].max() < 0.2
 
 

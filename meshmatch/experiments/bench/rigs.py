@@ -148,6 +148,13 @@ def row_of(folder: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
+def _short(row: dict[str, Any]) -> dict[str, Any]:
+    """A pair without its joints one by one."""
+    lists = {key: row[key] for key in ("cm", "bone_cm") if row[key]}
+    rest = {key: value for key, value in row.items() if not isinstance(value, list)}
+    return rest | {f"median_{key}": float(np.median(value)) for key, value in lists.items()}
+
+
 @runner.command
 def main(
     folders: Annotated[str, Option(help="folders of rigged files in DATA/rigs")] = FOLDERS,
@@ -166,6 +173,6 @@ def main(
             for a, b in runner.track(pairs, folder)
         ]
         rows.append(row_of(folder, each[folder]))
-    return runner.Report(
-        {"rows": rows, "each": each}, [runner.table("Rigs", rows, COLUMNS), runner.table("In motion", rows, MOVED)]
-    )
+    short = {folder: [_short(row) for row in some] for folder, some in each.items()}
+    tables = [runner.table("Rigs", rows, COLUMNS), runner.table("In motion", rows, MOVED)]
+    return runner.Report({"rows": rows, "each": short}, tables)
