@@ -6,6 +6,7 @@ mean.ply            the mean
 mean.vtp            the mean, its spread and what the first modes move, for ParaView and 3D Slicer
 modes.glb           the mean; the first modes at +2 and -2 standard deviations as morph targets
 scores.csv          a line for each shape: size, distance from the mean, scores in standard deviations
+components.csv      the same scores in the unit of the files
 distances.npy       (V, S) 32-bit floats: distance of each vertex of each shape from the mean
 measures.csv        compactness, generalisation and specificity
 groups.csv          where two groups differ, a line for each vertex
@@ -113,6 +114,7 @@ def write_folder(
     _write_mean(folder / "mean.vtp", atlas)
     _write_morphs(folder / "modes.glb", atlas)
     _write_scores(folder / "scores.csv", atlas)
+    _write_components(folder / "components.csv", atlas)
     _write_distances(folder / "distances.npy", atlas)
     if findings.measures is not None:
         _write_measures(folder / "measures.csv", findings.measures)
@@ -213,6 +215,13 @@ def _write_morphs(path: Path, atlas: Atlas) -> None:
 def _write_scores(path: Path, atlas: Atlas) -> None:
     header = ["name", "centroid_size", "distance", *(f"mode_{k + 1}" for k in range(len(atlas.modes)))]
     table = np.column_stack([atlas.sizes, atlas.distances, atlas.scores])
+    write_rows(path, header, ([name, *short(row)] for name, row in zip(atlas.names, table, strict=True)))
+
+
+def _write_components(path: Path, atlas: Atlas) -> None:
+    """Scores of principal components; their mean squares are the variances that the modes have over the surface."""
+    table = atlas.scores * atlas.deviations
+    header = ["name", *(f"PC{k + 1}" for k in range(len(atlas.modes)))]
     write_rows(path, header, ([name, *short(row)] for name, row in zip(atlas.names, table, strict=True)))
 
 

@@ -11,12 +11,14 @@ import numpy as np
 from meshmatch.arrays import Bool, Bools, Int, Ints
 from meshmatch.collections.superimpose import MOST_GROUPS
 from meshmatch.errors import InputError, OptionError
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.places import Places
 from meshmatch.shapes.files import mesh_list
 from meshmatch.shapes.parts import Parts
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 
+_NEARLY_ALL = 0.9  # of the vertices of a connected part
 WHOLE, EACH = "whole", "each"
 """Words for what is superimposed: the whole shape, or each of its connected parts alone."""
 Masks = Mapping[str, Bool[Bools, " V"]]
@@ -66,8 +68,9 @@ def parts_of_file(path: str | Path) -> Masks:
 def parts_of_template(
     template: Template, names: Sequence[str], file_of: Mapping[str, str], places_of: Callable[[str], Places]
 ) -> Masks:
-    """The parts of a template by the names that it has itself; or else each connected part by the meshes of the first shape
-    whose file has names, most of whose vertices belong there.
+    """The parts of a template by the names that it has itself; or else by the meshes of the first shape whose file has
+    names: each connected part by the one to which nearly all vertices there belong; where there is none, each vertex by the
+    nearest.
     """
     if len(template.label_names) > 1:
         return {name: template.labels == k for k, name in enumerate(template.label_names)}
@@ -80,7 +83,11 @@ def parts_of_template(
                 continue
         except InputError:  # it has been moved since
             continue
-        part = number[places.on(template.shape).vertex]
-        votes = np.stack([np.bincount(part[mask], minlength=number.max() + 1) for mask in masks.values()])
-        return {title: votes.argmax(axis=0)[number] == k for k, title in enumerate(masks)}
+        part, owners = number[places.on(template.shape).vertex], np.stack(list(masks.values()))
+        votes = np.stack([np.bincount(part[mask], minlength=number.max() + 1) for mask in owners])
+        owner = votes.argmax(axis=0)[number]
+        mixed = (votes.max(axis=0) < _NEARLY_ALL * votes.sum(axis=0))[number]
+        if mixed.any():
+            owner[mixed] = owners.argmax(axis=0)[cKDTree(places.resting).query(template.shape.verts[mixed])[1]]
+        return {title: owner == k for k, title in enumerate(masks)}
     return {}

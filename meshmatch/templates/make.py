@@ -87,11 +87,25 @@ def low_mesh(
     if shape.F <= faces:
         return np.arange(shape.V), np.asarray(shape.faces)
     small = decimate(shape, faces, quality)
-    nearest = cKDTree(shape.verts).query(small.verts)[1]
-    keep, renumbered = np.unique(nearest, return_inverse=True)
+    keep, renumbered = np.unique(_own_vertices(small, shape), return_inverse=True)
     corners = renumbered.reshape(-1)[small.faces]
     a, b, c = corners.T
     return keep, corners[(a != b) & (b != c) & (c != a)]
+
+
+def _own_vertices(small: Shape, shape: Shape) -> Int[Ints, " V"]:
+    """The vertex of a shape that is nearest to each one of the decimated shape, of the same connected part: the walls of
+    two chambers that touch must not become one."""
+    nearest = np.asarray(cKDTree(shape.verts).query(small.verts)[1], np.int64)
+    own, parts = shape.vertex_parts, small.vertex_parts
+    if own.max() == 0:
+        return nearest
+    (part, meant), votes = np.unique(np.stack([parts, own[nearest]]), axis=1, return_counts=True)
+    order, most = np.argsort(votes, kind="stable"), np.zeros(parts.max() + 1, np.int64)
+    most[part[order]] = meant[order]  # the last one, which has most votes, stays
+    away = 2 * shape.diagonal
+    tree = cKDTree(np.column_stack([shape.verts, away * own]))
+    return np.asarray(tree.query(np.column_stack([small.verts, away * most[parts]]))[1], np.int64)
 
 
 def make_template(
@@ -247,6 +261,8 @@ def _allowed(
     elif config.strategy == "geodesic":
         for share in _GEODESIC_SHARES:
             yield _geodesic_allowed(shape, config.radius, candidates, share)
+        if shape.vertex_parts.max() > 0:  # parts that touch everywhere, as the chambers of a heart do, move together
+            yield np.ones(len(candidates), bool)
     else:
         clusters = config.clusters
         while True:

@@ -215,3 +215,6 @@ def test_parts_of_a_template_are_named_by_the_scans(tmp_path: Path) -> None:
     )
     assert np.array_equal(masks["femur"], FIRST) and np.array_equal(masks["tibia"], ~FIRST)
     assert parts_of_template(template, ["unknown"], files, lambda name: places) == {}
+    template.shape = Shape(points, np.concatenate([FACES, [[0, V, V + 1]]]))  # in one part
+    masks = parts_of_template(template, ["a"], files, lambda name: places)
+    assert np.array_equal(masks["femur"], FIRST) and np.array_equal(masks["tibia"], ~FIRST)

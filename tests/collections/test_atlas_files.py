@@ -75,6 +75,10 @@ def test_every_file_says_what_the_atlas_knows(tmp_path: Path, atlas: Atlas) -> N
     assert tuple(row[0] for row in rows) == atlas.names
     numbers = np.array([[float(cell) for cell in row[1:]] for row in rows])
     assert np.allclose(numbers, np.column_stack([atlas.sizes, atlas.distances, atlas.scores]), rtol=1e-5, atol=1e-6)
+    head, rows = table(tmp_path / "components.csv")
+    assert head[:3] == ["name", "PC1", "PC2"] and tuple(row[0] for row in rows) == atlas.names
+    numbers = np.array([[float(cell) for cell in row[1:]] for row in rows])
+    assert np.allclose((numbers**2).sum(axis=0) / (len(numbers) - 1), atlas.variances, rtol=1e-4)
     apart = np.load(tmp_path / "distances.npy")
     assert apart.shape == (len(atlas.mean), 8)
     assert np.allclose(apart[:, 3], atlas.distance_from_mean(atlas.names[3]), atol=1e-6)

@@ -73,6 +73,18 @@ def test_low_mesh_keeps_a_subset_of_the_vertices(sphere: Shape) -> None:
     assert np.array_equal(all_faces, sphere.faces)
 
 
+def test_walls_that_touch_stay_apart(sphere: Shape) -> None:
+    """Two balls that share nothing but a flat wall, whose vertices lie beside each other."""
+    low = sphere.verts * [1, 1, 0.7]
+    low[:, 2] = np.minimum(low[:, 2], 0)
+    turned = low[:, [1, 0, 2]] * [1, 1, -1] + [0, 0, 1e-4]
+    both = Shape(np.concatenate([low, turned]), np.concatenate([sphere.faces, sphere.faces + sphere.V]))
+    keep, faces = low_mesh(both, 400)
+    found = Shape(both.verts[keep], faces)
+    assert found.vertex_parts.max() == 1
+    assert np.ptp(keep[faces] // sphere.V, axis=1).max() == 0
+
+
 def test_written_bundle_comes_back(ball: Template, tmp_path: Path) -> None:
     save_template(ball, tmp_path / "ball.safetensors")
     found = load_template(tmp_path / "ball.safetensors")
