@@ -121,7 +121,7 @@ def atlas(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Learn the mean shape of a collection and the modes in which its shapes vary.
+    """Learn the mean and the modes of a collection.
 
     Writes arrays, tables, pictures, the modes as morph targets, and page.html with a slider for each mode. With
     --groups, also tests where two groups differ (permutation test, corrected for multiple comparisons); with --model,

@@ -14,9 +14,10 @@ from meshmatch.outputs import replace_on_success
 def blender_addon(
     *, output: Path = output_option("ZIP", "The extension: .zip."), json: Json = False, quiet: Quiet = False
 ) -> None:
-    """Write an extension for Blender 4.2 or newer, which runs meshmatch on two objects of a scene.
+    """Write an extension for Blender 4.2 or newer.
 
-    In Blender: Edit, Preferences, Get Extensions, Install from Disk. Its panel is in the sidebar of the 3D view.
+    It runs meshmatch on two objects of a scene. In Blender: Edit, Preferences, Get Extensions, Install from Disk. Its
+    panel is in the sidebar of the 3D view.
     """
     if output.suffix.lower() != ".zip":
         raise OptionError(f"{output.name}: an extension for Blender is a zip", "end the name in .zip")

@@ -54,13 +54,13 @@ def fit(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Fit every shape of a collection once, for maps between any two of them and for atlases.
+    """Fit every shape of a collection once.
 
-    Each shape is reported when it is finished; one that cannot be fitted does not stop the others. Without --model, shapes
-    of another kind than the first are fitted by the model of theirs, in FITS/KIND. Run the command
-    again to continue after an interruption or to add shapes. With --model none the template is built from the shapes
-    themselves, in any pose and orientation; mirror images and cut shapes are found. FITS/fits.csv lists the result of every
-    shape.
+    Maps between any two of them, and atlases, follow from the fits. Each shape is reported when it is finished; one that
+    cannot be fitted does not stop the others. Without --model, shapes of another kind than the first are fitted by the
+    model of theirs, in FITS/KIND. Run the command again to continue after an interruption or to add shapes. With --model
+    none the template is built from the shapes themselves, in any pose and orientation; mirror images and cut shapes are
+    found. FITS/fits.csv lists the result of every shape.
     """
     from meshmatch.collections.fit_all import elsewhere_words
     from meshmatch.collections.setting import FAILED
@@ -131,9 +131,9 @@ def map(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Map shapes of a collection to each other; nothing is fitted again.
+    """Map shapes of a collection to each other.
 
-    Existing maps are kept unless the fits are newer.
+    Nothing is fitted again. Existing maps are kept unless the fits are newer.
     """
     from meshmatch.collections.map_all import load_pairs
 

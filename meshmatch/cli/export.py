@@ -48,10 +48,11 @@ def export(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Write the registered meshes of a collection: all have the vertices and faces of one template.
+    """Write the registered meshes of a collection.
 
-    Vertex i is the same point on every shape. Units are those of the files. Beside a table of coordinates, metadata.csv has
-    a row for each shape: its centroid size, whether it is a mirror image, and the row of TABLE.
+    All have the vertices and faces of one template: vertex i is the same point on every shape. Units are those of the
+    files. Beside a table of coordinates, metadata.csv has a row for each shape: its centroid size, whether it is a
+    mirror image, and the row of TABLE.
     """  # fmt: skip
     console = Console(quiet)
     with console.progress() as progress:

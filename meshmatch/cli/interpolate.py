@@ -57,7 +57,7 @@ def interpolate(
     how: FitOptions,
     run: RunOptions,
 ) -> None:
-    """Blend one shape into another, as a sequence of the shapes in between.
+    """Blend one shape into another, as a sequence.
 
     The model's template is fitted to both, the fits are blended, and A's own mesh follows. Time 0 is A as in its
     file; at time 1 A's mesh lies on B. Shapes given with --through are reached at even times in between. An implicit

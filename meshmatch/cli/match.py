@@ -89,9 +89,9 @@ def register(
     dense: bool = Option(False, "--dense", help="Write the template in its full resolution."),
     picture: Path | None = optional("PNG", "Draw the template over the shape, colored by distance."),
 ) -> None:
-    """Fit the model's template to one shape, or one shape to another.
+    """Fit the template, or a shape, to another shape.
 
-    This is a non-rigid registration: the template is deformed, and the shape stays where it is. Results for all
+    This is a non-rigid registration: the model's template is deformed, and the shape stays where it is. Results for all
     shapes have the same vertices and triangles in the same order. With more than one thread, results may differ in
     the last bits. With --onto, the mesh of SHAPE is deformed onto TARGET, which stays where it is.
     """

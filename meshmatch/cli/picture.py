@@ -268,7 +268,7 @@ def view(
     maps: ViewMapOptions,
     run: options.RunOptions,
 ) -> None:
-    """Write an interactive page of two shapes and the map between them.
+    """Write an interactive page of two shapes and a map.
 
     Corresponding points have the same color; point at one shape to see the place on the other. The page is a single
     file for any recent browser and needs no network. With --map, --up and --front give the orientation of SOURCE.

@@ -165,6 +165,10 @@ def transfer_weights(
 
     transfer = Transfer(source, target, output, maps, run, picture)
     rule = meshmatch.ConfidenceRule(min_confidence, fill)
+    if output.suffix.lower() in GLTF_SUFFIXES:
+        raise OptionError(
+            f"{output.name} needs a skeleton too", "use meshmatch transfer-rig, or end the name in .npz or .json"
+        )
     check_weights_suffix(output)
     with transfer.outputs(weights) as (temporary,):
         a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
@@ -226,7 +230,7 @@ def transfer_landmarks(
     ),
     picture: Picture = None,
 ) -> Json:
-    """Transfer landmarks to exact points on the surface of another shape.
+    """Transfer landmarks to points of another surface.
 
     For each landmark, .csv and .json files have its vertex, position, face with barycentric weights, and confidence;
     .pp, .fcsv and .mrk.json files its name and position, .tps files positions alone. A position in FILE stands for the

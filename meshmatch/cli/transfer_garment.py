@@ -28,7 +28,7 @@ def transfer_garment(
     join: bool = Option(False, "--join", help="Write TGT, a .glb, .gltf or .vrm, with GARMENT in it, as one .glb."),
     picture: Picture = None,
 ) -> Json:
-    """Transfer clothes, hair or other things that sit on one shape to another.
+    """Transfer clothes, hair or other things that are worn.
 
     GARMENT must lie on SRC, in its place and unit. Its vertices follow SRC to TGT, with their distance from the skin
     turned and scaled as the body is there, and are pushed out where they would sink below the skin of TGT. Vertex

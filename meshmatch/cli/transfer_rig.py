@@ -30,7 +30,7 @@ def transfer_rig(
     ),
     picture: Picture = None,
 ) -> Json:
-    """Transfer a rig: skeleton, skin weights and animation clips.
+    """Transfer a skeleton, skin weights and animation clips.
 
     SRC is a rigged .glb, .gltf or .vrm, or a file that Blender reads. Of a TGT in these formats everything is kept but a
     skeleton of its own; another TGT is turned upright. The skeleton has the bones and names of SRC; its clips play on TGT

@@ -34,11 +34,12 @@ def transfer_shapes(
     run: RunOptions,
     picture: Picture = None,
 ) -> Json:
-    """Transfer blendshapes (morph targets), such as the expressions of a face.
+    """Transfer blendshapes (morph targets).
 
-    SRC is a .glb, .gltf or .vrm with morph targets, a file that Blender reads, or any mesh with --shapes. Displacements
-    turn and grow with the surface; eyes, teeth and other separate parts move with what surrounds them; closed lips and
-    lids stay closed. Of a TGT in these formats everything is kept; clips that animate the shapes come along.
+    These are the expressions of a face, for instance. SRC is a .glb, .gltf or .vrm with morph targets, a file that
+    Blender reads, or any mesh with --shapes. Displacements turn and grow with the surface; eyes, teeth and other
+    separate parts move with what surrounds them; closed lips and lids stay closed. Of a TGT in these formats everything
+    is kept; clips that animate the shapes come along.
     """
     import numpy as np
 

@@ -53,11 +53,12 @@ def transfer_texture(
     run: RunOptions,
     picture: Picture = None,
 ) -> Json:
-    """Transfer the material of one shape to another: color, normals, roughness, metal, occlusion and emission.
+    """Transfer the textures of one shape to another.
 
-    Each texel takes those of the corresponding point of SRC, from its materials and images or from its vertex colors. The
-    VALUE of --blank is a color such as #808080, or 0 for transparent. A glb or an obj keeps everything else of a TGT in
-    the same format: nodes, skins, clips, groups, polygons. Another TGT is turned upright in a glb.
+    Color, normals, roughness, metal, occlusion and emission: each texel takes those of the corresponding point of SRC,
+    from its materials and images or from its vertex colors. The VALUE of --blank is a color such as #808080, or 0 for
+    transparent. A glb or an obj keeps everything else of a TGT in the same format: nodes, skins, clips, groups,
+    polygons. Another TGT is turned upright in a glb.
     """
     from meshmatch.api.texture import tiles_of_file
     from meshmatch.shapes import textured_files

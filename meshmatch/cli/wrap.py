@@ -35,10 +35,10 @@ def wrap(
     ),
     picture: Picture = None,
 ) -> None:
-    """Lay a mesh of your own onto a scan, with its vertex order, polygons, texture coordinates and groups.
+    """Lay a mesh of your own onto a scan.
 
-    BASE is matched to SCAN, deformed, and drawn onto the surface, smoothly at first and ever finer. Its distance from
-    the surface is printed, in the unit of SCAN.
+    Its vertex order, polygons, texture coordinates and groups stay. BASE is matched to SCAN, deformed, and drawn onto
+    the surface, smoothly at first and ever finer. Its distance from the surface is printed, in the unit of SCAN.
     """
     import numpy as np
 

@@ -28,6 +28,7 @@ def test_help_names_every_verb(run: Run) -> None:
     assert answer.status == 0
     assert answer.err == ""
     assert [verb for verb in VERBS if f"\n  {verb} " not in answer.out] == []
+    assert "..." not in answer.out.partition("Commands:")[2]  # none is cut, in 80 columns
 
 
 def test_version(run: Run) -> None:
