@@ -38,6 +38,7 @@ MIN_POINTS = 100
 _ARRAYS = tuple(f"{name}.safetensors" for name in ("template", "points", "shapes"))
 _WRITTEN = (*_ARRAYS, "normalised", "prepared.json", "nodes.png")
 _MOST_SIDES = 200  # shapes among which sides are looked for: it takes a second or two a shape
+_AVERAGED = 60  # of which the mean is made
 _MOST_ALIKE = 0.8  # so many stand as the template does, or none is turned as if they did; set by hand
 
 
@@ -374,10 +375,11 @@ def _in_the_middle(
     none of them is fitted."""
     viscous, fits = ViscousConfig(seed=nodes.seed), []
     finer = with_more_nodes(template, viscous)
-    for number, (clean, turn) in enumerate(zip(found, turns, strict=True)):
-        if turn is not None:
-            fits.append(fit_turned(finer, clean.shape, turn, viscous))
-        progress((number + 1) / len(found))
+    alike = [(clean.shape, turn) for clean, turn in zip(found, turns, strict=True) if turn is not None]
+    some = np.unique(np.linspace(0, len(alike) - 1, min(len(alike), _AVERAGED)).astype(int))
+    for shape, turn in (alike[number] for number in some):
+        fits.append(fit_turned(finer, shape, turn, viscous))
+        progress(len(fits) / len(some))
     sound = believed(fits)
     if not sound:
         return template, 0

@@ -20,7 +20,7 @@ class PrepareOptions:
     template: str | None = optional(
         "SHAPE",
         "The shape that becomes the template: a name in the folder, or any mesh or cloud. Default: the folder's "
-        "first if all are registered, otherwise the one closest to all others.",
+        "first if all are registered, otherwise the one closest to all others, or the mean of those that stand as it does.",
     )
     align: Literal["none", "near", "rigid"] | None = Option(
         None,
