@@ -1,7 +1,8 @@
 """Charts side by side in a square image, as large as they fit.
 
 Each is put where most of what is there is close to it, in the best of four turns; all places are tried at once by Fourier
-transforms of images of what is taken. Crumbs are put on shelves first, in one block.
+transforms of images of what is taken. In a finer image they are then moved closer together. Crumbs are put on shelves first,
+in one block.
 """
 
 from __future__ import annotations
@@ -12,20 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import fft, ifft, irfft, next_fast_len, rfft, rfft2
-from scipy.ndimage import distance_transform_cdt, maximum_filter
+from scipy.ndimage import distance_transform_cdt
 from scipy.spatial import ConvexHull, QhullError
 
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.transfer.texels import texels_in
+from meshmatch.transfer.tighten_charts import tightened
 
 # All of these were set by hand.
 _GRID, _FINE = 256, 4  # texels of the image in which places are looked for; how much finer they are at last
 _ALIKE = 1e-6  # what is closer is the same
-_MOVES = 4
-_LOOK = 64  # rows below a piece that are looked at, at once
-_SHUFFLED = 0.35
 _MOST = 80  # charts that are moved one by one
-_ORDERS = 3  # that are compared
+_TIGHTENED = 12  # moves of each piece that are tried at last
 _SHRINK, _STEPS = 0.995, 4  # of lengths, in which the largest with room for all charts is looked for; of them at once
 _DENSE = 0.78  # of the image, that the charts and half of what is between them fill at the first try
 _RINGS, _FADING = (
@@ -173,86 +172,35 @@ class _Place:
 
 
 def _search(pieces: list[_Piece], padding: float, rng: np.random.Generator) -> tuple[float, list[_Place]]:
-    """Texels per unit, and the places, of the tightest of a few orders."""
+    """Texels per unit, and the places, at about the largest scale with room for all."""
     longest = np.array([piece.size[0] * np.sqrt(piece.area) for piece in pieces])
-    longest = np.round(longest / max(float(longest.max()), 1e-300), 6)
-    scale, found = _first(pieces, padding), None
-    for k in range(_ORDERS):
-        order = np.argsort(-longest * np.exp(rng.normal(0, _SHUFFLED if k else 0.0, len(pieces))), kind="stable")
-        most, larger = np.inf, 0  # steps up that are too many, and that are not
-        while (last := _placed(pieces, order, scale, padding)) is None and found is None:
-            scale, most = scale * _SHRINK**_STEPS, _STEPS
-        if last is None:
-            continue
-        while most - larger > 1:
-            step = larger + 1 if np.isinf(most) else int(larger + most) // 2
-            places = _placed(pieces, order, scale / _SHRINK**step, padding)
-            if places is None:
-                most = step
-            else:
-                last, larger = places, step
-        scale /= _SHRINK**larger
-        fine = _together(pieces, last, scale, padding)
-        if found is None or scale / fine[0].grid > found[0] / found[1][0].grid:
-            found = scale, fine
-    assert found is not None
-    return found[0] * _FINE, found[1]
+    order = np.argsort(-np.round(longest / max(float(longest.max()), 1e-300), 6), kind="stable")
+    scale, most, larger = _first(pieces, padding), np.inf, 0  # steps up that are too many, and that are not
+    while (last := _placed(pieces, order, scale, padding)) is None:
+        scale, most = scale * _SHRINK**_STEPS, _STEPS
+    while most - larger > 1:
+        step = larger + 1 if np.isinf(most) else int(larger + most) // 2
+        if (places := _placed(pieces, order, scale / _SHRINK**step, padding)) is None:
+            most = step
+        else:
+            last, larger = places, step
+    scale *= _FINE / _SHRINK**larger
+    return scale, _tightened(pieces, last, scale, padding, rng)
 
 
-def _together(pieces: list[_Piece], places: list[_Place], scale: float, padding: float) -> list[_Place]:
-    """Places in a finer image, which is cut where the pieces end: each piece moved down and to the left by what rounding has
-    left free.
-    """
-    apart, grid = int(np.ceil(padding * _GRID * _FINE)), _GRID * _FINE
-    masks = [piece.mask(scale * _FINE) for piece in pieces]
+def _tightened(
+    pieces: list[_Piece], places: list[_Place], scale: float, padding: float, rng: np.random.Generator
+) -> list[_Place]:
+    """Places in a finer image, closer together, which is cut where the pieces end."""
+    masks = [piece.mask(scale) for piece in pieces]
     images = [np.rot90(mask, place.quarters) for mask, place in zip(masks, places, strict=True)]
-    at = []
-    for piece, place in zip(pieces, places, strict=True):
-        low = place.of(piece.uv * scale).min(axis=0) * grid
-        at.append(np.floor(low + 1e-6).astype(np.int64)[::-1])
-    taken = np.zeros((grid, grid), bool)
-    for image, (y, x) in zip(images, at, strict=True):
-        taken[y : y + image.shape[0], x : x + image.shape[1]] |= image
-    for turn in range(_MOVES):
-        axis = turn % 2
-        flat = taken if axis == 0 else taken.T
-        for k in sorted(range(len(pieces)), key=lambda k: (int(at[k][axis]), k)):
-            image = images[k] if axis == 0 else images[k].T
-            high, wide = image.shape
-            y, x = int(at[k][axis]), int(at[k][1 - axis])
-            flat[y : y + high, x : x + wide] &= ~image
-            y -= _fall(flat, image, y, x, apart)
-            flat[y : y + high, x : x + wide] |= image
-            at[k][axis] = y
-    end = max(int((corner + image.shape).max()) for corner, image in zip(at, images, strict=True))
+    low = [place.of(piece.uv * (scale / _FINE)).min(axis=0)[::-1] for piece, place in zip(pieces, places, strict=True)]
+    at = np.floor(np.array(low) * (_GRID * _FINE) + 1e-6).astype(np.int64)
+    corners, end = tightened(images, at, int(np.ceil(padding * _GRID * _FINE)), _TIGHTENED * len(pieces), rng)
     return [
-        _Place(place.quarters, (mask.shape[1], mask.shape[0]), int(corner[1]), int(corner[0]), end)
-        for place, mask, corner in zip(places, masks, at, strict=True)
+        _Place(place.quarters, (mask.shape[1], mask.shape[0]), int(x), int(y), end)
+        for place, mask, (y, x) in zip(places, masks, corners.tolist(), strict=True)
     ]
-
-
-def _fall(taken: Bools, image: Bools, y: int, x: int, apart: int) -> int:
-    """How far an image can move to smaller rows, and stay apart from what is taken."""
-    grown = maximum_filter(np.pad(image, apart), 2 * apart + 1) if apart else image
-    fallen = 0
-    while (step := _free_below(taken, grown, y - fallen, x, apart)) == _LOOK:  # there may be more
-        fallen += step
-    return fallen + step
-
-
-def _free_below(taken: Bools, grown: Bools, y: int, x: int, apart: int) -> int:
-    """How far an image, given with what must stay free around it, can move to smaller rows; `_LOOK` at most."""
-    width = grown.shape[1] - 2 * apart
-    low, left = max(y - apart, 0), max(x - apart, 0)
-    right = min(x + width + apart, taken.shape[1])
-    grown = grown[low - (y - apart) :, left - (x - apart) : right - (x - apart)][: taken.shape[0] - low]
-    begin = max(low - _LOOK, 0)
-    number = np.arange(begin + 1, low + len(grown) + 1, dtype=np.int32)[:, None]
-    rows = np.where(taken[begin : low + len(grown), left:right], number, 0)
-    below = np.maximum.accumulate(rows, axis=0)  # the row after the last that is taken, up to each
-    row, column = np.nonzero(grown & ~np.pad(grown, ((1, 0), (0, 0)))[:-1])
-    free = (row + low) - below[row + low - begin, column]
-    return max(min(int(free.min()) if len(free) else y, y, _LOOK), 0)
 
 
 def _first(pieces: list[_Piece], padding: float) -> float:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter
 
 from meshmatch.geometry.triangles import triangle_areas
 from meshmatch.shapes.shape import Shape
@@ -11,6 +12,7 @@ from meshmatch.transfer.flat_layout import Layout, laid_flat
 from meshmatch.transfer.new_charts import flat_areas, new_charts
 from meshmatch.transfer.pack_charts import Chart, packed, tightest
 from meshmatch.transfer.texels import faces_on
+from meshmatch.transfer.tighten_charts import tightened
 from tests.conftest import icosphere
 
 
@@ -166,6 +168,29 @@ def test_pairs_that_both_bend_are_laid_flat_again(monkeypatch: pytest.MonkeyPatc
         assert not len(layout.bad)
     monkeypatch.setattr(hinged_charts, "_MANY", len(faces))
     assert len(chart_regions(verts, faces, np.arange(len(faces)))) > 60
+
+
+def test_pieces_come_closer_and_stay_apart() -> None:
+    rng = np.random.default_rng(0)
+    images, at = [], []
+    for k in range(25):  # disks and rectangles, one in the middle of each cell of a grid
+        high, wide = rng.integers(12, 24, 2)
+        image = np.ones((high, wide), bool)
+        if k % 2:
+            y, x = np.ogrid[:high, :wide]
+            image = ((y - high / 2 + 0.5) / high) ** 2 + ((x - wide / 2 + 0.5) / wide) ** 2 < 0.25
+        images.append(image)
+        at.append((32 * (k // 5), 32 * (k % 5)))
+    found, end = tightened(images, np.array(at), 2, 400, np.random.default_rng(0))
+    assert end < 130  # from 4 * 32 and a piece
+    where = np.zeros((end, end), int)
+    for number, (image, (y, x)) in enumerate(zip(images, found.tolist(), strict=True), 1):
+        assert y >= 0 and x >= 0 and not where[y : y + len(image), x : x + image.shape[1]][image].any()
+        where[y : y + len(image), x : x + image.shape[1]][image] = number
+    for number in range(1, 26):
+        near = where[maximum_filter(where == number, 5)]  # two texels around
+        assert set(near.tolist()) <= {0, number}
+    assert tightened(images, np.array(at), 2, 0, np.random.default_rng(0))[1] > end + 10
 
 
 def test_packed_rectangles_are_apart() -> None:
