@@ -91,7 +91,7 @@ class Collection(FitsFolder):
         """Fit every shape once, and let all fits agree on how the template stretches.
 
         With the model "none" the shapes themselves make a template: one of them is fitted to all others, and then their
-        mean. They are of one kind, in any pose; mirror images and cut ones are found. Nothing agrees then, and
+        mean, twice. They are of one kind, in any pose; mirror images and cut ones are found. Nothing agrees then, and
         five fits or more are judged by comparison with each other. A run that was stopped goes on where it was, and
         shapes that were added since are fitted; the fits are those of a run that nobody stopped, bit for bit. A shape
         that cannot be read or fitted is a record and stops nothing else.

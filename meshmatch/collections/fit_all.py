@@ -11,8 +11,20 @@ from types import MappingProxyType
 
 from meshmatch.arrays import Floats
 from meshmatch.collections.compare import Compared, on_the_other_side
-from meshmatch.collections.setting import AGREEING, ALONE, FAILED, FIRST, Record, Setting, Source, digest_of
-from meshmatch.collections.settle import on_the_mean, save_text, settled
+from meshmatch.collections.setting import (
+    AGREEING,
+    ALONE,
+    FAILED,
+    FIRST,
+    SECOND,
+    SECOND_TEMPLATE,
+    TEMPLATE,
+    Record,
+    Setting,
+    Source,
+    digest_of,
+)
+from meshmatch.collections.settle import on_the_mean, save_text, settled, some_of
 from meshmatch.collections.sources import natural
 from meshmatch.collections.stores import Store
 from meshmatch.collections.tasks import (
@@ -94,8 +106,9 @@ def fit_all(
         first = _Run(setting, sources, crew, report).fit_alone(None, FIRST)
         cut, others = _perhaps_cut(first), on_the_other_side(first)
         usual = Compared.of(first)
-        setting = on_the_mean(
-            setting, [each.name for each in first if _believed(each, usual) and each.name not in others]
+        setting = _on_the_mean(
+            _Run(setting, sources, crew, report),
+            some_of([each.name for each in first if _believed(each, usual) and each.name not in others]),
         )
     run = _Run(setting, sources, crew, report)
     records = run.fit_alone(tell if setting.learned else None, others=others, cut=cut)
@@ -124,6 +137,18 @@ def fit_all(
     setting.store.remove(AGREEING)
     _write_table(setting.store, records)
     return Fitted(tuple(records), len(agreeing) if groups else 0, setting.model)
+
+
+def _on_the_mean(run: _Run, names: Sequence[str]) -> Setting:
+    """The setting with the mean of some shapes as the template, estimated anew from fits of a first mean, which still leans
+    towards the shape that was the template before.
+    """
+    setting = on_the_mean(run.setting, names, FIRST, SECOND_TEMPLATE)
+    if names:
+        chosen = [source for source in run.sources if source.name in set(names)]
+        again = replace(run, setting=setting, sources=chosen).fit_alone(None, SECOND)
+        names = [each.name for each in again if each.fitted and each.verdict != "poor"]
+    return on_the_mean(setting, names, SECOND, TEMPLATE)
 
 
 def _perhaps_cut(records: Sequence[Record]) -> dict[str, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, asdict, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
@@ -27,10 +28,10 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template, load_template
 from meshmatch.threads import thread_limit
 
-FIRST, ALONE, AGREEING, FITS = "first", "alone", "agreeing", "fits"
+FIRST, SECOND, ALONE, AGREEING, FITS = "first", "second", "alone", "agreeing", "fits"
 """Folders of a collection: without a model, fits of the shape that is the first template; fits before they agree; what
 they agree on so far; and finished fits."""
-TEMPLATE, FIRST_TEMPLATE = "template.safetensors", "first.safetensors"
+TEMPLATE, FIRST_TEMPLATE, SECOND_TEMPLATE = "template.safetensors", "first.safetensors", "second.safetensors"
 SUFFIX = ".safetensors"
 FAILED = "failed"
 """In place of a verdict, for a shape that could not be fitted."""
@@ -179,13 +180,17 @@ class Setting:
         return matcher.fit(shape) if last is None else matcher.follow(shape, last)
 
     def _begun(self, name: str) -> Fit | None:
-        """Without a model, where the mean begins: the fit of the first template, if it is to be believed."""
-        file = f"{FIRST}/{name}{SUFFIX}"
-        if self.template_file == FIRST_TEMPLATE or not self.store.exists(file):
-            return None
-        with self.store.reading(file) as path:
-            found = read_fit(path, template_at(self.store, FIRST_TEMPLATE)).fit
-        return None if found.verdict == "poor" else found
+        """Without a model, where a mean begins: the last fit of a template before it, if that is to be believed."""
+        before = {SECOND_TEMPLATE: 1, TEMPLATE: 2}.get(self.template_file, 0)
+        for folder, template in reversed(((FIRST, FIRST_TEMPLATE), (SECOND, SECOND_TEMPLATE))[:before]):
+            file = f"{folder}/{name}{SUFFIX}"
+            with suppress(InputError):  # one of a mean of other shapes, before some were added
+                if self.store.exists(file):
+                    with self.store.reading(file) as path:
+                        found = read_fit(path, template_at(self.store, template)).fit
+                    if found.verdict != "poor":
+                        return found
+        return None
 
     def choices(self) -> dict[str, Any]:
         """How shapes are read and fitted, as JSON has it. How long poor fits are searched for may change later."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from meshmatch.api.inputs import as_model, check_config, usable, validated
 from meshmatch.api.kinds import choose_model
-from meshmatch.collections.setting import FIRST, FIRST_TEMPLATE, TEMPLATE, Setting, Source
+from meshmatch.collections.setting import FIRST_TEMPLATE, TEMPLATE, Setting, Source
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.solve.viscous import ViscousConfig
@@ -86,20 +86,24 @@ def _first_template(wish: Setting, sources: Sequence[Source], new: bool) -> Temp
     return template_of(chosen.shape, chosen.shape.name, ViscousConfig())
 
 
-def on_the_mean(setting: Setting, names: Sequence[str]) -> Setting:
-    """The same with the mean of the shapes that the first template was fitted to as the template of all; with the first
-    where there are none.
+def some_of(names: Sequence[str]) -> list[str]:
+    """Of many shapes, those that the mean is made of, evenly chosen."""
+    return [
+        names[number] for number in np.unique(np.linspace(0, len(names) - 1, min(len(names), _AVERAGED)).astype(int))
+    ]
 
-    A template that lies in the middle has less far to go. Of many shapes, some make the mean.
+
+def on_the_mean(setting: Setting, names: Sequence[str], folder: str, file: str) -> Setting:
+    """The same with the mean of the shapes that its template was fitted to, by fits of a folder, as the template; with
+    the same one where there are none. A template that lies in the middle has less far to go.
     """
-    first = mean = setting.template
+    before = mean = setting.template
     if names:
-        some = np.unique(np.linspace(0, len(names) - 1, min(len(names), _AVERAGED)).astype(int))
-        fits = [setting.read(FIRST, names[number]).fit for number in some]
-        mean = template_of(Shape(mean_shape(first, fits), first.shape.faces), "mean", ViscousConfig())
-    with setting.store.writing(TEMPLATE) as path:
+        fits = [setting.read(folder, name).fit for name in names]
+        mean = template_of(Shape(mean_shape(before, fits), before.shape.faces), "mean", ViscousConfig())
+    with setting.store.writing(file) as path:
         save_template(mean, path)
-    return replace(setting, template_file=TEMPLATE, template_hash=mean.hash)
+    return replace(setting, template_file=file, template_hash=mean.hash)
 
 
 def _chosen(sources: Sequence[Source], wish: Setting) -> str:

@@ -27,6 +27,7 @@ from meshmatch.maps.fit_files import load_words, read_fit, write_fit
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
+from meshmatch.templates.template import load_template
 from tests.conftest import icosphere
 
 SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
@@ -450,6 +451,8 @@ def test_without_a_model_the_shapes_make_their_template(tmp_path: Path) -> None:
     template = collection.template.hash
     collection.fit(folder, model="none")
     assert collection.template.hash == template
+    means = {load_template(tmp_path / "fits" / name).hash for name in ("first.safetensors", "second.safetensors")}
+    assert len(means | {template}) == 3  # the mean of the first fits, and of those that it has
     with pytest.raises(OptionError, match="another model"):
         collection.fit(folder, model="human")
 
