@@ -7,8 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.geometry.triangles import cross_product, dot, interpolate, squared_lengths, triangle_vectors, unit
+from meshmatch.derived import derived
+from meshmatch.geometry.triangles import (
+    average_normals,
+    cross_product,
+    dot,
+    interpolate,
+    squared_lengths,
+    triangle_vectors,
+    unit,
+)
 from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.shapes.faces import turn_faces
 from meshmatch.shapes.shape import Shape
 
 CRUSHED = 0.25
@@ -37,7 +47,7 @@ class Folds:
     def of(cls, found: VertexMap, source: Shape, target: Shape) -> Folds:
         """Those of a map between two meshes."""
         points, verts = found.points(target) / _length(target), source.verts / _length(source)
-        faces, areas = source.faces[source.valid_faces], source.face_areas[source.valid_faces]
+        faces, areas = wound_alike(source)[source.valid_faces], source.face_areas[source.valid_faces]
         normals = normals_at(found, target)
         normals *= 1.0 if facing(points, normals, verts, faces) >= 0 else -1.0
         ratio = area_ratios(points, normals, verts, faces)
@@ -54,7 +64,19 @@ class Folds:
 
 def known_normals(shape: Shape) -> Float[Floats, "V 3"]:
     """Unit vertex normals of a mesh; zeros for a cloud, where inside and outside may be confused."""
-    return np.zeros_like(shape.verts) if shape.is_cloud else shape.vertex_normals
+    if shape.is_cloud:
+        return np.zeros_like(shape.verts)
+    faces = wound_alike(shape)
+    return average_normals(triangle_vectors(shape.verts, faces), faces, shape.V)
+
+
+@derived
+def wound_alike(shape: Shape) -> Int[Ints, "F 3"]:
+    """Faces of which neighbours run the same way around, as those of a file need not."""
+    edges = shape.edges
+    return (
+        turn_faces(shape.verts, shape.faces, shape.face_vectors, edges)[0] if edges.disagreeing.any() else shape.faces
+    )
 
 
 def normals_at(found: VertexMap, target: Shape) -> Float[Floats, "V_source 3"]:

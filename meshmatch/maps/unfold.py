@@ -8,7 +8,8 @@ better stays as it was.
 
 Where the surface bends sharply, as in an armpit or between fingers, what is sound on one side says little about the other.
 What is still folded is smoothed there: each image moves to the mean of its neighbours, weighted by mean value coordinates
-of the source (Floater, *Mean value coordinates*, 2003), which are positive, and back to the surface.
+of the source, which are positive, and back to the surface. Last, the surroundings and the part of the target that their
+images lie on are both laid flat, in one plane, where means of neighbours hardly fold and no crease is in the way.
 """
 
 from __future__ import annotations
@@ -17,19 +18,35 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.sparse.linalg import splu
 
 from meshmatch.arrays import Bools, Floats, Ints
-from meshmatch.geometry.triangles import dot, same_rows, squared_lengths, triangle_areas, triangle_vectors, unit
-from meshmatch.maps.folds import CRUSHED, area_ratios, facing, normals_at
+from meshmatch.derived import derived
+from meshmatch.geometry.disks import Disk, found_in, mean_values, patches
+from meshmatch.geometry.triangles import (
+    dot,
+    edge_lengths,
+    interpolate,
+    same_rows,
+    squared_lengths,
+    triangle_areas,
+    triangle_vectors,
+    unit,
+)
+from meshmatch.maps.folds import CRUSHED, area_ratios, facing, known_normals, normals_at, wound_alike
 from meshmatch.maps.mapped_mesh import MappedMesh, length_of
-from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.shape import Shape
 
 # All set by hand on bodies of SCAPE, FAUST and SHREC'19.
-_RINGS = (1, 2, 2, 3)  # of triangles around a fold that move, round by round; more rounds gain little
-_SMOOTHED, _SWEEPS = (2, 4), 3  # the same of smoothing, and steps of each round; ten gain little more
+_RINGS = (2, 3)  # of triangles around a fold that move, round by round; more rounds gain little
+_SMOOTHED, _SWEEPS = (3,), 3  # the same of smoothing, and steps of each round; ten gain little more
+_FLAT, _LAST = (1, 2, 3, 6), (1, 2, 4)  # the same of what is laid flat, at last only around what is turned over
+_CLOSED = 3  # rings around it, within which holes are closed
+# How far around images the target is laid flat: two of its edges, and so many times the longest edge of an image.
+_REACHES = 0.0, 0.5, 1.0
+_TURNED = 5.0  # a triangle that is turned over is so many times as bad as one that is crushed
 _STRETCH, _SLACK = 3.0, 0.02  # an edge whose image is longer, in units of sqrt(area), is where the map tears
 _THINNEST = 1e-3  # height over length: what is thinner has no area that its image could keep, and spoils the equations
 _STIFFEST = 50.0  # a sliver's sides count no more
@@ -43,10 +60,15 @@ def unfolded(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -
     if source.is_cloud or target.is_cloud or max(source.V, target.V) > _LARGEST:
         return found
     images = _Images(found, source, target, workers)
-    for move, rounds in ((images.relaid, _RINGS), (images.smoothed, _SMOOTHED)):
+    for move, rounds, least in (
+        (images.relaid, _RINGS, CRUSHED),
+        (images.smoothed, _SMOOTHED, CRUSHED),
+        (images.flattened, _FLAT, CRUSHED),
+        (images.flattened, _LAST, 0.0),
+    ):
         for rings in rounds:
-            if not move(rings):
-                return images.map
+            if not move(rings, least):
+                break
     return images.map
 
 
@@ -56,7 +78,7 @@ class _Images:
     def __init__(self, found: VertexMap, source: Shape, target: Shape, workers: int) -> None:
         self.map, self.source, self.workers = found, source, workers
         self.same = same_rows(source.verts)
-        faces = self.same[source.faces[source.valid_faces]]
+        faces = self.same[wound_alike(source)[source.valid_faces]]
         self.verts, self.points = source.verts / length_of(source), found.points(target) / length_of(target)
         sides = self.verts[faces] - self.verts[faces[:, [1, 2, 0]]]
         longest = squared_lengths(sides.reshape(-1, 3)).reshape(-1, 3).max(axis=1)
@@ -65,6 +87,7 @@ class _Images:
         self.side = 1.0 if facing(self.points, self.normals, self.verts, self.faces) >= 0 else -1.0
         self.normals *= self.side
         self.target = Shape(target.verts / length_of(target), target.faces, invalid=target.invalid)
+        self.upwards = known_normals(target)
         self.areas = triangle_areas(self.verts, self.faces)
         self.ratio = area_ratios(self.points, self.normals, self.verts, self.faces)
         self.torn = self._torn(self.points, self.faces)
@@ -78,40 +101,105 @@ class _Images:
             found |= image > _STRETCH * own + _SLACK
         return found
 
-    def relaid(self, rings: int) -> bool:
+    def relaid(self, rings: int, least: float) -> bool:
         """Lay out the surroundings of all folds anew, so many triangles wide; False where there is nothing to do."""
-        rows, near = self._around_folds(rings)
+        rows, near = self._around_folds(rings, least)
         laid = near[~self.torn[near] & np.isfinite(self.ratio[near])]
         if not len(rows) or not len(laid):
             return False
         self._take_better(rows, near, *self._on_surface(rows, self._solved(rows, laid), self.normals[rows]))
         return True
 
-    def smoothed(self, rings: int) -> bool:
+    def smoothed(self, rings: int, least: float) -> bool:
         """Let them move to the mean of their neighbours instead."""
-        rows, near = self._around_folds(rings)
+        rows, near = self._around_folds(rings, least)
         if not len(rows):
             return False
-        means = self._means(rows, near)
+        weights = mean_values(self.verts, self.faces[near])[rows]
+        means = diags_array(1 / weights.sum(axis=1)) @ weights
         points, normals = self.points, self.normals
         for _ in range(_SWEEPS):
             points, normals, found = self._on_surface(rows, means @ points, unit(means @ normals))
         self._take_better(rows, near, points, normals, found)
         return True
 
-    def _around_folds(self, rings: int) -> tuple[Ints, Ints]:
+    def flattened(self, rings: int, least: float) -> bool:
+        """Find images for what is still folded in a plane, in which both surfaces lie flat."""
+        rows, near = self._around_folds(rings, least)
+        if not len(rows):
+            return False
+        inside, zone = np.zeros((2, len(self.faces)), bool)
+        inside[near] = True
+        zone[self._dilated(self.faces[near].ravel(), _CLOSED)[self.faces].all(axis=1)] = True
+        for patch in patches(self.faces, inside, zone | inside):
+            disk = Disk.of(self.faces, patch)
+            if disk is not None and (self.ratio[patch] <= least).any():
+                any(self._laid_in_plane(disk, reach) for reach in _REACHES)
+        return True
+
+    def _laid_in_plane(self, disk: Disk, reach: float) -> bool:
+        """Find images for the inside of a disk where the target lies flat so far around; True where less is folded then."""
+        rim, rows = disk.vertices[disk.rim], np.delete(disk.vertices, disk.rim)
+        beneath = self._beneath(disk, reach)
+        if not len(rows) or beneath is None:
+            return False
+        number = np.full(self.target.V, -1)
+        number[beneath.vertices] = np.arange(len(beneath.vertices))
+        corners = number[corners_of(self.target.faces, self.map.face[rim], self.map.index[rim])]
+        plane = beneath.laid_flat(self.target.verts)
+        if plane is None or (corners < 0).any():
+            return False
+        places = disk.laid_flat(self.verts, interpolate(plane, corners, self.map.barycentric[rim]), self.side)
+        if places is None:
+            return False
+        face, weights = found_in(plane, beneath.corners, np.delete(places, disk.rim, axis=0))
+        corners = self.target.faces[beneath.faces[face]]
+        points, normals = self.points.copy(), self.normals.copy()
+        points[rows] = interpolate(self.target.verts, corners, weights)
+        normals[rows] = self.side * unit(interpolate(self.upwards, corners, weights))
+        moved = np.zeros(len(self.verts), bool)
+        moved[rows] = True
+        near = np.flatnonzero(self._touches(moved))
+        vertex = np.take_along_axis(corners, weights.argmax(axis=1)[:, None], axis=1)[:, 0]
+        return self._take_better(rows, near, points, normals, (vertex, beneath.faces[face], weights))
+
+    def _beneath(self, disk: Disk, reach: float) -> Disk | None:
+        """The part of the target that the images of a disk lie on, and so far around, if it is a disk."""
+        faces, images = self.target.faces, self.points[disk.vertices]
+        corners = np.unique(corners_of(faces, self.map.face[disk.vertices], self.map.index[disk.vertices]))
+        sides = images[disk.corners] - images[disk.corners[:, [1, 2, 0]]]
+        far = reach * np.sqrt(squared_lengths(sides.reshape(-1, 3)).max()) + 2 * self._edge
+        away = dijkstra(self._along, indices=corners, min_only=True, limit=2 * far)
+        away = np.maximum(np.maximum(away[faces[:, 0]], away[faces[:, 1]]), away[faces[:, 2]])
+        found = patches(faces, away <= far, away <= 2 * far)
+        return Disk.of(faces, found[0]) if len(found) == 1 else None
+
+    @property
+    @derived
+    def _along(self) -> csr_array:
+        """(V_target, V_target) lengths of the target's edges."""
+        edges, V = self.target.edges.vertices, self.target.V
+        lengths = edge_lengths(self.target.verts, edges)
+        return csr_array((np.tile(lengths, 2), np.concatenate([edges, edges[:, ::-1]]).T), shape=(V, V))
+
+    @property
+    @derived
+    def _edge(self) -> float:
+        return float(np.median(self._along.data))
+
+    def _around_folds(self, rings: int, least: float) -> tuple[Ints, Ints]:
         """The vertices so many triangles around folds, none where the map is sound or wrong; and the faces that move."""
-        folded = (self.ratio < CRUSHED) & ~self.torn
+        folded = (self.ratio <= least) & ~self.torn
         if not 0 < self.areas[folded].sum() < _MOST * self.areas.sum():
             return np.empty(0, np.int64), np.empty(0, np.int64)
         inside = self._dilated(self.faces[folded].ravel(), rings)
         inside[self.faces[self.torn].ravel()] = False
-        return np.flatnonzero(inside), np.flatnonzero(inside[self.faces].any(axis=1))
+        return np.flatnonzero(inside), np.flatnonzero(self._touches(inside))
 
     def _take_better(
         self, rows: Ints, near: Ints, points: Floats, normals: Floats, found: tuple[Ints, Ints, Floats]
-    ) -> None:
-        """Keep new images of these vertices where less of the faces around is folded."""
+    ) -> bool:
+        """Keep new images of these vertices where less of the faces around is folded; False if there are none."""
         ratio = area_ratios(points, normals, self.verts, self.faces[near])
         # each part that moved counts by itself
         number = np.full(len(self.verts), -1)
@@ -121,7 +209,7 @@ class _Images:
         of_face = np.where(corners >= 0, part[corners], -1).max(axis=1)
         own = self.areas[near]
         before, after = (
-            np.bincount(of_face, np.where(each < CRUSHED, own, 0.0), part.max() + 1)
+            np.bincount(of_face, own * np.where(each <= 0, _TURNED, each < CRUSHED), part.max() + 1)
             for each in (self.ratio[near], ratio)
         )
         # Where little is sound around, and much moves, a solution may lie anywhere; the rim, which is held, then tears.
@@ -131,13 +219,19 @@ class _Images:
         self._take(rows[better], points, normals, (found[0][better], found[1][better], found[2][better]))
         changed = near[improved[of_face]]
         self.ratio[changed] = area_ratios(self.points, self.normals, self.verts, self.faces[changed])
+        return bool(improved.any())
+
+    def _touches(self, marked: Bools) -> Bools:
+        """(F,) which faces have a corner that is marked."""
+        first, second, third = self.faces.T
+        return np.asarray(marked[first] | marked[second] | marked[third])
 
     def _dilated(self, vertices: Ints, rings: int) -> Bools:
         """(V,) these vertices, and those so many triangles around."""
         marked = np.zeros(len(self.verts), bool)
         marked[vertices] = True
         for _ in range(rings):
-            marked[self.faces[marked[self.faces].any(axis=1)].ravel()] = True
+            marked[self.faces[self._touches(marked)].ravel()] = True
         return marked
 
     def _gradients(self, some: Ints) -> Floats:
@@ -155,7 +249,7 @@ class _Images:
         """(N, 3, 3) the gradients that triangles should have: the mean of those around that are sound."""
         near = np.zeros(len(self.verts), bool)
         near[self.faces[laid].ravel()] = True
-        around = np.flatnonzero(near[self.faces].any(axis=1))
+        around = np.flatnonzero(self._touches(near))
         sound = around[~self.torn[around] & (self.ratio[around] >= CRUSHED)]
         area = self.areas[sound]
         vertices = np.unique(self.faces[around])
@@ -195,20 +289,6 @@ class _Images:
         held = csr_array((value[~free], (first[~free], second[~free])), shape=(N, V)) @ self.points
         return np.asarray(splu(matrix.tocsc()).solve(right[rows] - held + _HOLD * self.points[rows]))
 
-    def _means(self, rows: Ints, near: Ints) -> csr_array:
-        """(N, V) from values of all vertices to the means around some; these faces hold their neighbours."""
-        V, entries = len(self.verts), []
-        for k in range(3):
-            corner, *others = (self.faces[near, (k + each) % 3] for each in range(3))
-            sides = [self.verts[each] - self.verts[corner] for each in others]
-            lengths = [np.maximum(np.sqrt(squared_lengths(each)), 1e-300) for each in sides]
-            half = 0.5 * np.arccos(np.clip(dot(*sides) / (lengths[0] * lengths[1]), -1, 1))
-            tangent = np.minimum(np.tan(half), _STIFFEST)
-            entries += [(corner, other, tangent / length) for other, length in zip(others, lengths, strict=True)]
-        first, second, weight = (np.concatenate(each) for each in zip(*entries, strict=True))
-        weights = csr_array((weight, (first, second)), shape=(V, V))[rows]
-        return csr_array(diags_array(1 / weights.sum(axis=1)) @ weights)
-
     def _on_surface(
         self, rows: Ints, wanted: Floats, facing: Floats
     ) -> tuple[Floats, Floats, tuple[Ints, Ints, Floats]]:
@@ -218,7 +298,7 @@ class _Images:
         foot = self.surface.query(wanted, self.side * facing, self.workers)
         points, normals = self.points.copy(), self.normals.copy()
         points[rows] = foot.values(self.target.faces, self.target.verts)
-        normals[rows] = self.side * unit(foot.values(self.target.faces, self.target.vertex_normals))
+        normals[rows] = self.side * unit(foot.values(self.target.faces, self.upwards))
         return points, normals, (foot.vertex, foot.face, foot.barycentric)
 
     def _take(self, rows: Ints, points: Floats, normals: Floats, found: tuple[Ints, Ints, Floats]) -> None:

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from scipy.spatial import Delaunay
 from trimesh.creation import icosphere
 
 from meshmatch.arrays import Ints
+from meshmatch.geometry.disks import Disk
 from meshmatch.maps.folds import Folds
 from meshmatch.maps.mapped_mesh import MappedMesh
 from meshmatch.maps.unfold import _Images, unfolded
@@ -113,22 +113,11 @@ def test_what_does_not_become_better_stays(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(_Images, "_solved", lambda images, rows, laid: np.zeros((len(rows), 3)))
     smoothed = Folds.of(unfolded(found, source, target), source, target)
     assert smoothed == Folds(0.0, 0.0, pytest.approx(1.0, abs=0.15))  # what cannot be laid out is smoothed
-    monkeypatch.setattr(_Images, "_means", lambda images, rows, near: np.zeros((len(rows), source.V)))
+    monkeypatch.setattr("meshmatch.maps.unfold._SMOOTHED", ())
+    flat = Folds.of(unfolded(found, source, target), source, target)
+    assert flat == Folds(0.0, 0.0, pytest.approx(1.0, abs=0.15))  # or laid flat
+    monkeypatch.setattr(Disk, "laid_flat", lambda *each: None)
     np.testing.assert_array_equal(unfolded(found, source, target).points(target), found.points(target))
-
-
-def test_means_of_neighbours_keep_what_is_flat() -> None:
-    """Mean value coordinates reproduce linear functions, of triangles of any shape."""
-    rng = np.random.default_rng(0)
-    inner = rng.uniform(0.1, 0.9, (30, 2))
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
-    places = np.concatenate([corners, inner])
-    flat = Shape(np.column_stack([places, np.zeros(len(places))]), Delaunay(places).simplices)
-    images, rows = _Images(VertexMap.identity(flat), flat, flat, 1), np.arange(4, len(places))
-    faces = np.arange(len(images.faces))
-    means = images._means(rows, faces)
-    assert means.data.min() > 0
-    np.testing.assert_allclose(means @ images.verts, images.verts[rows], atol=1e-9)
 
 
 def test_where_the_map_tears_nothing_is_laid_out() -> None:
@@ -180,6 +169,20 @@ def test_what_would_be_torn_from_its_surroundings_stays(monkeypatch: pytest.Monk
     places[:, 2] = disc.verts[:, 2]
     found = put(disc, disc, places)
     assert Folds.of(unfolded(found, disc, disc), disc, disc).crushed < Folds.of(found, disc, disc).crushed
-    monkeypatch.setattr("meshmatch.maps.unfold._SMOOTHED", ())
+    for name in ("_SMOOTHED", "_FLAT", "_LAST"):
+        monkeypatch.setattr(f"meshmatch.maps.unfold.{name}", ())
     monkeypatch.setattr(_Images, "_solved", lambda *each: solved(*each) - [0.4, 0, 0])  # without a fold, but far away
     np.testing.assert_array_equal(unfolded(found, disc, disc).points(disc), found.points(disc))
+
+
+def test_faces_that_run_the_other_way_are_no_folds() -> None:
+    """A file may turn a part of its faces inside out; what lies there is not turned over."""
+    source, target = ball(3), ball(3, 0.0)
+    faces = target.faces.copy()
+    some = target.verts[faces].mean(axis=1)[:, 2] > 0.5
+    faces[some] = faces[some][:, ::-1]
+    mixed = Shape(target.verts, faces)
+    found = put(source, mixed, source.verts)
+    assert Folds.of(found, source, mixed).flipped < 0.001
+    back = put(mixed, source, mixed.verts)
+    assert Folds.of(back, mixed, source).flipped < 0.001
