@@ -26,6 +26,7 @@ from meshmatch.geometry.triangles import (
 )
 
 # All set by hand.
+_SHORT = 1e-6  # of the usual edge: shorter ones count as so long
 _STIFFEST = 50.0  # a sliver's sides count no more
 _EVENED = 4  # rounds of weights that follow the stretch; ten gain little more
 _SMALLEST = 1e-8  # of a triangle's area in the plane
@@ -77,22 +78,28 @@ class Disk:
         Returns
         -------
         places
-            None where the faces have no area, or hang together by nothing.
+            None where the faces have no area, or nothing holds some vertices.
         """
         own = verts[self.vertices]
         areas = triangle_areas(own, self.corners)
+        if not areas.sum() > 0:
+            return None
+        around = np.maximum(share_areas(areas, self.corners, len(own)), 1e-300)
         rim = _circle(own[self.rim], float(areas.sum())) if rim is None else rim
         weights, best, least = mean_values(own, self.corners), None, np.inf
         weights = weights.toarray() if len(own) <= _DENSE else weights
         for _ in range(_EVENED):
-            places = _balanced(weights, self.rim, rim)
+            try:
+                places = _balanced(weights, self.rim, rim)
+            except (RuntimeError, np.linalg.LinAlgError):  # nothing holds some vertices
+                return best
             squared, turned = _squared_stretch(own, places, self.corners, side)
             total = float((areas * np.where(turned, _TURNED, np.minimum(squared, _STRETCHES[1] ** 2))).sum())
             if not total < least:
                 break
             best, least = places, total
-            around = share_areas(areas * squared, self.corners, len(own)) / share_areas(areas, self.corners, len(own))
-            scales = 1 / np.clip(np.sqrt(around), *_STRETCHES)
+            mean = share_areas(areas * squared, self.corners, len(own)) / around
+            scales = 1 / np.clip(np.sqrt(mean), *_STRETCHES)
             weights = weights * scales if isinstance(weights, np.ndarray) else csr_array(weights @ diags_array(scales))
         return best
 
@@ -131,11 +138,11 @@ def found_in(
 
 def mean_values(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> csr_array:
     """(V, V) weights of the neighbours of each vertex: positive, and those whose mean keeps what is flat."""
-    entries = []
+    entries, least = [], _SHORT * float(np.sqrt(triangle_areas(verts, faces).mean())) + 1e-300
     for k in range(3):
         corner, *others = (faces[:, (k + each) % 3] for each in range(3))
         sides = [verts[each] - verts[corner] for each in others]
-        lengths = [np.maximum(np.sqrt(squared_lengths(each)), 1e-300) for each in sides]
+        lengths = [np.maximum(np.sqrt(squared_lengths(each)), least) for each in sides]
         half = 0.5 * np.arccos(np.clip(dot(*sides) / (lengths[0] * lengths[1]), -1, 1))
         tangent = np.minimum(np.tan(half), _STIFFEST)
         entries += [(corner, other, tangent / length) for other, length in zip(others, lengths, strict=True)]

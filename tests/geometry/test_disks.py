@@ -99,3 +99,16 @@ def test_means_of_neighbours_keep_what_is_flat() -> None:
     assert weights.data.min() > 0
     means = (weights @ verts) / weights.sum(axis=1)[:, None]
     np.testing.assert_allclose(means, verts[4:], atol=1e-9)
+
+
+def test_vertices_at_one_place_are_laid_flat_as_well() -> None:
+    """As files have them along seams: an edge without length, and triangles without area."""
+    verts = BALL.vertices.copy()
+    disk = cap(0.5)
+    inner = np.setdiff1d(np.arange(len(disk.vertices)), disk.rim)
+    first, second = disk.corners[np.isin(disk.corners, inner).all(axis=1)][0, :2]
+    verts[disk.vertices[first]] = verts[disk.vertices[second]]
+    places = disk.laid_flat(verts)
+    assert places is not None and np.isfinite(places).all()
+    assert turned(places, disk.corners) < 0.02
+    assert disk.laid_flat(np.zeros_like(verts)) is None
