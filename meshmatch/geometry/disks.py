@@ -86,8 +86,8 @@ class Disk:
             return None
         around = np.maximum(share_areas(areas, self.corners, len(own)), 1e-300)
         rim = _circle(own[self.rim], float(areas.sum())) if rim is None else rim
-        weights, best, least = mean_values(own, self.corners), None, np.inf
-        weights = weights.toarray() if len(own) <= _DENSE else weights
+        best, least, sparse = None, np.inf, mean_values(own, self.corners)
+        weights = sparse.toarray() if len(own) <= _DENSE else sparse
         for _ in range(_EVENED):
             try:
                 places = _balanced(weights, self.rim, rim)
