@@ -139,7 +139,10 @@ class MatchResult:
         return (self.source_fit.frame.turn, self.target_fit.frame.turn) if known else (None, None)
 
     def backward(self) -> VertexMap:
-        """The map from target to source, made from the same fits: it pulls values from the source to the target.
+        """The map from target to source: it pulls values from the source to the target.
+
+        Of two whole meshes that match well it is the inverse of `map`, so that what goes there and back comes to where it
+        was; otherwise it is made from the same fits.
 
         Returns
         -------
@@ -148,6 +151,9 @@ class MatchResult:
         """
         source, target = self.before_agreement
         with thread_limit(1):
+            if self.map.verdict == "good" and (shapes := _whole_meshes(self.source_fit, self.target_fit)) is not None:
+                there, here = shapes
+                return unfolded(invert_map(self.map, there, here, self.threads), here, there, self.threads)
             return map_of_fits((self.target_fit, self.source_fit), (target, source), self.threads)
 
     def deformed_source(self) -> Shape:
@@ -225,6 +231,16 @@ class MapPair(Brief):
             return self.match.backward()
         with thread_limit(1):
             return invert_map(self.forward, self.source, self.target, self.threads)
+
+
+def _whole_meshes(*fits: Fit | ImplicitFit) -> tuple[Shape, ...] | None:
+    """The meshes of fits as their files have them; None if one is a cloud, a part, or not at hand."""
+    found = []
+    for fit in fits:
+        if not isinstance(fit, Fit) or fit.partial or fit.repaired is None or fit.repaired.original.is_cloud:
+            return None
+        found.append(fit.repaired.original)
+    return tuple(found)
 
 
 def map_of_fits(

@@ -27,6 +27,7 @@ from meshmatch.geometry.disks import Disk, found_in, mean_values, patches
 from meshmatch.geometry.triangles import (
     dot,
     edge_lengths,
+    edges_of,
     interpolate,
     same_rows,
     squared_lengths,
@@ -145,7 +146,7 @@ class _Images:
             return False
         number = np.full(self.target.V, -1)
         number[beneath.vertices] = np.arange(len(beneath.vertices))
-        corners = number[corners_of(self.target.faces, self.map.face[rim], self.map.index[rim])]
+        corners = number[self._corners(rim)]
         plane = beneath.laid_flat(self.target.verts)
         if plane is None or (corners < 0).any():
             return False
@@ -165,20 +166,29 @@ class _Images:
 
     def _beneath(self, disk: Disk, reach: float) -> Disk | None:
         """The part of the target that the images of a disk lie on, and so far around, if it is a disk."""
-        faces, images = self.target.faces, self.points[disk.vertices]
-        corners = np.unique(corners_of(faces, self.map.face[disk.vertices], self.map.index[disk.vertices]))
+        faces, images = self._welded[self.target.faces], self.points[disk.vertices]
         sides = images[disk.corners] - images[disk.corners[:, [1, 2, 0]]]
         far = reach * np.sqrt(squared_lengths(sides.reshape(-1, 3)).max()) + 2 * self._edge
-        away = dijkstra(self._along, indices=corners, min_only=True, limit=2 * far)
+        away = dijkstra(self._along, indices=np.unique(self._corners(disk.vertices)), min_only=True, limit=2 * far)
         away = np.maximum(np.maximum(away[faces[:, 0]], away[faces[:, 1]]), away[faces[:, 2]])
         found = patches(faces, away <= far, away <= 2 * far)
         return Disk.of(faces, found[0]) if len(found) == 1 else None
+
+    def _corners(self, rows: Ints) -> Ints:
+        """(N, 3) the target's vertices that images lie between."""
+        return self._welded[corners_of(self.target.faces, self.map.face[rows], self.map.index[rows])]
+
+    @property
+    @derived
+    def _welded(self) -> Ints:
+        """(V_target,) the first vertex at the place of each: files have several along seams."""
+        return same_rows(self.target.verts)
 
     @property
     @derived
     def _along(self) -> csr_array:
         """(V_target, V_target) lengths of the target's edges."""
-        edges, V = self.target.edges.vertices, self.target.V
+        edges, V = edges_of(self._welded[self.target.faces]).vertices, self.target.V
         lengths = edge_lengths(self.target.verts, edges)
         return csr_array((np.tile(lengths, 2), np.concatenate([edges, edges[:, ::-1]]).T), shape=(V, V))
 

@@ -14,6 +14,8 @@ from meshmatch.api.results import MatchResult
 from meshmatch.errors import MeshmatchError, OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fitter import Fitter
+from meshmatch.geometry.triangles import interpolate
+from meshmatch.maps.vertex_map import corners_of
 from meshmatch.shapes.shape import Shape
 from tests.conftest import some_fit
 
@@ -36,7 +38,6 @@ def test_fits_made_once_give_the_map_of_match(matcher: Matcher, result: MatchRes
     found = matcher.map(*fits)
     assert np.array_equal(found.index, result.map.index)
     assert np.array_equal(found.confidence, result.map.confidence)
-    assert np.array_equal(matcher.map(fits[1], fits[0]).confidence, result.backward().confidence)
     # without agreement the map is another one, and knows less about what it got wrong
     plain = matcher.map(*fits, agree=False)
     assert 0.2 < (plain.index == found.index).mean() < 0.9
@@ -46,7 +47,20 @@ def test_fits_made_once_give_the_map_of_match(matcher: Matcher, result: MatchRes
 def test_the_backward_map_doubts_what_the_forward_map_doubts(result: MatchResult) -> None:
     forward, backward = result.map.confidence, result.backward().confidence
     assert abs(float(forward.mean()) - float(backward.mean())) < 0.02
-    assert 0.06 < (backward < 0.8).mean() < 0.16  # 0.026 where agreement is forgotten
+    assert 0.04 < (backward < 0.8).mean() < 0.16  # 0.026 where agreement is forgotten
+
+
+def test_what_goes_there_and_back_comes_to_where_it_was(matcher: Matcher, result: MatchResult) -> None:
+    climber, dancer = (meshmatch.load_shape(SAMPLES / name) for name in ("climber.ply", "dancer.ply"))
+    other = matcher.map(*matcher.fit_all([dancer, climber]))  # of the same two fits, the other way
+
+    def missed(back: meshmatch.VertexMap) -> float:
+        forward = result.map
+        corners = corners_of(dancer.faces, forward.face, forward.index)
+        again = interpolate(back.points(climber), corners, forward.barycentric)
+        return float(np.median(np.linalg.norm(again - climber.verts, axis=1)) / np.sqrt(climber.area))
+
+    assert missed(result.backward()) < 0.7 * missed(other)
 
 
 def test_fits_of_other_templates_or_without_shapes_are_refused(matcher: Matcher, result: MatchResult) -> None:

@@ -186,3 +186,15 @@ def test_faces_that_run_the_other_way_are_no_folds() -> None:
     assert Folds.of(found, source, mixed).flipped < 0.001
     back = put(mixed, source, mixed.verts)
     assert Folds.of(back, mixed, source).flipped < 0.001
+
+
+def test_seams_of_the_target_are_not_in_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A textured glb has its vertices several times along the seams of its image."""
+    source, target = ball(3), ball(3, 0.0)
+    cut = Shape(target.verts[target.faces].reshape(-1, 3), np.arange(3 * target.F).reshape(-1, 3))
+    whole = folded(source, target)
+    found = put(source, cut, whole.points(target))
+    for name in ("_RINGS", "_SMOOTHED"):
+        monkeypatch.setattr(f"meshmatch.maps.unfold.{name}", ())
+    assert Folds.of(found, source, cut).flipped > 0.003
+    assert Folds.of(unfolded(found, source, cut), source, cut).flipped == 0
