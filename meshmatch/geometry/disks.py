@@ -99,7 +99,7 @@ class Disk:
                 break
             best, least = places, total
             mean = share_areas(areas * squared, self.corners, len(own)) / around
-            scales = 1 / np.clip(np.sqrt(mean), *_STRETCHES)
+            scales = 1 / np.clip(np.sqrt(np.maximum(mean, 0.0)), *_STRETCHES)
             weights = weights * scales if isinstance(weights, np.ndarray) else csr_array(weights @ diags_array(scales))
         return best
 

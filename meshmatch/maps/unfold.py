@@ -41,13 +41,13 @@ from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.shape import Shape
 
 # All set by hand on bodies of SCAPE, FAUST and SHREC'19.
-_RINGS = (1, 2, 3)  # of triangles around a fold that move, round by round; more rounds gain little
-_SMOOTHED, _SWEEPS = (3,), 3  # the same of smoothing, and steps of each round; ten gain little more
+_RINGS = (2, 3)  # of triangles around a fold that move, round by round; more rounds gain little
+_SMOOTHED, _SWEEPS = (3,), 2  # the same of smoothing, and steps of each round; ten gain little more
 _FLAT, _LAST = (1, 2, 3, 6), (1, 2, 4, 1)  # the same of what is laid flat, at last only around what is turned over
 _CLOSED = 3  # rings around it, within which holes are closed
 # How far around images the target is laid flat: two of its edges, and so many times the longest edge of an image.
 _REACHES = 0.0, 0.5, 1.0
-_TURNED = 4.0  # a triangle that is turned over is so many times as bad as one that is crushed
+_TURNED = 5.0  # a triangle that is turned over is so many times as bad as one that is crushed
 _STRETCH, _SLACK = 3.0, 0.02  # an edge whose image is longer, in units of sqrt(area), is where the map tears
 _THINNEST = 1e-3  # height over length: what is thinner has no area that its image could keep, and spoils the equations
 _STIFFEST = 50.0  # a sliver's sides count no more
