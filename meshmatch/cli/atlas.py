@@ -68,7 +68,18 @@ class AtlasOptions:
     symmetry: bool = Option(
         False,
         "--symmetry",
-        help="Compare shapes that are symmetric by themselves, such as heads, with their mirror images.",
+        help="Compare shapes that are symmetric by themselves, such as heads, with their mirror images; with --sides, left "
+        "and right ones.",
+    )
+    individuals: str | None = Option(
+        None,
+        metavar="COLUMN",
+        help="With --symmetry: whose shape each is. Of individuals that were measured several times the error is told, too.",
+    )
+    sides: str | None = Option(
+        None,
+        metavar="COLUMN",
+        help="With --symmetry: which side of its individual each shape is, such as left or right.",
     )
     permutations: int = Option(10_000, min=1, metavar="N", help="Maximum number of permutations in tests.")
     samples: int = Option(0, min=0, max=10_000, metavar="N", help="Number of random shapes to write.")
@@ -85,14 +96,22 @@ class AtlasOptions:
         if self.groups is None and self.model is None and not self.symmetry and self.statistic != "normal":
             hint = "add --groups A.txt B.txt, --model or --symmetry"
             raise OptionError("--statistic is for groups, models and symmetry, and there are none", hint)
-        if self.symmetry and self.align_by != "whole":
+        if self.symmetry and self.sides is None and self.align_by != "whole":
             raise OptionError("--symmetry is of whole shapes", "leave out --align-by")
         if self.format != "png":
             from meshmatch.render.charts import check_chart
 
             check_chart(f"charts.{self.format}")
-        for option, given in {"--metadata": self.metadata, "--blocks": self.blocks}.items():
-            if given is not None and self.model is None:
+        for option, given in {"--individuals": self.individuals, "--sides": self.sides}.items():
+            if given is not None and not self.symmetry:
+                raise OptionError(f"{option} is for symmetry", "add --symmetry")
+            if given is not None and self.metadata is None:
+                raise OptionError(f"{option} is a column of a table, and there is none", "add --metadata TABLE")
+        if self.sides is not None and self.individuals is None:
+            raise OptionError("--sides are of individuals", "add --individuals COLUMN")
+        table = self.metadata is not None and self.individuals is None
+        for option, idle in {"--metadata": table, "--blocks": self.blocks is not None}.items():
+            if idle and self.model is None:
                 raise OptionError(f"{option} is for a model, and there is none", "add --model 'shape ~ ...'")
         if self.model is not None and self.space is not None:
             space = {"keep": "form", "remove": "shape"}.get(self.space, self.space)
@@ -203,7 +222,10 @@ def _find(console: Console, made: Any, shapes: "Registered", how: AtlasOptions) 
             console.warn(f"{name}: left out of the model, for its {column} is missing")
     asymmetry = None
     if how.symmetry:
-        asymmetry = measure_asymmetry(made, kind=how.statistic, permutations=how.permutations, seed=how.seed)
+        asymmetry = measure_asymmetry(
+            made, how.metadata, individuals=how.individuals, sides=how.sides,
+            kind=how.statistic, permutations=how.permutations, seed=how.seed,
+        )  # fmt: skip
     measures = None
     if how.measures and len(shapes.names) > 3:
         with console.progress() as progress:
@@ -246,8 +268,9 @@ def _tell(console: Console, about: dict[str, Any]) -> None:
             f"permutations{blocks} of residuals"
         )
     if "asymmetry" in about:
-        far = about["asymmetry"]["of_mean"]
-        console.say(f"the mean is {far:.4g} from its mirror image on average; of each shape: asymmetry.csv")
+        found = about["asymmetry"]
+        whose = "the sides differ by" if found["matching"] else "the mean differs from its mirror image by"
+        console.say(f"{whose} {found['of_mean']:.4g} on average; each individual: asymmetry.csv")
 
 
 _KINDS = "generalisation", "specificity"

@@ -5,9 +5,9 @@ anova.csv      a line for each term, what is left, and all: df, SS, MS, R2, F, Z
 effects.csv    a line for each vertex: displacement by each coefficient; F and p-values of each term
 effects.vtp    the same on the mean, for ParaView and 3D Slicer
 allometry.csv  a line for each shape: size, scores that go with it, group
-asymmetry.csv  a line for each shape: how far it is from its mirror image, and without what all have in common
-asymmetry.vtp  directional and fluctuating asymmetry on the mean
-symmetry.csv   individuals, sides, and fluctuating asymmetry, as in anova.csv
+asymmetry.csv  a line for each individual: how far its sides differ, and without what all have in common
+asymmetry.vtp  directional and fluctuating asymmetry on the mean, and errors of measurement
+symmetry.csv   individuals, sides, fluctuating asymmetry, and errors of measurement, as in anova.csv
 =============  ===================================================================================================
 """
 
@@ -51,7 +51,8 @@ def write_asymmetry(folder: Path, mean: Shape, found: Asymmetry) -> None:
     write_rows(folder / "symmetry.csv", _HEADER, _lines(asymmetry_record(found)))
     rows = zip(found.names, short(found.total_of), short(found.fluctuating_of), strict=True)
     write_rows(folder / "asymmetry.csv", ["name", "asymmetry", "fluctuating"], rows)
-    write_vtp(folder / "asymmetry.vtp", mean, _arrays([found.directional]) | {"fluctuating": found.fluctuating})
+    arrays = _arrays(found.table.effects[1:]) | {"fluctuating": found.fluctuating}
+    write_vtp(folder / "asymmetry.vtp", mean, arrays | ({} if found.error is None else {"error": found.error}))
 
 
 def _arrays(effects: Sequence[Effect]) -> dict[str, np.ndarray]:
@@ -92,11 +93,12 @@ def model_record(found: Explained) -> dict[str, Any]:
 def asymmetry_record(found: Asymmetry) -> dict[str, Any]:
     """Asymmetry and its table, for JSON."""
     told = {
+        "matching": found.matching,
         "of_mean": short(found.of_mean),
         "of_shapes": dict(zip(found.names, short(found.total_of), strict=True)),
         "fluctuating_of_shapes": dict(zip(found.names, short(found.fluctuating_of), strict=True)),
     }
-    return told | _table_record(found.table, "fluctuating")
+    return told | _table_record(found.table, "fluctuating" if found.error is None else "error")
 
 
 def _table_record(about: Variances, left: str = "residuals") -> dict[str, Any]:

@@ -12,7 +12,7 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from tests.cli.conftest import Run
 from tests.collections.ellipsoids import ellipsoids
-from tests.conftest import icosphere
+from tests.conftest import icosphere, vtp_arrays
 
 
 @pytest.fixture(autouse=True)
@@ -152,8 +152,31 @@ def test_mirror_images_are_compared(run: Run, shapes: Path, tmp_path: Path) -> N
     assert (output / "asymmetry.vtp").exists()
 
 
+def test_left_and_right_ones_of_a_table(run: Run, shapes: Path, tmp_path: Path) -> None:
+    """Each measured twice."""
+    table, output, given = tmp_path / "table.csv", tmp_path / "atlas", ellipsoids(12, splits=1)
+    for k in range(8, 12):
+        save_shape(shapes / f"egg-{k}.ply", Shape(given.points[k], given.faces))
+    rows = [f"egg-{k},{k // 4},{'left' if k % 2 else 'right'}" for k in range(12)]
+    table.write_text("\n".join(["name,who,side", *rows]) + "\n")
+    words = ("--symmetry", "--metadata", table, "--individuals", "who", "--sides", "side", "--permutations", 20)
+    answer = run("atlas", shapes, "-o", output, "--no-measures", *words)
+    assert answer.status == 0, answer.err
+    assert "the sides differ by" in answer.err
+    assert [line.split()[0] for line in answer.out.splitlines()] == [
+        *("term", "individual", "side", "individual:side", "error", "total")
+    ]
+    assert len((output / "asymmetry.csv").read_text().splitlines()) == 4
+    arrays = vtp_arrays(output / "asymmetry.vtp")
+    assert {"side: right - left", "individual:side, p corrected", "fluctuating", "error"} <= set(arrays)
+
+
 @pytest.mark.parametrize(
-    "wrong", ["nowhere", "file", "input", "both", "unknown", "statistic", "table", "space", "row", "part", "parts"]
+    "wrong",
+    [
+        *("nowhere", "file", "input", "both", "unknown", "statistic", "table", "space", "row", "part", "parts"),
+        *("sides", "individuals", "no table"),
+    ],
 )
 def test_what_is_refused_leaves_nothing(run: Run, shapes: Path, tmp_path: Path, wrong: str) -> None:
     output, one = tmp_path / "atlas", group(tmp_path / "one.txt", range(4))
@@ -170,6 +193,9 @@ def test_what_is_refused_leaves_nothing(run: Run, shapes: Path, tmp_path: Path, 
         "row": ("--model", "shape ~ x", "--metadata", table),
         "part": ("--align-by", "femur"),
         "parts": ("--align-by", "1", "--symmetry"),
+        "sides": ("--symmetry", "--metadata", table, "--sides", "x"),
+        "individuals": ("--individuals", "x", "--metadata", table),
+        "no table": ("--symmetry", "--individuals", "x"),
     }
     before = sorted(tmp_path.rglob("*"))
     answer = run("atlas", where, "-o", shapes if wrong == "input" else output, *more.get(wrong, ()))
