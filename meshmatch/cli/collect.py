@@ -10,9 +10,12 @@ from typer import Argument, Option
 import meshmatch
 from meshmatch.cli import options
 from meshmatch.cli.options import FitOptions, grouped, optional, output_option
-from meshmatch.cli.words import Console, print_json
+from meshmatch.cli.words import Console, map_record, print_json
 from meshmatch.errors import OptionError, PoorFit
+from meshmatch.maps import MAP_SUFFIXES
 from meshmatch.models.registry import AUTO, check_model
+from meshmatch.outputs import replace_on_success
+from meshmatch.shapes.input_files import stem_of
 
 if TYPE_CHECKING:
     from meshmatch.collections.setting import Record
@@ -119,8 +122,15 @@ def _table(console: Console) -> Callable[["Record"], None]:
 
 def map(
     fits: Annotated[str, Argument(metavar="FITS", help="A folder that `meshmatch fit` made, or its URL.")],
-    output: str = output_option("MAPS", "The folder of the maps: the one from A to B is MAPS/A/B with a suffix."),
-    pairs: Path | None = optional("FILE", "Pairs to map: the names of a source and a target per line."),
+    names: Annotated[
+        list[str] | None,
+        Argument(metavar="A B", help="Map the shape A to the shape B: their names, as in FITS/fits.csv."),
+    ] = None,
+    *,
+    output: str = output_option(
+        "MAPS", "The folder of the maps: the one from A to B is MAPS/A/B with a suffix. Of A and B also a file."
+    ),
+    pairs: Path | None = optional("FILE", "Or pairs to map: the names of a source and a target per line."),
     to: str | None = optional("NAME", "Or map every shape to this one."),
     all_pairs: bool = Option(False, "--all", help="Or map every shape to every other."),
     suffix: str = Option(
@@ -137,14 +147,49 @@ def map(
     """
     from meshmatch.collections.map_all import load_pairs
 
-    if [pairs is not None, to is not None, all_pairs].count(True) != 1:
-        raise OptionError("no maps are chosen", "choose one of --pairs FILE, --to NAME and --all")
+    chosen = [bool(names), pairs is not None, to is not None, all_pairs].count(True)
+    if chosen != 1:
+        several = "more than one choice of maps" if chosen else "no maps are chosen"
+        raise OptionError(several, "name two shapes, or give one of --pairs FILE, --to NAME and --all")
+    if names and len(names) != 2:
+        given = "one name was given" if len(names) == 1 else f"{len(names)} names were given"
+        raise OptionError(f"a map leads from one shape to another, and {given}", "name the source and the target")
     console = Console(quiet)
     with console.progress() as progress:
         collection = meshmatch.Collection(fits, scheduler or jobs, progress)
-        wanted = collection.pairs(to) if pairs is None else load_pairs(pairs)
+        if names:
+            pair = _name_of(collection, names[0]), _name_of(collection, names[1])
+            if Path(output).suffix.lower() in MAP_SUFFIXES:
+                _write_map(collection, pair, Path(output), console, json)
+                return
+            wanted = [pair]
+        else:
+            wanted = collection.pairs(to) if pairs is None else load_pairs(pairs)
         count = collection.save_maps(output, wanted, suffix=suffix)
     files = f"{output}/SOURCE/TARGET.{suffix.removeprefix('.')}"
-    console.say(f"{count} maps in {output}: {files}; those that were as new as the fits were kept")
+    console.say(f"{count} map{'s' * (count != 1)} in {output}: {files}; those that were as new as the fits were kept")
     if json:
         print_json({"output": output, "fits": fits, "maps": count})
+
+
+def _name_of(collection: meshmatch.Collection, word: str) -> str:
+    """A name, which may be that of a file; `InputError` for what has no fit here."""
+    known = collection.names
+    found = next((name for name in (word, stem_of(Path(word))) if name in known), None)
+    if found is None:
+        collection.pairs(word)  # says what is wrong with it
+    return found or word
+
+
+def _write_map(
+    collection: meshmatch.Collection, pair: tuple[str, str], output: Path, console: Console, json: bool
+) -> None:
+    """Write the map of two shapes into a file."""
+    from meshmatch.maps.files import save_map
+
+    with replace_on_success(output) as temporary:
+        found = collection.map(*pair)
+        save_map(temporary, found)
+    console.say(f"wrote {output}: {pair[0]} to {pair[1]}, {found.verdict}")
+    if json:
+        print_json({"output": output, "fits": collection.store.location, "maps": 1} | map_record(found, pair))

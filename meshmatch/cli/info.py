@@ -40,6 +40,8 @@ def info(
         return
     rows = []
     for key, value in record.items():
+        if key == "unit_if_a_person" and value is None:
+            continue
         values = value if key in ("repair", "reasons", "meshes") else [value]  # a line each
         if key == "largest_parts":
             values = _part_lines(value, record["parts"])

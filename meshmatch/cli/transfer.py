@@ -258,10 +258,10 @@ def transfer_landmarks(
         found, b = result.data, result.maps.target
         result.writer(temporary, output)
     low = np.flatnonzero(found.confidence < min_confidence)
-    for k in low[:10].tolist():
-        console.warn(f"landmark {found.names[k]} is uncertain: its confidence is {found.confidence[k]:.2f}")
-    if len(low) > 10:
-        console.warn(f"so are {len(low) - 10} more")
+    if len(low):
+        told = [f"{found.names[k]} ({found.confidence[k]:.2f})" for k in low[:10].tolist()]
+        more = f" and {len(low) - 10} more" if len(low) > 10 else ""
+        console.warn(f"{transfer.names[1]}: landmarks of confidence below {min_confidence:g}: {', '.join(told)}{more}")
     console.say(f"wrote {output}: {len(found.names)} landmarks on {transfer.names[1]}")
     if picture is not None:
         from meshmatch.render.compose import compose_points

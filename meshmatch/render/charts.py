@@ -168,13 +168,22 @@ def draw_dots(path: str | Path, charts: Sequence[Dots], groups: Sequence[str], *
                     axes.plot(*outline.T, color=ink, linewidth=1.1)
                     if hulls:
                         axes.fill(*outline.T, color=ink, alpha=0.12, linewidth=0)
+            low, high = points.min(axis=0), points.max(axis=0)
+            span = np.full(2, (high - low).max()) if hulls else high - low
+            named: list[Floats] = []
             for number, name in dots.names.items():
+                at = (points[number] - low) / np.maximum(span, 1e-300)
+                below = any(np.abs(at - other).max() < 0.08 for other in named)  # names of neighbours do not meet
+                named.append(at)
                 about = {"textcoords": "offset points", "color": _GREY, "fontsize": 7.5}
-                axes.annotate(short(name, 24), points[number], (4, 4), **about)
+                about |= {"ha": "right" if at[0] > 0.5 else "left"}
+                axes.annotate(short(name, 24), points[number], (-4 if at[0] > 0.5 else 4, -11 if below else 4), **about)
             axes.set(xlabel=short(dots.xlabel), ylabel=short(dots.ylabel))
+            if dots.ends:  # pictures are beside the words
+                axes.xaxis.label.set_size(8.5)
+                axes.yaxis.label.set_size(8.5)
             _show_ends(axes, dots.ends)
             if hulls:  # a square in which both axes have one scale
-                low, high = points.min(axis=0), points.max(axis=0)
                 reach = 0.55 * float((high - low).max()) or 1.0
                 middle = (low + high) / 2
                 axes.set(xlim=middle[0] + [-reach, reach], ylim=middle[1] + [-reach, reach], box_aspect=1)

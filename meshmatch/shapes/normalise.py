@@ -32,6 +32,7 @@ _CLEARLY = 0.9  # a turn must fit better than the given orientation by this fact
 _CLOSE = 15.0  # degrees: two alignments nearer than that are one
 # Standing people are 1.2 to 2.2 m tall; a unit fits if it makes that of the longest extent.
 _SMALL, _TALL = 1.2, 2.2
+_SLENDER = 1.0  # longest extent in roots of the area; of people 1.1 to 1.7, however they stand
 _UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "feet": 0.3048}
 
 
@@ -76,8 +77,12 @@ def long_axis(shape: Shape) -> str | None:
 
 
 def guess_unit(shape: Shape) -> str | None:
-    """The unit in which the shape would be as long as a standing person; None if there is none."""
+    """The unit in which the shape would be as long as a standing person; None if there is none, or its surface is too
+    large for one.
+    """
     length = float((shape.bounds[1] - shape.bounds[0]).max())
+    if not shape.is_cloud and length < _SLENDER * np.sqrt(shape.area):
+        return None
     return next((name for name, metres in _UNITS.items() if _SMALL <= length * metres <= _TALL), None)
 
 

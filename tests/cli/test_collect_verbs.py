@@ -85,6 +85,20 @@ def test_maps_of_names(fits: Path, run: Run, tmp_path: Path) -> None:
     assert len(list((tmp_path / "some").rglob("*.csv"))) == 2
 
 
+def test_a_map_of_two_names(fits: Path, run: Run, tmp_path: Path) -> None:
+    """Into a folder or a file; shapes may be called by their files."""
+    shapes = SAMPLES / "climber.ply", SAMPLES / "dancer.ply"
+    answer = run("map", fits, "climber", shapes[1], "-o", tmp_path / "maps", "--jobs", "1", "-q")
+    assert (answer.status, answer.err) == (0, "")
+    assert [path.relative_to(tmp_path) for path in tmp_path.rglob("*.npz")] == [Path("maps", "climber", "dancer.npz")]
+    answer = run("map", fits, *shapes, "-o", tmp_path / "one.npz", "--json")
+    assert f"wrote {tmp_path / 'one.npz'}: climber to dancer, good" in answer.err
+    record = json.loads(answer.out)
+    assert (record["source"], record["target"], record["maps"]) == ("climber", "dancer", 1)
+    one, other = (load_map(path, *shapes) for path in (tmp_path / "one.npz", tmp_path / "maps/climber/dancer.npz"))
+    np.testing.assert_array_equal(one.index, other.index)
+
+
 @pytest.mark.parametrize("suffix", ["vtp", ".obj"])
 def test_registered_meshes_are_exported(fits: Path, run: Run, tmp_path: Path, suffix: str) -> None:
     answer = run("export", fits, "-o", tmp_path / "out", "--format", suffix, "--json")
@@ -263,7 +277,10 @@ def test_what_cannot_be_mapped(fits: Path, run: Run, tmp_path: Path) -> None:
         return answer.err
 
     assert "no maps are chosen" in refused(fits)
-    assert "no maps are chosen" in refused(fits, "--all", "--to", "dancer")
+    assert "more than one choice of maps" in refused(fits, "--all", "--to", "dancer")
+    assert "more than one choice of maps" in refused(fits, "climber", "dancer", "--all")
+    assert "one name was given" in refused(fits, "climber")
+    assert "did you mean dancer?" in refused(fits, "climber", "dancr")
     assert "is not a folder of fits" in refused(fits.parent / "shapes", "--all")
     assert "did you mean dancer?" in refused(fits, "--to", "dancr")
     pairs = tmp_path / "pairs.txt"

@@ -46,7 +46,7 @@ def test_a_mesh_that_needs_repair(run: Run, tmp_path: Path, sphere: Shape) -> No
 
 
 def test_parts_holes_axis_and_unit(run: Run, tmp_path: Path, sphere: Shape) -> None:
-    tall = sphere.verts * [20, 30, 88]  # as long as a person in centimetres, along z
+    tall = sphere.verts * [12, 18, 88]  # as long as a person in centimetres, along z
     twice = np.concatenate([tall, tall + np.array([45.0, 0, 0])])
     faces = np.concatenate([sphere.faces[1:], sphere.faces + 642])
     save_shape(tmp_path / "two.ply", Shape(twice, faces))
@@ -72,6 +72,13 @@ def test_unit_of_a_person(run: Run, tmp_path: Path, sphere: Shape, length: float
     save_shape(tmp_path / "a.ply", Shape(sphere.verts * [0.1 * length, 0.5 * length, 0.1 * length], sphere.faces))
     found = record(run, tmp_path / "a.ply")
     assert (found["longest_along"], found["unit_if_a_person"]) == ("y", unit)
+
+
+def test_what_is_too_stout_for_a_person_has_no_such_unit(run: Run, tmp_path: Path, sphere: Shape) -> None:
+    """As a bone of a hand's length, which would be a child in centimetres."""
+    save_shape(tmp_path / "bone.ply", Shape(sphere.verts * [40.0, 45.0, 60.0], sphere.faces))
+    assert record(run, tmp_path / "bone.ply")["unit_if_a_person"] is None
+    assert "person" not in run("info", tmp_path / "bone.ply").out
 
 
 def test_nothing_to_repair_is_said(run: Run, two: tuple[Path, Path]) -> None:
