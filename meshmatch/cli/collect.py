@@ -12,12 +12,11 @@ from meshmatch.cli import options
 from meshmatch.cli.options import FitOptions, grouped, optional, output_option
 from meshmatch.cli.words import Console, map_record, print_json
 from meshmatch.errors import OptionError, PoorFit
-from meshmatch.maps import MAP_SUFFIXES
 from meshmatch.models.registry import AUTO, check_model
 from meshmatch.outputs import replace_on_success
-from meshmatch.shapes.input_files import stem_of
 
 if TYPE_CHECKING:
+    from meshmatch.collections.collection import Collection
     from meshmatch.collections.setting import Record
 
 Jobs = Annotated[int | None, Option(min=1, metavar="N", help="Number of processes. Default: one per core.")]
@@ -146,6 +145,7 @@ def map(
     Nothing is fitted again. Existing maps are kept unless the fits are newer.
     """
     from meshmatch.collections.map_all import load_pairs
+    from meshmatch.maps import MAP_SUFFIXES
 
     chosen = [bool(names), pairs is not None, to is not None, all_pairs].count(True)
     if chosen != 1:
@@ -172,8 +172,10 @@ def map(
         print_json({"output": output, "fits": fits, "maps": count})
 
 
-def _name_of(collection: meshmatch.Collection, word: str) -> str:
+def _name_of(collection: "Collection", word: str) -> str:
     """A name, which may be that of a file; `InputError` for what has no fit here."""
+    from meshmatch.shapes.input_files import stem_of
+
     known = collection.names
     found = next((name for name in (word, stem_of(Path(word))) if name in known), None)
     if found is None:
@@ -182,7 +184,7 @@ def _name_of(collection: meshmatch.Collection, word: str) -> str:
 
 
 def _write_map(
-    collection: meshmatch.Collection, pair: tuple[str, str], output: Path, console: Console, json: bool
+    collection: "Collection", pair: tuple[str, str], output: Path, console: Console, json: bool
 ) -> None:
     """Write the map of two shapes into a file."""
     from meshmatch.maps.files import save_map

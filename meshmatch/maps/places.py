@@ -22,6 +22,7 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import blend, triangle_areas, vertex_areas, vertex_normals
 from meshmatch.maps.footpoints import Footpoints, Surface, closest_footpoints, in_core_frame, template_footpoints
+from meshmatch.maps.mapped_mesh import MappedMesh
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 
@@ -189,21 +190,15 @@ class PlacedFit(Fit):
 
 def surface_distance(shape: Shape, fitted: Shape, one_way: bool = False) -> tuple[float, float]:
     """How far two surfaces in one frame lie apart, on average over both and at most, in its unit: from every vertex of each
-    to the nearest place of the other that faces the same way.
+    to the nearest place of the other.
 
     Of a cloud, and with ``one_way`` of what is only a part of the fitted one, only from there.
     """
-    scale = float(np.sqrt(fitted.area))
-    one, other = (Surface(each.verts / scale, each.faces, _facing(each)) for each in (shape, fitted))
-    ways = [(other.query(one.verts, _facing(shape)).distance, shape.vertex_areas)]
+    ways = [(MappedMesh.of(fitted).query(shape.verts).distance, shape.vertex_areas)]
     if not (one_way or shape.is_cloud):
-        ways.append((one.query(other.verts, _facing(fitted)).distance, fitted.vertex_areas))
+        ways.append((MappedMesh.of(shape).query(fitted.verts).distance, fitted.vertex_areas))
     mean = np.mean([np.average(distance, weights=weights) for distance, weights in ways])
-    return scale * float(mean), scale * float(max(distance.max() for distance, _ in ways))
-
-
-def _facing(shape: Shape) -> Floats:
-    return np.zeros_like(shape.verts) if shape.is_cloud else shape.vertex_normals
+    return float(mean), float(max(distance.max() for distance, _ in ways))
 
 
 def heights(shape: Shape, fit: Fit, foot: Footpoints) -> Float[Floats, " V"]:

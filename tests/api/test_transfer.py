@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 import meshmatch
 from meshmatch import ConfidenceRule
@@ -304,6 +305,17 @@ def test_distances_of_surfaces_are_in_the_unit_of_the_file(sphere: Shape) -> Non
     assert meshmatch.measure_distance(half, other).most > 50
     for part in (meshmatch.measure_distance(half, other, one_way=True), meshmatch.measure_distance(half.verts, other)):
         assert part.most == pytest.approx(5.0, rel=0.01)
+    turn, k = 2 * np.pi * np.arange(40) / 40, np.arange(40)
+    rim, after, fan = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1), (k + 1) % 40, np.zeros(38, int)
+    sides = [[k, after, k + 40], [after, after + 40, k + 40]]
+    ends = [[fan, k[2:], k[1:-1]], [fan + 40, k[1:-1] + 40, k[2:] + 40]]
+    cut = Shape(
+        np.concatenate([rim, rim + np.array([0, 0, 3])]),
+        np.concatenate([np.stack(each, axis=1) for each in sides + ends]),
+    )
+    fine = trimesh.Trimesh(cut.verts, cut.faces).subdivide().subdivide()
+    many = Shape(np.asarray(fine.vertices), np.asarray(fine.faces, np.int64))
+    assert meshmatch.measure_distance(many, cut).most < 1e-9  # its ends are flat, of triangles that reach far
     with pytest.raises(InputError, match="no faces"):
         meshmatch.measure_distance(one, other.verts)
     with pytest.raises(OptionError, match="invalid unit"):
