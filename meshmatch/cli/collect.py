@@ -183,9 +183,7 @@ def _name_of(collection: "Collection", word: str) -> str:
     return found or word
 
 
-def _write_map(
-    collection: "Collection", pair: tuple[str, str], output: Path, console: Console, json: bool
-) -> None:
+def _write_map(collection: "Collection", pair: tuple[str, str], output: Path, console: Console, json: bool) -> None:
     """Write the map of two shapes into a file."""
     from meshmatch.maps.files import save_map
 
