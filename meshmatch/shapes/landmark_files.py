@@ -11,7 +11,8 @@ import csv
 import math
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path, PureWindowsPath
 from typing import Any, Literal
 from xml.etree import ElementTree
@@ -36,6 +37,10 @@ Space = Literal["", "LPS", "RAS"]
 Kind = Literal["vertex", "face", "position", "missing"]
 # One as a file has it: name; vertex, face and barycentric, or position. What is missing is None or nan.
 Record = dict[str, Any]
+Markup = tuple[int, str]
+"""The number of a list of 3D Slicer that a point is in, and what the list is."""
+_POINTS = "Fiducial"
+_BY_POINTS = ("Line", "Angle", "Curve", "ClosedCurve")  # lists that their points say all about
 _LARGEST_PP = 10_000_000
 _HEAD = 4096  # bytes of a mesh's file within which 3D Slicer says its frame
 _RECORD = 1200  # bytes of memory that a landmark takes while it is read
@@ -53,6 +58,7 @@ class Place:
     name: str
     kind: Kind
     where: Any  # a vertex; a face and three weights; three coordinates; why it is missing
+    markup: Markup = (0, _POINTS)
 
 
 @dataclass(frozen=True)
@@ -104,7 +110,10 @@ def read_landmark_file(path: Path, shape: str = "", space: Space = "") -> Landma
     if own and space and own != space:
         turned = f"{path.name} is in {own}, {shape} is in {space}: x and y change their signs"
     named = [not is_missing(str(record.get("name") or "")) for record in records]
-    places = tuple(_place(record, k, bool(turned)) for k, record in enumerate(records))
+    places = tuple(
+        replace(_place(record, k, bool(turned)), markup=record.get("markup", (0, _POINTS)))
+        for k, record in enumerate(records)
+    )
     return LandmarkFile(places, all(named), own, turned)
 
 
@@ -252,16 +261,18 @@ def _record(value: Any) -> Record:
 def _markups(path: Path, lists: list[Any]) -> list[Record]:
     """The control points of 3D Slicer's markups."""
     records: list[Record] = []
-    for markup in lists:
+    for list_number, markup in enumerate(lists):
         points = markup.get("controlPoints", []) if isinstance(markup, dict) else None  # a region has none
         if not isinstance(points, list) or not all(isinstance(point, dict) for point in points):
             raise InputError("its markups hold no list of control points")
         check_memory(path.name, path.stat().st_size, _RECORD * (len(records) + len(points)))
         space = _SPACES.get(str(markup.get("coordinateSystem", "")).upper(), "") if points else ""
+        kind = markup["type"] if markup.get("type") in _BY_POINTS else _POINTS
+        common = {"space": space, "markup": (list_number, kind)}
         for point in points:
             is_set = point.get("positionStatus", "defined") == "defined"
             position = point.get("position") if is_set else None
-            records.append({"name": point.get("label"), "position": position or None, "space": space})
+            records.append({"name": point.get("label"), "position": position or None, **common})
     return records
 
 
@@ -437,8 +448,12 @@ def _description(confidence: float) -> str:
     return "" if math.isnan(confidence) else f"confidence {confidence:.3g}"
 
 
-def markups_record(points: Iterable[tuple[str, Sequence[float], float]], space: Space) -> dict[str, Any]:
-    """3D Slicer's markups (.mrk.json), from names, positions and confidences, in a frame."""
+def markups_record(
+    points: Iterable[tuple[str, Sequence[float], float]], space: Space, lists: Sequence[Markup] = ()
+) -> dict[str, Any]:
+    """3D Slicer's markups (.mrk.json), from names, positions and confidences, in a frame; in the lists that they come from,
+    such as curves.
+    """
     controls = [
         {
             "id": str(k),
@@ -450,5 +465,9 @@ def markups_record(points: Iterable[tuple[str, Sequence[float], float]], space: 
         for k, (name, position, confidence) in enumerate(points, 1)
     ]
     schema = "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
-    markup = {"type": "Fiducial", "coordinateSystem": space, "controlPoints": controls}
-    return {"@schema": f"{schema}markups-schema-v1.0.3.json#", "markups": [markup]}
+    pairs = zip(lists or [(0, _POINTS)] * len(controls), controls, strict=True)
+    markups = [
+        {"type": kind, "coordinateSystem": space, "controlPoints": [control for _, control in own]}
+        for (_, kind), own in groupby(pairs, key=lambda pair: pair[0])
+    ]
+    return {"@schema": f"{schema}markups-schema-v1.0.3.json#", "markups": markups}

@@ -25,6 +25,7 @@ from meshmatch.shapes.landmark_files import (
     LANDMARK_READERS,
     READERS_OF_SEVERAL,
     LandmarkFile,
+    Markup,
     Space,
     fcsv_lines,
     markups_record,
@@ -55,6 +56,7 @@ class Landmarks(Brief):
     barycentric: Float[Floats, "N 3"]  # weights of the face's corners; (1, 0, 0) where the face is -1
     confidence: Float[Floats, " N"]  # 0 (a guess) to 1 (certain)
     notes: tuple[str, ...] = ()  # what was left out or turned while they were read
+    lists: tuple[Markup, ...] = ()  # the list of 3D Slicer that each is in, such as a curve; of other files none
 
 
 def at_vertices(shape: Shape, vertex: Int[Ints, " N"], names: tuple[str, ...] = ()) -> Landmarks:
@@ -143,7 +145,8 @@ def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: 
         places = MappedMesh.of(target).query(interpolate(forward.points(target), corners, share), facing)
         vertex[inside], face[inside], weights[inside] = places.vertex, places.face, places.barycentric
         confidence[inside] = np.einsum("nk,nk->n", share, forward.confidence[corners])
-    return _on_surface(target, landmarks.names, vertex, face, weights, np.clip(confidence, 0, 1))
+    found = _on_surface(target, landmarks.names, vertex, face, weights, np.clip(confidence, 0, 1))
+    return replace(found, lists=landmarks.lists)
 
 
 def load_landmarks(path: str | Path, shape: Shape, space: Space = "") -> tuple[Landmarks, float]:
@@ -204,7 +207,8 @@ def _on_shape(found: LandmarkFile, shape: Shape) -> tuple[Landmarks, float]:
             on_surface, distance = at_points(shape, np.array(where), names)
             parts.append(on_surface)
             largest = float(distance.max())
-    return replace(joined(parts, np.argsort(rows)), notes=tuple(notes)), largest
+    lists = tuple(place.markup for place in found.places if place.kind != "missing")
+    return replace(joined(parts, np.argsort(rows)), notes=tuple(notes), lists=lists), largest
 
 
 def save_landmarks(path: Path, landmarks: Landmarks, space: Space = "LPS", name: str = "", specimen: str = "") -> None:
@@ -224,7 +228,7 @@ def save_landmarks(path: Path, landmarks: Landmarks, space: Space = "LPS", name:
     elif suffix == ".fcsv":
         path.write_text("\n".join(fcsv_lines(points, space)) + "\n", encoding="utf-8")
     elif (name or path.name).lower().endswith(".mrk.json"):
-        tables.write_json(path, markups_record(points, space), indent=1)
+        tables.write_json(path, markups_record(points, space, landmarks.lists), indent=1)
     elif suffix == ".csv":
         cells = ([name, vertex, *xyz, face, *weights, trust] for name, vertex, xyz, face, weights, trust in rows)
         tables.write_rows(path, ["name", "vertex", "x", "y", "z", "face", "w0", "w1", "w2", "confidence"], cells)

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError, MeshmatchWarning
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.landmark_files import mesh_space, read_landmark_file
 from meshmatch.shapes.repair import repair
 from meshmatch.templates.prepared_folder import KnownPoints, in_one_order, read_known_points, read_landmarks
-from meshmatch.transfer.landmarks import at_vertices, load_landmarks, save_landmarks
+from meshmatch.transfer.landmarks import at_vertices, load_landmarks, push_landmarks, save_landmarks
 from tests.conftest import icosphere
 
 SHAPE = icosphere(1)
@@ -151,6 +152,22 @@ def test_what_slicer_gets_states_its_frame(tmp_path: Path, suffix: str, space: s
     assert (found.space, found.has_names) == (space, True)
     assert [place.name for place in found.places] == list(NAMES)
     assert np.array_equal([place.where for place in found.places], POINTS)
+
+
+def test_curves_of_slicer_stay_curves(tmp_path: Path) -> None:
+    """Semi-landmarks of a curve are one on every specimen; a plane's points do not say all about it."""
+    kinds = ["Curve", "Plane", "ClosedCurve", "Curve"]
+    given = json.loads(markups())["markups"][0]
+    given = {"markups": [given | {"type": kind} for kind in kinds]}
+    (tmp_path / "a.mrk.json").write_text(json.dumps(given))
+    found, _ = load_landmarks(tmp_path / "a.mrk.json", SHAPE)
+    pushed = push_landmarks(VertexMap.identity(SHAPE), SHAPE, SHAPE, found)
+    save_landmarks(tmp_path / "b.mrk.json", pushed)
+    lists = json.loads((tmp_path / "b.mrk.json").read_text())["markups"]
+    assert [each["type"] for each in lists] == ["Curve", "Fiducial", "ClosedCurve", "Curve"]
+    assert [[point["label"] for point in each["controlPoints"]] for each in lists] == 4 * [list(NAMES)]
+    ids = [point["id"] for each in lists for point in each["controlPoints"]]
+    assert ids == [str(k + 1) for k in range(4 * len(NAMES))]
 
 
 @pytest.mark.parametrize(
