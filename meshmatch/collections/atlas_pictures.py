@@ -120,14 +120,24 @@ def draw_effect(
 
 
 def draw_asymmetry(folder: Path, mean: Shape, found: Asymmetry, turn: Float[Floats, "3 3"]) -> None:
-    """Directional asymmetry as an effect, and how large fluctuating asymmetry is, from where it is largest."""
+    """Directional asymmetry as an effect, and how large fluctuating asymmetry is, from where it is largest; also where it
+    is more than errors of measurement, if these are known.
+    """
     side = found.directional
     if side.places is not None:
-        name = "a side less the mirror image of the other"
+        name = side.coefficients[0] if found.matching else "a side less the mirror image of the other"
         draw_effect(folder / "asymmetry.png", mean, name, side.along_normal[0], side.places, turn)
     scale = Scale.of(found.fluctuating, "fluctuating asymmetry, root mean square (unit of the files)")
-    colors, front = scale.colors(found.fluctuating), _towards(mean, int(np.argmax(found.fluctuating)), turn)
-    panels = [Panel(mean, colors, rotation=front), Panel(mean, colors, "from behind", rotation=_BACK @ front)]
+    front = _towards(mean, int(np.argmax(found.fluctuating)), turn)
+    shown = {"": np.ones(len(found.fluctuating), bool)}
+    places = found.table.effects[-1].places
+    if found.error is not None and places is not None:
+        shown = {"all": shown[""], f"more than errors, family-wise p <= {LEVEL:g}": places.p_corrected <= LEVEL}
+    panels = []
+    for label, kept in shown.items():
+        colors = scale.colors(np.where(kept, found.fluctuating, np.nan))
+        panels.append(Panel(mean, colors, label, rotation=front))
+        panels.append(Panel(mean, colors, "from behind", rotation=_BACK @ front))
     render_shapes(panels, folder / "fluctuating.png", Look(turn=0, tilt=0, legend=scale))
 
 
