@@ -18,12 +18,13 @@ from meshmatch.shapes.input_files import stem_of, suffix_of
 
 _COMPANIONS = {
     *(".mtl", ".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff", ".gif", ".exr", ".hdr", ".psd"),
-    *(".mp4", ".mov", ".bin", ".raw", ".zraw", ".zip", ".safetensors"),
+    *(".mp4", ".mov", ".bin", ".raw", ".zraw", ".safetensors"),
     *(".csv", ".tsv", ".xls", ".xlsx", ".ods", ".json", ".npz", ".mat", ".xml", ".yaml", ".yml", ".rds", ".rda"),
     *(".fcsv", ".tps", ".pts", ".pp"),
     *(".txt", ".md", ".rst", ".html", ".pdf", ".svg", ".doc", ".docx", ".odt", ".rtf", ".log", ".ini", ".db"),
     *(".py", ".r", ".rdata", ".ipynb", ".sh"),
 }  # what lies beside shapes and is none
+_ABOUT = {"readme", "license", "licence", "copying", "changelog", "makefile", "authors", "notice"}
 _NAMED = 5  # of the files that are not read
 _PATTERN = "*?["
 
@@ -115,7 +116,8 @@ def _find(given: str | Path, output: Store | None, found: list[Source], left_out
 
 
 def _is_unknown(file: PurePath) -> bool:
-    return bool(file.suffix) and suffix_of(file) not in (*SUFFIXES, *_COMPANIONS)
+    """Slices of a scanner often have no suffix."""
+    return suffix_of(file) not in (*SUFFIXES, *_COMPANIONS) if file.suffix else file.name.lower() not in _ABOUT
 
 
 def _leave_out(given: str, why: str, files: Iterable[PurePath], left_out: list[Record], folder: str = "") -> None:

@@ -296,10 +296,11 @@ def test_other_compressors_are_named(tmp_path: Path) -> None:
 def test_a_folder_of_them_is_fitted_whole(tmp_path: Path) -> None:
     for name in ("a.vtk", "b.vtp", "c.ply"):
         save_shape(tmp_path / name, icosphere(1))
-    for name in ("c.mtl", "notes.txt", "README", "scan.wrl", "volume.dcm"):
+    for name in ("c.mtl", "notes.txt", "README", "scan.wrl", "volume.dcm", "IM0001", "more.zip"):
         (tmp_path / name).write_text("something")
-    with pytest.warns(MeshmatchWarning, match=r"files of unknown format are left out: scan\.wrl, volume\.dcm$"):
+    unknown = ["IM0001", "more.zip", "scan.wrl", "volume.dcm"]
+    with pytest.warns(MeshmatchWarning, match=f"files of unknown format are left out: {', '.join(unknown)}$"):
         found, left_out = find_sources(tmp_path, Store.of(tmp_path / "out"))
-    assert [(record.name, record.verdict) for record in left_out] == [("scan.wrl", "failed"), ("volume.dcm", "failed")]
+    assert [(record.name, record.verdict) for record in left_out] == [(name, "failed") for name in unknown]
     assert [source.file for source in found] == ["a.vtk", "b.vtp", "c.ply"]
     assert meshmatch.load_shape(tmp_path / "b.vtp").F == icosphere(1).F
