@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from meshmatch.api.inputs import LandmarkPairs, landmark_vertices, refuse_far_parts
-from meshmatch.api.results import MatchResult, map_of_fits
+from meshmatch.api.results import MatchResult, maps_of_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.build import judged_by_pairs
@@ -58,7 +58,7 @@ def match_without_model(
     if guess is not None and verdict != "good" and (verdict == "poor" or found.over_guess < CLEARLY):
         return guess
     with thread_limit(1):
-        mapped = map_of_fits((fits[0], fits[1]), (fits[0], fits[1]), threads)
+        mapped, opposite = maps_of_fits((fits[0], fits[1]), (fits[0], fits[1]), threads)
         if pairs is not None:
             mapped = judged_by_pairs(mapped, target.original, pairs, fits[1].frame.scale)
     notes = direct_notes(clean, configs, unknown)
@@ -69,7 +69,8 @@ def match_without_model(
             notes = (*notes, f"{one.shape.name}: taken for a part of {other.shape.name}")
     if guess is not None:
         notes = (_BETTER.format(guess.source_fit.model), *notes)
-    return MatchResult(mapped, fits[0], fits[1], time.monotonic() - began, notes, (fits[0], fits[1]), threads)
+    seconds = time.monotonic() - began
+    return MatchResult(mapped, fits[0], fits[1], seconds, notes, (fits[0], fits[1]), threads, opposite)
 
 
 def fit_to_first(

@@ -8,7 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from meshmatch.api.inputs import configs_for
-from meshmatch.api.results import MatchResult, map_of_fits
+from meshmatch.api.results import MatchResult, maps_of_fits
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.implicit.codes import fit_implicit
@@ -60,7 +60,7 @@ class ImplicitMatcher:
         began = time.monotonic()
         a, b = self.fit_all([source, target], config)
         with thread_limit(1):
-            found = map_of_fits((a, b), (a, b), self.threads)
+            found, _ = maps_of_fits((a, b), (a, b), self.threads)
         return MatchResult(found, a, b, time.monotonic() - began, (*a.notes, *b.notes), (a, b), self.threads)
 
     def dense(self, fit: ImplicitFit) -> Shape:

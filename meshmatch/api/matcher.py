@@ -26,7 +26,7 @@ from meshmatch.api.inputs import (
     usable,
     validated,
 )
-from meshmatch.api.results import MatchResult, map_of_fits, shape_of
+from meshmatch.api.results import MatchResult, maps_of_fits, shape_of
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
@@ -284,7 +284,7 @@ class Matcher:
                     raise OptionError(f"a map is made from fits, not from {type(fit).__name__}", hint)
             agree = agree and not any(isinstance(fit, PlacedFit) for fit in (source, target))
             fits = self._agreed((source, target)) if agree else (source, target)
-            return map_of_fits(fits, (source, target), self.threads)
+            return maps_of_fits(fits, (source, target), self.threads)[0]
 
     def match(
         self,
@@ -332,11 +332,11 @@ class Matcher:
                 fits = [self._finished(*each) for each in zip(pulled, clean, configs, strict=True)]
             before = fits[0], fits[1]
             agreed = self._agreed(before, configs[0], known)
-            found = map_of_fits(agreed, before, self.threads)
+            found, opposite = maps_of_fits(agreed, before, self.threads)
             if landmarks is not None:
                 found = judged_by_pairs(found, clean[1].original, pairs, agreed[1].frame.scale)
         notes = tuple(dict.fromkeys((*(words for kind in kinds for words in kind), *fits[0].notes, *fits[1].notes)))
-        result = MatchResult(found, *agreed, time.monotonic() - began, notes, before, self.threads)
+        result = MatchResult(found, *agreed, time.monotonic() - began, notes, before, self.threads, opposite)
         if self._auto and landmarks is None and found.verdict != "good" and _both_whole(clean, agreed):
             with suppress(InputError):  # one that cannot be matched directly has the model's map
                 result = match_without_model(clean, configs, None, self.threads, self.progress, guess=result)

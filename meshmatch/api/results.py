@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Real
 from pathlib import Path
@@ -21,7 +21,7 @@ from meshmatch.maps.evaluate import CM, Evaluation, SurfaceDistance, evaluate_ma
 from meshmatch.maps.files import load_map
 from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.places import PlacedFit, Places, surface_distance
-from meshmatch.maps.unfold import unfolded
+from meshmatch.maps.unfold import unfolded, unfolded_both_ways
 from meshmatch.maps.vertex_map import VertexMap, check_map
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.progress import ProgressCallback
@@ -103,6 +103,8 @@ class MatchResult:
         Both fits before they agreed: where agreement moved them much, the map is not to be trusted.
     threads
         How many were allowed.
+    opposite
+        The map from target to source where it was found together with `map`, as of two whole meshes that match well.
 
     Examples
     --------
@@ -118,6 +120,7 @@ class MatchResult:
     notes: tuple[str, ...]
     before_agreement: tuple[Fit | ImplicitFit, Fit | ImplicitFit]
     threads: int = 1
+    opposite: VertexMap | None = None
 
     def __repr__(self) -> str:
         return f"MatchResult({self.map!r}, {self.seconds:.1f} s, {len(self.notes)} notes)"
@@ -141,20 +144,19 @@ class MatchResult:
     def backward(self) -> VertexMap:
         """The map from target to source: it pulls values from the source to the target.
 
-        Of two whole meshes that match well it is the inverse of `map`, so that what goes there and back comes to where it
-        was; otherwise it is made from the same fits.
+        Of two whole meshes that match well it is the inverse of `map`, whichever of them is the source: what goes there and
+        back comes to where it was. Otherwise it is made from the same fits.
 
         Returns
         -------
         VertexMap
             One entry for each vertex of the target.
         """
+        if self.opposite is not None and self.map.verdict == "good":
+            return self.opposite
         source, target = self.before_agreement
         with thread_limit(1):
-            if self.map.verdict == "good" and (shapes := _whole_meshes(self.source_fit, self.target_fit)) is not None:
-                there, here = shapes
-                return unfolded(invert_map(self.map, there, here, self.threads), here, there, self.threads)
-            return map_of_fits((self.target_fit, self.source_fit), (target, source), self.threads)
+            return maps_of_fits((self.target_fit, self.source_fit), (target, source), self.threads)[0]
 
     def deformed_source(self) -> Shape:
         """The source's own mesh, deformed onto the target.
@@ -233,26 +235,17 @@ class MapPair(Brief):
             return invert_map(self.forward, self.source, self.target, self.threads)
 
 
-def _whole_meshes(*fits: Fit | ImplicitFit) -> tuple[Shape, ...] | None:
-    """The meshes of fits as their files have them; None if one is a cloud, a part, or not at hand."""
-    found = []
-    for fit in fits:
-        if not isinstance(fit, Fit) or fit.partial or fit.repaired is None or fit.repaired.original.is_cloud:
-            return None
-        found.append(fit.repaired.original)
-    return tuple(found)
-
-
-def map_of_fits(
+def maps_of_fits(
     fits: tuple[Fit | ImplicitFit, Fit | ImplicitFit], before: tuple[Fit | ImplicitFit, Fit | ImplicitFit], threads: int
-) -> VertexMap:
-    """The map from the shape of the first fit to that of the second. `OptionError` where the fits are of different
-    templates, or do not know their shapes.
+) -> tuple[VertexMap, VertexMap | None]:
+    """The map from the shape of the first fit to that of the second; of two whole meshes that match well, with its inverse:
+    the same two maps, whichever comes first. `OptionError` where the fits are of different templates, or do not know their
+    shapes.
     """
     first, second = fits
     if not isinstance(first, Fit) and not isinstance(second, Fit):
         assert first.owner and first.source and second.source
-        return first.owner.match(first, second, first.source, second.source)
+        return first.owner.match(first, second, first.source, second.source), None
 
     def placed(fit: Fit | ImplicitFit, own: Fit | ImplicitFit) -> tuple[Places, Shape | None]:
         assert isinstance(fit, Fit) and isinstance(own, Fit)
@@ -263,7 +256,21 @@ def map_of_fits(
 
     (here, source), (there, target) = placed(first, before[0]), placed(second, before[1])
     found = build_map(here, there, threads)
-    return found if source is None or target is None else unfolded(found, source, target, threads)
+    if source is None or target is None:
+        return found, None
+    if found.verdict != "good" or source.is_cloud or target.is_cloud or _partial(first) or _partial(second):
+        return unfolded(found, source, target, threads), None
+    opposite = build_map(there, here, threads)
+    if (source.V, source.hash) <= (target.V, target.hash):  # the inverse of the coarser one's is finer
+        forward, backward = unfolded_both_ways(found, source, target, threads)
+    else:
+        backward, forward = unfolded_both_ways(opposite, target, source, threads)
+    # what is certain was asked of fits, each way by itself
+    return replace(forward, confidence=found.confidence), replace(backward, confidence=opposite.confidence)
+
+
+def _partial(fit: Fit | ImplicitFit) -> bool:
+    return isinstance(fit, Fit) and fit.partial
 
 
 def shape_of(fit: Fit) -> Repaired:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array, diags_array
+from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
@@ -33,6 +33,7 @@ _SMALLEST = 1e-8  # of a triangle's area in the plane
 _STRETCHES = 1e-2, 1e4  # of what lies around a vertex, as the weights see it
 _TURNED = 1e12  # what a triangle that is turned over counts, against squares of stretches
 _DENSE = 300  # vertices: of fewer a sparse matrix takes longer
+_INSIDE = 1e-9  # the weights that a point on the border of a triangle may have
 _NEAR = 24  # triangles that a point in the plane may lie in: those whose centres are nearest
 
 
@@ -86,11 +87,11 @@ class Disk:
             return None
         around = np.maximum(share_areas(areas, self.corners, len(own)), 1e-300)
         rim = _circle(own[self.rim], float(areas.sum())) if rim is None else rim
-        best, least, sparse = None, np.inf, mean_values(own, self.corners)
-        weights = sparse.toarray() if len(own) <= _DENSE else sparse
+        best, least, scales = None, np.inf, np.ones(len(own))
+        springs = _Springs(mean_values(own, self.corners), self.rim)
         for _ in range(_EVENED):
             try:
-                places = _balanced(weights, self.rim, rim)
+                places = springs.balanced(scales, rim)
             except (RuntimeError, np.linalg.LinAlgError):  # nothing holds some vertices
                 return best
             squared, turned = _squared_stretch(own, places, self.corners, side)
@@ -99,9 +100,47 @@ class Disk:
                 break
             best, least = places, total
             mean = share_areas(areas * squared, self.corners, len(own)) / around
-            scales = 1 / np.clip(np.sqrt(np.maximum(mean, 0.0)), *_STRETCHES)
-            weights = weights * scales if isinstance(weights, np.ndarray) else csr_array(weights @ diags_array(scales))
+            scales = scales / np.clip(np.sqrt(np.maximum(mean, 0.0)), *_STRETCHES)
         return best
+
+
+class _Springs:
+    """Weights (M, M) that pull each vertex to its neighbours, with some vertices held."""
+
+    def __init__(self, weights: csr_array, held: Int[Ints, " R"]) -> None:
+        M = weights.shape[0]
+        moves = np.ones(M, bool)
+        moves[held] = False
+        self.held, self.free = held, np.flatnonzero(moves)
+        number = np.full(M, -1)
+        number[self.free] = np.arange(len(self.free))
+        edges = weights.tocoo()
+        own = moves[edges.row]
+        self.row, self.column, self.weight = number[edges.row[own]], edges.col[own], edges.data[own]
+        self.inner = moves[self.column]
+        self.order = number[self.column[self.inner]]
+
+    def balanced(self, scales: Float[Floats, " M"], places: Float[Floats, "R 2"]) -> Float[Floats, "M 2"]:
+        """All vertices at the means of their neighbours, weighted by these scales too, but for those that are held."""
+        N, result = len(self.free), np.zeros((len(scales), 2))
+        result[self.held] = places
+        if not N:
+            return result
+        weight = self.weight * scales[self.column]
+        total = np.bincount(self.row, weight, N)
+        total += 1e-9 * total.mean()  # what hangs by nothing stays solvable
+        outer = weight[~self.inner, None] * result[self.column[~self.inner]]
+        right = np.column_stack([np.bincount(self.row[~self.inner], outer[:, k], N) for k in range(2)])
+        entries = np.concatenate([total, -weight[self.inner]])
+        rows, columns = (np.concatenate([np.arange(N), each]) for each in (self.row[self.inner], self.order))
+        if N <= _DENSE:
+            matrix = np.zeros((N, N))
+            matrix[rows, columns] = entries
+            result[self.free] = np.linalg.solve(matrix, right)
+        else:
+            sparse = csc_array((entries, (rows, columns)), shape=(N, N))
+            result[self.free] = splu(sparse, permc_spec="MMD_AT_PLUS_A").solve(right)
+        return result
 
 
 def patches(surface: Int[Ints, "F 3"], inside: Bool[Bools, " F"], zone: Bool[Bools, " F"]) -> list[Int[Ints, " N"]]:
@@ -122,8 +161,10 @@ def patches(surface: Int[Ints, "F 3"], inside: Bool[Bools, " F"], zone: Bool[Boo
 
 def found_in(
     places: Float[Floats, "M 2"], corners: Int[Ints, "F 3"], points: Float[Floats, "N 2"]
-) -> tuple[Int[Ints, " N"], Float[Floats, "N 3"]]:
-    """The triangles of the plane that points lie in, or nearly, and their weights there, none of them negative."""
+) -> tuple[Int[Ints, " N"], Float[Floats, "N 3"], Bool[Bools, " N"]]:
+    """The triangles of the plane that points lie in, or nearly, their weights there, none of them negative; and which
+    points do lie in one.
+    """
     near = cKDTree(places[corners].mean(axis=1)).query(points, min(_NEAR, len(corners)))[1].reshape(len(points), -1)
     a, b, c = (places[corners[near, k]] for k in range(3))
     own = points[:, None] - a
@@ -132,8 +173,9 @@ def found_in(
     second, third = _cross(own, c - a) / whole, _cross(b - a, own) / whole
     weights = np.stack([1 - second - third, second, third], axis=2)
     best = np.arange(len(points)), weights.min(axis=2).argmax(axis=1)
+    inside = weights[best].min(axis=1) >= -_INSIDE
     found = np.maximum(weights[best], 0.0)
-    return near[best], found / found.sum(axis=1, keepdims=True)
+    return near[best], found / found.sum(axis=1, keepdims=True), inside
 
 
 def mean_values(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> csr_array:
@@ -164,25 +206,6 @@ def _circle(points: Float[Floats, "R 3"], area: float) -> Float[Floats, "R 2"]:
     length = np.sqrt(squared_lengths(np.roll(points, -1, axis=0) - points))
     angle = 2 * np.pi * np.concatenate([[0.0], np.cumsum(length)[:-1]]) / max(float(length.sum()), 1e-300)
     return np.asarray(np.sqrt(area / np.pi) * np.column_stack([np.cos(angle), np.sin(angle)]))
-
-
-def _balanced(
-    weights: csr_array | Float[Floats, "M M"], held: Int[Ints, " R"], places: Float[Floats, "R 2"]
-) -> Float[Floats, "M 2"]:
-    """All vertices at the weighted means of their neighbours, but for those that are held."""
-    M = weights.shape[0]
-    result, moves = np.zeros((M, 2)), np.ones(M, bool)
-    result[held], moves[held] = places, False
-    free = np.flatnonzero(moves)
-    if len(free):
-        total = np.asarray(weights.sum(axis=1)).ravel()
-        own, most = weights[free], total[free] + 1e-9 * total.mean()  # what hangs by nothing stays solvable
-        right = own[:, held] @ places
-        if isinstance(weights, np.ndarray):
-            result[free] = np.linalg.solve(np.diag(most) - own[:, free], right)
-        else:
-            result[free] = splu(csc_array(diags_array(most) - own[:, free])).solve(right)
-    return result
 
 
 def _squared_stretch(

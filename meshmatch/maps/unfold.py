@@ -9,11 +9,13 @@ better stays as it was.
 Where the surface bends sharply, as in an armpit or between fingers, what is sound on one side says little about the other.
 What is still folded is smoothed there: each image moves to the mean of its neighbours, weighted by mean value coordinates
 of the source, which are positive, and back to the surface. Last, the surroundings and the part of the target that their
-images lie on are both laid flat, in one plane, where means of neighbours hardly fold and no crease is in the way.
+images lie on are both laid flat, in one plane, where means of neighbours hardly fold and no crease is in the way. The plane
+holds the way back as well.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -36,17 +38,17 @@ from meshmatch.geometry.triangles import (
     unit,
 )
 from meshmatch.maps.folds import CRUSHED, area_ratios, facing, known_normals, normals_at, wound_alike
-from meshmatch.maps.mapped_mesh import MappedMesh, length_of
+from meshmatch.maps.mapped_mesh import MappedMesh, invert_map, length_of
 from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.shape import Shape
 
 # All set by hand on bodies of SCAPE, FAUST and SHREC'19.
 _RINGS = (2, 3)  # of triangles around a fold that move, round by round; more rounds gain little
 _SMOOTHED, _SWEEPS = (3,), 2  # the same of smoothing, and steps of each round; ten gain little more
-_FLAT, _LAST = (1, 2, 3, 6), (1, 2, 4, 1)  # the same of what is laid flat, at last only around what is turned over
+_FLAT, _LAST = (1, 2, 3), (1, 2)  # the same of what is laid flat, at last only around what is turned over
 _CLOSED = 3  # rings around it, within which holes are closed
 # How far around images the target is laid flat: two of its edges, and so many times the longest edge of an image.
-_REACHES = 0.0, 0.5, 1.0
+_REACHES = 0.0, 0.5
 _TURNED = 5.0  # a triangle that is turned over is so many times as bad as one that is crushed
 _STRETCH, _SLACK = 3.0, 0.02  # an edge whose image is longer, in units of sqrt(area), is where the map tears
 _THINNEST = 1e-3  # height over length: what is thinner has no area that its image could keep, and spoils the equations
@@ -61,16 +63,29 @@ def unfolded(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -
     if source.is_cloud or target.is_cloud or max(source.V, target.V) > _LARGEST:
         return found
     images = _Images(found, source, target, workers)
-    for move, rounds, least in (
-        (images.relaid, _RINGS, CRUSHED),
-        (images.smoothed, _SMOOTHED, CRUSHED),
-        (images.flattened, _FLAT, CRUSHED),
-        (images.flattened, _LAST, 0.0),
-    ):
-        for rings in rounds:
-            if not move(rings, least):
-                break
+    images.repeat(images.relaid, _RINGS)
+    images.repeat(images.smoothed, _SMOOTHED)
+    images.repeat(images.flattened, _FLAT)
+    images.repeat(images.flattened, _LAST, 0.0)
     return images.map
+
+
+def unfolded_both_ways(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -> tuple[VertexMap, VertexMap]:
+    """Such a map and its inverse, which has few folds as well: what is laid out anew in the one is so in the other."""
+    if source.is_cloud or target.is_cloud or max(source.V, target.V) > _LARGEST:
+        return found, invert_map(found, source, target, workers)
+    there = _Images(found, source, target, workers)
+    there.repeat(there.relaid, _RINGS)
+    there.repeat(there.smoothed, _SMOOTHED)
+    there.repeat(there.flattened, _FLAT)
+    back = _Images(invert_map(there.map, source, target, workers), target, source, workers)
+    back.repeat(back.relaid, _RINGS)
+    back.repeat(back.flattened, _FLAT)
+    there = _Images(invert_map(back.map, target, source, workers), source, target, workers)
+    there.opposite, back.opposite = back, there
+    for each in (there, back):
+        each.repeat(each.flattened, _LAST, 0.0)
+    return there.map, back.map
 
 
 class _Images:
@@ -78,12 +93,14 @@ class _Images:
 
     def __init__(self, found: VertexMap, source: Shape, target: Shape, workers: int) -> None:
         self.map, self.source, self.workers = found, source, workers
+        self.opposite: _Images | None = None  # of the way back, which follows what is laid flat
         self.same = same_rows(source.verts)
         faces = self.same[wound_alike(source)[source.valid_faces]]
         self.verts, self.points = source.verts / length_of(source), found.points(target) / length_of(target)
         sides = self.verts[faces] - self.verts[faces[:, [1, 2, 0]]]
         longest = squared_lengths(sides.reshape(-1, 3)).reshape(-1, 3).max(axis=1)
-        self.faces = faces[2 * triangle_areas(self.verts, faces) > _THINNEST * longest]
+        kept = 2 * triangle_areas(self.verts, faces) > _THINNEST * longest
+        self.faces, self.face_in_file = faces[kept], np.flatnonzero(source.valid_faces)[kept]
         self.normals = normals_at(found, target)
         self.side = 1.0 if facing(self.points, self.normals, self.verts, self.faces) >= 0 else -1.0
         self.normals *= self.side
@@ -93,6 +110,12 @@ class _Images:
         self.ratio = area_ratios(self.points, self.normals, self.verts, self.faces)
         self.torn = self._torn(self.points, self.faces)
         self.surface: MappedMesh | None = None
+
+    def repeat(self, move: Callable[[int, float], bool], rounds: tuple[int, ...], least: float = CRUSHED) -> None:
+        """Move what lies around folds, triangles whose area shrinks to less, round by round so many triangles wide."""
+        for rings in rounds:
+            if not move(rings, least):
+                break
 
     def _torn(self, points: Floats, faces: Ints) -> Bools:
         """(F,) which faces images (V, 3) pull apart. Where the map does, their corners never move."""
@@ -153,7 +176,7 @@ class _Images:
         places = disk.laid_flat(self.verts, interpolate(plane, corners, self.map.barycentric[rim]), self.side)
         if places is None:
             return False
-        face, weights = found_in(plane, beneath.corners, np.delete(places, disk.rim, axis=0))
+        face, weights, _ = found_in(plane, beneath.corners, np.delete(places, disk.rim, axis=0))
         corners = self.target.faces[beneath.faces[face]]
         points, normals = self.points.copy(), self.normals.copy()
         points[rows] = interpolate(self.target.verts, corners, weights)
@@ -161,8 +184,44 @@ class _Images:
         moved = np.zeros(len(self.verts), bool)
         moved[rows] = True
         near = np.flatnonzero(self._touches(moved))
-        vertex = np.take_along_axis(corners, weights.argmax(axis=1)[:, None], axis=1)[:, 0]
-        return self._take_better(rows, near, points, normals, (vertex, beneath.faces[face], weights))
+        found = _heaviest(corners, weights), beneath.faces[face], weights
+        if self.opposite is None:
+            return self._take_better(rows, near, points, normals, found)
+        both = self, self.opposite
+        kept, folded = [each._state for each in both], sum(each._folded for each in both)
+        if not self._take_better(rows, near, points, normals, found):
+            return False
+        face, weights, inside = found_in(places, disk.corners, plane)
+        self.opposite._follow(beneath.vertices[inside], self, disk.faces[face[inside]], weights[inside])
+        if sum(each._folded for each in both) < folded:
+            return True
+        for each, state in zip(both, kept, strict=True):
+            each.map, each.points, each.normals, each.ratio = state
+        return False
+
+    @property
+    def _state(self) -> tuple[VertexMap, Floats, Floats, Floats]:
+        return self.map, self.points.copy(), self.normals.copy(), self.ratio.copy()
+
+    @property
+    def _folded(self) -> float:
+        """How much of the surface is folded, and how badly."""
+        return float((self.areas * _badness(self.ratio)).sum())
+
+    def _follow(self, rows: Ints, back: _Images, faces: Ints, weights: Floats) -> None:
+        """Put vertices where those faces of the other way lie that now cover them."""
+        corners, in_file = back.faces[faces], back.face_in_file[faces]
+        points, normals = self.points.copy(), self.normals.copy()
+        points[rows] = interpolate(back.verts, corners, weights)
+        normals[rows] = self.side * unit(interpolate(self.upwards, corners, weights))
+        order = (back.same[back.source.faces[in_file]][:, :, None] == corners[:, None, :]).argmax(axis=2)
+        weights = np.take_along_axis(weights, order, axis=1)
+        vertex = _heaviest(back.source.faces[in_file], weights)
+        self._take(rows, points, normals, (vertex, in_file, weights))
+        moved = np.zeros(len(self.verts), bool)
+        moved[rows] = True
+        changed = np.flatnonzero(self._touches(moved))
+        self.ratio[changed] = area_ratios(self.points, self.normals, self.verts, self.faces[changed])
 
     def _beneath(self, disk: Disk, reach: float) -> Disk | None:
         """The part of the target that the images of a disk lie on, and so far around, if it is a disk."""
@@ -219,8 +278,7 @@ class _Images:
         of_face = np.where(corners >= 0, part[corners], -1).max(axis=1)
         own = self.areas[near]
         before, after = (
-            np.bincount(of_face, own * np.where(each <= 0, _TURNED, each < CRUSHED), part.max() + 1)
-            for each in (self.ratio[near], ratio)
+            np.bincount(of_face, own * _badness(each), part.max() + 1) for each in (self.ratio[near], ratio)
         )
         # Where little is sound around, and much moves, a solution may lie anywhere; the rim, which is held, then tears.
         tears = np.bincount(of_face, self._torn(points, self.faces[near]) & ~self.torn[near], part.max() + 1) > 0
@@ -323,6 +381,16 @@ class _Images:
         index, face, weights = self.map.index.copy(), self.map.face.copy(), self.map.barycentric.copy()
         index[moved], face[moved], weights[moved] = (each[at[moved]] for each in found)
         self.map = replace(self.map, index=index, face=face, barycentric=weights)
+
+
+def _badness(ratio: Floats) -> Floats:
+    """(N,) what is wrong with triangles of these ratios of areas."""
+    return np.where(ratio <= 0, _TURNED, ratio < CRUSHED)
+
+
+def _heaviest(corners: Ints, weights: Floats) -> Ints:
+    """(N,) the corners (N, 3) of most weight."""
+    return np.take_along_axis(corners, weights.argmax(axis=1)[:, None], axis=1)[:, 0]
 
 
 def _parts(corners: Ints, N: int) -> Ints:

@@ -128,7 +128,7 @@ def test_what_cannot_be_matched_directly_keeps_the_map_of_its_model(
 
     monkeypatch.setattr(Matcher, "_choose", lambda self, clean, _: (clean, [(), ()], []))
     monkeypatch.setattr(Matcher, "_fit_all", lambda *_: fits)
-    monkeypatch.setattr("meshmatch.api.matcher.map_of_fits", lambda *_: unsure)
+    monkeypatch.setattr("meshmatch.api.matcher.maps_of_fits", lambda *_: (unsure, None))
     monkeypatch.setattr("meshmatch.api.matcher.match_without_model", refuse)
     assert Matcher("auto").match(*shapes).map is unsure
 

@@ -51,16 +51,21 @@ def test_the_backward_map_doubts_what_the_forward_map_doubts(result: MatchResult
 
 
 def test_what_goes_there_and_back_comes_to_where_it_was(matcher: Matcher, result: MatchResult) -> None:
+    """Whichever shape comes first: maps that are made each way by itself miss more of it."""
     climber, dancer = (meshmatch.load_shape(SAMPLES / name) for name in ("climber.ply", "dancer.ply"))
-    other = matcher.map(*matcher.fit_all([dancer, climber]))  # of the same two fits, the other way
+    fits = matcher.fit_all([dancer, climber])
+    other, plain = matcher.map(*fits), matcher.map(*fits, agree=False)
+    assert np.array_equal(other.points(climber), result.backward().points(climber))
 
     def missed(back: meshmatch.VertexMap) -> float:
+        """The share of vertices that do not come within a centimetre, where the body is 1.8 m."""
         forward = result.map
         corners = corners_of(dancer.faces, forward.face, forward.index)
         again = interpolate(back.points(climber), corners, forward.barycentric)
-        return float(np.median(np.linalg.norm(again - climber.verts, axis=1)) / np.sqrt(climber.area))
+        return float((np.linalg.norm(again - climber.verts, axis=1) > 0.007 * np.sqrt(climber.area)).mean())
 
-    assert missed(result.backward()) < 0.7 * missed(other)
+    assert missed(other) < 0.03
+    assert missed(plain) > 0.1
 
 
 def test_fits_of_other_templates_or_without_shapes_are_refused(matcher: Matcher, result: MatchResult) -> None:

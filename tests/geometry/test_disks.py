@@ -84,7 +84,9 @@ def test_points_are_found_where_they_lie() -> None:
     weights = rng.dirichlet(np.ones(3), 100)
     face = rng.integers(0, len(corners), 100)
     points = (places[corners[face]] * weights[:, :, None]).sum(axis=1)
-    found, at = found_in(places, corners, points)
+    found, at, inside = found_in(places, corners, points)
+    assert inside.all()
+    assert not found_in(places, corners, points + 2)[2].any()
     np.testing.assert_allclose((places[corners[found]] * at[:, :, None]).sum(axis=1), points, atol=1e-9)
     assert at.min() >= 0 and (found == face).mean() > 0.95
 

@@ -6,10 +6,11 @@ from trimesh.creation import icosphere
 
 from meshmatch.arrays import Ints
 from meshmatch.geometry.disks import Disk
+from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.folds import Folds
-from meshmatch.maps.mapped_mesh import MappedMesh
-from meshmatch.maps.unfold import _Images, unfolded
-from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.maps.mapped_mesh import MappedMesh, invert_map
+from meshmatch.maps.unfold import _Images, unfolded, unfolded_both_ways
+from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.shape import Shape
 
 MOVED = np.array([100, 300, 500])
@@ -48,6 +49,33 @@ def test_folds_are_opened_and_the_rest_stays() -> None:
     away = np.linalg.norm(after.points(target) - right, axis=1)
     assert away[MOVED].max() < 0.3 * np.linalg.norm(before.points(target) - right, axis=1)[MOVED].min()
     np.testing.assert_array_equal(after.confidence, before.confidence)
+
+
+def test_both_ways_are_inverse_and_have_no_folds() -> None:
+    source, target = ball(3), ball(3, 0.0)
+    there, back = unfolded_both_ways(folded(source, target), source, target)
+    for found, one, other in ((there, source, target), (back, target, source)):
+        assert Folds.of(found, one, other) == Folds(0.0, 0.0, pytest.approx(1.0, abs=0.15))
+    assert missed(there, back, source, target) < 0.05
+
+
+def test_the_way_back_follows_what_is_laid_flat() -> None:
+    source, target = ball(3), ball(3, 0.0)
+    found = folded(source, target)
+    back = invert_map(found, source, target)
+    images = _Images(found, source, target, 1)
+    images.opposite = _Images(back, target, source, 1)
+    images.repeat(images.flattened, (1, 2))
+    followed = images.opposite.map
+    assert (followed.points(source) != back.points(source)).any(axis=1).mean() < 0.1
+    assert missed(images.map, followed, source, target) < 0.5 * missed(images.map, back, source, target)
+    assert Folds.of(followed, target, source) == Folds(0.0, 0.0, pytest.approx(1.0, abs=0.15))
+
+
+def missed(there: VertexMap, back: VertexMap, source: Shape, target: Shape) -> float:
+    """How far from itself a vertex comes at most, there and back."""
+    again = interpolate(back.points(source), corners_of(target.faces, there.face, there.index), there.barycentric)
+    return float(np.linalg.norm(again - source.verts, axis=1).max())
 
 
 def test_a_map_without_folds_is_the_same() -> None:

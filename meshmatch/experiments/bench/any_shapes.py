@@ -34,7 +34,7 @@ from typer import Option
 
 from meshmatch.api.inputs import usable
 from meshmatch.api.matcher import Matcher
-from meshmatch.api.results import map_of_fits
+from meshmatch.api.results import maps_of_fits
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.experiments import runner
@@ -181,7 +181,7 @@ def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[
 
     def row(found: DirectMatch) -> dict[str, Any]:
         fits = replace(found.source, repaired=clean[0]), replace(found.target, repaired=clean[1])
-        return _row(folder, pair, map_of_fits(fits, fits, 1)) | {
+        return _row(folder, pair, maps_of_fits(fits, fits, 1)[0]) | {
             "energy": found.energy,
             "leads": found.leads,
             "turns": found.turns,
