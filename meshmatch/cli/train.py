@@ -129,6 +129,12 @@ class TrainOptions(Options):
     )
     poses: Path | None = optional("FILE", "Poses to mix with the sampled ones: .npz, .json or .csv (docs/formats.md).")
     pose_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies that stand in a pose of --poses.")
+    mhr: Path | None = optional(
+        "FOLDER",
+        "Mix in bodies of Meta's Momentum Human Rig, whose shapes were learned from scans: lod3.fbx and compact_v6_1.model "
+        "of its releases (github.com/facebookresearch/MHR).",
+    )
+    mhr_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies that are of --mhr.")
     bf16: bool | None = Option(None, "--bf16/--no-bf16", help="bfloat16 arithmetic; default: the preset's choice.")
     device: Literal["auto", "cpu", "cuda", "mps"] = Option(
         "auto", help="Where the network is trained. auto: a GPU of CUDA if there is one, else the CPU."
@@ -288,7 +294,7 @@ def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None
     if how.preset != "default" or how.unsupervised:
         name = "--unsupervised" if how.unsupervised else f"--preset {how.preset}"
         raise OptionError(f"{name} does not go with fits", "fits have correspondence; leave it out")
-    how.refuse(("template", "poses", "characters", "identities", "bodies"), "fits, but with generated shapes")
+    how.refuse(("template", "poses", "characters", "identities", "bodies", "mhr"), "fits, but with generated shapes")
     collection = Collection(how.shapes)
     found = collection.to_learn()
     if collection.model == NO_MODEL:
@@ -311,11 +317,17 @@ def _generated(how: TrainOptions) -> "Kind | Bodies | None":
     from meshmatch.generators.pose_files import load_poses
 
     known = None if how.poses is None else load_poses(how.poses, how.pose_share)
+    scanned = None
+    if how.mhr is not None:
+        from meshmatch.api.scanned import scanned_bodies
+
+        scanned = scanned_bodies(how.mhr, how.mhr_share, how.template)
     if how.kind in (None, "human"):
-        if how.shapes is not None and all(each is None for each in (how.kind, known, how.characters, how.bodies)):
+        choices = how.kind, known, how.characters, how.bodies, scanned
+        if how.shapes is not None and all(each is None for each in choices):
             return None
-        return Bodies(how.template, how.identities or Bodies.identities, known, how.characters, how.bodies)
-    how.refuse(("template", "poses", "characters", "bodies"), f"--kind {how.kind}, but with human bodies")
+        return Bodies(how.template, how.identities or Bodies.identities, known, how.characters, how.bodies, scanned)
+    how.refuse(("template", "poses", "characters", "bodies", "mhr"), f"--kind {how.kind}, but with human bodies")
     return Kind(str(how.kind), how.identities or Kind.identities)
 
 

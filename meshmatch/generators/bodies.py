@@ -21,6 +21,7 @@ from meshmatch.arrays import Float, Int
 from meshmatch.errors import OptionError
 from meshmatch.generators.generator import Source
 from meshmatch.generators.limbs import FOLDED, Draw, Limbs, draw_arms, draw_limbs, mirrored, with_legs
+from meshmatch.generators.momentum_rig import Scanned
 from meshmatch.generators.pose_files import GivenPoses
 from meshmatch.generators.rig import Rig, cached_rig, forward_kinematics, penetration, skin
 from meshmatch.generators.rotations import DEGREE, rotation_between, rotation_from_vector
@@ -37,7 +38,8 @@ class Bodies:
     """Which human bodies are generated: on the vertices of a template, of so many different people, some in given poses.
 
     ``characters`` is the share of those in clothes, of other proportions or built of parts; the others are naked. ``bodies``
-    is how many are drawn, once, and learned from again and again; 0 draws ever new ones.
+    is how many are drawn, once, and learned from again and again; 0 draws ever new ones. A share of naked bodies may be
+    ``scanned``, in the same poses.
     """
 
     template: str | Path | None = None  # the recipe's, see `meshmatch.training.recipes.Recipe`
@@ -45,6 +47,7 @@ class Bodies:
     poses: GivenPoses | None = None
     characters: float | None = None  # the recipe's
     bodies: int | None = None  # the recipe's
+    scanned: Scanned | None = None
     name: ClassVar[str] = "human"  # of the kind
 
     def __post_init__(self) -> None:
@@ -62,6 +65,9 @@ class Bodies:
             words += f", {self.characters:.0%} of them characters: clothed, children, stylised or built of parts"
         if self.poses is not None:
             words += f", {self.poses.share:.0%} of them in {self.poses.P} poses of {self.poses.name}"
+        if self.scanned is not None:
+            other = "naked bodies of the Momentum Human Rig (Meta, Apache-2.0), its shapes learned from scans"
+            words = f"{1 - self.scanned.share:.0%} {words}; {self.scanned.share:.0%} {other}"
         return words
 
 

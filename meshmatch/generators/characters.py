@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -20,11 +20,12 @@ from meshmatch.generators.bodies import (
 )
 from meshmatch.generators.clothes import dressed, skirted
 from meshmatch.generators.figure import Figure
-from meshmatch.generators.generator import Source
+from meshmatch.generators.generator import Source, mixed
 from meshmatch.generators.limbs import Draw, Limbs
 from meshmatch.generators.pose_files import GivenPoses
 from meshmatch.generators.proportions import PLAIN, SHARES, TOON, draw_style, rounded, stretched
 from meshmatch.generators.rig import Rig, forward_kinematics, skin
+from meshmatch.generators.scanned_bodies import scanned_source
 from meshmatch.progress import Progress
 from meshmatch.templates.template import Template
 
@@ -45,6 +46,9 @@ class Cast:
 
 def people_source(template: Template, bodies: Bodies, seed: int = 0, progress: Progress | None = None) -> Source:
     """Generated people on a human template's vertices; errors as `meshmatch.generators.bodies.human_source`."""
+    if bodies.scanned is not None:
+        others = people_source(template, replace(bodies, scanned=None), seed, progress)
+        return mixed(others, scanned_source(template, bodies.scanned, seed), bodies.scanned.share)
     if not bodies.characters:
         return human_source(template, bodies.identities, seed, progress, bodies.poses)
     rig = posable_rig(template, bodies.identities, seed, progress, bodies.poses)

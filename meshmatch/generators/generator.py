@@ -60,3 +60,17 @@ def shipped_template(kind: str) -> Template | None:
     """The template of the included model of a kind, if there is one."""
     shipped = bundled_folder() / "models" / kind / "template.safetensors"
     return read_template(shipped) if shipped.is_file() else None
+
+
+def mixed(first: Source, second: Source, share: float) -> Source:
+    """Draws shapes of the first source and, in random places, a share of the second."""
+
+    def draw(count: int, generator: torch.Generator) -> Tensor:
+        other = torch.rand(count, generator=generator) < share
+        drawn = [
+            source(int(rows.sum()), generator) for source, rows in ((first, ~other), (second, other)) if rows.any()
+        ]
+        order = torch.argsort(torch.cat([torch.nonzero(~other)[:, 0], torch.nonzero(other)[:, 0]]))
+        return torch.cat(drawn)[order]
+
+    return draw

@@ -17,6 +17,7 @@ from meshmatch.training.loop import StepReport
 from meshmatch.training.recipes import recipe_for
 from tests.cli.conftest import Run
 from tests.fitting.eggs import egg_template
+from tests.generators.momentum_files import write_rig
 
 
 class Recorder:
@@ -97,6 +98,16 @@ def test_half_of_the_people_are_characters_unless_another_share_is_asked_for(
     assert "characters" not in stub.called["data"]
     assert run("train", "-o", tmp_path / "paper", "--preset", "paper").status == 0
     assert stub.characters == 0
+
+
+def test_scanned_bodies_are_mixed_in(run: Run, stub: Recorder, tmp_path: Path) -> None:
+    write_rig(tmp_path / "rig")
+    answer = run("train", "-o", tmp_path / "mine", "--mhr", tmp_path / "rig", "--mhr-share", 1.5)
+    assert answer.status == 2 and "--mhr-share" in answer.err
+    answer = run("train", "-o", tmp_path / "mine", "--mhr", tmp_path)
+    assert answer.status == 1 and "lod3.fbx cannot be read" in answer.err
+    answer = run("train", "-o", tmp_path / "mine", "--mhr", tmp_path / "rig", "--kind", "hand")
+    assert answer.status == 1 and "--mhr" in answer.err
 
 
 def test_bodies_are_drawn_once_where_so_many_are_asked_for(run: Run, stub: Recorder, tmp_path: Path) -> None:
