@@ -1,12 +1,12 @@
 """Rigs from one character to another: joints and weights of characters that share the names of their bones.
 
 Every ordered pair of a folder of rigged files, as `transfer_rig` does it. The truth is the target's own rig: the share
-of its vertices whose main joint has the same name; or that of a parent, a child or a sibling; and how far joints that
-move vertices on both lie from where they belong, in centimetres with the target's longest side scaled to 1.8 m. Beside it
-the neighbours that two other methods find, from the same alignment; and how far joints lie from the bones that meet at
-the true joint, which tells those that only sit further up or down. Then the target moves, in a clip of the source, or sits:
-how much of its volume stays, and the share of vertices that are over a centimetre further from the bone of their joint than
-at rest, by the new rig and by its own.
+of the vertices that it moves whose main joint has the same name; or that of a parent, a child or a sibling; and how far
+joints that move vertices on both lie from where they belong, in centimetres with the target's longest side scaled to
+1.8 m. Beside it the neighbours that two other methods find, from the same alignment; and how far joints lie from the
+bones that meet at the true joint, which tells those that only sit further up or down. Then the target moves, in a clip
+of the source, or sits: how much of its volume stays, and the share of vertices that are over a centimetre further from
+the bone of their joint than at rest, by the new rig and by its own.
 """
 
 from __future__ import annotations
@@ -88,12 +88,13 @@ def measured(source: _Character, target: _Character, matcher: Matcher) -> dict[s
     made = meshmatch.transfer_rig(source.path, target.path, matcher)
     seconds = time.process_time() - began
     true = _main(target.weights)
+    known = true != ""  # what the target's own rig does not move has no truth
     mine = _main(made.weights)
-    same = mine == true
+    same = (mine == true)[known]
     aligned = made.maps.forward.points(target.shape)
     others = nearest_and_inpainted(source.shape, aligned, source.weights.matrix, target.shape)
     near, nearest, inpainted = (
-        float(np.mean([pair in target.near for pair in zip(names.tolist(), true.tolist(), strict=True)]))
+        float(np.mean([pair in target.near for pair in zip(names[known].tolist(), true[known].tolist(), strict=True)]))
         for names in (mine, *(_main(SkinWeights(each, source.weights.names)) for each in others))
     )
     carried = dict(zip(made.rig.names, made.rig.worlds()[:, :3, 3], strict=True))
