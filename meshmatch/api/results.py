@@ -21,7 +21,7 @@ from meshmatch.maps.evaluate import CM, Evaluation, SurfaceDistance, evaluate_ma
 from meshmatch.maps.files import load_map
 from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.places import PlacedFit, Places, surface_distance
-from meshmatch.maps.unfold import unfolded, unfolded_both_ways
+from meshmatch.maps.unfold import LARGEST_BOTH_WAYS, unfolded, unfolded_both_ways
 from meshmatch.maps.vertex_map import VertexMap, check_map
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.progress import ProgressCallback
@@ -104,7 +104,8 @@ class MatchResult:
     threads
         How many were allowed.
     opposite
-        The map from target to source where it was found together with `map`, as of two whole meshes that match well.
+        The map from target to source where it was found together with `map`: of two whole meshes of up to 60,000 vertices
+        that match well.
 
     Examples
     --------
@@ -144,8 +145,8 @@ class MatchResult:
     def backward(self) -> VertexMap:
         """The map from target to source: it pulls values from the source to the target.
 
-        Of two whole meshes that match well it is the inverse of `map`, whichever of them is the source: what goes there and
-        back comes to where it was. Otherwise it is made from the same fits.
+        Of two whole meshes of up to 60,000 vertices that match well it is the inverse of `map`, whichever of them is the
+        source: what goes there and back comes to where it was. Otherwise it is made from the same fits.
 
         Returns
         -------
@@ -238,9 +239,9 @@ class MapPair(Brief):
 def maps_of_fits(
     fits: tuple[Fit | ImplicitFit, Fit | ImplicitFit], before: tuple[Fit | ImplicitFit, Fit | ImplicitFit], threads: int
 ) -> tuple[VertexMap, VertexMap | None]:
-    """The map from the shape of the first fit to that of the second; of two whole meshes that match well, with its inverse:
-    the same two maps, whichever comes first. `OptionError` where the fits are of different templates, or do not know their
-    shapes.
+    """The map from the shape of the first fit to that of the second; of two whole meshes that match well, and are not
+    too large, with its inverse: the same two maps, whichever comes first. `OptionError` where the fits are of different
+    templates, or do not know their shapes.
     """
     first, second = fits
     if not isinstance(first, Fit) and not isinstance(second, Fit):
@@ -258,7 +259,8 @@ def maps_of_fits(
     found = build_map(here, there, threads)
     if source is None or target is None:
         return found, None
-    if found.verdict != "good" or source.is_cloud or target.is_cloud or _partial(first) or _partial(second):
+    whole = not (source.is_cloud or target.is_cloud or _partial(first) or _partial(second))
+    if not whole or found.verdict != "good" or max(source.V, target.V) > LARGEST_BOTH_WAYS:
         return unfolded(found, source, target, threads), None
     opposite = build_map(there, here, threads)
     if (source.V, source.hash) <= (target.V, target.hash):  # the inverse of the coarser one's is finer

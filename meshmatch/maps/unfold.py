@@ -55,6 +55,8 @@ _THINNEST = 1e-3  # height over length: what is thinner has no area that its ima
 _STIFFEST = 50.0  # a sliver's sides count no more
 _MOST = 0.2  # a map that folds more of the surface is wrong as a whole
 _LARGEST = 200_000  # vertices; triangles of larger meshes are smaller than the fits are exact
+LARGEST_BOTH_WAYS = 60_000
+"""Vertices of meshes for which both maps are made at once: of larger ones that takes longer than matching."""
 _HOLD = 1e-3  # how much each image stays, so that every part has a solution
 
 
@@ -72,8 +74,6 @@ def unfolded(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -
 
 def unfolded_both_ways(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -> tuple[VertexMap, VertexMap]:
     """Such a map and its inverse, which has few folds as well: what is laid out anew in the one is so in the other."""
-    if source.is_cloud or target.is_cloud or max(source.V, target.V) > _LARGEST:
-        return found, invert_map(found, source, target, workers)
     there = _Images(found, source, target, workers)
     there.repeat(there.relaid, _RINGS)
     there.repeat(there.smoothed, _SMOOTHED)
