@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array, diags_array
 
 from meshmatch.api.matcher import Matcher
 from meshmatch.experiments.bench import rigs
 from meshmatch.experiments.bench.skinning import from_bones, in_motion, nearest_and_inpainted, skinned, volume
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.weight_files import SkinWeights
 from tests.transfer.rigs import write_tube
 
 
@@ -41,6 +43,18 @@ def test_a_folder_of_equal_tubes_has_no_error(
     assert (row["median_cm"], row["high_good_cm"], row["near_good"]) == (0.5, 1.0, 1.0)
     assert rigs.main(["--data", str(tmp_path), "--folders", "horses"]) == 1
     assert "*.glb files in" in capsys.readouterr().err
+
+
+def test_what_the_target_s_own_rig_does_not_move_has_no_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("a.glb", "b.glb"):
+        write_tube(tmp_path / name)
+    monkeypatch.setattr(Matcher, "match", lambda _, a, b: VertexMap.between(a, b, np.arange(a.V), verdict="good"))
+    source, target = rigs._Character(tmp_path / "a.glb"), rigs._Character(tmp_path / "b.glb")
+    moved = np.ones(target.shape.V)
+    moved[:20] = 0
+    target.weights = SkinWeights(csr_array(diags_array(moved) @ target.weights.matrix), target.weights.names)
+    row = rigs.measured(source, target, Matcher("human"))
+    assert (row["same"], row["near"], row["nearest"]) == (1.0, 1.0, 1.0)
 
 
 def test_a_shape_that_moves(tmp_path: Path) -> None:

@@ -72,6 +72,18 @@ def test_the_way_back_follows_what_is_laid_flat() -> None:
     assert Folds.of(followed, target, source) == Folds(0.0, 0.0, pytest.approx(1.0, abs=0.15))
 
 
+def test_what_folds_the_way_back_more_is_undone(monkeypatch: pytest.MonkeyPatch) -> None:
+    source, target = ball(3), ball(3, 0.0)
+    found = folded(source, target)
+    images = _Images(found, source, target, 1)
+    back = images.opposite = _Images(invert_map(found, source, target), target, source, 1)
+    before = back.ratio.copy()
+    monkeypatch.setattr(back, "_follow", lambda *_: back.ratio.fill(-1.0))
+    images.repeat(images.flattened, (1, 2))
+    np.testing.assert_array_equal(images.map.points(target), found.points(target))
+    np.testing.assert_array_equal(back.ratio, before)
+
+
 def missed(there: VertexMap, back: VertexMap, source: Shape, target: Shape) -> float:
     """How far from itself a vertex comes at most, there and back."""
     again = interpolate(back.points(source), corners_of(target.faces, there.face, there.index), there.barycentric)
