@@ -291,14 +291,30 @@ def recall(path: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
         return None
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        found = None
+    return as_asked(found, asked, str(path))
+
+
+def as_asked(found: Any, asked: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """A kept result, which must be one; ``where`` it was kept, in words.
+
+    Raises
+    ------
+    InputError
+        It is no result.
+    OptionError
+        It was measured with other choices than ``asked``.
+    """
+    try:
         before = dict(found["asked"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{path} is not a result of this experiment", "remove it to measure again") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{where} is not a result of this experiment", "remove it to measure again") from error
     now = plain(asked)
     if differences := sorted(key for key in {*before, *now} if before.get(key) != now.get(key)):
         raise OptionError(
-            f"{path} was measured with other choices ({', '.join(differences)})",
-            "choose another output folder, or remove the file",
+            f"{where} was measured with other choices ({', '.join(differences)})",
+            "choose another output folder, or remove it",
         )
     return dict(found)
 

@@ -287,16 +287,37 @@ def test_the_command_goes_on(
         assert ablations.main([*words, *more]) == 0
         return json.loads(capsys.readouterr().out.splitlines()[-1])
 
-    assert run("--show")["runs"] == {}
-    first = run()
+    assert run("--show")["rows"] == {}
+    first = run()["rows"]
     ours = {"base", "supervised-50", "supervised-100"}
     coded = {f"field-pointwise.constraint-none{each}" for each in ("", ".supervised-50", ".supervised-100")}
-    assert set(first["runs"]) == ours | coded and {each["steps"] for each in first["runs"].values()} == {2}
-    assert {"base scape chamfer", "supervised-50 scape code"} <= first["errors"].keys()
-    (output / "supervised-50" / "error-scape-code.json").unlink()
-    assert "supervised-50 scape code" not in run("--show")["errors"]
-    assert run()["errors"] == first["errors"]  # the one that lacks is measured again, by the same model
+    trained = {name.removesuffix("/trained.json"): row for name, row in first.items() if name.endswith("trained.json")}
+    assert set(trained) == ours | coded and {each["steps"] for each in trained.values()} == {2}
+    lacking = "supervised-50/error-scape-code.json"
+    assert {"base/error-scape-chamfer.json", "frames-scape.json", lacking} <= first.keys()
+
+    saved = tmp_path / "saved.json"
+    (output / lacking).unlink()
+    begun = run("--show", "--save", str(saved))["rows"]
+    assert first.keys() - begun.keys() == {lacking, "supervised-50/trained.json"}  # nothing of it without its model
+    again = run()["rows"]
+    assert again[lacking]["pair_cm"] == first[lacking]["pair_cm"]  # measured again, by the same model
     assert ablations.main([*words, "--steps", "3"]) == 1  # runs of another budget
+
+    # elsewhere, with the file alone: one run is trained again, and the file that is written then holds all
+    words[1] = str(tmp_path / "elsewhere")
+    there = run("--rows", str(saved), "--save", str(saved))["rows"]
+    assert there.keys() == first.keys() and there[lacking]["pair_cm"] == first[lacking]["pair_cm"]
+    assert {name: row for name, row in there.items() if name in begun} == begun
+    assert [each.name for each in (tmp_path / "elsewhere").iterdir()] == ["supervised-50"]
+    words[words.index("figure10")] = "figure9"
+    assert run("--show", "--rows", str(saved))["rows"].keys() == first.keys()  # also those of other views
+    capsys.readouterr()
+    words[words.index("figure9")] = "figure10"
+    assert ablations.main([*words, "--rows", str(saved), "--shapes", "3"]) == 1
+    assert "was measured with other choices (measure)" in capsys.readouterr().err
+    assert ablations.main([*words, "--rows", str(output / lacking)]) == 1
+    assert "holds no rows of ablations" in capsys.readouterr().err
 
 
 def test_cells_take_turns(setting: Setting) -> None:

@@ -7,16 +7,20 @@ All are trained for the same number of --steps; how many that should be, the vie
 without constraints for 1,000 to 30,000.
 
 What is measured lies in the output folder and is not measured again, so that a stopped command goes on with what is
-missing; --show measures nothing and shows what is there. The tables say the budget. Errors are in cm at 1.9 m2 of skin:
-held out, the mean distance of the template's points from where they belong, by the network alone; on a set, the geodesic
-error after the search over codes with the run's own regularisers, on all ordered pairs of some shapes. The paper's numbers
-beside them are of long trainings on an A100 and of its own pairs.
+missing. A file that --save wrote holds the same of every run whose errors are all known, without weights: --rows goes on
+with it in another folder. --show measures nothing and shows what is there.
+
+The tables say the budget. Errors are in cm at 1.9 m2 of skin: held out, the mean distance of the template's points from
+where they belong, by the network alone; on a set, the geodesic error after the search over codes with the run's own
+regularisers, on all ordered pairs of some shapes. The paper's numbers beside them are of long trainings on an A100 and of
+its own pairs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,7 +28,7 @@ from typing import Annotated, Any
 from typer import Option
 
 from meshmatch.api.inputs import as_model
-from meshmatch.errors import OptionError, TemplateError
+from meshmatch.errors import InputError, OptionError, TemplateError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.sets import ALL_SETS, CLOUD_SET, BenchSet, load_set
 from meshmatch.experiments.paper.ablation_errors import (
@@ -45,7 +49,11 @@ from meshmatch.models.registry import find_model
 
 @dataclass(frozen=True)
 class Kept:
-    """The output folder and what is asked of it; each method measures what is not there yet."""
+    """The output folder and what is asked of it; each method measures what is not there yet.
+
+    ``earlier`` are rows that were measured before, by the names of their files in such a folder; ``rows`` all that were
+    asked for and are there.
+    """
 
     folder: Path
     setting: Setting
@@ -56,6 +64,8 @@ class Kept:
     cache: Path | None
     show: bool
     methods: Sequence[str] = METHODS
+    earlier: Mapping[str, Any] = field(default_factory=dict)
+    rows: dict[str, Any] = field(default_factory=dict)
 
     def here(self) -> dict[str, Any]:
         """The circumstances of a measurement."""
@@ -70,7 +80,14 @@ class Kept:
         self, path: Path, asked: dict[str, Any], measured: Callable[[], dict[str, Any]]
     ) -> dict[str, Any] | None:
         """A kept result, measured if it must be and may be."""
-        return runner.recall(path, asked) if self.show else runner.once(path, asked, measured)
+        name = path.relative_to(self.folder).as_posix()
+        if name in self.earlier and not path.is_file():
+            found: dict[str, Any] | None = runner.as_asked(self.earlier[name], asked, f"{name} of --rows")
+        else:
+            found = runner.recall(path, asked) if self.show else runner.once(path, asked, measured)
+        if found is not None:
+            self.rows[name] = found
+        return found
 
     def train(self, run: Run) -> dict[str, Any] | None:
         """How its training went; {"skipped": why} where nodes cannot be laid."""
@@ -102,7 +119,8 @@ class Kept:
 
                 def measured(bench: BenchSet = bench, how: str = how) -> dict[str, Any]:
                     if not (folder / "model").is_dir():
-                        raise OptionError(f"{folder} has lost its model", "remove that folder to train it again")
+                        hint = "train it again: remove that folder, and its rows from the file of --rows"
+                        raise OptionError(f"{folder} has lost its model", hint)
                     runner.tell(f"measuring {run.name} on {bench.name}: {how}")
                     model, subjects = as_model(folder / "model"), self.subjects(bench)
                     return {**self.here(), **errors_of(model, run, subjects, self.model, how, self.measure)}
@@ -117,20 +135,23 @@ class Kept:
     def _subjects(self) -> dict[str, list[Subject]]:
         return {}
 
+    def frames(self, bench: BenchSet) -> dict[str, Any] | None:
+        """The orientation that the reference model finds of the shapes on which a set's errors are measured."""
+        names = chosen_names(bench, self.measure)
+
+        def measured() -> dict[str, Any]:
+            runner.tell(f"orienting {len(names)} shapes of {bench.name}")
+            return {"frames": {name: asdict(oriented(bench.seen(name), self.model, self.measure)) for name in names}}
+
+        asked = {"shapes": names, "seed": self.measure.seed, "reference": self.reference}
+        return self.answer(self.folder / f"frames-{bench.name}.json", asked, measured)
+
     def subjects(self, bench: BenchSet) -> list[Subject]:
         """The shapes on which a set's errors are measured, in the orientation that the reference model finds."""
         if bench.name not in self._subjects:
-            names = chosen_names(bench, self.measure)
-
-            def measured() -> dict[str, Any]:
-                runner.tell(f"orienting {len(names)} shapes of {bench.name}")
-                frames = {name: oriented(bench.seen(name), self.model, self.measure) for name in names}
-                return {"frames": {name: asdict(frame) for name, frame in frames.items()}}
-
-            asked = {"shapes": names, "seed": self.measure.seed, "reference": self.reference}
-            frames = runner.once(self.folder / f"frames-{bench.name}.json", asked, measured)["frames"]
+            frames = (self.frames(bench) or {}).get("frames", {})
             self._subjects[bench.name] = [
-                subject(bench, name, Frame(**frames[name]), self.measure, self.cache) for name in names
+                subject(bench, name, Frame(**frame), self.measure, self.cache) for name, frame in frames.items()
             ]
         return self._subjects[bench.name]
 
@@ -154,7 +175,20 @@ class Kept:
             if (found := self.train(run)) is not None:
                 trained[run] = found
                 errors |= self.errors(run, found)
+        for bench in self.benches if errors else ():
+            self.frames(bench)
         return Known(trained, errors, self.cost(rounds) if "table4" in views and rounds else {})
+
+    def finished(self, known: Known) -> dict[str, Any]:
+        """Earlier and new rows that need no weights to go on with: all but those of runs whose errors are not all there."""
+        begun = {
+            run.name
+            for run, found in known.trained.items()
+            for bench in self.benches if "skipped" not in found
+            for how in methods_of(run) if how in self.methods and (run, bench.name, how) not in known.errors
+        }  # fmt: skip
+        rows = {**self.earlier, **self.rows}
+        return {name: row for name, row in rows.items() if name.partition("/")[0] not in begun}
 
     def budget(self) -> str:
         """What the numbers cost, in words."""
@@ -163,6 +197,20 @@ class Kept:
             words.append(f"batches of {self.setting.batch}")
         words.append(f"{self.measure.code_steps} steps on the code")
         return ", ".join([*words, f"the pairs of {self.measure.shapes} shapes of a set"])
+
+
+def saved_rows(path: Path) -> dict[str, Any]:
+    """Rows of a file of results.
+
+    Raises
+    ------
+    InputError
+        It holds none.
+    """
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8"))["values"]["rows"])
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+        raise InputError(f"{path} holds no rows of ablations", "name a file that --save wrote") from error
 
 
 @runner.command
@@ -183,6 +231,7 @@ def main(
     model: runner.Model = "human",
     data: runner.Data = runner.DATA,
     cache: runner.Cache = None,
+    rows: Annotated[Path | None, Option(help="that --save wrote; what it holds counts as measured")] = None,
     show: Annotated[bool, Option("--show", help="measure nothing, show what is there")] = False,
 ) -> runner.Report:
     names = [name for name in VIEWS if name in runner.names_of(views, VIEWS, "view")]
@@ -190,16 +239,15 @@ def main(
     benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
     setting, measure = Setting(threads, batch, loss), Measure(shapes=shapes, code_steps=code_steps)
     wanted = runner.names_of(methods, METHODS, "method")
-    kept = Kept(output, setting, measure, steps, model, benches, cache, show, wanted)
+    earlier = saved_rows(rows) if rows else {}
+    kept = Kept(output, setting, measure, steps, model, benches, cache, show, wanted, earlier)
     known = kept.known(runs, names, rounds)
     where = [bench.name for bench in benches]
     found = claims(known, where)
     missing = [run.name for run in runs if run not in known.trained]
     record = {
         **{"setting": asdict(setting), "measure": asdict(measure)},
-        "runs": {run.name: each for run, each in known.trained.items()},
-        "errors": {f"{run.name} {name} {how}": r["mean_cm"] for (run, name, how), r in known.errors.items()},
-        **{"times": known.times, "claims": [asdict(claim) for claim in found]},
+        **{"rows": kept.finished(known), "claims": [asdict(claim) for claim in found]},
     }
     drawn = [*tables(known, names, where, kept.budget()), claims_table(found)]
     return runner.Report(record, drawn, [f"Not measured: {', '.join(missing)}"] if missing else [])
