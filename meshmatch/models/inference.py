@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from meshmatch.models.deformer import Deformer
 
 _EPSILON = np.float32(1e-5)  # of layer and batch norms, as in torch
+_SINGLE_ROWS, _FEW_ROWS = 3, 32  # how many rows are multiplied one by one, and how many as columns
 
 
 def load_network(path: str | Path, config: NetworkConfig, K: int) -> Network:
@@ -155,7 +156,7 @@ class NodeNetwork:
         return vectors + np.float32(0.1) * change.reshape(B, -1, 3)
 
     def _linear(self, name: str, x: Floats32) -> Floats32:
-        out = x @ self.weights[f"{name}.weight"].T
+        out = _product(x, self.weights[f"{name}.weight"])
         bias = self.weights.get(f"{name}.bias")
         return np.asarray(out if bias is None else out + bias)
 
@@ -187,6 +188,15 @@ def rotation_from_six(six: Float[Floats, "B 6"]) -> Float[Floats, "B 3 3"]:
     b = b - (a * b).sum(-1, keepdims=True) * a
     b = b / np.maximum(np.linalg.norm(b, axis=-1, keepdims=True), 1e-12)
     return np.stack([a, b, np.cross(a, b)], -1)
+
+
+def _product(x: Floats32, weight: Float[Floats32, "O I"]) -> Floats32:
+    """``x @ weight.T``; otherwise for few rows, where BLAS takes longer to copy the matrix than to multiply."""
+    if x.ndim != 2 or len(x) > _FEW_ROWS:
+        return np.asarray(x @ weight.T)
+    if len(x) <= _SINGLE_ROWS:
+        return np.stack([weight @ row for row in x])
+    return np.ascontiguousarray((weight @ x.T).T)
 
 
 def _gelu(x: Floats32) -> Floats32:
