@@ -31,7 +31,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 PAGES = ("results.md", "method.md", "paper.md", "rigs.md", "collections.md", "categories.md")
 _BLOCK = re.compile(r"(<!-- (results|summary)([^>]*?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 _COLUMNS = ("mean", "median", "lost", "flips", "pairs")
-_SHOWN_AS = {"not testable at this length": "undecided"}  # cells of the files that a page shows in a word
+_SHOWN_AS = {"not testable at this length": "not testable here"}  # as earlier files word it
 
 
 class Row(NamedTuple):

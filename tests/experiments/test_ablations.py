@@ -19,9 +19,10 @@ from meshmatch.experiments.paper.ablation_errors import (
     refinement_of,
     subject,
 )
-from meshmatch.experiments.paper.ablation_results import Sample, difference, rising
+from meshmatch.experiments.paper.ablation_results import Sample, claims_table, difference, rising
 from meshmatch.experiments.paper.ablation_training import SCANS, Setting, fewer, new_network, pool_of, timed, train_run
 from meshmatch.experiments.paper.ablation_views import BASE, CODED, CONSTRAINTS, VIEWS, Run, all_runs
+from meshmatch.experiments.runner import words_of
 from meshmatch.fields.shape_functions import FIELDS
 from meshmatch.fitting.fit_config import FitConfig, LatentRefineConfig
 from meshmatch.fitting.solve.system import node_system
@@ -172,14 +173,20 @@ def test_a_template_of_heavy_people_stands_as_the_usual_one() -> None:
     [
         (([1.0, 1.1], [2.0, 2.1], [3.0, 3.1]), "supported"),
         (([1.0, 1.1], [3.0, 3.1], [2.0, 2.1]), "not supported"),
-        (([2.0, 2.1], [2.0, 2.1], [3.0, 3.1]), "not testable at this length"),
-        (([1.0], [2.0]), "not testable at this length"),  # one seed
-        (([1.0, 4.0], [2.0, 5.0]), "not testable at this length"),
+        (([2.0, 2.1], [2.0, 2.1], [3.0, 3.1]), "not testable here"),
+        (([1.0], [2.0]), "not testable here"),  # one seed
+        (([1.0, 4.0], [2.0, 5.0]), "not testable here"),
         (([1.0, 1.1], []), "not measured"),
     ],
 )
 def test_a_claim_needs_an_interval_beside_zero(errors: tuple[list[float], ...], verdict: str) -> None:
     assert rising("held out", "rising", [Sample(each) for each in errors]).verdict == verdict
+
+
+def test_a_claim_that_nobody_measured_has_no_row() -> None:
+    there = Sample([1.0, 1.1]), Sample([2.0, 2.1])
+    found = [rising("held out", "a < b", there), rising("scape", "b < c", [Sample([]), Sample([])])]
+    assert words_of(claims_table(found)) == (["claim", "held out", "scape"], [["a < b", "supported", ""]])
 
 
 def test_an_interval_of_seeds_is_the_textbooks() -> None:
@@ -192,7 +199,7 @@ def test_an_interval_of_seeds_is_the_textbooks() -> None:
 def test_pairs_must_carry_an_order_too() -> None:
     """Half of the pairs are better and half worse: the mean of one pair more or less decides."""
     clear, even = [1.0] * 4, [0.0, 0.0, 2.2, 2.2]
-    for pairs, verdict in (([1.1] * 4, "supported"), (even, "not testable at this length")):
+    for pairs, verdict in (([1.1] * 4, "supported"), (even, "not testable here")):
         samples = Sample([1.0, 1.01], [clear, clear]), Sample([1.1, 1.11], [pairs, pairs])
         assert rising("scape", "rising", samples).verdict == verdict
 

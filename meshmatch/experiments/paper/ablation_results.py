@@ -3,7 +3,7 @@
 Training again from another seed moves errors by as much as many choices do, and six shapes are a small sample. So an order
 of two errors is there only where 95 % intervals of their difference leave out 0: over seeds (Welch's, of at least two
 trainings each), and over what was measured on, the pairs of a set or held-out bodies (a paired bootstrap). A claim is
-*supported* if every next error is larger, *not supported* if one is smaller, and else *not testable at this length*.
+*supported* if every next error is larger, *not supported* if one is smaller, and else *not testable here*.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ from meshmatch.experiments.paper.ablation_views import (
 )
 from meshmatch.experiments.runner import table
 
-SUPPORTED, NOT_SUPPORTED, UNTESTED = "supported", "not supported", "not testable at this length"
+SUPPORTED, NOT_SUPPORTED, UNTESTED = "supported", "not supported", "not testable here"
+_UNMEASURED = "not measured"
 CLAIMS: tuple[tuple[str, tuple[Run, ...]], ...] = (
     (
         "with vol+arap+Z: mls < rbf < pointwise",
@@ -109,7 +110,7 @@ def difference(a: Sample, b: Sample, paired: bool = False) -> tuple[float, float
 def rising(where: str, words: str, samples: Sequence[Sample], paired: bool = False) -> Claim:
     """Whether every next error is larger."""
     if not all(sample.seeds for sample in samples):
-        return Claim(words, where, "not measured")
+        return Claim(words, where, _UNMEASURED)
     numbers = tuple(float(np.mean(sample.seeds)) for sample in samples)
     found = tuple(difference(a, b, paired) for a, b in pairwise(samples))
     if any(each is not None and each[1] < 0 for each in found):
@@ -141,9 +142,9 @@ def claims(known: Known, sets: Sequence[str]) -> list[Claim]:
 
 
 def claims_table(found: Sequence[Claim]) -> Table:
-    """Each claim in a row, its verdicts on the held-out shapes and each set."""
+    """Each claim that was measured in a row, its verdicts on the held-out shapes and each set."""
     rows: dict[str, dict[str, str]] = {}
-    for claim in found:
+    for claim in (each for each in found if each.verdict != _UNMEASURED):
         rows.setdefault(claim.words, {"claim": claim.words})[claim.where] = claim.verdict
     columns = {"claim": "claim", **{claim.where: claim.where for claim in found}}
     return table("What the paper claims", list(rows.values()), columns)
