@@ -13,9 +13,10 @@ import numpy as np
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.direct import MIRROR
+from meshmatch.fitting.kind_templates import mean_shape, template_of, with_more_nodes
 from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.fitting.usual import FEWEST, believed, have_sides
-from meshmatch.fitting.without_model import Standing, fit_turned, mean_shape, standing, template_of, with_more_nodes
+from meshmatch.fitting.without_model import Standing, fit_turned, standing
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.outputs import as_path, folder_on_success, make_folder
 from meshmatch.progress import Progress, ProgressCallback

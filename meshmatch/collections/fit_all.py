@@ -46,6 +46,7 @@ from meshmatch.collections.workers import Died, Item, Result, Workers
 from meshmatch.errors import InputError
 from meshmatch.fitting.solve.agreement import AgreeConfig, held_mean, log_stretch, stretch_of
 from meshmatch.fitting.usual import FAIR
+from meshmatch.fitting.without_model import stand_alike
 from meshmatch.maps.vertex_map import VERDICTS
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.progress import ProgressCallback
@@ -68,6 +69,7 @@ COLUMNS = (
     *("mirrored", "up", "front", "vertices", "seconds", "notes", "kind"),
 )
 _MOST_NAMED = 10  # in one line
+_MOST_ALIKE = 0.8  # share of shapes that stand as their mean does
 _GROUP = 4  # fits that one task of the agreement takes a step with: fixed, for sums must not depend on the workers
 
 
@@ -141,14 +143,16 @@ def fit_all(
 
 def _on_the_mean(run: _Run, names: Sequence[str]) -> Setting:
     """The setting with the mean of some shapes as the template, estimated anew from fits of a first mean, which still leans
-    towards the shape that was the template before.
+    towards the shape that was the template before. It has more nodes where nearly all of these stand alike.
     """
-    setting = on_the_mean(run.setting, names, FIRST, SECOND_TEMPLATE)
+    setting, alike = on_the_mean(run.setting, names, FIRST, SECOND_TEMPLATE), 0
     if names:
         chosen = [source for source in run.sources if source.name in set(names)]
         again = replace(run, setting=setting, sources=chosen).fit_alone(None, SECOND)
-        names = [each.name for each in again if each.fitted and each.verdict != "poor"]
-    return on_the_mean(setting, names, SECOND, TEMPLATE)
+        sound = [each for each in again if each.fitted and each.verdict != "poor"]
+        alike = sum(stand_alike(each.residual, each.stretch) for each in sound)
+        names = [each.name for each in sound]
+    return on_the_mean(setting, names, SECOND, TEMPLATE, fine=alike > _MOST_ALIKE * len(names))
 
 
 def _perhaps_cut(records: Sequence[Record]) -> dict[str, float]:

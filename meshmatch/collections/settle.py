@@ -16,8 +16,8 @@ from meshmatch.api.kinds import choose_model
 from meshmatch.collections.setting import FIRST_TEMPLATE, TEMPLATE, Setting, Source
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.fitting.kind_templates import finest, mean_shape, template_of
 from meshmatch.fitting.solve.viscous import ViscousConfig
-from meshmatch.fitting.without_model import mean_shape, template_of
 from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.input_files import read_json
@@ -93,14 +93,15 @@ def some_of(names: Sequence[str]) -> list[str]:
     ]
 
 
-def on_the_mean(setting: Setting, names: Sequence[str], folder: str, file: str) -> Setting:
-    """The same with the mean of the shapes that its template was fitted to, by fits of a folder, as the template; with
-    the same one where there are none. A template that lies in the middle has less far to go.
+def on_the_mean(setting: Setting, names: Sequence[str], folder: str, file: str, fine: bool = False) -> Setting:
+    """The same with the mean of the shapes that its template was fitted to, by fits of a folder, as the template, perhaps
+    with `finest` nodes; with the same one where there are none. A template that lies in the middle has less far to go.
     """
     before = mean = setting.template
     if names:
         fits = [setting.read(folder, name).fit for name in names]
         mean = template_of(Shape(mean_shape(before, fits), before.shape.faces), "mean", ViscousConfig())
+        mean = finest(mean, ViscousConfig()) if fine else mean
     with setting.store.writing(file) as path:
         save_template(mean, path)
     return replace(setting, template_file=file, template_hash=mean.hash)

@@ -18,19 +18,12 @@ from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import cap_verdict, judged_of_kind, may_show_part, with_side
 from meshmatch.fitting.judge.reasons import SIDE_IN_DOUBT, Reason
+from meshmatch.fitting.kind_templates import template_of, viscous_system, with_more_nodes
 from meshmatch.fitting.one_way import DirectConfig
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.fitting.solve.viscous import ViscousConfig
-from meshmatch.fitting.without_model import (
-    fit_alike,
-    fit_near,
-    fit_otherwise,
-    fit_without_model,
-    template_of,
-    viscous_system,
-    with_more_nodes,
-)
+from meshmatch.fitting.without_model import fit_alike, fit_near, fit_otherwise, fit_without_model
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.trained import TrainedModel

@@ -22,6 +22,7 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.solve.agreement import agree_step
 from meshmatch.fitting.solve.system import node_system
+from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.locks import locked
 from meshmatch.maps.fit_files import load_words, read_fit, write_fit
 from meshmatch.shapes.files import load_shape, save_shape
@@ -453,6 +454,7 @@ def test_without_a_model_the_shapes_make_their_template(tmp_path: Path) -> None:
     assert collection.template.hash == template
     means = {load_template(tmp_path / "fits" / name).hash for name in ("first.safetensors", "second.safetensors")}
     assert len(means | {template}) == 3  # the mean of the first fits, and of those that it has
+    assert collection.template.K == ViscousConfig().finest().nodes > ViscousConfig.nodes
     with pytest.raises(OptionError, match="another model"):
         collection.fit(folder, model="human")
 

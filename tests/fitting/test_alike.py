@@ -16,10 +16,11 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.judge.reasons import Reason, Verdict
+from meshmatch.fitting.kind_templates import template_of, viscous_system
 from meshmatch.fitting.one_way import DirectConfig, KnownPairs
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.fitting.solve.viscous import ViscousConfig
-from meshmatch.fitting.without_model import fit_near, fit_without_model, template_of, viscous_system
+from meshmatch.fitting.without_model import fit_near, fit_without_model
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.trained import TrainedModel
@@ -137,7 +138,7 @@ def test_what_stands_otherwise_than_the_template_is_searched_once(
     model = TrainedModel(replace(known.card, correspondence=False), known.template, known.inference)
     rested, faces = node_system(model).verts, model.template.shape.faces
     plain = Fitter(model).fit(Shape(rested, faces))
-    places = rested * [1, 2.5, 1]
+    places = rested * [1, 3, 1]
     frame = MIRROR if mirrored else Frame.identity()
     shape = Shape(frame.undo(places), faces[:, :: -1 if mirrored else 1], "tall")
 
@@ -181,8 +182,8 @@ def test_what_stands_otherwise_is_only_turned_where_a_search_finds_nothing_bette
     known = egg_model()
     model = TrainedModel(replace(known.card, correspondence=False), known.template, known.inference)
     system = node_system(model)
-    shape = Shape(system.verts * [1, 2.5, 1], model.template.shape.faces)
-    crumpled = system.verts @ np.diag([1.0, -1.0, 1.0]) * [2.5, 1, 1]
+    shape = Shape(system.verts * [1, 3, 1], model.template.shape.faces)
+    crumpled = system.verts @ np.diag([1.0, -1.0, 1.0]) * [3, 1, 1]
     fit = replace(Fitter(model).fit(shape), points=crumpled, verdict="fair", frame=Frame.identity())
     monkeypatch.setattr(alike, "_searched", lambda template, part, start, progress: start)
     found = finer(model, shape, fit, FitConfig(mirror="no"))

@@ -7,8 +7,9 @@ import pytest
 
 from meshmatch.experiments.makers.bones import draw_bones, scan
 from meshmatch.fitting.fit_config import Schedule
+from meshmatch.fitting.kind_templates import template_of
 from meshmatch.fitting.solve.viscous import ViscousConfig
-from meshmatch.fitting.without_model import fit_without_model, template_of
+from meshmatch.fitting.without_model import fit_without_model
 from meshmatch.shapes.shape import Shape
 
 SCHEDULE = Schedule(steps=10, prior=(1e-3, 1e-6), scale=(0.1, 0.02), damping=1e-6)

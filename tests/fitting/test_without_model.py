@@ -12,10 +12,11 @@ from meshmatch.experiments.makers.molars_and_leaves import leaves
 from meshmatch.fitting import without_model
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.judge.direct import DirectFeatures
+from meshmatch.fitting.kind_templates import finest, mean_shape, template_of, viscous_system
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.solve.terms import RimTerm
 from meshmatch.fitting.solve.viscous import ViscousConfig
-from meshmatch.fitting.without_model import fit_without_model, mean_shape, template_of, viscous_system
+from meshmatch.fitting.without_model import fit_without_model
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.trees import cKDTree
@@ -105,10 +106,29 @@ def test_the_last_fit_is_softer_unless_the_template_is_far(
     monkeypatch.setattr(without_model, "_FAR", -1.0 if far else 1.0)
     fit = fit_without_model(template, template.shape, mirror=False)
     assert asked[0] == ViscousConfig.choosing()
-    assert asked[-1] == (ViscousConfig.choosing() if far else ViscousConfig())
+    assert asked[-1] == (ViscousConfig.folding() if far else ViscousConfig())
     asked.clear()
     fit_without_model(template, template.shape, start=fit)
-    assert (ViscousConfig.choosing() in asked) == far
+    assert (asked[-1] == ViscousConfig.folding()) == far
+
+
+def test_a_template_that_would_fold_is_held(template: Template) -> None:
+    """A creature on something of another build: less of it is inside out, by the stiffer fit."""
+    other = Shape(creature(3).verts * [2.5, 1, 0.4], creature(3).faces)
+    folded = []
+    for config in (ViscousConfig.choosing(), ViscousConfig.folding()):
+        task = without_model._Task(template, other, replace(config, samples=3000, back_points=1500))
+        vectors = task.fitted(without_model._Begin(sqrt_area_frame(other), np.zeros((task.system.K, 3)))).vectors
+        folded.append(task.system.regularity(vectors).inverted)
+    assert folded[1] < 0.5 * folded[0]
+
+
+def test_last_fits_have_more_nodes_but_of_sheets(template: Template) -> None:
+    fine, few = finest(template, CONFIG), len(template.nodes)
+    assert len(fine.nodes) == round(5 / 3 * few) and np.allclose(fine.shape.verts, template.shape.verts)
+    assert fine.hash != template.hash
+    sheet = template_of(disc(count=1000), "sheet", CONFIG)
+    assert finest(sheet, CONFIG) is sheet
 
 
 def test_the_mean_of_poses_keeps_the_size_of_what_turns(template: Template) -> None:

@@ -1,0 +1,64 @@
+"""Templates of a kind that no model knows: one of its shapes, or their mean, with nodes for fits without a model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.derived import derived
+from meshmatch.fields.shape_functions import build_field
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.solve.blend import FieldPath
+from meshmatch.fitting.solve.system import NodeSystem
+from meshmatch.fitting.solve.viscous import ViscousConfig
+from meshmatch.geometry.frames import kabsch
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.make import NodeConfig, low_mesh, make_template
+from meshmatch.templates.template import Template
+
+_SHRUNK = 0.93  # area of a mean of shapes that are posed, against theirs: 0.997 of femurs, 0.87 of ants
+
+
+def template_of(shape: Shape, name: str, config: ViscousConfig) -> Template:
+    """A template of one shape, with nodes anywhere near its surface."""
+    nodes = NodeConfig("uniform", config.nodes, config.radius, 0.01, seed=config.seed)
+    return make_template(shape, name, nodes, low=low_mesh(shape, config.faces))
+
+
+@derived
+def with_more_nodes(template: Template, config: ViscousConfig) -> Template:
+    """The same vertices, with nodes as fits without a model have them."""
+    shape = template.shape
+    nodes = NodeConfig("uniform", config.nodes, config.radius, 0.01, seed=config.seed)
+    return make_template(shape, template.name, nodes, low=(np.arange(shape.V), np.asarray(shape.faces)))
+
+
+def finest(template: Template, config: ViscousConfig) -> Template:
+    """The same vertices for the last fits of shapes that stand alike. On leaves and other sheets, which glide along
+    themselves, more nodes are worse (0.67 to 1.86 mm)."""
+    return template if viscous_system(template).is_sheet else with_more_nodes(template, config.finest())
+
+
+@derived
+def viscous_system(template: Template) -> NodeSystem:
+    """The least-squares system of a template without a model."""
+    verts = template.shape.verts
+    return NodeSystem(template.shape, build_field(verts, template.nodes, template.radius, "smooth"))
+
+
+def mean_shape(template: Template, fits: Sequence[Fit]) -> Float[Floats, "V 3"]:
+    """The template's vertices in the middle of its fits: their mean, after rotation and translation to the first mean,
+    twice.
+
+    Where shapes are posed, that would shrink what turns. The mean is then of what the field does.
+    """
+    mean = np.asarray(template.shape.verts)
+    for _ in range(2):
+        mean = np.mean([kabsch(fit.points, mean).to_world(fit.points) for fit in fits], axis=0)
+    faces = template.shape.faces
+    if Shape(mean, faces).area > _SHRUNK * np.mean([Shape(fit.points, faces).area for fit in fits]):
+        return np.asarray(mean)
+    path = FieldPath(viscous_system(template), [fit.vectors for fit in fits], template.core)
+    return viscous_system(template).moved(path(np.full(len(fits), 1 / len(fits))))
