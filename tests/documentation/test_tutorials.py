@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch.distributed as dist
 from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -25,6 +26,7 @@ from meshmatch.fitting import without_model
 from meshmatch.fitting.fit_config import Schedule
 from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.maps.files import load_map
+from meshmatch.models.card import read_card
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
@@ -51,12 +53,13 @@ def script(page: str, language: str) -> str:
     return "".join(re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL))
 
 
-def run(words: list[str], source: str, folder: Path) -> None:
+def run(words: list[str], source: str, folder: Path) -> str:
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     done = subprocess.run(
         words, input=source, cwd=folder, env=os.environ | {"PATH": path}, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def write_hero(folder: Path) -> None:
@@ -204,6 +207,19 @@ def test_the_code_of_a_page_runs(
     (tmp_path / "templates").symlink_to(ROOT / "templates")
     monkeypatch.chdir(tmp_path)
     exec(compile(script(page, "python"), f"{page}.md", "exec"), {"__name__": "__main__"})
+
+
+@pytest.mark.skipif(not dist.is_gloo_available(), reason="this torch has no gloo")
+def test_the_training_by_two_processes_goes_on_exactly(tmp_path: Path) -> None:
+    (tmp_path / "two.py").write_text(script("training", 'python title="two.py"'), encoding="utf-8")
+    cards = []
+    for line in script("training", 'bash title="terminal"').splitlines():
+        program, *words = shlex.split(line)
+        assert program == "torchrun"
+        run([sys.executable, "-m", "torch.distributed.run", "--standalone", *words], "", tmp_path)
+        cards.append(read_card(tmp_path / words[-2] / "card.json"))
+    assert [card.steps for card in cards] == [1, 3, 3]
+    assert cards[0].weights_sha256 != cards[1].weights_sha256 == cards[2].weights_sha256
 
 
 @pytest.mark.slow
