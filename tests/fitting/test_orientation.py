@@ -1,15 +1,20 @@
 """Proposed core frames: every one is a rotation, obeys what it must, and turns along with the scan."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import OptionError
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.search.frames import (
     ask_aligner,
     axis_vector,
     forced_frames,
+    frames_anywhere,
+    frames_to_try,
     propose,
     standing_grid,
     turned_copies,
@@ -67,6 +72,18 @@ def test_frames_move_along_with_the_scan(model: TrainedModel, points: np.ndarray
     moved_R, moved_t = ask_aligner(model.network, points @ Q.T + shift, turns)
     assert np.allclose(moved_R, Q @ R, atol=1e-4)
     assert np.allclose(moved_t, t @ Q.T + shift, atol=1e-4)
+
+
+def test_frames_do_not_depend_on_how_the_file_stands(model: TrainedModel) -> None:
+    Q, shift = Rotation.from_rotvec([0.5, 1.0, -0.4]).as_matrix(), np.array([1.0, -2, 0.5])
+    scan = scan_of(bent_egg(model), 300)
+    turned = replace(scan, points=scan.points @ Q.T + shift, normals=scan.normals @ Q.T)
+    for search in (frames_to_try, frames_anywhere):
+        own, theirs = (search(model, each, FitConfig()) for each in (scan, turned))
+        assert len(own) == len(theirs) > 1
+        np.testing.assert_allclose(Q @ rotations(own), rotations(theirs), atol=1e-6)
+        for one, other in zip(own, theirs, strict=True):
+            np.testing.assert_allclose(Q @ one.center + shift, other.center, atol=1e-6)
 
 
 def test_hypotheses_are_rotations_with_the_most_voted_first(model: TrainedModel, points: np.ndarray) -> None:

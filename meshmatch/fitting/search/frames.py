@@ -57,8 +57,10 @@ def frames_to_try(
     if frames is None and not model.inference.config.align_basis:
         frames = standing_grid(samples.points.mean(0))
     elif frames is None:
-        points = samples.points[:_VOTERS]
-        frames = with_flips(propose(model.on(config.device), points, config.copies, config.hypotheses, config.seed))
+        own = own_axes(samples.points)
+        points = own.to_local(samples.points[:_VOTERS])
+        voted = propose(model.on(config.device), points, config.copies, config.hypotheses, config.seed)
+        frames = with_flips([own @ pose for pose in voted])
         if upright and not any(stands_upright(pose) for pose in frames):
             frames.append(RigidPose.identity())
     return _obeying(frames, config) or forced_frames(*_axes(config))
@@ -70,8 +72,9 @@ def frames_anywhere(model: TrainedModel, samples: OrientedPoints, config: FitCon
     """
     if model.card.frame["orientation"] in ALIGNS:
         return []
-    middle = samples.points.mean(0)
-    return _obeying([RigidPose(turn, middle - _BELOW * turn[:, 1]) for turn in _even_turns(_ANYWHERE)], config)
+    own = own_axes(samples.points)
+    turned = [own @ RigidPose(turn, -_BELOW * turn[:, 1]) for turn in _even_turns(_ANYWHERE)]
+    return _obeying(turned, config)
 
 
 def _obeying(frames: list[RigidPose], config: FitConfig) -> list[RigidPose]:
@@ -139,6 +142,18 @@ def _axes(config: FitConfig) -> tuple[Float[Floats, " 3"] | None, Float[Floats, 
     """The user's up and front."""
     up, front = (None if name is None else axis_vector(name) for name in (config.up, config.front))
     return up, front
+
+
+def own_axes(points: Float[Floats, "P 3"]) -> RigidPose:
+    """The middle of points and their principal axes, each towards the side that reaches further.
+
+    A search that begins there finds the same however the file stands.
+    """
+    middle = points.mean(0)
+    axes = np.linalg.eigh(np.cov(points.T))[1]
+    axes *= np.where((((points - middle) @ axes) ** 3).sum(0) < 0, -1.0, 1.0)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return RigidPose(axes, middle)
 
 
 def turned_copies(count: int, seed: int) -> Float[Floats, "count 3 3"]:
