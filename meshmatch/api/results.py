@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
 from pathlib import Path
@@ -263,12 +263,7 @@ def maps_of_fits(
     if not whole or found.verdict != "good" or max(source.V, target.V) > LARGEST_BOTH_WAYS:
         return unfolded(found, source, target, threads), None
     opposite = build_map(there, here, threads)
-    if (source.V, source.hash) <= (target.V, target.hash):  # the inverse of the coarser one's is finer
-        forward, backward = unfolded_both_ways(found, source, target, threads)
-    else:
-        backward, forward = unfolded_both_ways(opposite, target, source, threads)
-    # what is certain was asked of fits, each way by itself
-    return replace(forward, confidence=found.confidence), replace(backward, confidence=opposite.confidence)
+    return unfolded_both_ways(found, opposite, source, target, threads)
 
 
 def _partial(fit: Fit | ImplicitFit) -> bool:

@@ -16,20 +16,19 @@ holds the way back as well.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.sparse.linalg import splu
 
-from meshmatch.arrays import Bools, Floats, Ints
+from meshmatch.arrays import Bools, Floats, Int, Ints
 from meshmatch.derived import derived
 from meshmatch.geometry.disks import Disk, found_in, mean_values, patches
 from meshmatch.geometry.triangles import (
     dot,
     edge_lengths,
-    edges_of,
     interpolate,
     same_rows,
     squared_lengths,
@@ -64,38 +63,107 @@ def unfolded(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -
     """A map between these shapes with fewer folds: the same where it has none, and of clouds and very large meshes."""
     if source.is_cloud or target.is_cloud or max(source.V, target.V) > _LARGEST:
         return found
-    images = _Images(found, source, target, workers)
+    own, theirs = _welded(source), _welded(target)
+    start = _between_welded(found, own, theirs)
+    images = _Images(start, own.shape, theirs.shape, workers)
     images.repeat(images.relaid, _RINGS)
     images.repeat(images.smoothed, _SMOOTHED)
     images.repeat(images.flattened, _FLAT)
     images.repeat(images.flattened, _LAST, 0.0)
-    return images.map
+    if images.map is start:
+        return found
+    moved = (images.map.face != start.face) | (images.map.barycentric != start.barycentric).any(axis=1)
+    return _between_files(images.map, found, own, target, np.flatnonzero(moved[own.number]))
 
 
-def unfolded_both_ways(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -> tuple[VertexMap, VertexMap]:
-    """Such a map and its inverse, which has few folds as well: what is laid out anew in the one is so in the other."""
-    there = _Images(found, source, target, workers)
+def unfolded_both_ways(
+    found: VertexMap, opposite: VertexMap, source: Shape, target: Shape, workers: int = 1
+) -> tuple[VertexMap, VertexMap]:
+    """Such a map and its inverse, which has few folds as well: what is laid out anew in the one is so in the other.
+
+    Which of the two shapes is the source makes no difference, nor do copies of vertices along the seams of a file, nor how
+    it stands: the map of the coarser one begins, for the inverse of that is finer. What is certain is kept from the map
+    ``found`` and from its ``opposite``, which were asked of fits.
+    """
+    own, theirs = _welded(source), _welded(target)
+    if theirs.order < own.order:
+        backward, forward = unfolded_both_ways(opposite, found, target, source, workers)
+        return forward, backward
+    there = _Images(_between_welded(found, own, theirs), own.shape, theirs.shape, workers)
     there.repeat(there.relaid, _RINGS)
     there.repeat(there.smoothed, _SMOOTHED)
     there.repeat(there.flattened, _FLAT)
-    back = _Images(invert_map(there.map, source, target, workers), target, source, workers)
+    back = there.inverse()
     back.repeat(back.relaid, _RINGS)
     back.repeat(back.flattened, _FLAT)
-    there = _Images(invert_map(back.map, target, source, workers), source, target, workers)
+    there = back.inverse()
     there.opposite, back.opposite = back, there
     for each in (there, back):
         each.repeat(each.flattened, _LAST, 0.0)
-    return there.map, back.map
+    return _between_files(there.map, found, own, target), _between_files(back.map, opposite, theirs, source)
+
+
+@dataclass(frozen=True, eq=False)
+class _Welded:
+    """A mesh whose vertices at one place are one, in the order in which faces name them: the same whatever copies of
+    vertices a file has.
+
+    Attributes
+    ----------
+    first : the file's first vertex at each place
+    number : which place each vertex of the file is at
+    """
+
+    shape: Shape
+    first: Int[Ints, " N"]
+    number: Int[Ints, " V"]
+
+    @property
+    def order(self) -> tuple[int, int, float]:
+        """By which the coarser of two meshes is known, whatever their size and however they stand."""
+        sides = edge_lengths(self.shape.verts, self.shape.edges.vertices)
+        return self.shape.V, self.shape.F, float(sides.mean()) / length_of(self.shape)
+
+
+@derived
+def _welded(shape: Shape) -> _Welded:
+    twin = same_rows(shape.verts)
+    first, begins = np.unique(np.concatenate([twin[shape.faces].ravel(), twin]), return_index=True)
+    first = first[np.argsort(begins)]
+    number = np.empty(shape.V, np.int64)
+    number[first] = np.arange(len(first))
+    number = number[twin]
+    invalid = None if shape.invalid is None else shape.invalid[first]
+    return _Welded(Shape(shape.verts[first], number[shape.faces], shape.name, invalid=invalid), first, number)
+
+
+def _between_welded(found: VertexMap, source: _Welded, target: _Welded) -> VertexMap:
+    """A map between two files as one between their welded meshes, which have the same faces."""
+    rows = source.first
+    rest = {"face": found.face[rows], "barycentric": found.barycentric[rows], "confidence": found.confidence[rows]}
+    return VertexMap.between(source.shape, target.shape, target.number[found.index[rows]], **rest)
+
+
+def _between_files(
+    welded: VertexMap, found: VertexMap, source: _Welded, target: Shape, rows: Ints | None = None
+) -> VertexMap:
+    """A map between two files with images, by default of all vertices, as one between their welded meshes has them."""
+    rows = np.arange(len(source.number)) if rows is None else rows
+    at, theirs = source.number[rows], _welded(target)
+    index, face, weights = found.index.copy(), found.face.copy(), found.barycentric.copy()
+    face[rows], weights[rows] = welded.face[at], welded.barycentric[at]
+    corners = corners_of(target.faces, face[rows], theirs.first[welded.index[at]])
+    index[rows] = _heaviest(corners, weights[rows])
+    return replace(found, index=index, face=face, barycentric=weights)
 
 
 class _Images:
-    """The source's vertices on the target, both scaled to area 1; vertices at one place are one."""
+    """The source's vertices on the target, both scaled to area 1."""
 
     def __init__(self, found: VertexMap, source: Shape, target: Shape, workers: int) -> None:
-        self.map, self.source, self.workers = found, source, workers
+        self.map, self.source, self._target_in_file, self.workers = found, source, target, workers
         self.opposite: _Images | None = None  # of the way back, which follows what is laid flat
-        self.same = same_rows(source.verts)
-        faces = self.same[wound_alike(source)[source.valid_faces]]
+        faces = wound_alike(source)[source.valid_faces]
         self.verts, self.points = source.verts / length_of(source), found.points(target) / length_of(target)
         sides = self.verts[faces] - self.verts[faces[:, [1, 2, 0]]]
         longest = squared_lengths(sides.reshape(-1, 3)).reshape(-1, 3).max(axis=1)
@@ -110,6 +178,11 @@ class _Images:
         self.ratio = area_ratios(self.points, self.normals, self.verts, self.faces)
         self.torn = self._torn(self.points, self.faces)
         self.surface: MappedMesh | None = None
+
+    def inverse(self) -> _Images:
+        """Of the inverse of the map as it is now."""
+        source, target = self.source, self._target_in_file
+        return _Images(invert_map(self.map, source, target, self.workers), target, source, self.workers)
 
     def repeat(self, move: Callable[[int, float], bool], rounds: tuple[int, ...], least: float = CRUSHED) -> None:
         """Move what lies around folds, triangles whose area shrinks to less, round by round so many triangles wide."""
@@ -214,7 +287,7 @@ class _Images:
         points, normals = self.points.copy(), self.normals.copy()
         points[rows] = interpolate(back.verts, corners, weights)
         normals[rows] = self.side * unit(interpolate(self.upwards, corners, weights))
-        order = (back.same[back.source.faces[in_file]][:, :, None] == corners[:, None, :]).argmax(axis=2)
+        order = (back.source.faces[in_file][:, :, None] == corners[:, None, :]).argmax(axis=2)
         weights = np.take_along_axis(weights, order, axis=1)
         vertex = _heaviest(back.source.faces[in_file], weights)
         self._take(rows, points, normals, (vertex, in_file, weights))
@@ -225,7 +298,7 @@ class _Images:
 
     def _beneath(self, disk: Disk, reach: float) -> Disk | None:
         """The part of the target that the images of a disk lie on, and so far around, if it is a disk."""
-        faces, images = self._welded[self.target.faces], self.points[disk.vertices]
+        faces, images = self.target.faces, self.points[disk.vertices]
         sides = images[disk.corners] - images[disk.corners[:, [1, 2, 0]]]
         far = reach * np.sqrt(squared_lengths(sides.reshape(-1, 3)).max()) + 2 * self._edge
         away = dijkstra(self._along, indices=np.unique(self._corners(disk.vertices)), min_only=True, limit=2 * far)
@@ -235,19 +308,13 @@ class _Images:
 
     def _corners(self, rows: Ints) -> Ints:
         """(N, 3) the target's vertices that images lie between."""
-        return self._welded[corners_of(self.target.faces, self.map.face[rows], self.map.index[rows])]
-
-    @property
-    @derived
-    def _welded(self) -> Ints:
-        """(V_target,) the first vertex at the place of each: files have several along seams."""
-        return same_rows(self.target.verts)
+        return corners_of(self.target.faces, self.map.face[rows], self.map.index[rows])
 
     @property
     @derived
     def _along(self) -> csr_array:
         """(V_target, V_target) lengths of the target's edges."""
-        edges, V = edges_of(self._welded[self.target.faces]).vertices, self.target.V
+        edges, V = self.target.edges.vertices, self.target.V
         lengths = edge_lengths(self.target.verts, edges)
         return csr_array((np.tile(lengths, 2), np.concatenate([edges, edges[:, ::-1]]).T), shape=(V, V))
 
@@ -314,7 +381,7 @@ class _Images:
         return np.asarray(after @ np.linalg.inv(before))
 
     def _wanted(self, laid: Ints) -> Floats:
-        """(N, 3, 3) the gradients that triangles should have: the mean of those around that are sound."""
+        """(N, 3, 3) the gradients that triangles should have: the mean of those beside them that are sound, or of all."""
         near = np.zeros(len(self.verts), bool)
         near[self.faces[laid].ravel()] = True
         around = np.flatnonzero(self._touches(near))
@@ -329,9 +396,8 @@ class _Images:
             (np.ones(len(places)), (places, np.repeat(np.arange(len(sound)), 3))), shape=(len(vertices), len(sound))
         )
         mean = (to_vertices @ values)[local[self.faces[laid]]].sum(axis=1)
-        found = mean[:, :9] / np.maximum(mean[:, 9:], 1e-300)
-        found[mean[:, 9] <= 0] = np.eye(3).ravel()
-        return np.asarray(found.reshape(-1, 3, 3))
+        mean[mean[:, 9] <= 0] = values.sum(axis=0)
+        return np.asarray((mean[:, :9] / np.maximum(mean[:, 9:], 1e-300)).reshape(-1, 3, 3))
 
     def _solved(self, rows: Ints, laid: Ints) -> Floats:
         """(N, 3) images of vertices whose triangles' gradients are nearest to those wanted, the rest staying."""
@@ -370,16 +436,10 @@ class _Images:
         return points, normals, (foot.vertex, foot.face, foot.barycentric)
 
     def _take(self, rows: Ints, points: Floats, normals: Floats, found: tuple[Ints, Ints, Floats]) -> None:
-        """Move these vertices, and all at their places."""
-        if not len(rows):
-            return
-        at = np.full(len(self.verts), -1)
-        at[rows] = np.arange(len(rows))
-        at = at[self.same]
-        moved = np.flatnonzero(at >= 0)
-        self.points[moved], self.normals[moved] = points[self.same[moved]], normals[self.same[moved]]
+        """Move these vertices."""
+        self.points[rows], self.normals[rows] = points[rows], normals[rows]
         index, face, weights = self.map.index.copy(), self.map.face.copy(), self.map.barycentric.copy()
-        index[moved], face[moved], weights[moved] = (each[at[moved]] for each in found)
+        index[rows], face[rows], weights[rows] = found
         self.map = replace(self.map, index=index, face=face, barycentric=weights)
 
 

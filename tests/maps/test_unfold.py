@@ -53,7 +53,7 @@ def test_folds_are_opened_and_the_rest_stays() -> None:
 
 def test_both_ways_are_inverse_and_have_no_folds() -> None:
     source, target = ball(3), ball(3, 0.0)
-    there, back = unfolded_both_ways(folded(source, target), source, target)
+    there, back = unfolded_both_ways(folded(source, target), put(target, source, target.verts), source, target)
     for found, one, other in ((there, source, target), (back, target, source)):
         assert Folds.of(found, one, other) == Folds(0.0, 0.0, pytest.approx(1.0, abs=0.15))
     assert missed(there, back, source, target) < 0.05
@@ -82,6 +82,29 @@ def test_what_folds_the_way_back_more_is_undone(monkeypatch: pytest.MonkeyPatch)
     images.repeat(images.flattened, (1, 2))
     np.testing.assert_array_equal(images.map.points(target), found.points(target))
     np.testing.assert_array_equal(back.ratio, before)
+
+
+def test_both_ways_are_the_same_in_either_order_however_a_file_stands_and_is_cut() -> None:
+    source, target = ball(3), ball(4, 0.0)
+    place = source.verts[100]
+    near = np.linalg.norm(source.verts - place, axis=1, keepdims=True) < 0.3
+    crushed = np.where(near, place + 0.02 * (source.verts - place), source.verts)  # beside its middle nothing is sound
+    found, back = put(source, target, crushed), put(target, source, target.verts)
+    there, again = unfolded_both_ways(found, back, source, target)
+    swapped = unfolded_both_ways(back, found, target, source)
+    for one, other in zip((again, there), swapped, strict=True):
+        np.testing.assert_array_equal(one.face, other.face)
+        np.testing.assert_array_equal(one.barycentric, other.barycentric)
+    turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
+    corner = target.faces.ravel()  # each face has its own vertices, in the order of its corners
+    cut = Shape(2 * target.verts[corner] @ turn.T, np.arange(3 * target.F).reshape(-1, 3))
+    rest = {"face": found.face, "barycentric": found.barycentric, "confidence": found.confidence}
+    onto = VertexMap.between(source, cut, 3 * found.face + found.barycentric.argmax(1), **rest)
+    rest = {name: getattr(back, name)[corner] for name in ("face", "barycentric", "confidence")}
+    off = VertexMap.between(cut, source, back.index[corner], **rest)
+    there_cut, again_cut = unfolded_both_ways(onto, off, source, cut)
+    np.testing.assert_allclose(there_cut.points(cut), 2 * there.points(target) @ turn.T, atol=1e-9)
+    np.testing.assert_allclose(again_cut.points(source), again.points(source)[corner], atol=1e-9)
 
 
 def missed(there: VertexMap, back: VertexMap, source: Shape, target: Shape) -> float:
