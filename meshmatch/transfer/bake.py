@@ -122,16 +122,19 @@ def transfer_texture(
     atlas: Atlas,
     options: BakeOptions = BakeOptions(),  # frozen
     progress: Callable[[float], None] = lambda share: None,
+    bends: Floats | None = None,
 ) -> Baked:
     """Bake the look of a source's file (`load_appearance`) for a target mesh, along a map from target to source, into
-    an atlas (`atlas_of`) for the options' size and padding; `progress` is called with the share that is done.
+    an atlas (`atlas_of`) for the options' size and padding; `progress` is called with the share that is done, and
+    `bends_of` the two maps say how images of triangles are curved.
     """
     walker, look = _arranged(source, look)
     uv = atlas.uv
     if target.invalid is not None:  # faces with a corner that has no position
         valid = target.valid_faces
         target, uv = Shape(target.verts, target.faces[valid], target.name), uv[valid]
-    locator = TexelLocator(walker, target, back, uv * options.size)
+        bends = None if bends is None else bends[valid]
+    locator = TexelLocator(walker, target, back, uv * options.size, bends)
     on = faces_on(uv * options.size, options.size)[0]
     inside = on >= 0
     grow(on, _OVERHANG if options.padding else 0)
@@ -164,6 +167,7 @@ def transfer_tiles(
     atlas: Atlas,
     options: BakeOptions = BakeOptions(),  # frozen
     progress: Callable[[float], None] = lambda share: None,
+    bends: Floats | None = None,
 ) -> tuple[Baked, dict[int, BakedMaterial]]:
     """The same for an atlas of several tiles (UDIM): a material for each, and one with the images of the first that says
     what alpha means in any, with shares of all.
@@ -174,7 +178,7 @@ def transfer_tiles(
     baked: list[Baked] = []
     for k, tile in enumerate(numbers):
         report = _within(progress, k / len(numbers), (k + 1) / len(numbers))
-        baked.append(transfer_texture(source, look, target, back, atlas.of_tile(tile), options, report))
+        baked.append(transfer_texture(source, look, target, back, atlas.of_tile(tile), options, report, bends))
     area = np.array([target.face_areas[tiles == tile].sum() for tile in numbers])
     low = float(np.dot(area, [each.low for each in baked]) / max(area.sum(), 1e-300))
     alpha = max((each.material.alpha for each in baked), key=("opaque", "mask", "blend").index)

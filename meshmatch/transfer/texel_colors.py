@@ -21,6 +21,9 @@ from meshmatch.transfer.texels import MOST_ROWS, pyramids_of, rows_of, texels_in
 # The map is discontinuous on a triangle if an edge of its image is this many times as long as usual, and a little
 # more (sqrt(area)). Set by hand, as in `mapped_mesh`.
 _STRETCH, _SLACK = 3.0, 0.02
+# An edge of the target whose middle lies further off than this share of its length knows nothing of its bend, and on meshes
+# of more faces edges are short enough to be straight. Set by hand.
+_BENT, _FEW = 0.25, 60_000
 # A place this far off, in sizes of its triangle's image, is searched again from the other corners. Set by hand.
 _FAR = 0.1
 
@@ -185,10 +188,13 @@ class TexelLocator:
     The walker is that of the source, `back` a map from target to source, and corners (F, 3, 2) are those of the
     target's triangles in the atlas, counted in texels. `discontinuous` (F,) are triangles whose corners' images lie far
     apart. Their texels continue the surface around the nearest corner, by the `jacobian` (V, 3, 3) there, and meet in the
-    middle: a cut, where interpolation would smear. `reach` (F,) is the size of a texel on the source.
+    middle: a cut, where interpolation would smear. `reach` (F,) is the size of a texel on the source. With `bends` (F, 3, 3)
+    images of triangles are curved.
     """
 
-    def __init__(self, walker: SurfaceWalker, target: Shape, back: VertexMap, corners: Floats) -> None:
+    def __init__(
+        self, walker: SurfaceWalker, target: Shape, back: VertexMap, corners: Floats, bends: Floats | None = None
+    ) -> None:
         self.walker = walker
         self._confidence = back.assumed_confidence.astype(np.float32)
         self._image, start = images_of(walker, back)
@@ -212,7 +218,8 @@ class TexelLocator:
             self.reach[self.discontinuous] *= bend[self.discontinuous]
         self._steps = first, second
         self._start = list(start[target.faces].T.astype(np.int32, order="C"))
-        table = np.concatenate([corners[:, 0], flat, held[:, 0], first, second], axis=1)
+        bent = [] if bends is None else [bends.reshape(-1, 9)]
+        table = np.concatenate([corners[:, 0], flat, held[:, 0], first, second, *bent], axis=1)
         self._table = list(table.T.astype(np.float32, order="C"))
 
     def laid(self, directions: Float[Floats, "F N M 3"]) -> Float[Floats, "F N M 3"]:
@@ -240,6 +247,12 @@ class TexelLocator:
         points = np.empty((3, len(face)), np.float32)
         for k in range(3):
             points[k] = column[6 + k] + weights[1] * column[9 + k] + weights[2] * column[12 + k]
+        if len(column) > 15:  # 1 in the middle of an edge, 0 at the other middles and at the corners, linear in between
+            one, two, three = np.maximum(weights, 0)
+            for at, (left, right, far) in ((15, (two, three, one)), (18, (three, one, two)), (21, (one, two, three))):
+                share = np.maximum(np.minimum(np.minimum(2 * left, 2 * right), 1 - 2 * far), 0)
+                for k in range(3):
+                    points[k] += share * column[at + k]
         corner = np.where(weights[2] > np.maximum(weights[0], weights[1]), 2, weights[1] > weights[0])
         cut = np.flatnonzero(self.discontinuous.take(face))
         if len(cut):
@@ -273,6 +286,31 @@ class TexelLocator:
         away = np.einsum("kn,nkd->nd", weights, corners) - self.verts[vertex]
         points = self._image[vertex] + np.einsum("nij,nj->ni", self.jacobian[vertex], away)
         return np.asarray(points.T, np.float32)
+
+
+def bends_of(source: Shape, target: Shape, forward: VertexMap, back: VertexMap) -> Float[Floats, "F 3 3"] | None:
+    """How far the image of the middle of each triangle's edge, opposite to each corner, lies from the middle of the images
+    of its ends (units of the source's sqrt(area)), as the map ``forward`` from source to target has it.
+
+    A map is known at the vertices of a mesh, and images of its triangles are flat. The map that goes the other way is flat
+    elsewhere, and says how they bend: so a texture comes back to where it was. None where nothing is known.
+    """
+    if source.is_cloud or target.F > _FEW:
+        return None
+    ends = np.sort(target.faces[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
+    edges, of_face = np.unique(ends[..., 0] * target.V + ends[..., 1], return_inverse=True)
+    ends = np.stack(np.divmod(edges, target.V), axis=1)
+    there, own = SurfaceWalker(Shape(forward.points(target), source.faces)), SurfaceWalker(source)
+    image, start = images_of(own, back)
+    verts = (target.verts - there.center) / there.unit
+    middle = verts[ends].mean(axis=1)
+    face, weights, _ = there.closest(middle.T.astype(np.float32, order="C"), start[ends[:, 0]].astype(np.int32))
+    found, weights = there.faces[face], weights.T.astype(np.float64)
+    bend = interpolate(own.verts, found, weights) - image[ends].mean(axis=1)
+    missed = interpolate(there.verts, found, weights) - middle
+    for off, at in ((bend, image), (missed, verts)):
+        bend[np.linalg.norm(off, axis=1) > _BENT * np.linalg.norm(at[ends[:, 1]] - at[ends[:, 0]], axis=1)] = 0.0
+    return np.asarray(bend[of_face.reshape(-1, 3)])
 
 
 def images_of(walker: SurfaceWalker, back: VertexMap) -> tuple[Floats, Ints]:
