@@ -44,7 +44,7 @@ from meshmatch.shapes.shape import Shape
 # All set by hand on bodies of SCAPE, FAUST and SHREC'19.
 _RINGS = (2, 3)  # of triangles around a fold that move, round by round; more rounds gain little
 _SMOOTHED, _SWEEPS = (3,), 2  # the same of smoothing, and steps of each round; ten gain little more
-_FLAT, _LAST = (1, 2, 3), (1, 2)  # the same of what is laid flat, at last only around what is turned over
+_FLAT = _LAST = (1, 2, 3)  # the same of what is laid flat, at last only around what is turned over
 _CLOSED = 3  # rings around it, within which holes are closed
 # How far around images the target is laid flat: two of its edges, and so many times the longest edge of an image.
 _REACHES = 0.0, 0.5
