@@ -82,7 +82,7 @@ def _first_template(wish: Setting, sources: Sequence[Source], new: bool) -> Temp
             found.append(validated(sources[number].load(wish.only, wish.without)))
     if not found:
         raise InputError(f"none of {len(some)} shapes can be a template", "are they meshes?")
-    chosen = found[medoid(found, "rigid", "area", 0)]
+    chosen = found[medoid(found, "rigid", "area", 0, either_side=wish.config.mirror != "no")]
     return template_of(chosen.shape, chosen.shape.name, ViscousConfig())
 
 

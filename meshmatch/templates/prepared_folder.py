@@ -27,6 +27,7 @@ from meshmatch.shapes.normalise import ALIGNS, Align, align, residual
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.tables import read_by_suffix
+from meshmatch.templates.sides import mirror_image
 from meshmatch.templates.template import SCALES, Scale, Template, template_radius, template_samples, unit_frame
 
 T = TypeVar("T")
@@ -114,15 +115,21 @@ def rotation_range(stack: Float[Floats32, "N V 3"], like: Float[Floats, "V 3"]) 
     return "near" if min(cosines) > np.cos(np.radians(_ALIKE)) else "rigid"
 
 
-def medoid(shapes: Sequence[Repaired], how: Align, scale: Scale, seed: int) -> int:
-    """The shape, a mesh if there is one, with the smallest mean distance to all others, or of many to some of them."""
+def medoid(shapes: Sequence[Repaired], how: Align, scale: Scale, seed: int, either_side: bool = False) -> int:
+    """The shape, a mesh if there is one, with the smallest mean distance to all others, or of many to some of them; to their
+    mirror images where those lie nearer to the first, if either side may be meant."""
     pool = [k for k, one in enumerate(shapes) if not one.shape.is_cloud] or list(range(len(shapes)))
     pool = [pool[k] for k in np.unique(np.linspace(0, len(pool) - 1, min(len(pool), _COMPARED)).astype(int))]
     aligned: list[OrientedPoints] = []
     for k in pool:
         shape = shapes[k].shape
         part = sample_surface(shape, 800, np.random.default_rng(seed)).in_frame(unit_frame(shape, scale, 0.5))
-        aligned.append(part.to_local(align(part, aligned[0], how)[0].pose) if aligned else part)
+        if aligned:
+            sides = [part, mirror_image(part)] if either_side else [part]
+            found = [align(side, aligned[0], how)[0] for side in sides]
+            nearest = int(np.argmin([each.residual for each in found]))
+            part = sides[nearest].to_local(found[nearest].pose)
+        aligned.append(part)
     distance = np.zeros((len(aligned), len(aligned)))
     for i, j in combinations(range(len(aligned)), 2):
         distance[i, j] = distance[j, i] = residual(aligned[j], aligned[i])

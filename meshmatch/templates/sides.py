@@ -43,7 +43,7 @@ def other_side(shapes: Sequence[Repaired], scale: Scale, seed: int, progress: Pr
     if N < 3:
         return nobody
     parts = [_samples(each.shape, scale, [seed, number]) for number, each in enumerate(shapes)]
-    images = [_image(part) for part in parts]
+    images = [mirror_image(part) for part in parts]
     compared = np.unique(np.linspace(0, N - 1, min(N, _COMPARED)).astype(int))
     own = [align(images[k], parts[k], "rigid")[0].residual for k in compared]
     evidence, apart = np.zeros((N, N)), []
@@ -71,7 +71,7 @@ def other_side(shapes: Sequence[Repaired], scale: Scale, seed: int, progress: Pr
 def is_other_side(shape: Repaired, others: Sequence[Repaired], scale: Scale, seed: int) -> bool:
     """Whether a shape is the mirror image of what some shapes of one side are."""
     part = _samples(shape.shape, scale, [seed, len(others)])
-    image, evidence = _image(part), 0.0
+    image, evidence = mirror_image(part), 0.0
     for number in np.unique(np.linspace(0, len(others) - 1, min(len(others), _COMPARED)).astype(int)):
         one = _samples(others[number].shape, scale, [seed, int(number)])
         same, other = (align(each, one, "rigid")[0].residual for each in (part, image))
@@ -83,7 +83,7 @@ def apart(source: Shape, target: Shape, seed: int) -> tuple[float, float]:
     """How far apart a source and a target lie, turned as they fit best, and a source and the mirror image of the target; in
     units of sqrt(area), normals included."""
     one, other = (_samples(shape, "area", [seed, number]) for number, shape in enumerate((source, target)))
-    same, image = parallel_map(lambda each: align(each, one, "rigid")[0].residual, (other, _image(other)))
+    same, image = parallel_map(lambda each: align(each, one, "rigid")[0].residual, (other, mirror_image(other)))
     return same, image
 
 
@@ -91,7 +91,7 @@ def laid_mirrored(shape: Shape, seed: int) -> Shape:
     """The mirror image of a shape as it lies nearest to the shape, its vertices in their order, facing out."""
     frame = unit_frame(shape, "area", 0.5)
     part = _samples(shape, "area", [seed])
-    pose = align(part, _image(part), "rigid")[0].pose
+    pose = align(part, mirror_image(part), "rigid")[0].pose
     laid = frame.undo(pose.to_world(frame.apply(shape.verts) * _MIRROR))
     return Shape(laid, shape.faces[:, ::-1])
 
@@ -100,5 +100,6 @@ def _samples(shape: Shape, scale: Scale, seed: list[int]) -> OrientedPoints:
     return sample_surface(shape, _SAMPLES, np.random.default_rng(seed)).in_frame(unit_frame(shape, scale, 0.5))
 
 
-def _image(part: OrientedPoints) -> OrientedPoints:
+def mirror_image(part: OrientedPoints) -> OrientedPoints:
+    """Points of the mirror image in the plane x = 0."""
     return OrientedPoints(part.points * _MIRROR, part.normals * _MIRROR, part.signed, part.weights)
