@@ -16,7 +16,7 @@ from meshmatch.shapes.normalise import Mirroring
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
-from meshmatch.templates.prepared_folder import has_sides
+from meshmatch.templates.prepared_folder import has_sides, medoid
 from meshmatch.templates.sides import mirrored, other_side
 from tests.conftest import icosphere
 
@@ -143,3 +143,11 @@ def test_fits_tell_sides_and_turns(
     assert made.mirrored == odd
     apart = json.loads((tmp_path / "made" / "prepared.json").read_text())["apart"]
     assert max(apart) < 0.08 or mirror == "no"
+
+
+def test_what_lies_nearest_to_all_may_be_a_mirror_image() -> None:
+    one = hook(0, left=False, turned=False)
+    sizes = [Shape(one.verts * [1, 1, long], one.faces, f"{long}") for long in (0.75, 1.0, 1.3)]
+    shapes = [repair(mirrored(each) if number == 1 else each) for number, each in enumerate(sizes)]
+    assert medoid(shapes, "rigid", "area", 0) != 1
+    assert medoid(shapes, "rigid", "area", 0, either_side=True) == 1
