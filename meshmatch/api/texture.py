@@ -28,7 +28,6 @@ from meshmatch.threads import thread_limit
 from meshmatch.transfer import bake
 from meshmatch.transfer.bake import Baked, BakeOptions
 from meshmatch.transfer.source_layout import check_layout, source_layout
-from meshmatch.transfer.texel_colors import bends_of
 from meshmatch.transfer.unwrap import (
     Atlas,
     Keep,
@@ -207,11 +206,10 @@ def transfer_texture(
                 atlas, bake.contradicted(shape, look, mesh, maps.backward, atlas), mesh, options, uv, polygons
             )
         tiles: dict[int, BakedMaterial] = {}
-        bends = bends_of(shape, mesh, maps.forward, maps.backward)
         if atlas.tiles is None:
-            baked = bake.transfer_texture(shape, look, mesh, maps.backward, atlas, options, report, bends)
+            baked = bake.transfer_texture(shape, look, mesh, maps.backward, atlas, options, report, maps.forward)
         else:
-            baked, tiles = bake.transfer_tiles(shape, look, mesh, maps.backward, atlas, options, report, bends)
+            baked, tiles = bake.transfer_tiles(shape, look, mesh, maps.backward, atlas, options, report, maps.forward)
     turn = np.eye(3)
     if file is None or file.suffix.lower() not in gltf.SUFFIXES:
         turn = turn_upright(maps, Path(shape.name).suffix.lower() in gltf.SUFFIXES)

@@ -23,7 +23,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map
 from meshmatch.transfer.layers import ColorPainter, NormalPainter, Painter, Spots, SurfacePainter, painted_bytes
 from meshmatch.transfer.surface_walk import PointWalker, SurfaceWalker
-from meshmatch.transfer.texel_colors import MaterialSampler, TexelLocator, images_of
+from meshmatch.transfer.texel_colors import MaterialSampler, TexelLocator, bends_of, images_of
 from meshmatch.transfer.texels import beside_another, faces_on, fill, grow
 from meshmatch.transfer.unwrap import Atlas
 
@@ -122,14 +122,15 @@ def transfer_texture(
     atlas: Atlas,
     options: BakeOptions = BakeOptions(),  # frozen
     progress: Callable[[float], None] = lambda share: None,
-    bends: Floats | None = None,
+    forward: VertexMap | None = None,
 ) -> Baked:
     """Bake the look of a source's file (`load_appearance`) for a target mesh, along a map from target to source, into
     an atlas (`atlas_of`) for the options' size and padding; `progress` is called with the share that is done, and
-    `bends_of` the two maps say how images of triangles are curved.
+    where the map `forward` from source to target is given, images of triangles bend as it says.
     """
     walker, look = _arranged(source, look)
     uv = atlas.uv
+    bends = None if forward is None else bends_of(source, target, forward, back)
     if target.invalid is not None:  # faces with a corner that has no position
         valid = target.valid_faces
         target, uv = Shape(target.verts, target.faces[valid], target.name), uv[valid]
@@ -167,7 +168,7 @@ def transfer_tiles(
     atlas: Atlas,
     options: BakeOptions = BakeOptions(),  # frozen
     progress: Callable[[float], None] = lambda share: None,
-    bends: Floats | None = None,
+    forward: VertexMap | None = None,
 ) -> tuple[Baked, dict[int, BakedMaterial]]:
     """The same for an atlas of several tiles (UDIM): a material for each, and one with the images of the first that says
     what alpha means in any, with shares of all.
@@ -178,7 +179,7 @@ def transfer_tiles(
     baked: list[Baked] = []
     for k, tile in enumerate(numbers):
         report = _within(progress, k / len(numbers), (k + 1) / len(numbers))
-        baked.append(transfer_texture(source, look, target, back, atlas.of_tile(tile), options, report, bends))
+        baked.append(transfer_texture(source, look, target, back, atlas.of_tile(tile), options, report, forward))
     area = np.array([target.face_areas[tiles == tile].sum() for tile in numbers])
     low = float(np.dot(area, [each.low for each in baked]) / max(area.sum(), 1e-300))
     alpha = max((each.material.alpha for each in baked), key=("opaque", "mask", "blend").index)
