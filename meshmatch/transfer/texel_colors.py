@@ -290,7 +290,7 @@ class TexelLocator:
 
 def bends_of(source: Shape, target: Shape, forward: VertexMap, back: VertexMap) -> Float[Floats, "F 3 3"] | None:
     """How far the image of the middle of each triangle's edge, opposite to each corner, lies from the middle of the images
-    of its ends (units of the source's sqrt(area)), as the map ``forward`` from source to target has it.
+    of its ends (units of the source's sqrt(area)), if these are where the map ``forward`` from source to target says.
 
     A map is known at the vertices of a mesh, and images of its triangles are flat. The map that goes the other way is flat
     elsewhere, and says how they bend: so a texture comes back to where it was. None where nothing is known.
@@ -301,16 +301,17 @@ def bends_of(source: Shape, target: Shape, forward: VertexMap, back: VertexMap) 
     edges, of_face = np.unique(ends[..., 0] * target.V + ends[..., 1], return_inverse=True)
     ends = np.stack(np.divmod(edges, target.V), axis=1)
     there, own = SurfaceWalker(Shape(forward.points(target), source.faces)), SurfaceWalker(source)
-    image, start = images_of(own, back)
-    verts = (target.verts - there.center) / there.unit
-    middle = verts[ends].mean(axis=1)
-    face, weights, _ = there.closest(middle.T.astype(np.float32, order="C"), start[ends[:, 0]].astype(np.int32))
-    found, weights = there.faces[face], weights.T.astype(np.float64)
-    bend = interpolate(own.verts, found, weights) - image[ends].mean(axis=1)
-    missed = interpolate(there.verts, found, weights) - middle
-    for off, at in ((bend, image), (missed, verts)):
-        bend[np.linalg.norm(off, axis=1) > _BENT * np.linalg.norm(at[ends[:, 1]] - at[ends[:, 0]], axis=1)] = 0.0
-    return np.asarray(bend[of_face.reshape(-1, 3)])
+    verts, start = (target.verts - there.center) / there.unit, images_of(own, back)[1]
+    asked = np.concatenate([verts, verts[ends].mean(axis=1)])
+    start = np.concatenate([start, start[ends[:, 0]]])
+    face, weights, _ = there.closest(asked.T.astype(np.float32, order="C"), start.astype(np.int32))
+    corners, weights = there.faces[face], weights.T.astype(np.float64)
+    image, off = interpolate(own.verts, corners, weights), interpolate(there.verts, corners, weights) - asked
+    bends, off = image[target.V :] - image[ends].mean(axis=1), off[target.V :]
+    one, two = ends.T
+    for far, at in ((bends, image), (off, verts)):
+        bends[squared_lengths(far) > _BENT**2 * squared_lengths(at[two] - at[one])] = 0.0
+    return np.asarray(bends[of_face.reshape(-1, 3)])
 
 
 def images_of(walker: SurfaceWalker, back: VertexMap) -> tuple[Floats, Ints]:

@@ -67,6 +67,11 @@ def test_a_map_that_is_straight_bends_nothing() -> None:
     np.testing.assert_allclose(found, 0.0, atol=1e-6)
 
 
+def test_maps_that_disagree_bend_no_more_than_one_of_them(forward: VertexMap) -> None:
+    shifted = put(TARGET, SOURCE, bent(TARGET.verts + [0.02, 0, 0]))
+    np.testing.assert_array_equal(bends_of(SOURCE, TARGET, forward, shifted), bends_of(SOURCE, TARGET, forward, BACK))
+
+
 def test_what_the_way_there_does_not_know_bends_nothing(forward: VertexMap, monkeypatch: pytest.MonkeyPatch) -> None:
     elsewhere = put(SOURCE, TARGET, SOURCE.verts[::-1])  # turned about: the middles belong far from the ends
     turned = bends_of(SOURCE, TARGET, elsewhere, BACK)
