@@ -68,7 +68,7 @@ def test_a_map_that_is_straight_bends_nothing() -> None:
 
 
 def test_maps_that_disagree_bend_no_more_than_one_of_them(forward: VertexMap) -> None:
-    shifted = put(TARGET, SOURCE, bent(TARGET.verts + [0.02, 0, 0]))
+    shifted = put(TARGET, SOURCE, bent(TARGET.verts + np.array([0.02, 0, 0])))
     np.testing.assert_array_equal(bends_of(SOURCE, TARGET, forward, shifted), bends_of(SOURCE, TARGET, forward, BACK))
 
 
