@@ -26,6 +26,7 @@ from meshmatch.outputs import replace_on_success
 from meshmatch.training.losses import CorrespondenceLoss, Objective
 
 _OF_TEMPLATE = ("nodes", "anchors")  # what a checkpoint must share with the training that goes on from it
+_STATISTICS = ("running_mean", "running_var")  # of batch norms
 _MOMENTS, _COUNT = ("exp_avg", "exp_avg_sq"), {"step": torch.Size()}  # of Adam: what it knows of each parameter
 
 
@@ -224,16 +225,23 @@ class Trainer:
         self.optimiser.zero_grad(set_to_none=True)
         terms["total"].backward()
         if self.world > 1:
-            for parameter in self.model.parameters():
-                if parameter.grad is not None:
-                    dist.all_reduce(parameter.grad)
-                    parameter.grad /= self.world
+            self._exchange()
         if config.clip is not None:
             torch.nn.utils.clip_grad_norm_(self.model.parameters(), config.clip)
         self.optimiser.step()
         self.step += 1
         self._update_average()
         return terms
+
+    def _exchange(self) -> None:
+        """Gradients, and the statistics of batch norms, become the means over all processes: all at once, for each exchange
+        takes time of its own."""
+        held = [each.grad for each in self.model.parameters() if each.grad is not None]
+        held += [each for name, each in self.model.named_buffers() if name.endswith(_STATISTICS)]
+        flat = torch.cat([each.flatten() for each in held])
+        dist.all_reduce(flat)
+        for each, mean in zip(held, (flat / self.world).split([each.numel() for each in held]), strict=True):
+            each.copy_(mean.view_as(each))
 
     def _update_average(self) -> None:
         # A young average follows quickly, an old one slowly.
