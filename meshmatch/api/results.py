@@ -21,7 +21,7 @@ from meshmatch.maps.evaluate import CM, Evaluation, SurfaceDistance, evaluate_ma
 from meshmatch.maps.files import load_map
 from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.places import PlacedFit, Places, surface_distance
-from meshmatch.maps.unfold import LARGEST_BOTH_WAYS, unfolded, unfolded_both_ways
+from meshmatch.maps.unfold import unfolded_pair
 from meshmatch.maps.vertex_map import VertexMap, check_map
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.progress import ProgressCallback
@@ -259,11 +259,8 @@ def maps_of_fits(
     found = build_map(here, there, threads)
     if source is None or target is None:
         return found, None
-    whole = not (source.is_cloud or target.is_cloud or _partial(first) or _partial(second))
-    if not whole or found.verdict != "good" or max(source.V, target.V) > LARGEST_BOTH_WAYS:
-        return unfolded(found, source, target, threads), None
-    opposite = build_map(there, here, threads)
-    return unfolded_both_ways(found, opposite, source, target, threads)
+    partial = _partial(first) or _partial(second)
+    return unfolded_pair(found, lambda: build_map(there, here, threads), source, target, partial, threads)
 
 
 def _partial(fit: Fit | ImplicitFit) -> bool:

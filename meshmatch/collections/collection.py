@@ -32,7 +32,7 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.build import build_map
 from meshmatch.maps.files import check_suffix
 from meshmatch.maps.places import Places
-from meshmatch.maps.unfold import unfolded
+from meshmatch.maps.unfold import unfolded, unfolded_pair
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.progress import ProgressCallback
@@ -255,8 +255,7 @@ class Collection(FitsFolder):
         shapes = as_shape(source, "source"), as_shape(target, "target")
         names = {self._hash_of(name): name for name in self._fitted}
         for other in self._others():
-            theirs = {other._hash_of(name): name for name in other._fitted}
-            if all(shape.hash in theirs for shape in shapes):
+            if {shape.hash for shape in shapes} <= {other._hash_of(name) for name in other._fitted}:
                 return other.maps_between(*shapes)
         for shape in shapes:
             if shape.hash not in names:
@@ -264,7 +263,9 @@ class Collection(FitsFolder):
                 raise InputError(f"{self.store.location} holds no fit of {shape.name or 'this shape'}", hint)
         a, b = (names[shape.hash] for shape in shapes)
         there, back = self.map(a, b).for_shapes(*shapes), self.map(b, a).for_shapes(*shapes[::-1])
-        return MapPair(*shapes, unfolded(there, *shapes), opposite=unfolded(back, *shapes[::-1]))
+        part = self._words(a)["partial"] or self._words(b)["partial"]
+        there, opposite = unfolded_pair(there, lambda: back, *shapes, part)
+        return MapPair(*shapes, there, opposite=opposite or unfolded(back, *shapes[::-1]))
 
     def holds(self, shape: ShapeLike) -> bool:
         """Whether a shape is among the fits, or among those of another kind, by its vertices and faces.
@@ -285,8 +286,7 @@ class Collection(FitsFolder):
     def _names_of_one_kind(self) -> list[str]:
         """`names`; with a warning about those that it does not have."""
         names = self.names
-        known = set(names)
-        for text in elsewhere_words(self._elsewhere([name for name in self._fitted if name not in known])):
+        for text in elsewhere_words(self._elsewhere(sorted(set(self._fitted) - set(names)))):
             warn(text)
         return names
 
