@@ -10,8 +10,7 @@ or along the target in percent of sqrt(area) where there is no unit. A place is 
 - own: ``prepare --grow-radii``, ``train --shapes`` of so many steps, and ``fit FOLDER --model own``, of the same specimens.
 - pairs: ``match A B --model none`` of every pair by itself, or of ``--limit-pairs`` of them.
 - meshmonk: the first specimen is registered to all others, from a start that it is given: the similarity, and the
-  side, that brings true places together best.
-- pyclarcs: for bilateral symmetry; told as missing where it is not installed.
+  side, that brings true places together best; told as missing where it is not installed.
 
 CPU seconds are those of all processes. Kept in ``--work``, a run goes on where it was stopped.
 """
@@ -62,7 +61,7 @@ SIDED = ("femurs", "hearts", "knees", "molars")
 BY_KEYPOINTS = ("bust", "bird", "fish", "chair")
 SETS = (*SIDED, "leaves", *BY_KEYPOINTS)
 PAIRS = "pairs"
-METHODS = (NO_MODEL, "own", PAIRS, "meshmonk", "pyclarcs")
+METHODS = (NO_MODEL, "own", PAIRS, "meshmonk")
 _OTHERS = METHODS[3:]
 LOST = 0.1  # of sqrt(area)
 _CUT = 2  # femurs

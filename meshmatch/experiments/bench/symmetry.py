@@ -1,0 +1,147 @@
+"""Which point lies across from which, on shapes that are nearly symmetric: fits without a model, and pyclarcs.
+
+Truth: keypoints of SHREC'07 that are mirror images of each other. The error is the distance along the shape's edges
+between where a keypoint's counterpart is said to be and where it is, in percent of sqrt(area). A counterpart is lost beyond
+a tenth of sqrt(area).
+
+- none: ``fit FOLDER --model none``; what lies across from a place of a shape is what lies across from it on the template.
+- pyclarcs: ``clarcs asymmetry``: its plane of symmetry, and its registration of the mirror image, of each shape by itself,
+  with 4,000 triangles. Its widths are millimetres of endocasts, so shapes are brought to their size.
+
+In the ``--work`` folder of `meshmatch.experiments.bench.specimens` the fits of that are taken.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from typer import Option
+
+from meshmatch.arrays import Floats, Int, Ints
+from meshmatch.collections.collection import Collection
+from meshmatch.experiments import runner
+from meshmatch.experiments.bench import any_shapes
+from meshmatch.experiments.bench.specimens import BY_KEYPOINTS, LOST, Specimens, load
+from meshmatch.geometry.frames import kabsch
+from meshmatch.geometry.trees import cKDTree
+from meshmatch.geometry.triangles import interpolate
+from meshmatch.maps.footpoints import Surface
+from meshmatch.models.registry import NO_MODEL
+from meshmatch.outputs import make_folder
+from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.files import save_shape
+from meshmatch.templates.sides import laid_mirrored
+
+PYCLARCS = "pyclarcs"
+METHODS = (NO_MODEL, PYCLARCS)
+SETS = tuple(name for name in BY_KEYPOINTS if name != "chair")
+_TRIANGLES, _SIZE = 4000, 200.0  # of what pyclarcs is given: mm
+_COLUMNS = {"set": "set", "method": "method", "shapes": "shapes:d", "keypoints": "keypoints:d"}
+_COLUMNS |= {"error, % of sqrt(area)": "error:.2f", "worst shape": "worst:.2f", "lost": "lost:.1%"}
+
+Across = Callable[[str, Ints], Floats]
+"""Where the counterparts of some vertices of a shape are."""
+
+
+def pairs_of(folder: Path, shape: str) -> Int[Ints, "N 2"]:
+    """Keypoints, and those that lie across from them."""
+    plain, swapped = any_shapes.symmetries(folder, shape)
+    paired = np.flatnonzero(plain != swapped)
+    return np.stack([paired, swapped[paired]], axis=1)
+
+
+def by_fits(some: Specimens, scans: Path, work: Path) -> Across:
+    """By the template of a collection, and how it lies on its own mirror image."""
+    collection = Collection(work, workers=1)
+    collection.fit(scans, model=NO_MODEL)
+    template = collection.template.shape
+    images = template.verts * [-1.0, 1, 1]
+    across = kabsch(images, laid_mirrored(template, 0).verts)
+
+    def points(name: str, vertices: Ints) -> Floats:
+        places = collection.places_of(name)
+        image = across.to_world(places.resting[vertices] * [-1.0, 1, 1]).astype(np.float32)
+        found = places.nearest(image)
+        return interpolate(some.each[name].shape.verts, places.faces[found.face].astype(np.int64), found.barycentric)
+
+    return points
+
+
+def clarcs(some: Specimens, scans: Path, work: Path) -> Across:
+    """By pyclarcs."""
+    plane, coarse, fine, align, io, nonrigid = (
+        import_module(f"{PYCLARCS}.{name}")
+        for name in ("principal_axes", "coarse", "fine", "alignment", "io", "nonrigid")
+    )
+
+    def points(name: str, vertices: Ints) -> Floats:
+        shape = some.each[name].shape
+        small, unit = decimate(shape, _TRIANGLES), float(np.sqrt(shape.area)) / _SIZE
+        verts, faces = np.asarray(small.verts) / unit, small.faces.tolist()
+        found = coarse.coarse_symmetry(verts, plane.best_principal_axis_plane(verts), verbose=False)
+        for step in (fine.em_icp_sym, fine.em_icp_sym_corres):
+            found = step(verts, found, verbose=False)
+        image, inside_out = align.reflect_surface(verts, found.n, found.n * found.d), [each[::-1] for each in faces]
+        normals = [io.compute_surface_normals(*mesh) for mesh in ((image, inside_out), (verts, faces))]
+        moved = image + nonrigid.register(
+            image, normals[0], verts, normals[1], inside_out, faces, n_levels=1, verbose=False
+        )
+        foot = Surface(verts, small.faces, small.vertex_normals).query(
+            shape.verts[vertices] / unit, shape.vertex_normals[vertices]
+        )
+        return interpolate(moved, small.faces[foot.face], foot.barycentric) * unit
+
+    return points
+
+
+def measure(name: str, method: str, data: Path, seed: int, work: Path) -> dict[str, Any]:
+    """A row."""
+    some = load(name, data, any_shapes.SHAPES, seed)
+    assert some.folder is not None
+    scans = work / "scans" / name
+    make_folder(scans)
+    for key, each in some.each.items():
+        save_shape(scans / f"{key}.ply", each.shape)
+    ways: dict[str, Callable[[Specimens, Path, Path], Across]] = {NO_MODEL: by_fits, PYCLARCS: clarcs}
+    across, errors = ways[method](some, scans, work / "fits" / f"{name}-{method}"), {}
+    for key, each in some.each.items():
+        paired, known = pairs_of(some.folder, key), any_shapes.distances(some.folder, key)
+        vertices = any_shapes.keypoints_of(some.folder, key)[paired[:, 0]]
+        arrived = cKDTree(each.shape.verts).query(across(key, vertices))[1]
+        errors[key] = 100 * known[paired[:, 1], arrived]
+    off = np.concatenate(list(errors.values()))
+    means = {key: float(each.mean()) for key, each in errors.items()}
+    row = {"set": name, "method": method, "shapes": len(errors), "keypoints": len(off), "error": float(off.mean())}
+    return row | {"worst": max(means.values()), "lost": float((off > 100 * LOST).mean()), "each": means}
+
+
+@runner.command
+def main(
+    data: runner.Data = runner.DATA,
+    sets: Annotated[str, Option(help=f"of {', '.join(SETS)}")] = ",".join(SETS),
+    methods: Annotated[str, Option(help=f"of {', '.join(METHODS)}")] = ",".join(METHODS),
+    work: runner.Work = None,
+    threads: runner.Threads = 1,
+    seed: runner.Seed = 0,
+) -> runner.Report:
+    names = runner.names_of(sets, SETS, "set")
+    rows, skipped = [], []
+    with tempfile.TemporaryDirectory() as temporary:
+        place = work or Path(temporary)
+        for method in runner.names_of(methods, METHODS, "method"):
+            if method == PYCLARCS and find_spec(method) is None:
+                skipped.append(f"skipped: {method} is not installed")
+                continue
+            for name in names:
+                runner.tell(f"{name}: {method}")
+                call = partial(measure, name, method, data, seed, place)
+                rows.append(runner.once(place / "symmetry" / f"{name}-{method}.json", {"seed": seed}, call))
+    rows.sort(key=lambda row: names.index(row["set"]))
+    return runner.Report({"rows": rows}, [runner.table("Across the plane of symmetry", rows, _COLUMNS)], skipped)
