@@ -21,6 +21,7 @@ from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.input_files import read_json
+from meshmatch.shapes.rims import is_sheet
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.prepared_folder import medoid
 from meshmatch.templates.template import Template, load_template, save_template
@@ -82,7 +83,8 @@ def _first_template(wish: Setting, sources: Sequence[Source], new: bool) -> Temp
             found.append(validated(sources[number].load(wish.only, wish.without)))
     if not found:
         raise InputError(f"none of {len(some)} shapes can be a template", "are they meshes?")
-    chosen = found[medoid(found, "rigid", "area", 0, either_side=wish.config.mirror != "no")]
+    sided = wish.config.mirror != "no" and not all(is_sheet(each.shape) for each in found)  # a leaf only turns over
+    chosen = found[medoid(found, "rigid", "area", 0, either_side=sided)]
     return template_of(chosen.shape, chosen.shape.name, ViscousConfig())
 
 
