@@ -30,7 +30,6 @@ from meshmatch.geometry.triangles import (
     dot,
     edge_lengths,
     interpolate,
-    same_rows,
     squared_lengths,
     triangle_areas,
     triangle_vectors,
@@ -39,12 +38,13 @@ from meshmatch.geometry.triangles import (
 from meshmatch.maps.folds import CRUSHED, area_ratios, facing, known_normals, normals_at, wound_alike
 from meshmatch.maps.mapped_mesh import MappedMesh, invert_map, length_of
 from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.shapes.faces import seams
 from meshmatch.shapes.shape import Shape
 
 # All set by hand on bodies of SCAPE, FAUST and SHREC'19.
 _RINGS = (2, 3)  # of triangles around a fold that move, round by round; more rounds gain little
 _SMOOTHED, _SWEEPS = (3,), 2  # the same of smoothing, and steps of each round; ten gain little more
-_FLAT = _LAST = (1, 2, 3)  # the same of what is laid flat, at last only around what is turned over
+_FLAT = 1, 2, 3  # the same of what is laid flat, first around all folds and last around what is turned over
 _CLOSED = 3  # rings around it, within which holes are closed
 # How far around images the target is laid flat: two of its edges, and so many times the longest edge of an image.
 _REACHES = 0.0, 0.5
@@ -60,7 +60,7 @@ _HOLD = 1e-3  # how much each image stays, so that every part has a solution
 
 def unfolded(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -> VertexMap:
     """A map between these shapes with fewer folds: the same where it has none, and of clouds and very large meshes."""
-    if source.is_cloud or target.is_cloud or max(source.V, target.V) > _LARGEST:
+    if source.is_cloud or target.is_cloud or _largest(source, target) > _LARGEST:
         return found
     own, theirs = _welded(source), _welded(target)
     start = _between_welded(found, own, theirs)
@@ -68,7 +68,7 @@ def unfolded(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -
     images.repeat(images.relaid, _RINGS)
     images.repeat(images.smoothed, _SMOOTHED)
     images.repeat(images.flattened, _FLAT)
-    images.repeat(images.flattened, _LAST, 0.0)
+    images.repeat(images.flattened, _FLAT, 0.0)
     if images.map is start:
         return found
     moved = (images.map.face != start.face) | (images.map.barycentric != start.barycentric).any(axis=1)
@@ -82,7 +82,7 @@ def unfolded_pair(
     inverse, which takes the place of the map that ``opposite`` makes.
     """
     clouds = source.is_cloud or target.is_cloud
-    if partial or clouds or found.verdict != "good" or max(source.V, target.V) > _LARGEST_BOTH_WAYS:
+    if partial or clouds or found.verdict != "good" or _largest(source, target) > _LARGEST_BOTH_WAYS:
         return unfolded(found, source, target, workers), None
     return unfolded_both_ways(found, opposite(), source, target, workers)
 
@@ -93,8 +93,8 @@ def unfolded_both_ways(
     """Such a map and its inverse, which has few folds as well: what is laid out anew in the one is so in the other.
 
     Which of the two shapes is the source makes no difference, nor do copies of vertices along the seams of a file, nor how
-    it stands: the map of the coarser one begins, for the inverse of that is finer. What is certain is kept from the map
-    ``found`` and from its ``opposite``, which were asked of fits.
+    it stands: the coarser mesh's map is unfolded first, for the inverse of that is finer. Confidence is kept from the map
+    ``found`` and from its ``opposite``, which were made from fits.
     """
     own, theirs = _welded(source), _welded(target)
     if theirs.order < own.order:
@@ -110,14 +110,14 @@ def unfolded_both_ways(
     there = back.inverse()
     there.opposite, back.opposite = back, there
     for each in (there, back):
-        each.repeat(each.flattened, _LAST, 0.0)
+        each.repeat(each.flattened, _FLAT, 0.0)
     return _between_files(there.map, found, own, target), _between_files(back.map, opposite, theirs, source)
 
 
 @dataclass(frozen=True, eq=False)
 class _Welded:
-    """A mesh whose vertices at one place are one, in the order in which faces name them: the same whatever copies of
-    vertices a file has.
+    """A mesh whose vertices along seams are one, in the order in which faces name them: the same whatever copies of
+    vertices a file has. Parts that merely touch stay apart.
 
     Attributes
     ----------
@@ -130,15 +130,18 @@ class _Welded:
     number: Int[Ints, " V"]
 
     @property
-    def order(self) -> tuple[int, int, float]:
-        """By which the coarser of two meshes is known, whatever their size and however they stand."""
+    def order(self) -> tuple[int, int, float, str]:
+        """By which the coarser of two meshes is known, whatever their size and however they stand; of meshes of the same
+        triangles, as a shape and its mirror image, one or the other.
+        """
         sides = edge_lengths(self.shape.verts, self.shape.edges.vertices)
-        return self.shape.V, self.shape.F, float(sides.mean()) / length_of(self.shape)
+        fineness = round(float(sides.mean()) / length_of(self.shape), 6)  # formats of single precision hold that much
+        return self.shape.V, self.shape.F, fineness, self.shape.hash
 
 
 @derived
 def _welded(shape: Shape) -> _Welded:
-    twin = same_rows(shape.verts)
+    twin = seams(shape.verts, shape.faces[shape.valid_faces])
     first, begins = np.unique(np.concatenate([twin[shape.faces].ravel(), twin]), return_index=True)
     first = first[np.argsort(begins)]
     number = np.empty(shape.V, np.int64)
@@ -146,6 +149,10 @@ def _welded(shape: Shape) -> _Welded:
     number = number[twin]
     invalid = None if shape.invalid is None else shape.invalid[first]
     return _Welded(Shape(shape.verts[first], number[shape.faces], shape.name, invalid=invalid), first, number)
+
+
+def _largest(source: Shape, target: Shape) -> int:
+    return max(_welded(each).shape.V for each in (source, target))
 
 
 def _between_welded(found: VertexMap, source: _Welded, target: _Welded) -> VertexMap:
@@ -392,7 +399,8 @@ class _Images:
         return np.asarray(after @ np.linalg.inv(before))
 
     def _wanted(self, laid: Ints) -> Floats:
-        """(N, 3, 3) the gradients that triangles should have: the mean of those beside them that are sound, or of all."""
+        """(N, 3, 3) the gradients that triangles should have: the mean of the sound ones beside them or, where
+        there are none, of all sound ones around."""
         near = np.zeros(len(self.verts), bool)
         near[self.faces[laid].ravel()] = True
         around = np.flatnonzero(self._touches(near))

@@ -21,9 +21,9 @@ from meshmatch.transfer.texels import MOST_ROWS, pyramids_of, rows_of, texels_in
 # The map is discontinuous on a triangle if an edge of its image is this many times as long as usual, and a little
 # more (sqrt(area)). Set by hand, as in `mapped_mesh`.
 _STRETCH, _SLACK = 3.0, 0.02
-# An edge of the target whose middle lies further off than this share of its length knows nothing of its bend, and on meshes
-# of more faces edges are short enough to be straight. Set by hand.
-_BENT, _FEW = 0.25, 60_000
+# A bend by more than this share of an edge is where the map is discontinuous, or maps disagree. Set by hand.
+_BENT = 0.25
+_FEW = 200_000  # faces; on larger meshes edges are short enough to be straight
 # A place this far off, in sizes of its triangle's image, is searched again from the other corners. Set by hand.
 _FAR = 0.1
 
@@ -188,8 +188,8 @@ class TexelLocator:
     The walker is that of the source, `back` a map from target to source, and corners (F, 3, 2) are those of the
     target's triangles in the atlas, counted in texels. `discontinuous` (F,) are triangles whose corners' images lie far
     apart. Their texels continue the surface around the nearest corner, by the `jacobian` (V, 3, 3) there, and meet in the
-    middle: a cut, where interpolation would smear. `reach` (F,) is the size of a texel on the source. With `bends` (F, 3, 3)
-    images of triangles are curved.
+    middle: a cut, where interpolation would smear. `reach` (F,) is the size of a texel on the source. With
+    `bends_of` the maps, images of triangles are bent.
     """
 
     def __init__(
@@ -290,26 +290,28 @@ class TexelLocator:
 
 def bends_of(source: Shape, target: Shape, forward: VertexMap, back: VertexMap) -> Float[Floats, "F 3 3"] | None:
     """How far the image of the middle of each triangle's edge, opposite to each corner, lies from the middle of the images
-    of its ends (units of the source's sqrt(area)), if these are where the map ``forward`` from source to target says.
+    of its ends (units of the source's sqrt(area)), all by the inverse of the map ``forward`` from source to target.
 
     A map is known at the vertices of a mesh, and images of its triangles are flat. The map that goes the other way is flat
-    elsewhere, and says how they bend: so a texture comes back to where it was. None where nothing is known.
+    on the other mesh's triangles, and says how they bend: so a texture comes back to where it was. None where nothing is
+    known, also of a map that knows vertices alone; an edge does not bend where both maps disagree about its ends.
     """
-    if source.is_cloud or target.F > _FEW:
+    if source.is_cloud or target.F > _FEW or forward.on_vertex.mean() > 0.5:
         return None
     ends = np.sort(target.faces[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
     edges, of_face = np.unique(ends[..., 0] * target.V + ends[..., 1], return_inverse=True)
     ends = np.stack(np.divmod(edges, target.V), axis=1)
-    there, own = SurfaceWalker(Shape(forward.points(target), source.faces)), SurfaceWalker(source)
-    verts, start = (target.verts - there.center) / there.unit, images_of(own, back)[1]
+    there = SurfaceWalker(Shape(forward.points(target), source.faces, invalid=source.invalid))
+    own, verts = SurfaceWalker(source), (target.verts - there.center) / there.unit
+    known, start = images_of(own, back)
     asked = np.concatenate([verts, verts[ends].mean(axis=1)])
     start = np.concatenate([start, start[ends[:, 0]]])
     face, weights, _ = there.closest(asked.T.astype(np.float32, order="C"), start.astype(np.int32))
     corners, weights = there.faces[face], weights.T.astype(np.float64)
     image, off = interpolate(own.verts, corners, weights), interpolate(there.verts, corners, weights) - asked
-    bends, off = image[target.V :] - image[ends].mean(axis=1), off[target.V :]
-    one, two = ends.T
-    for far, at in ((bends, image), (off, verts)):
+    bends, (one, two) = image[target.V :] - image[ends].mean(axis=1), ends.T
+    apart = image[: target.V] - known
+    for far, at in ((bends, known), (apart[one], known), (apart[two], known), (off[target.V :], verts)):
         bends[squared_lengths(far) > _BENT**2 * squared_lengths(at[two] - at[one])] = 0.0
     return np.asarray(bends[of_face.reshape(-1, 3)])
 

@@ -15,6 +15,7 @@ from meshmatch.fitting.search.frames import (
     forced_frames,
     frames_anywhere,
     frames_to_try,
+    own_axes,
     propose,
     standing_grid,
     turned_copies,
@@ -84,6 +85,17 @@ def test_frames_do_not_depend_on_how_the_file_stands(model: TrainedModel) -> Non
         np.testing.assert_allclose(Q @ rotations(own), rotations(theirs), atol=1e-6)
         for one, other in zip(own, theirs, strict=True):
             np.testing.assert_allclose(Q @ one.center + shift, other.center, atol=1e-6)
+
+
+def test_own_axes_turn_with_what_is_flat_or_mirrored() -> None:
+    rng = np.random.default_rng(0)
+    cloud = rng.gamma(2.0, size=(500, 3)) * [3, 2, 1]
+    for points in (cloud * [1, 1, 0], np.concatenate([cloud, cloud * [1, 1, -1]])):
+        own = own_axes(points)
+        for Q in Rotation.random(10, random_state=1).as_matrix():
+            turned = own_axes(points @ Q.T)
+            check_rotations(turned.rotation[None])
+            np.testing.assert_allclose(turned.to_local(points @ Q.T), own.to_local(points), atol=1e-9)
 
 
 def test_hypotheses_are_rotations_with_the_most_voted_first(model: TrainedModel, points: np.ndarray) -> None:

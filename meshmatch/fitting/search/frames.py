@@ -145,14 +145,16 @@ def _axes(config: FitConfig) -> tuple[Float[Floats, " 3"] | None, Float[Floats, 
 
 
 def own_axes(points: Float[Floats, "P 3"]) -> RigidPose:
-    """The middle of points and their principal axes, each towards the side that reaches further.
+    """The middle of points and their principal axes; two point to the side that reaches further, by third moments, and
+    the one of which these say least makes it a rotation.
 
-    A search that begins there finds the same however the file stands.
+    A search that begins there finds the same however the file stands, unless the points are symmetric.
     """
     middle = points.mean(0)
     axes = np.linalg.eigh(np.cov(points.T))[1]
-    axes *= np.where((((points - middle) @ axes) ** 3).sum(0) < 0, -1.0, 1.0)
-    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    further = (((points - middle) @ axes) ** 3).sum(0)
+    axes *= np.where(further < 0, -1.0, 1.0)
+    axes[:, np.abs(further).argmin()] *= np.sign(np.linalg.det(axes))
     return RigidPose(axes, middle)
 
 
