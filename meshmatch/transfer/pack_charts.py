@@ -33,7 +33,7 @@ _RINGS, _FADING = (
 )  # texels around a piece in which others count as close, each ring so much less than the one before
 _COUNTS = np.array([1.0, *_FADING ** np.arange(_RINGS), 0.0], np.float32)  # so many texels further than others may be
 _LOW = 0.3  # how much it counts to lie low in the image, beside the share of the rings that is taken
-_BETWEEN = 0.2  # of the image at most: what lies between crumbs
+_BETWEEN = 0.2  # of the image at most: what lies between crumbs, and between charts
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +85,7 @@ def packed(charts: list[Chart], padding: float, seed: int = 0) -> list[Float[Flo
         between = min(padding, np.sqrt(_BETWEEN / len(crumbs))) * np.sqrt(2 * total)
         shelves, size = _on_shelves([pieces[k] for k in crumbs], between)
         moved.append(_Piece(np.array([[0, 0], [size[0], 0], size, [0, size[1]]]), np.array([[0, 1, 2], [0, 2, 3]])))
+    padding = min(padding, np.sqrt(_BETWEEN / len(moved)))
     scale, places = _search(moved, padding, np.random.default_rng(seed))
     out: list[Floats] = [np.empty(0)] * len(charts)
     for k, piece, place in zip(large, moved, places, strict=False):

@@ -219,3 +219,14 @@ def test_the_smallest_rectangle() -> None:
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     found, area = tightest(np.array([[0, 0], [3, 0], [3, 1], [0, 1], [1, 0.5]]) @ turn)
     assert found == pytest.approx(angle) and area == pytest.approx(3.0)
+
+
+def test_padding_that_leaves_no_room_is_less() -> None:
+    square, corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    charts = [Chart(np.arange(2), square, corners) for _ in range(70)]
+    found = packed(charts, 0.125)  # an eighth of the image around each of 70
+    assert all(uv.min() >= 0 and uv.max() <= 1 for uv in found)
+    low, high = (np.array([edge(uv, axis=0) for uv in found]) for edge in (np.min, np.max))
+    assert (high - low).min() > 0.01
+    gaps = np.maximum(low[:, None] - high[None], low[None] - high[:, None]).max(axis=2)
+    assert gaps[~np.eye(70, dtype=bool)].min() > 0.02
