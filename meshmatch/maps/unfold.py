@@ -42,9 +42,9 @@ from meshmatch.shapes.faces import seams
 from meshmatch.shapes.shape import Shape
 
 # All set by hand on bodies of SCAPE, FAUST and SHREC'19.
-_RINGS = (2, 3)  # of triangles around a fold that move, round by round; more rounds gain little
+_RINGS = (2,)  # of triangles around a fold that move, round by round; more rounds gain little
 _SMOOTHED, _SWEEPS = (3,), 2  # the same of smoothing, and steps of each round; ten gain little more
-_FLAT = 1, 2, 3  # the same of what is laid flat, first around all folds and last around what is turned over
+_FLAT, _LAST = (1, 2), (1, 2, 3)  # the same of what is laid flat, at last only around what is turned over
 _CLOSED = 3  # rings around it, within which holes are closed
 # How far around images the target is laid flat: two of its edges, and so many times the longest edge of an image.
 _REACHES = 0.0, 0.5
@@ -68,7 +68,7 @@ def unfolded(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -
     images.repeat(images.relaid, _RINGS)
     images.repeat(images.smoothed, _SMOOTHED)
     images.repeat(images.flattened, _FLAT)
-    images.repeat(images.flattened, _FLAT, 0.0)
+    images.repeat(images.flattened, _LAST, 0.0)
     if images.map is start:
         return found
     moved = (images.map.face != start.face) | (images.map.barycentric != start.barycentric).any(axis=1)
@@ -110,7 +110,7 @@ def unfolded_both_ways(
     there = back.inverse()
     there.opposite, back.opposite = back, there
     for each in (there, back):
-        each.repeat(each.flattened, _FLAT, 0.0)
+        each.repeat(each.flattened, _LAST, 0.0)
     return _between_files(there.map, found, own, target), _between_files(back.map, opposite, theirs, source)
 
 

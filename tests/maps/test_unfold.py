@@ -259,7 +259,7 @@ def test_what_would_be_torn_from_its_surroundings_stays(monkeypatch: pytest.Monk
     places[:, 2] = disc.verts[:, 2]
     found = put(disc, disc, places)
     assert Folds.of(unfolded(found, disc, disc), disc, disc).crushed < Folds.of(found, disc, disc).crushed
-    for name in ("_SMOOTHED", "_FLAT"):
+    for name in ("_SMOOTHED", "_FLAT", "_LAST"):
         monkeypatch.setattr(f"meshmatch.maps.unfold.{name}", ())
     monkeypatch.setattr(_Images, "_solved", lambda *each: solved(*each) - [0.4, 0, 0])  # without a fold, but far away
     np.testing.assert_array_equal(unfolded(found, disc, disc).points(disc), found.points(disc))
