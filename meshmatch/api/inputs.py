@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from meshmatch.errors import InputError, ModelError, OptionError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import landmark_places
 from meshmatch.shapes.cloud import on_a_line
+from meshmatch.shapes.normalise import in_single_precision
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
 
@@ -69,7 +71,7 @@ def refuse_far_parts(clean: Repaired) -> None:
 
 def usable(shape: Shape) -> Repaired:
     """As `validated`, for shapes whose parts may be tried apart: large parts may be far apart."""
-    clean = repair(shape)
+    clean = replace(repair(in_single_precision(shape)), original=shape)
     fixed = clean.shape
     name = shape.name or "the shape"
     if fixed.is_cloud and fixed.V < MINIMUM_POINTS:

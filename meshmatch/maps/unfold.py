@@ -39,6 +39,7 @@ from meshmatch.maps.folds import CRUSHED, area_ratios, facing, known_normals, no
 from meshmatch.maps.mapped_mesh import MappedMesh, invert_map, length_of
 from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.faces import seams
+from meshmatch.shapes.normalise import in_single_precision
 from meshmatch.shapes.shape import Shape
 
 # All set by hand on bodies of SCAPE, FAUST and SHREC'19.
@@ -55,6 +56,8 @@ _STIFFEST = 50.0  # a sliver's sides count no more
 _MOST = 0.2  # a map that folds more of the surface is wrong as a whole
 _LARGEST = 200_000  # vertices; triangles of larger meshes are smaller than the fits are exact
 _LARGEST_BOTH_WAYS = 60_000  # vertices for which both maps are made at once: of more that takes longer than matching
+_BETTER = 1 - 1e-6  # what is less than this share of what was folded: rounding is not to decide
+_NOTHING = 1e-6  # share of its area that an image without any may have
 _HOLD = 1e-3  # how much each image stays, so that every part has a solution
 
 
@@ -141,6 +144,7 @@ class _Welded:
 
 @derived
 def _welded(shape: Shape) -> _Welded:
+    shape = in_single_precision(shape)
     twin = seams(shape.verts, shape.faces[shape.valid_faces])
     first, begins = np.unique(np.concatenate([twin[shape.faces].ravel(), twin]), return_index=True)
     first = first[np.argsort(begins)]
@@ -193,7 +197,7 @@ class _Images:
         self.target = Shape(target.verts / length_of(target), target.faces, invalid=target.invalid)
         self.upwards = known_normals(target)
         self.areas = triangle_areas(self.verts, self.faces)
-        self.ratio = area_ratios(self.points, self.normals, self.verts, self.faces)
+        self.ratio = _ratios(self.points, self.normals, self.verts, self.faces)
         self.torn = self._torn(self.points, self.faces)
         self.surface: MappedMesh | None = None
 
@@ -284,7 +288,7 @@ class _Images:
             return False
         face, weights, inside = found_in(places, disk.corners, plane)
         self.opposite._follow(beneath.vertices[inside], self, disk.faces[face[inside]], weights[inside])
-        if sum(each._folded for each in both) < folded:
+        if sum(each._folded for each in both) < _BETTER * folded:
             return True
         for each, state in zip(both, kept, strict=True):
             each.map, each.points, each.normals, each.ratio = state
@@ -312,7 +316,7 @@ class _Images:
         moved = np.zeros(len(self.verts), bool)
         moved[rows] = True
         changed = np.flatnonzero(self._touches(moved))
-        self.ratio[changed] = area_ratios(self.points, self.normals, self.verts, self.faces[changed])
+        self.ratio[changed] = _ratios(self.points, self.normals, self.verts, self.faces[changed])
 
     def _beneath(self, disk: Disk, reach: float) -> Disk | None:
         """The part of the target that the images of a disk lie on, and so far around, if it is a disk."""
@@ -354,7 +358,7 @@ class _Images:
         self, rows: Ints, near: Ints, points: Floats, normals: Floats, found: tuple[Ints, Ints, Floats]
     ) -> bool:
         """Keep new images of these vertices where less of the faces around is folded; False if there are none."""
-        ratio = area_ratios(points, normals, self.verts, self.faces[near])
+        ratio = _ratios(points, normals, self.verts, self.faces[near])
         # each part that moved counts by itself
         number = np.full(len(self.verts), -1)
         number[rows] = np.arange(len(rows))
@@ -367,11 +371,11 @@ class _Images:
         )
         # Where little is sound around, and much moves, a solution may lie anywhere; the rim, which is held, then tears.
         tears = np.bincount(of_face, self._torn(points, self.faces[near]) & ~self.torn[near], part.max() + 1) > 0
-        improved = (after < before) & ~tears
+        improved = (after < _BETTER * before) & ~tears
         better = improved[part]
         self._take(rows[better], points, normals, (found[0][better], found[1][better], found[2][better]))
         changed = near[improved[of_face]]
-        self.ratio[changed] = area_ratios(self.points, self.normals, self.verts, self.faces[changed])
+        self.ratio[changed] = _ratios(self.points, self.normals, self.verts, self.faces[changed])
         return bool(improved.any())
 
     def _touches(self, marked: Bools) -> Bools:
@@ -460,6 +464,13 @@ class _Images:
         index, face, weights = self.map.index.copy(), self.map.face.copy(), self.map.barycentric.copy()
         index[rows], face[rows], weights[rows] = found
         self.map = replace(self.map, index=index, face=face, barycentric=weights)
+
+
+def _ratios(points: Floats, normals: Floats, verts: Floats, faces: Ints) -> Floats:
+    """(F,) `area_ratios`, nothing where there is next to nothing: rounding is not to decide what is turned over."""
+    ratio = area_ratios(points, normals, verts, faces)
+    ratio[np.abs(ratio) < _NOTHING] = 0.0
+    return ratio
 
 
 def _badness(ratio: Floats) -> Floats:

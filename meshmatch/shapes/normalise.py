@@ -8,7 +8,7 @@ shapes, in all 24 ways. Where several fit nearly as well, the orientation that t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Literal, get_args
 
@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Floats
+from meshmatch.derived import derived
 from meshmatch.errors import InputError
 from meshmatch.geometry.closest_points import ClosestPoints
 from meshmatch.geometry.frames import Frame, RigidPose
@@ -33,6 +34,7 @@ _CLOSE = 15.0  # degrees: two alignments nearer than that are one
 # Standing people are 1.2 to 2.2 m tall; a unit fits if it makes that of the longest extent.
 _SMALL, _TALL = 1.2, 2.2
 _SLENDER = 1.0  # longest extent in roots of the area; of people 1.1 to 1.7, however they stand
+_FINE = 1e-6  # of the diagonal: what rounding may move
 _UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "feet": 0.3048}
 
 
@@ -59,6 +61,16 @@ def unit_sphere_frame(shape: Shape) -> Frame:
     if not radius > 0:
         raise InputError(f"{shape.name or 'the shape'} has no size", "all its vertices lie in one point")
     return Frame(radius, np.eye(3), center)
+
+
+@derived
+def in_single_precision(shape: Shape) -> Shape:
+    """A shape as formats of single precision hold it: two interpretations of a pose may fit so nearly alike that less
+    decides between them, and a shape is to be fitted the same from any file. One far from the origin stays as it is.
+    """
+    verts = shape.verts.astype(np.float32).astype(np.float64)
+    moved = float(np.abs(verts - shape.verts).max())
+    return replace(shape, verts=verts) if 0 < moved < _FINE * shape.diagonal else shape
 
 
 def _centroid(shape: Shape) -> Floats:
