@@ -329,8 +329,14 @@ class _Images:
         return Disk.of(faces, found[0]) if len(found) == 1 else None
 
     def _corners(self, rows: Ints) -> Ints:
-        """(N, 3) the target's vertices that images lie between."""
-        return corners_of(self.target.faces, self.map.face[rows], self.map.index[rows])
+        """(N, 3) the target's vertices that images lie between; of an image on an edge those of the edge alone, whichever of
+        its two faces it is told to be on.
+        """
+        corners, weights = (
+            corners_of(self.target.faces, self.map.face[rows], self.map.index[rows]),
+            self.map.barycentric[rows],
+        )
+        return np.where(weights < _NOTHING, _heaviest(corners, weights)[:, None], corners)
 
     @property
     @derived
