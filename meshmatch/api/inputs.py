@@ -71,7 +71,7 @@ def refuse_far_parts(clean: Repaired) -> None:
 
 def usable(shape: Shape) -> Repaired:
     """As `validated`, for shapes whose parts may be tried apart: large parts may be far apart."""
-    clean = replace(repair(in_single_precision(shape)), original=shape)
+    clean = repair(shape)
     fixed = clean.shape
     name = shape.name or "the shape"
     if fixed.is_cloud and fixed.V < MINIMUM_POINTS:
@@ -83,7 +83,8 @@ def usable(shape: Shape) -> Repaired:
         raise InputError(f"{name} has no surface: all its points lie on a line", "is it a point cloud?")
     if not fixed.area > 0:
         raise InputError(f"{name} has no surface area", "are all its points the same, or on a line?")
-    return clean
+    single = in_single_precision(fixed)
+    return clean if single is fixed else replace(clean, shape=single)
 
 
 def checked_threads(threads: int | None) -> int:
