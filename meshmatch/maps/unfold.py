@@ -63,7 +63,7 @@ _HOLD = 1e-3  # how much each image stays, so that every part has a solution
 
 def unfolded(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -> VertexMap:
     """A map between these shapes with fewer folds: the same where it has none, and of clouds and very large meshes."""
-    if source.is_cloud or target.is_cloud or _largest(source, target) > _LARGEST:
+    if source.is_cloud or target.is_cloud or max(source.V, target.V) > _LARGEST:
         return found
     own, theirs = _welded(source), _welded(target)
     start = _between_welded(found, own, theirs)
@@ -85,7 +85,7 @@ def unfolded_pair(
     inverse, which takes the place of the map that ``opposite`` makes.
     """
     clouds = source.is_cloud or target.is_cloud
-    if partial or clouds or found.verdict != "good" or _largest(source, target) > _LARGEST_BOTH_WAYS:
+    if partial or clouds or found.verdict != "good" or max(source.V, target.V) > _LARGEST_BOTH_WAYS:
         return unfolded(found, source, target, workers), None
     return unfolded_both_ways(found, opposite(), source, target, workers)
 
@@ -153,10 +153,6 @@ def _welded(shape: Shape) -> _Welded:
     number = number[twin]
     invalid = None if shape.invalid is None else shape.invalid[first]
     return _Welded(Shape(shape.verts[first], number[shape.faces], shape.name, invalid=invalid), first, number)
-
-
-def _largest(source: Shape, target: Shape) -> int:
-    return max(_welded(each).shape.V for each in (source, target))
 
 
 def _between_welded(found: VertexMap, source: _Welded, target: _Welded) -> VertexMap:
@@ -332,10 +328,8 @@ class _Images:
         """(N, 3) the target's vertices that images lie between; of an image on an edge those of the edge alone, whichever of
         its two faces it is told to be on.
         """
-        corners, weights = (
-            corners_of(self.target.faces, self.map.face[rows], self.map.index[rows]),
-            self.map.barycentric[rows],
-        )
+        weights = self.map.barycentric[rows]
+        corners = corners_of(self.target.faces, self.map.face[rows], self.map.index[rows])
         return np.where(weights < _NOTHING, _heaviest(corners, weights)[:, None], corners)
 
     @property
@@ -409,8 +403,9 @@ class _Images:
         return np.asarray(after @ np.linalg.inv(before))
 
     def _wanted(self, laid: Ints) -> Floats:
-        """(N, 3, 3) the gradients that triangles should have: the mean of the sound ones beside them or, where
-        there are none, of all sound ones around."""
+        """(N, 3, 3) the gradients that triangles should have: the mean of the sound ones beside them or, where there are
+        none, of all sound ones around.
+        """
         near = np.zeros(len(self.verts), bool)
         near[self.faces[laid].ravel()] = True
         around = np.flatnonzero(self._touches(near))
@@ -466,6 +461,8 @@ class _Images:
 
     def _take(self, rows: Ints, points: Floats, normals: Floats, found: tuple[Ints, Ints, Floats]) -> None:
         """Move these vertices."""
+        if not len(rows):
+            return
         self.points[rows], self.normals[rows] = points[rows], normals[rows]
         index, face, weights = self.map.index.copy(), self.map.face.copy(), self.map.barycentric.copy()
         index[rows], face[rows], weights[rows] = found

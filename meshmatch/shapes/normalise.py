@@ -68,7 +68,8 @@ def in_single_precision(shape: Shape) -> Shape:
     """A shape as formats of single precision hold it: two interpretations of a pose may fit so nearly alike that less
     decides between them, and a shape is to be fitted the same from any file. One far from the origin stays as it is.
     """
-    verts = shape.verts.astype(np.float32).astype(np.float64)
+    with np.errstate(over="ignore"):  # what is larger than single precision holds moves without end
+        verts = shape.verts.astype(np.float32).astype(np.float64)
     moved = float(np.abs(verts - shape.verts).max())
     return replace(shape, verts=verts) if 0 < moved < _FINE * shape.diagonal else shape
 
