@@ -56,7 +56,6 @@ _STIFFEST = 50.0  # a sliver's sides count no more
 _MOST = 0.2  # a map that folds more of the surface is wrong as a whole
 _LARGEST = 200_000  # vertices; triangles of larger meshes are smaller than the fits are exact
 _LARGEST_BOTH_WAYS = 60_000  # vertices for which both maps are made at once: of more that takes longer than matching
-_BETTER = 1 - 1e-6  # what is less than this share of what was folded: rounding is not to decide
 _NOTHING = 1e-6  # share of its area that an image without any may have
 _HOLD = 1e-3  # how much each image stays, so that every part has a solution
 
@@ -284,7 +283,7 @@ class _Images:
             return False
         face, weights, inside = found_in(places, disk.corners, plane)
         self.opposite._follow(beneath.vertices[inside], self, disk.faces[face[inside]], weights[inside])
-        if sum(each._folded for each in both) < _BETTER * folded:
+        if sum(each._folded for each in both) < folded:
             return True
         for each, state in zip(both, kept, strict=True):
             each.map, each.points, each.normals, each.ratio = state
@@ -371,7 +370,7 @@ class _Images:
         )
         # Where little is sound around, and much moves, a solution may lie anywhere; the rim, which is held, then tears.
         tears = np.bincount(of_face, self._torn(points, self.faces[near]) & ~self.torn[near], part.max() + 1) > 0
-        improved = (after < _BETTER * before) & ~tears
+        improved = (after < before) & ~tears
         better = improved[part]
         self._take(rows[better], points, normals, (found[0][better], found[1][better], found[2][better]))
         changed = near[improved[of_face]]

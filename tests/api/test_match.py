@@ -35,6 +35,16 @@ def turned(shape: Shape) -> Shape:
     return Shape(shape.verts @ (Z @ X).T / 2.54 + [300, -20, 5], shape.faces, "turned")
 
 
+def test_a_shape_is_matched_the_same_from_any_file(both, dancer: Shape) -> None:
+    """The climber of a file that stands upright, in single precision, each face with its own vertices."""
+    climber = meshmatch.load_shape(SAMPLES / "climber.ply")
+    corner, single = climber.faces.ravel(), climber.verts.astype(np.float32).astype(np.float64)
+    upright = np.stack([single[:, 0], single[:, 2], -single[:, 1]], axis=1)[corner]
+    other = match(dancer, Shape(upright, np.arange(len(corner)).reshape(-1, 3), "climber"))
+    x, y, z = other.map.points(Shape(upright, np.arange(len(corner)).reshape(-1, 3))).T
+    np.testing.assert_allclose(np.stack([x, -z, y], axis=1), both.map.points(climber), atol=1e-5)
+
+
 def test_the_samples_match_well(both) -> None:
     assert both.map.verdict != "poor"
     assert both.map.source_vertices == len(both.map.index)

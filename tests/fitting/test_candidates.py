@@ -127,6 +127,7 @@ def test_how_a_file_stands_is_tried_however_badly_it_begins(
     model = egg_model()
     task = FitTask.of(model, FitConfig(), replace(model.template.shape, upright=upright))
     odd = np.eye(3)[[1, 2, 0]]
+    monkeypatch.setattr(frames, "own_axes", lambda _: RigidPose.identity())
     monkeypatch.setattr(frames, "propose", lambda *_: [RigidPose(odd, np.zeros(3))])
     monkeypatch.setattr(frames, "with_flips", lambda poses: poses * 5)
     asked: list[list[RigidPose]] = []
@@ -134,12 +135,12 @@ def test_how_a_file_stands_is_tried_however_badly_it_begins(
     def fit_all(self: Predictor, starts: list[tuple[OrientedPoints, RigidPose]], *_: int, **__: int) -> list[Candidate]:
         asked.append([pose for _, pose in starts])
         still = np.zeros((task.system.K, 3))
-        return [Candidate(pose, still, 0.04 if pose.rotation is odd else 0.045) for _, pose in starts]
+        return [Candidate(pose, still, 0.04 if (pose.rotation == odd).all() else 0.045) for _, pose in starts]
 
     monkeypatch.setattr(Predictor, "fit_all", fit_all)
     _, found = candidates_of_whole(task)
     assert [len(poses) for poses in asked] == [5 + upright, careful, 1]
-    assert [each.pose.rotation is odd for each in found] == [True] * 3 + [False] * upright
+    assert [bool((each.pose.rotation == odd).all()) for each in found] == [True] * 3 + [False] * upright
     assert candidates.of_file(task, found) == found[3:]  # it will be refined, too
 
 

@@ -33,7 +33,7 @@ def test_samples_have_the_weights_of_where_they_lie(sphere: Shape, cloud: bool) 
     shape = Shape(verts, NO_FACES if cloud else sphere.faces, weights=np.append(height, 1))
     samples = sample_surface(validated(shape).shape, 300, np.random.default_rng(0))
     assert samples.weights is not None
-    assert np.abs(samples.weights - (0.5 + 0.5 * samples.points[:, 2])).max() < 1e-9
+    assert np.abs(samples.weights - (0.5 + 0.5 * samples.points[:, 2])).max() < 1e-7  # single precision
     assert samples.signed == (not cloud)
 
 

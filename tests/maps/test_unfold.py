@@ -10,7 +10,7 @@ from meshmatch.geometry.disks import Disk
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.folds import Folds
 from meshmatch.maps.mapped_mesh import MappedMesh, invert_map
-from meshmatch.maps.unfold import _Images, unfolded, unfolded_both_ways
+from meshmatch.maps.unfold import _Images, _ratios, unfolded, unfolded_both_ways
 from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.shape import Shape
 
@@ -132,6 +132,13 @@ def test_parts_that_touch_stay_apart() -> None:
         off = np.linalg.norm(one.points(other) - other.verts, axis=1)
         inside = (np.abs(part.vertices) < 0.5).sum(axis=1) > 1  # at the rim of the wall normals do not tell parts apart
         assert (off[np.tile(inside, 2)] < 1e-6).all()
+
+
+def test_an_image_without_area_is_not_turned_over_by_rounding() -> None:
+    verts, faces, up = np.eye(3), np.array([[0, 1, 2]]), np.tile([0, 0, 1.0], (3, 1))
+    for angle in np.linspace(0.1, 6, 20):
+        line = np.outer([0, 1, 1 / 3], [np.cos(angle), np.sin(angle), 0.3])
+        assert _ratios(line, up, verts, faces) == 0
 
 
 def missed(there: VertexMap, back: VertexMap, source: Shape, target: Shape) -> float:

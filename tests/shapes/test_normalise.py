@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
-from meshmatch.shapes.normalise import sqrt_area_frame, unit_sphere_frame
+from meshmatch.shapes.normalise import in_single_precision, sqrt_area_frame, unit_sphere_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -71,3 +71,12 @@ def test_shape_without_area_is_refused(faces: list[list[int]]) -> None:
         sqrt_area_frame(point)
     with pytest.raises(InputError, match="no size"):
         unit_sphere_frame(point)
+
+
+@pytest.mark.parametrize(("offset", "size", "rounded"), [(0, 1, True), (1e6, 1, False), (0, 1e60, False)])
+def test_single_precision_moves_next_to_nothing(offset: float, size: float, rounded: bool) -> None:
+    shape = Shape(size * np.random.default_rng(0).random((20, 3)) + offset, np.arange(18).reshape(-1, 3))
+    single = in_single_precision(shape)
+    assert (single is not shape) == rounded
+    np.testing.assert_allclose(single.verts, shape.verts, atol=1e-7 * size)
+    assert in_single_precision(single) is single
