@@ -27,6 +27,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -178,6 +179,12 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.integer):
         return int(value)
     return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def installed(methods: Sequence[str], packages: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The methods but those named as a package that is not here, and a line for each of these."""
+    missing = [name for name in methods if name in packages and find_spec(name) is None]
+    return [name for name in methods if name not in missing], [f"skipped: {name} is not installed" for name in missing]
 
 
 def names_of(words: str, known: Iterable[str], what: str) -> list[str]:

@@ -9,6 +9,7 @@ import pytest
 
 from meshmatch.api.matcher import Matcher
 from meshmatch.collections.setting import Record
+from meshmatch.experiments import runner
 from meshmatch.experiments.bench import specimens
 from meshmatch.experiments.bench.specimens import Done, Specimens, by_points, main, scanned, sides_found, start_of
 from meshmatch.experiments.makers.molars_and_leaves import MAKERS
@@ -88,3 +89,9 @@ def test_the_command_goes_on_with_the_rows_that_are_there(tmp_path: Path, monkey
     monkeypatch.setattr(specimens, "measure", measure)
     words = ["--methods", "none", "--work", str(tmp_path), "--sets"]
     assert main([*words, "leaves"]) == 0 == main([*words, "molars,leaves"]) and called == ["leaves", "molars"]
+
+
+def test_a_method_that_is_not_here_is_told() -> None:
+    found = runner.installed(["none", "no_such_package", "own"], ["no_such_package", "numpy"])
+    assert found == (["none", "own"], ["skipped: no_such_package is not installed"])
+    assert runner.installed(["numpy"], ["numpy"]) == (["numpy"], [])

@@ -23,7 +23,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from importlib.util import find_spec
 from itertools import permutations
 from pathlib import Path
 from typing import Annotated, Any
@@ -359,14 +358,11 @@ def main(
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
 ) -> runner.Report:
-    names = runner.names_of(sets, SETS, "set")
-    rows, skipped = [], []
+    names, rows = runner.names_of(sets, SETS, "set"), []
+    chosen, skipped = runner.installed(runner.names_of(methods, METHODS, "method"), _OTHERS)
     with tempfile.TemporaryDirectory() as temporary:
         place = work or Path(temporary)
-        for method in runner.names_of(methods, METHODS, "method"):
-            if method in _OTHERS and find_spec(method) is None:
-                skipped.append(f"skipped: {method} is not installed")
-                continue
+        for method in chosen:
             asked: dict[str, Any] = {"count": count, "seed": seed}
             asked |= {"steps": steps} if method == "own" else {"pairs": limit_pairs} if method == PAIRS else {}
             for name in names:

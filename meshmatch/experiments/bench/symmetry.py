@@ -17,7 +17,6 @@ import tempfile
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -131,14 +130,11 @@ def main(
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
 ) -> runner.Report:
-    names = runner.names_of(sets, SETS, "set")
-    rows, skipped = [], []
+    names, rows = runner.names_of(sets, SETS, "set"), []
+    chosen, skipped = runner.installed(runner.names_of(methods, METHODS, "method"), (PYCLARCS,))
     with tempfile.TemporaryDirectory() as temporary:
         place = work or Path(temporary)
-        for method in runner.names_of(methods, METHODS, "method"):
-            if method == PYCLARCS and find_spec(method) is None:
-                skipped.append(f"skipped: {method} is not installed")
-                continue
+        for method in chosen:
             for name in names:
                 runner.tell(f"{name}: {method}")
                 call = partial(measure, name, method, data, seed, place)
