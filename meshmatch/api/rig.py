@@ -50,6 +50,8 @@ class RiggedResult(Brief):
         Joints that move vertices of the source and none of the target.
     replaced
         How many joints of a skeleton that the target had take no part any more.
+    replaced_clips
+        The names of clips that moved these joints, and do so no more.
     maps
         The maps that were followed.
     glb
@@ -66,6 +68,7 @@ class RiggedResult(Brief):
     weights: SkinWeights
     unused: tuple[str, ...]
     replaced: int
+    replaced_clips: tuple[str, ...]
     maps: MapPair
     glb: bytes
 
@@ -160,4 +163,5 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
         glb, replaced = gltf.understood(path, data, "scene makes", lambda document: rigged(document, binding))
     before, after = (np.asarray(each.sum(axis=0)).ravel() > 0 for each in (weights.matrix, found))
     unused = tuple(weights.names[joint] for joint in np.flatnonzero(before & ~after))
-    return RiggedResult(standing, SkinWeights(found, weights.names), unused, replaced, maps, remembering(glb, b))
+    moving = SkinWeights(found, weights.names)
+    return RiggedResult(standing, moving, unused, replaced.joints, replaced.clips, maps, remembering(glb, b))

@@ -1,5 +1,6 @@
 """``meshmatch transfer-rig``."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -11,7 +12,7 @@ from meshmatch.cli.targets import to_targets
 from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, Transfer
 from meshmatch.cli.words import Json
 
-_NAMED = 8  # joints that a note lists
+_NAMED = 8  # joints or clips that a note lists
 
 
 @grouped
@@ -46,14 +47,17 @@ def transfer_rig(
         temporary.write_bytes(result.glb)
     joints, clips = len(result.rig.joints), [clip.name for clip in result.rig.clips]
     if result.unused:
-        many = len(result.unused)
-        names = ", ".join(result.unused[:_NAMED]) + (", ..." if many > _NAMED else "")
+        many, names = len(result.unused), _listed(result.unused)
         have = "joint that moves" if many == 1 else "joints that move"
         console.warn(
             f"{many} {have} {transfer.names[0]} {'has' if many == 1 else 'have'} no vertex on the target: {names}"
         )
     if result.replaced:
         console.say(f"note: the skeleton that {transfer.names[1]} had ({result.replaced} joints) is replaced")
+    if result.replaced_clips:
+        many, names = len(result.replaced_clips), _listed(result.replaced_clips)
+        have = "clip that moved that skeleton is" if many == 1 else "clips that moved that skeleton are"
+        console.warn(f"{many} {have} left out: {names}")
     played = f", {len(clips)} clip{'s' if len(clips) != 1 else ''}" if clips else ""
     console.say(f"wrote {output}: {transfer.names[1]} with {joints} joints{played}")
     if picture is not None:
@@ -65,5 +69,9 @@ def transfer_rig(
         heaviest = most_votes(load_weights(source, a).matrix), most_votes(result.weights.matrix)
         transfer.draw(result.maps, compose_labels((a, b), heaviest, result.weights.names))
     record = {"picture": picture, "pose": pose, "joints": joints, "clips": clips, "unused_joints": list(result.unused)}
-    record |= {"replaced_joints": result.replaced}
+    record |= {"replaced_joints": result.replaced, "replaced_clips": list(result.replaced_clips)}
     return transfer.record(record, result.maps, float(result.maps.forward.confidence.mean()))
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")

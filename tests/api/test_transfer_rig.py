@@ -276,12 +276,12 @@ def test_a_skeleton_of_its_own_is_replaced(source: Path, stands: float) -> None:
     animation["name"] = "old"
     samplers = [animation["samplers"][0]] * 2
     channels = [{"sampler": k, "target": {"node": node, "path": "rotation"}} for k, node in enumerate((3, 7))]
-    swings = {"name": "swing", "samplers": samplers, "channels": channels}
+    swings = {"name": "swings", "samplers": samplers, "channels": channels}
     write_tube(target, stands=stands, nodes=nodes, scenes=[{"nodes": [0, 6, 7]}], animations=[animation, swings])
     shape = load_shape(target)
     out, result = rigged(source, target)
     found = Document(out, out.read_bytes())
-    assert result.replaced == 4
+    assert (result.replaced, result.replaced_clips) == (4, ("old", "swings"))
     assert len(found.json["skins"]) == 1
     assert [node["name"] for node in found.json["nodes"]] == [
         "tube",
@@ -289,7 +289,7 @@ def test_a_skeleton_of_its_own_is_replaced(source: Path, stands: float) -> None:
         "source",
         *NODES[:-1],
     ]  # all of the old is gone
-    assert [(each["name"], len(each["channels"])) for each in found.json["animations"]][:1] == [("swing", 1)]
+    assert [(each["name"], len(each["channels"])) for each in found.json["animations"]][:1] == [("swings", 1)]
     assert [each["name"] for each in found.json["animations"]][1:] == ["bend"]
     assert np.abs(load_shape(out).verts - shape.verts).max() < 1e-5
     same = found.json["meshes"][0]["primitives"][0]["attributes"]["POSITION"] == 0

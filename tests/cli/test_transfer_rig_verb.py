@@ -54,7 +54,8 @@ def test_a_vrm_is_read_and_a_rigged_target_said(run: Run, pair: Path) -> None:
     a = load_shape("a.vrm")
     save_map("aa.npz", VertexMap.between(a, load_shape("c.vrm"), np.arange(a.V)))
     answer = well(run("transfer-rig", "a.vrm", "c.vrm", "-o", "rigged.glb", "--map", "aa.npz"))
-    assert "note: the skeleton that c.vrm had (4 joints) is replaced" in answer.err
+    assert "note: the skeleton that c.vrm had (4 joints) is replaced\n" in answer.err
+    assert "warning: 1 clip that moved that skeleton is left out: bend\n" in answer.err
 
 
 def test_joints_without_a_vertex_are_named(run: Run, pair: Path) -> None:

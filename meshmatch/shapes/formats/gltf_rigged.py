@@ -57,9 +57,17 @@ class Binding(Brief):
         return joints.astype("<u1" if len(self.rig.joints) <= 256 else "<u2"), weights.astype(np.float32)
 
 
-def rigged(document: Document, binding: Binding) -> tuple[bytes, int]:
-    """The scene as a glb, moved by a skeleton, which hangs from its first node; and how many joints of its own move it no
-    more: these and their clips are taken out, but for nodes that something else needs.
+@dataclass(frozen=True)
+class Replaced:
+    """What moved a scene before and moves it no more: the number of its joints, and the names of clips that moved them."""
+
+    joints: int = 0
+    clips: tuple[str, ...] = ()
+
+
+def rigged(document: Document, binding: Binding) -> tuple[bytes, Replaced]:
+    """The scene as a glb, moved by a skeleton, which hangs from its first node; and what of its own moves it no more:
+    joints and their clips are taken out, but for nodes that something else needs.
 
     Vertices are stored as they are, unless a skin of their own bends them: then as they stand. Those of the binding are in
     the order of the scene.
@@ -99,7 +107,7 @@ def rigged(document: Document, binding: Binding) -> tuple[bytes, int]:
         if "skin" in node:
             before.add(node["skin"])
         node["skin"] = skins[standing.tobytes()]
-    gone = _drop_skins(editor, before)
+    gone, clips = _drop_skins(editor, before)
     _lift(editor, document)
     arrays: dict[bytes, int] = {}
     for clip in rig.clips:
@@ -107,7 +115,7 @@ def rigged(document: Document, binding: Binding) -> tuple[bytes, int]:
     if gone:
         drop_nodes(editor.json, nodes_of_skeleton(document, sorted(gone)))
         editor.prune(document)
-    return editor.to_bytes(), len(gone)
+    return editor.to_bytes(), Replaced(len(gone), clips)
 
 
 def hanging_groups(document: Document) -> list[Ints]:
@@ -183,8 +191,10 @@ def straighten(editor: Editor, document: Document, number: int, part: dict[str, 
             target[key] = editor.add_array(turned(target[key], False).astype("<f4"), bounds=key == "POSITION")
 
 
-def _drop_skins(editor: Editor, before: set[int]) -> set[int]:
-    """Remove skins that move nothing any more, and what moves their joints; returns these joints."""
+def _drop_skins(editor: Editor, before: set[int]) -> tuple[set[int], tuple[str, ...]]:
+    """Remove skins that move nothing any more, and what moves their joints; returns these joints, and the names of clips
+    that moved them.
+    """
     nodes, skins = editor.json["nodes"], editor.json["skins"]
     used = {node["skin"] for node in nodes if "skin" in node}
     gone = before - used
@@ -197,18 +207,23 @@ def _drop_skins(editor: Editor, before: set[int]) -> set[int]:
         if "skin" in node:
             node["skin"] = number[node["skin"]]
     editor.json["skins"] = [skins[k] for k in kept]
-    _drop_channels(editor, lambda target: target.get("node") in joints)
-    return joints
+    clips = _drop_channels(editor, lambda target: target.get("node") in joints)
+    return joints, clips
 
 
-def _drop_channels(editor: Editor, gone: Callable[[dict[str, Any]], bool]) -> None:
-    """Let clips move some targets no more, and go where they move nothing."""
-    for animation in editor.json.get("animations", []):
-        animation["channels"] = [each for each in animation["channels"] if not gone(each["target"])]
+def _drop_channels(editor: Editor, gone: Callable[[dict[str, Any]], bool]) -> tuple[str, ...]:
+    """Let clips move some targets no more, and go where they move nothing; returns the names of those that did."""
+    names = []
+    for number, animation in enumerate(editor.json.get("animations", [])):
+        kept = [each for each in animation["channels"] if not gone(each["target"])]
+        if len(kept) < len(animation["channels"]):
+            names.append(str(animation.get("name") or f"clip {number}"))
+        animation["channels"] = kept
     if "animations" in editor.json:
         editor.json["animations"] = [each for each in editor.json["animations"] if each["channels"]]
         if not editor.json["animations"]:
             del editor.json["animations"]
+    return tuple(names)
 
 
 def _lift(editor: Editor, document: Document) -> None:
