@@ -57,7 +57,9 @@ def transfer_shapes(
         listed = ", ".join(result.still[:_NAMED]) + (", ..." if len(result.still) > _NAMED else "")
         console.warn(f"{len(result.still)} of {len(names)} shapes move no vertex of {transfer.names[1]}: {listed}")
     if clips and output.suffix.lower() in ("", ".npz"):
-        console.warn(f"{output.name} holds no clips: {', '.join(clips[:_NAMED])}{', ...' if len(clips) > _NAMED else ''}")
+        console.warn(
+            f"{output.name} holds no clips: {', '.join(clips[:_NAMED])}{', ...' if len(clips) > _NAMED else ''}"
+        )
         clips = []
     played = f", {len(clips)} clip{'s' if len(clips) != 1 else ''}" if clips else ""
     many = f"{len(names)} blendshape{'s' if len(names) != 1 else ''}"

@@ -218,7 +218,7 @@ def _squared_stretch(
         gram.append((dot(first, first), dot(first, second), dot(second, second)))
     (a, b, c), (p, q, r) = gram
     flat, whole = _cross(first, second), np.sqrt(np.maximum(a * c - b * b, 0.0))
-    area = np.maximum(np.abs(flat), _SMALLEST * whole + 1e-300)
+    area = np.maximum(np.abs(flat), _SMALLEST * whole + 1e-140)
     return np.asarray((a * r - 2 * b * q + c * p) / (2 * area**2)), np.asarray(flat * side <= 0)
 
 

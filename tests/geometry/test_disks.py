@@ -6,7 +6,7 @@ from scipy.spatial import Delaunay
 from trimesh.creation import cylinder, icosphere
 
 from meshmatch.arrays import Floats, Ints
-from meshmatch.geometry.disks import Disk, found_in, mean_values, patches
+from meshmatch.geometry.disks import Disk, _squared_stretch, found_in, mean_values, patches
 
 BALL = icosphere(4)
 
@@ -27,6 +27,18 @@ def cap(height: float) -> Disk:
     disk = Disk.of(BALL.faces, np.flatnonzero(BALL.vertices[BALL.faces, 2].min(axis=1) > height))
     assert disk is not None
     return disk
+
+
+def test_a_triangle_without_area_on_either_side() -> None:
+    """Three vertices at one place, held at one place: nothing is divided by nothing, which stopped the evening."""
+    disk = cap(0.5)
+    verts, a, at = BALL.vertices.copy(), disk.rim[0], disk.rim
+    rim = np.column_stack([np.cos(angle := np.linspace(0, 2 * np.pi, len(at), endpoint=False)), np.sin(angle)])
+    face = disk.corners[(disk.corners == a).any(axis=1)][0]
+    verts[disk.vertices[face]] = verts[disk.vertices[a]]
+    squared, turned_over = _squared_stretch(verts[disk.vertices], np.zeros((len(disk.vertices), 2)), disk.corners, 1.0)
+    assert np.isfinite(squared).all() and turned_over.all()
+    assert disk.laid_flat(verts, rim) is not None
 
 
 @pytest.mark.parametrize("height", [0.5, 0.0, -0.8])

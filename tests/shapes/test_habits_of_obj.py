@@ -388,6 +388,11 @@ def test_udim_tiles_are_images_of_their_own(tmp_path: Path) -> None:
         *(f"{stem}{k}.png" for stem in ("skin.", "n_") for k in (1001, 1012)),
     }
     assert missing == []
+    corner = "vt 0.5 1\nusemtl skin\nf 1/1 2/2 3/3\nf 1/5 3/6 4/7\nf 1/8 2/8 3/8\n"
+    path.write_text(
+        HEAD + VERTS + COORDINATES + far + corner
+    )  # a face without area in the image, on the edge of a tile
+    assert np.array_equal(load_appearance(path, load_shape(path)).material, [0, 1, 0])
     (tmp_path / "skin.1012.png").unlink()
     with pytest.raises(InputError, match=r"needs the image skin.1012.png"):
         load_appearance(path, load_shape(path))

@@ -192,7 +192,8 @@ def _by_tile(worn: _Worn) -> _Worn:
     rows = np.flatnonzero(tiled[worn.kind]) if tiled.any() else worn.kind[:0]
     if not len(rows):
         return worn
-    place = np.clip(np.nan_to_num(np.floor(worn.corners[rows].mean(axis=1)), nan=-1.0), -1.0, 10.0).astype(np.int64)
+    middle = np.nextafter(worn.corners[rows].mean(axis=1), 0.0)  # without area on an edge: in the tile before it
+    place = np.clip(np.nan_to_num(np.floor(middle), nan=-1.0), -1.0, 10.0).astype(np.int64)
     if place.min() < 0 or place.max() > 9:
         name = worn.entries[int(worn.kind[rows[0]])][0]
         raise InputError(f"faces of the material {name} lie in no tile of its images", "UDIM tiles are 1001 to 1100")
