@@ -147,6 +147,25 @@ def test_everything_else_of_a_scene_stays(tmp_path: Path) -> None:
     np.testing.assert_allclose(load_coordinates(out, load_shape(out)), apart(load_shape(path)), atol=1e-6)
 
 
+@pytest.mark.parametrize("own", [True, False])
+def test_a_normal_map_brings_the_normals_that_it_was_baked_for(tmp_path: Path, own: bool) -> None:
+    """Of a part without normals, viewers ignore tangents; those of another part of the mesh stay."""
+    path = tmp_path / "scene.glb"
+    scene(path)
+    before = read(path)
+    layers = BakedMaterial(quarters(8), name="made", normal=np.full((8, 8, 4), [128, 128, 255, 255], np.uint8))
+    out = dressed(path, own=own, material=layers)
+    document = read(out)
+    assert len(document.json["meshes"]) == 2
+    for mesh in document.json["meshes"]:
+        first, second = (primitive["attributes"] for primitive in mesh["primitives"])
+        assert (first["NORMAL"] == before.json["meshes"][0]["primitives"][0]["attributes"]["NORMAL"]) == own
+        for part in (first, second):
+            count = document.count(part["POSITION"])
+            np.testing.assert_allclose(document.accessor(part["NORMAL"]), np.tile([0, 0, 1], (count, 1)), atol=1e-6)
+            assert document.accessor(part["TANGENT"]).shape == (count, 4)
+
+
 def test_coordinates_that_are_kept_split_nothing(tmp_path: Path) -> None:
     path = tmp_path / "own.gltf"
     write_gltf(path, images=[encoded(quarters())], primitives=[{"material": 0}])

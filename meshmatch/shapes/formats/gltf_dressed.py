@@ -17,6 +17,7 @@ from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.formats.gltf import COMPRESSED, Document
 from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor, drawn
+from meshmatch.shapes.formats.gltf_out import smooth_normals
 from meshmatch.shapes.formats.gltf_prune import textures_in
 from meshmatch.shapes.formats.seams import split_at_seams, vertex_tangents
 
@@ -53,6 +54,7 @@ def dressed(
     seen = 0
     for number, parts in drawn(document).items():
         mesh = editor.own_mesh(number)  # each has its own place in the image
+        normals = {} if material.normal is None else _normals(document, parts)
         for k, part in parts.items():
             faces = document.triangles(part)
             corners = uv[seen : seen + len(faces)]
@@ -67,8 +69,8 @@ def dressed(
                 laid = split_at_seams(V, faces, corners)
             moved_to = None if own else _lay(editor, document, V, primitive, laid)
             _untint(document, part, primitive)
-            if material.normal is not None and "NORMAL" in part["attributes"]:
-                _add_tangents(editor, document, part, primitive, laid)
+            if k in normals:
+                _add_tangents(editor, document, part, primitive, normals[k], laid)
             wardrobe.dress(primitive, moved_to)
     if not np.array_equal(turn, np.eye(3)):
         editor.turn(turn)
@@ -132,13 +134,30 @@ def _untint(document: Document, part: dict[str, Any], primitive: dict[str, Any])
         primitive["attributes"]["_COLOR_0"] = primitive["attributes"].pop("COLOR_0")
 
 
+def _normals(document: Document, parts: dict[int, dict[str, Any]]) -> dict[int, Floats]:
+    """The normals of each primitive of a node; smooth ones where one has none."""
+    if all("NORMAL" in part["attributes"] for part in parts.values()):
+        return {k: document.accessor(part["attributes"]["NORMAL"]) for k, part in parts.items()}
+    places = [document.accessor(part["attributes"]["POSITION"]) for part in parts.values()]
+    starts = np.cumsum([0, *map(len, places)])
+    faces = [document.triangles(part) + start for part, start in zip(parts.values(), starts, strict=False)]
+    smooth = smooth_normals(np.concatenate(places), np.concatenate(faces))
+    own = dict(zip(parts, np.split(smooth, starts[1:-1]), strict=True))
+    held = {k: part["attributes"]["NORMAL"] for k, part in parts.items() if "NORMAL" in part["attributes"]}
+    return own | {k: document.accessor(number) for k, number in held.items()}
+
+
 def _add_tangents(
-    editor: Editor, document: Document, part: dict[str, Any], primitive: dict[str, Any], laid: Laid
+    editor: Editor, document: Document, part: dict[str, Any], primitive: dict[str, Any], normals: Floats, laid: Laid
 ) -> None:
-    """The tangents that the normal map was baked for."""
+    """The tangents that the normal map was baked for, and normals where there are none, without which they count for
+    nothing.
+    """
     vertex, coordinates, faces = laid
-    places, normals = (document.accessor(part["attributes"][key])[vertex] for key in ("POSITION", "NORMAL"))
-    tangents = vertex_tangents(places, unit(normals), faces, coordinates)
+    places, normals = document.accessor(part["attributes"]["POSITION"])[vertex], unit(normals[vertex])
+    if "NORMAL" not in primitive["attributes"]:
+        primitive["attributes"]["NORMAL"] = editor.add_array(normals.astype("<f4"), target=VERTICES)
+    tangents = vertex_tangents(places, normals, faces, coordinates)
     primitive["attributes"]["TANGENT"] = editor.add_array(tangents.astype("<f4"), target=VERTICES)
     for target in primitive.get("targets", []):
         target.pop("TANGENT", None)
