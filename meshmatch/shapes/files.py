@@ -187,6 +187,8 @@ def _read(path: str | Path) -> tuple[Shape, Raw]:
     shape = Shape.with_invalid(raw.verts, raw.faces, name, _visible(name, raw.colors))
     if suffix in gltf.SUFFIXES:
         shape = replace(shape, skinned=raw.skinned, upright=True, made_of=raw.made_of)
+    if raw.meshes:
+        shape = replace(shape, meshes=tuple((names[0] if names else "", count) for names, count in raw.meshes))
     return shape, raw
 
 

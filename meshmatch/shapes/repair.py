@@ -19,6 +19,7 @@ from meshmatch.shapes.denoise import without_noise
 from meshmatch.shapes.faces import collapsed, duplicate_faces, find_parts, flat_faces, seams, turn_faces
 from meshmatch.shapes.shape import Shape
 
+_NAMED = 5  # meshes that a note lists
 NOT_TRUSTED = "left out, as was asked for (weight 0)"
 """The end of a note about faces or points that nobody trusts."""
 
@@ -114,7 +115,7 @@ def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     if len(faces) == 0:
         raise InputError(f"{shape.name or 'the shape'} has no face with any area", "is it a mesh at all?")
     outlier, outlier_parts, parts, far, far_share = find_parts(shape.verts, faces, cross, shape.skinned)
-    what = f"dropped ({outlier.sum():,} {'face' if outlier.sum() == 1 else 'faces'})"
+    what = f"dropped ({outlier.sum():,} {'face' if outlier.sum() == 1 else 'faces'}{_meshes_of(shape, faces[outlier])})"
     _note(notes, outlier_parts, "outlier part", what)
     faces, cross, which = _without(outlier, faces, cross, which)
     _note(notes, parts if parts > 1 else 0, "separate part", "kept")
@@ -136,6 +137,15 @@ def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     if not passes:
         return found
     return replace(found, shape=smooth, notes=(*found.notes, f"smoothed {passes} times, because noise hid the surface"))
+
+
+def _meshes_of(shape: Shape, faces: Int[Ints, "N 3"]) -> str:
+    """Of which meshes of a scene some faces are, for a note; nothing where meshes have no names."""
+    if not len(faces) or sum(count for _, count in shape.meshes) != shape.V:
+        return ""
+    mesh = np.repeat(np.arange(len(shape.meshes)), [count for _, count in shape.meshes])
+    names = list(dict.fromkeys(name for k in np.unique(mesh[faces]) if (name := shape.meshes[k][0])))
+    return f" of {', '.join(names[:_NAMED])}{', ...' if len(names) > _NAMED else ''}" if names else ""
 
 
 def _without(bad: Bools, *arrays: NDArray[Any]) -> tuple[NDArray[Any], ...]:

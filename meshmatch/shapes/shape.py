@@ -49,6 +49,8 @@ class Shape(Pickled):
     made_of
         Hashes of meshes whose vertices are the first ones of this one, in their order, with the same triangles: of a file
         that a transfer made of them. Maps to one of these are maps to this shape too.
+    meshes
+        The meshes of its scene, or labels of its label map: the name of each, and how many vertices, in their order.
 
     Raises
     ------
@@ -71,6 +73,7 @@ class Shape(Pickled):
     skinned: Bool[Bools, " V"] | None = None
     upright: bool = False
     made_of: tuple[str, ...] = ()
+    meshes: tuple[tuple[str, int], ...] = ()
 
     def __post_init__(self) -> None:
         label = self.name or "the shape"

@@ -14,6 +14,7 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
+from tests.transfer.rigs import write_tube
 
 
 def join(*shapes: Shape, **more: object) -> Shape:
@@ -376,3 +377,19 @@ def test_small_parts_that_joints_move_are_no_dirt() -> None:
     assert done.notes[0] == "1 outlier part dropped (80 faces)"
     assert done.shape.V == ball.V + finger.V
     assert repair(join(ball, finger, dirt)).shape.V == ball.V
+
+
+def test_the_meshes_of_what_is_dropped_are_named() -> None:
+    ball, dirt = icosphere(3), move(icosphere(1), (3, 0, 0), 0.05)
+    named = (("head", ball.V), ("eye", dirt.V), ("", dirt.V), ("eye", dirt.V), ("tooth", dirt.V))
+    shape = join(ball, dirt, move(dirt, (0, 1, 0)), move(dirt, (0, 2, 0)), move(dirt, (0, 3, 0)), meshes=named)
+    assert repair(shape).notes[0] == "4 outlier parts dropped (320 faces of eye, tooth)"
+    assert repair(join(ball, dirt, meshes=named)).notes[0] == "1 outlier part dropped (80 faces)"  # of another shape
+
+
+def test_a_scene_names_its_meshes(tmp_path: Path) -> None:
+    write_tube(tmp_path / "tube.glb")
+    shape = load_shape(tmp_path / "tube.glb")
+    assert shape.meshes == (("tube", shape.V),)
+    save_shape(tmp_path / "tube.ply", shape)
+    assert load_shape(tmp_path / "tube.ply").meshes == ()
