@@ -59,6 +59,7 @@ def read(path):
         bpy.ops.wm.open_mainfile(filepath=path, load_ui=False, use_scripts=False)
     elif suffix == ".fbx":
         call(operator("import_scene.fbx"), filepath=path, use_image_search=False, ignore_leaf_bones=False)
+        call_clips_by_name()
     elif suffix == ".dae":
         call(operator("wm.collada_import"), filepath=path, keep_bind_info=True)
     elif suffix in (".usd", ".usda", ".usdc", ".usdz"):
@@ -115,9 +116,29 @@ def image_above(socket):
     return None
 
 
+def call_clips_by_name():
+    """Take from the names of clips those of objects, which an fbx puts before them, once each time it is written."""
+    for action in list(bpy.data.actions):
+        name = action.name
+        for each in bpy.data.objects:
+            while name.startswith(f"{each.name}|") and len(name) > len(each.name) + 1:
+                name = name[len(each.name) + 1 :]
+        action.name = name
+
+
 def tell_clips(suffix):
-    """Tell which clips a format leaves out that holds but one."""
+    """Tell which clips a format leaves out: of shapes, or all but one."""
     names = {}
+    if suffix == ".fbx":
+        moved = [each.animation_data for each in bpy.data.shape_keys if each.animation_data is not None]
+        for data in moved:
+            names |= dict.fromkeys(track.name for track in data.nla_tracks)
+            names |= {data.action.name: None} if data.action is not None else {}
+        if names:
+            note(
+                f"an .fbx file holds no clips of shapes: {', '.join(list(names)[:6])}{', ...' if len(names) > 6 else ''}"
+            )
+        return
     for each in bpy.data.objects:
         data = each.animation_data
         if data is not None and data.action is not None:
@@ -132,6 +153,73 @@ def lay_images_bare():
         for node in material.node_tree.nodes if material.use_nodes else ():
             if node.type == "BSDF_PRINCIPLED" and (image := image_above(node.inputs["Base Color"])) is not None:
                 material.node_tree.links.new(image, node.inputs["Base Color"])
+
+
+def packed(name, pixels, size):
+    """A new image inside the file."""
+    made = bpy.data.images.new(name, *size, is_data=True)
+    made.pixels.foreach_set(pixels)
+    made.update()
+    made.pack()
+    return made
+
+
+def split_channels():
+    """Give roughness and metal, which glTF has as channels of one image, images of their own: exporters look for these."""
+    import numpy as np
+
+    made = {}
+    for material in bpy.data.materials:
+        for node in list(material.node_tree.nodes) if material.use_nodes else ():
+            if node.type != "BSDF_PRINCIPLED":
+                continue
+            for socket, channel in (("Roughness", 1), ("Metallic", 2)):
+                found = image_above(node.inputs[socket])
+                if found is None or found.node.image is None:
+                    continue
+                image = found.node.image
+                if (image.name, channel) not in made:
+                    pixels = np.empty(len(image.pixels), np.float32)
+                    image.pixels.foreach_get(pixels)
+                    grey = pixels.reshape(-1, image.channels)[:, [min(channel, image.channels - 1)] * 4].copy()
+                    grey[:, 3] = 1.0
+                    made[image.name, channel] = packed(f"{material.name} {socket.lower()}", grey.ravel(), image.size)
+                own = material.node_tree.nodes.new("ShaderNodeTexImage")
+                own.image = made[image.name, channel]
+                for link in found.node.inputs["Vector"].links:
+                    material.node_tree.links.new(link.from_socket, own.inputs["Vector"])
+                material.node_tree.links.new(own.outputs["Color"], node.inputs[socket])
+
+
+def name_images():
+    """Give packed images file names of their own: fbx goes by these, and all that are empty would be one image."""
+    taken = set()
+    for image in bpy.data.images:
+        if image.packed_file is None:
+            continue
+        stem = os.path.splitext(bpy.path.clean_name(image.name))[0] or "image"
+        name = next(each for k in range(len(taken) + 1) if (each := f"{stem}-{k}" if k else stem) not in taken)
+        taken.add(name)
+        image.filepath_raw = f"//{name}.{'jpg' if image.file_format == 'JPEG' else 'png'}"
+
+
+def tell_layers(suffix):
+    """Tell which images of materials a format leaves out."""
+    lost = {}
+    for material in bpy.data.materials:
+        for node in material.node_tree.nodes if material.use_nodes else ():
+            if node.type == "GROUP" and any(image_above(each) is not None for each in node.inputs):
+                lost["occlusion"] = None
+            elif node.type == "BSDF_PRINCIPLED" and suffix == ".dae":
+                inputs = {
+                    "Normal": "normals",
+                    "Roughness": "roughness",
+                    "Metallic": "metal",
+                    "Emission Color": "emission",
+                }
+                lost |= {word: None for name, word in inputs.items() if image_above(node.inputs[name]) is not None}
+    if lost:
+        note(f"{'an' if suffix == '.fbx' else 'a'} {suffix} file holds no images of {', '.join(lost)}")
 
 
 def write(path, apply):
@@ -150,7 +238,7 @@ def write(path, apply):
         )  # fmt: skip
     elif suffix == ".dae":
         stem = os.path.splitext(os.path.basename(path))[0]
-        for image in bpy.data.images:  # its file lies beside the dae, among others
+        for image in list(bpy.data.images):  # renamed ones move in it; its file lies beside the dae, among others
             image.name = f"{stem}-{image.name}"
         call(operator("wm.collada_export"), filepath=path, use_texture_copies=True, apply_modifiers=apply)
     elif suffix == ".blend":
@@ -174,8 +262,12 @@ def main(source, output):
     suffix = os.path.splitext(output)[1].lower()
     if suffix != ".glb":
         lay_images_bare()
-    if suffix in (".usdz", ".dae"):
+    if suffix in (".fbx", ".usdz", ".dae"):
         tell_clips(suffix)
+        tell_layers(suffix)
+    if suffix == ".fbx":
+        split_channels()
+        name_images()
     write(output, prepare())
     if not os.path.isfile(output):
         raise SystemExit("Blender wrote nothing")

@@ -13,15 +13,18 @@ import meshmatch
 from meshmatch import blender
 from meshmatch.errors import InputError, MeshmatchWarning, OptionError, OutputError
 from meshmatch.outputs import replace_on_success
-from meshmatch.shapes.dressed_files import save_textured
+from meshmatch.shapes.appearance import BakedMaterial
+from meshmatch.shapes.dressed_files import Dressed, save_textured
 from meshmatch.shapes.formats import gltf_out
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_rig import read_rig
 from meshmatch.shapes.input_files import read_bytes
+from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import find_appearance, load_appearance
 from meshmatch.transfer.weight_files import load_weights
 from tests.blender_at_hand import needs_blender, run_inside, stand_in
+from tests.shapes.painted import CORNERS, FACES, UV
 from tests.transfer.rigs import tube, write_tube
 
 HOSTILE = """
@@ -266,6 +269,46 @@ def test_blender_writes_a_textured_mesh_as_fbx(tmp_path: Path) -> None:
     save_textured(tmp_path / "a.fbx", mesh, np.full((4, 4, 4), 200, np.uint8))
     assert (tmp_path / "a.fbx").read_bytes().startswith(b"Kaydara FBX Binary")
     assert meshmatch.load_shape(tmp_path / "a.fbx").F == 2
+
+
+@needs_blender
+@pytest.mark.parametrize("suffix", blender.WRITTEN)
+def test_blender_keeps_each_image_of_a_material(suffix: str, tmp_path: Path) -> None:
+    """An fbx took the color for the normals and the emission; what a format does not hold is told."""
+    colors = {"color": (200, 40, 40), "normal": (128, 128, 255), "surface": (255, 60, 180), "glow": (10, 220, 90)}
+    images = {name: np.full((32, 32, 4), [*color, 255], np.uint8) for name, color in colors.items()}
+    made = BakedMaterial(
+        **images, name="made", double_sided=False, occluded=True, metal=1.0, roughness=1.0, light=(1.0, 1.0, 1.0)
+    )
+    Dressed(Shape(CORNERS, FACES, "square"), None, UV[FACES], False, made).save(tmp_path / "a.glb")
+    path = tmp_path / f"a{suffix}"
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        with replace_on_success(path) as glb:
+            shutil.copyfile(tmp_path / "a.glb", glb)
+        look = load_appearance(path, meshmatch.load_shape(path))
+    lost = {".fbx": "occlusion", ".usdz": "occlusion", ".dae": "normals, roughness, metal, emission, occlusion"}
+    words = [str(each.message) for each in told if "holds no images" in str(each.message)]
+    assert [word.partition("images of ")[2] for word in words] == [lost[suffix]] if suffix in lost else not words
+    assert look.materials[0].image is not None and look.finish is not None
+    found = {"color": look.materials[0].image} | {
+        name: layer.materials[0].image for name, layer in look.finish.layers.items()
+    }
+    for name in ("color",) if suffix == ".dae" else ("color", "normal", "surface", "glow"):
+        image = found[name]
+        assert image is not None
+        off = np.abs(image[..., :3].reshape(-1, 3).mean(axis=0) - colors[name])
+        assert off[1 if name == "surface" else 0 :].max() < 4, name
+
+
+@needs_blender
+def test_clips_of_an_fbx_keep_their_names(tmp_path: Path) -> None:
+    """Each time, Blender puts the name of the skeleton before them."""
+    write_tube(tmp_path / "tube.glb")
+    for before, after in (("tube.glb", "a.fbx"), ("a.fbx", "b.fbx")):
+        with replace_on_success(tmp_path / after) as glb:
+            glb.write_bytes(read_bytes(tmp_path / before))
+    assert [clip.name for clip in read_rig(tmp_path / "b.fbx", read_bytes(tmp_path / "b.fbx")).clips] == ["bend"]
 
 
 @needs_blender
