@@ -86,6 +86,9 @@ def register(
     how: FitOptions,
     run: RunOptions,
     onto: Path | None = optional("TARGET", "Deform the mesh of SHAPE onto this shape instead, of any kind."),
+    template: Path | None = optional(
+        "MESH", "Deform this mesh, which may be your own, onto SHAPE: as the mesh with --onto SHAPE."
+    ),
     dense: bool = Option(False, "--dense", help="Write the template in its full resolution."),
     picture: Path | None = optional("PNG", "Draw the template over the shape, colored by distance."),
 ) -> None:
@@ -93,16 +96,20 @@ def register(
 
     This is a non-rigid registration: the model's template is deformed, and the shape stays where it is. Results for all
     shapes have the same vertices and triangles in the same order. With more than one thread, results may differ in
-    the last bits. With --onto, the mesh of SHAPE is deformed onto TARGET, which stays where it is.
+    the last bits. With --onto, the mesh of SHAPE is deformed onto TARGET, which stays where it is; an .obj from an .obj, or
+    a .glb from a .glb, keeps everything but the positions, as with `wrap`, which also draws it to the surface.
     """
     from meshmatch.api.matching import matcher_for
     from meshmatch.api.upright import turn_of_fit
     from meshmatch.shapes.files import check_suffix, save_upright
 
-    how.check(not_implicit=["dense", "onto"])
+    how.check(not_implicit=["dense", "onto", "template"])
     check_suffix(output)
-    check_outputs([shape, onto], output, picture=picture)
+    check_outputs([shape, onto, template], output, picture=picture)
     console = Console(run.quiet)
+    if template is not None:
+        how.refuse(["dense", "onto"], "--template")
+        return _register_onto(template, shape, output, picture, how, run, console)
     if onto is not None:
         how.refuse(["dense"], "--onto")
         return _register_onto(shape, onto, output, picture, how, run, console)
@@ -144,12 +151,21 @@ def _register_onto(
     shape: Path, onto: Path, output: Path, picture: Path | None, how: FitOptions, run: RunOptions, console: Console
 ) -> None:
     """Deform the mesh of one shape onto another."""
+    import numpy as np
+
+    from meshmatch.api.bound import carried_along
     from meshmatch.api.matching import match as match_shapes
     from meshmatch.api.upright import turn_of_moved
-    from meshmatch.shapes.files import save_upright
+    from meshmatch.geometry.triangles import shortest_turns
+    from meshmatch.outputs import replace_all_on_success
+    from meshmatch.shapes.blend_shapes import shape_normals
+    from meshmatch.shapes.moved_files import MovedFile
 
     names = words.names_of([shape, onto])
-    with replace_on_success(output) as temporary:
+    plan = MovedFile.planned(output, shape)
+    check_outputs([shape, onto], *plan.files, picture=picture)
+    plan.make_folders()
+    with replace_all_on_success(plan.files) as temporary:
         check_model(how.model)
         a, b = how.load(shape, onto)
         if a.is_cloud:
@@ -161,7 +177,10 @@ def _register_onto(
         found = result.map
         words.refuse_poor(run.strict, found.verdict, found.reasons, "the registration")
         moved = result.deformed_source()
-        turned = save_upright(temporary, moved, turn_of_moved(a, moved.verts, b, result.target_fit))
+        turn = turn_of_moved(a, moved.verts, b, result.target_fit)
+        before, after = shape_normals(a, (moved.verts - a.verts)[None].astype(np.float32))
+        binding = carried_along(shape, moved, b.upright)
+        plan.write(temporary, moved, shortest_turns(before, after), binding, turn)
     if picture is not None:
         from meshmatch.render.compose import compose_fit
 
@@ -172,9 +191,10 @@ def _register_onto(
     apart = meshmatch.measure_distance(*begins, one_way=any(parts))
     console.say(str(apart))
     words.tell_verdict(console, found.verdict, found.reasons, "the registration")
-    if turned:
+    if plan.is_turned(binding, turn):
         console.say(f"note: a node turns {names[0]} upright, along y")
-    console.say(f"wrote {output}: the mesh of {names[0]} on {names[1]}, {moved.V} vertices ({result.seconds:.1f} s)")
+    where = " ".join(map(str, plan.files))
+    console.say(f"wrote {where}: the mesh of {names[0]} on {names[1]}, {moved.V} vertices ({result.seconds:.1f} s)")
     if picture is not None:
         console.say(f"drew {picture}: the mesh over {names[1]}, and their distance")
     if run.json:

@@ -127,6 +127,23 @@ def test_register_stands_upright_in_a_glb(run: Run, two: tuple[Path, Path], stub
     assert f"a node turns {two[0].name} upright, along y" in answer.err
 
 
+def test_register_keeps_the_file_of_a_mesh_of_your_own(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
+    """All but positions, as wrap does; --template says the same from the other side."""
+    base = two[0].with_name("base.obj")
+    save_shape(base, load_shape(two[0]))
+    words = base.read_text().splitlines()
+    first = next(k for k, line in enumerate(words) if line.startswith("f"))
+    words[first:first] = ["vt 0.5 0.5", "g mine"]
+    base.write_text("\n".join(["# made by hand", *words, "f 1/1 2/1 3/1 4/1", ""]))
+    onto, template = (two[0].with_name(name) for name in ("onto.obj", "template.obj"))
+    assert (answer := run("register", base, "--onto", two[1], "-o", onto)).status == 0, answer.err
+    assert (answer := run("register", two[1], "--template", base, "-o", template)).status == 0, answer.err
+    assert template.read_text() == onto.read_text()
+    assert {"# made by hand", "g mine", "vt 0.5 0.5", "f 1/1 2/1 3/1 4/1"} <= set(onto.read_text().splitlines())
+    answer = run("register", two[1], "--template", base, "--onto", two[0], "-o", onto)
+    assert answer.status == 1 and "--onto does not go with --template" in answer.err
+
+
 def test_register_draws_the_template_over_the_shape(
     run: Run, two: tuple[Path, Path], stub: FakeMatching, monkeypatch: pytest.MonkeyPatch
 ) -> None:
