@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from meshmatch.api.results import measure_distance as measure_distance
     from meshmatch.api.rig import RiggedResult as RiggedResult
     from meshmatch.api.rig import transfer_rig as transfer_rig
+    from meshmatch.api.symmetry import Symmetry as Symmetry
+    from meshmatch.api.symmetry import find_symmetry as find_symmetry
     from meshmatch.api.texture import TexturedResult as TexturedResult
     from meshmatch.api.texture import transfer_texture as transfer_texture
     from meshmatch.api.transfer import find_maps as find_maps
@@ -92,6 +94,7 @@ _NAMES = {
     "api.prepare": "prepare",
     "api.results": "ConfidenceRule MapPair MatchResult Transferred evaluate measure_distance",
     "api.rig": "RiggedResult transfer_rig",
+    "api.symmetry": "Symmetry find_symmetry",
     "api.texture": "TexturedResult transfer_texture",
     "api.transfer": "find_maps transfer_colors transfer_labels transfer_landmarks transfer_values transfer_weights",
     "api.wrap": "WrapResult wrap",

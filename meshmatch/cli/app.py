@@ -16,6 +16,7 @@ from meshmatch.cli.match import evaluate, match, register
 from meshmatch.cli.models import models
 from meshmatch.cli.picture import picture, view
 from meshmatch.cli.prepare import prepare
+from meshmatch.cli.symmetry import symmetry
 from meshmatch.cli.train import train
 from meshmatch.cli.transfer import transfer_color, transfer_labels, transfer_landmarks, transfer_weights
 from meshmatch.cli.transfer_garment import transfer_garment
@@ -71,7 +72,7 @@ for verb in (
     *(match, register, wrap, evaluate),
     *(transfer_texture, transfer_color, transfer_labels, transfer_weights),
     *(transfer_rig, transfer_shapes, transfer_landmarks, transfer_garment),
-    *(fit, map, export, atlas),
+    *(fit, map, export, atlas, symmetry),
     *(interpolate, picture, view, info, prepare, train, blender_addon),
 ):
     app.command()(verb)

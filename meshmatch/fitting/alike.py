@@ -42,7 +42,12 @@ _CLEAR_SIDE = 0.05  # see `Fit.side`: 0.15 and more of molars
 
 
 def match_alike(
-    source: Shape, target: Shape, found: DirectMatch, config: FitConfig, progress: ProgressCallback | None = None
+    source: Shape,
+    target: Shape,
+    found: DirectMatch,
+    config: FitConfig,
+    progress: ProgressCallback | None = None,
+    turned: bool = True,
 ) -> DirectMatch:
     """A direct match, made finer where the shapes stand alike, or where one is open and clearly better seen as a part.
 
@@ -58,6 +63,8 @@ def match_alike(
         Whether parts and mirror images are looked for, and the seed.
     progress
         As of `match_directly`.
+    turned
+        Whether other turns than that of the match are tried.
 
     Returns
     -------
@@ -80,7 +87,7 @@ def match_alike(
     if of_whole.frame.mirrored:  # the template is not
         of_other = replace(of_other, frame=of_other.frame.compose(MIRROR), points=MIRROR.apply(of_other.points))
     size = float(np.sqrt(whole.area)) if part else None
-    finer = fit_alike(template, other, (resting, of_other), viscous, config.mirror != "no", size)
+    finer = fit_alike(template, other, (resting, of_other), viscous, config.mirror != "no", size, turned)
     report(1.0)
     if finer is None:
         return found

@@ -193,6 +193,61 @@ def match_either_side(
     return replace(_of_mirror_image(image.matched(to_image, report, began), target), apart=search.apart)
 
 
+def match_where_it_lies(
+    source: Shape,
+    targets: Sequence[Shape],
+    config: DirectConfig | None = None,
+    progress: ProgressCallback | None = None,
+) -> tuple[int, DirectMatch]:
+    """As `match_directly`, one way and without a search: to the one of some targets that fits best.
+
+    Parameters
+    ----------
+    targets
+        One shape, moved rigidly in some ways, in each of which it may lie on the source.
+
+    Returns
+    -------
+    int
+        The number of the target.
+    DirectMatch
+        Of the source and of that target.
+    """
+    began, report = time.monotonic(), Progress(progress, source.name).stage("fits of the guesses")
+    config = config or DirectConfig()
+    searches = [_Search.of(source, target, config, None, None) for target in targets]
+    own, sides = searches[0].source, [each.target for each in searches]
+    at = own.frame.undo(own.fine_mesh.verts)
+
+    def as_of_first(number: int, found: Tried) -> Tried:
+        """A fit as if the target were the first one."""
+        back = kabsch(targets[number].verts, targets[0].verts)
+        there = sides[number].frame.undo(own.fine.system.moved(found.vectors))
+        return replace(found, moved=sides[0].frame.apply(back.to_world(there)))
+
+    def fit(number: int) -> Tried:
+        goals = sides[number].frame.apply(at)
+        return as_of_first(number, finish(own, sides[number], Proposal(f"place {number}", goals), goals))
+
+    def go_on(found: Tried) -> Tried:
+        number = int(found.proposal.kind.split()[1])
+        return as_of_first(number, glide(own, sides[number], found))
+
+    _ = own.fine  # once, and not by each thread
+    report(0.0)
+    tried = parallel_map(fit, range(len(targets)))
+    report(0.6)
+    best = distinct(tried, config.gliding, config.unlike)
+    rest = [each for each in tried if each not in best]
+    found = sorted([*parallel_map(go_on, best), *rest], key=attrgetter("energy"))
+    chosen = int(found[0].proposal.kind.split()[1])
+    turns = turns_onto_itself(own.thin)
+    match = replace(searches[chosen], source=own)._match(_Judged(found, config.unlike, DIRECT, turns))
+    report(1.0)
+    first, second = (replace(each, seconds=time.monotonic() - began) for each in (match.source, match.target))
+    return chosen, replace(match, source=first, target=second)
+
+
 def _alike(plain: DirectFeatures, image: DirectFeatures, apart: float) -> bool:
     """Whether the mirror image is meant, if it fits better. A creature in another pose may have less to bend onto the mirror
     image of a target, whose other leg is in front; there the relief must say so too.

@@ -341,6 +341,7 @@ def fit_alike(
     config: ViscousConfig | None = None,
     mirror: bool = True,
     whole: float | None = None,
+    turned: bool = True,
 ) -> tuple[Fit, bool] | None:
     """Fit a template to a repaired shape that may stand as it does, or be a part of it, and has been matched to it.
 
@@ -350,6 +351,8 @@ def fit_alike(
         Positions (N, 3) on the resting template, and a fit whose points (N, 3) say where a search found them to belong.
     mirror, whole
         As of `fit_without_model`.
+    turned
+        Whether the template is also only turned, in any way.
 
     Returns
     -------
@@ -365,14 +368,13 @@ def fit_alike(
     task, (resting, start) = _Task(template, shape, few), begun
     at = np.asarray(cKDTree(task.system.verts).query(resting)[1], np.int64)
     as_found = partial(task.fitted, _Begin(start.frame, task.onto(at, start.points)))
-    first, *turns = parallel_calls((as_found, *(partial(task.best_turn, side) for side in sides)))
+    others = [partial(task.best_turn, side) for side in sides] if turned else []
+    first, *turns = parallel_calls((as_found, *others))
     best = first
-    for turned in turns:
-        other = turned.begin.frame.mirrored != best.begin.frame.mirrored
-        relaxed = (
-            whole is None and other and turned.alike and turned.features.stretch < _OTHER_SIDE * best.features.stretch
-        )
-        best = turned if relaxed else _clearly_better(turned, best, _TURNED)
+    for turn in turns:
+        other = turn.begin.frame.mirrored != best.begin.frame.mirrored
+        relaxed = whole is None and other and turn.alike and turn.features.stretch < _OTHER_SIDE * best.features.stretch
+        best = turn if relaxed else _clearly_better(turn, best, _TURNED)
     if whole is not None:
         part = _Task(template, shape, few, whole).best_part(sides)
         poor = _Judged.of(task, best).judgement.verdict == "poor"

@@ -73,6 +73,23 @@ def repair(shape: Shape) -> Repaired:
     return (_repair_cloud if shape.is_cloud else _repair_mesh)(shape, valid, notes)
 
 
+def turned_outwards(shape: Shape) -> Shape:
+    """The shape with its faces turned as `repair` turns them, and nothing else: a node of negative scale has them inside
+    out, as some scans have.
+    """
+    real = np.flatnonzero(shape.face_areas > 0)
+    if not len(real):
+        return shape
+    faces = seams(shape.verts, shape.faces)[shape.faces[real]]
+    turned, many = turn_faces(shape.verts, faces, shape.face_vectors[real], edges_of(faces))
+    if not many:
+        return shape
+    flip = real[(turned != faces).any(axis=1)]
+    own = shape.faces.copy()
+    own[flip] = own[flip][:, ::-1]
+    return replace(shape, faces=own)
+
+
 def _repair_cloud(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     twin = np.where(valid, same_rows(shape.verts), np.arange(shape.V))
     kept = valid & (twin == np.arange(shape.V))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.shape import Shape
 from tests.cli.conftest import FakeMatching, Run, refused, well
 from tests.transfer.worn import rod, tube
 
@@ -35,6 +36,14 @@ def test_the_text_stays_and_the_distance_is_printed(run: Run, files: Path) -> No
     radius = np.linalg.norm(load_shape("out.obj").verts[:-2, [0, 2]], axis=1)
     assert np.quantile(np.abs(radius - 0.21), 0.9) < 0.003
     assert Path("p.png").is_file()
+
+
+def test_faces_may_run_the_other_way(run: Run, files: Path) -> None:
+    """As those of a node of negative scale do: what faces as a vertex does is there all the same."""
+    shape = rod()
+    save_shape("base.obj", Shape(shape.verts, shape.faces[:, ::-1]))
+    answer = well(run("wrap", "base.obj", "scan.ply", "-o", "out.obj", "--json"))
+    assert json.loads(answer.out)["distance"]["95 %"] < 0.003
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The bench of counterparts across the plane of symmetry, on eggs."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.experiments.bench import any_shapes, symmetry
 from meshmatch.experiments.bench.specimens import Specimens, by_points
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
@@ -44,6 +46,19 @@ def test_counterparts_are_found_by_fits(some: Specimens, tmp_path: Path) -> None
     row = symmetry.measure("bird", "none", tmp_path, 0, tmp_path / "work")
     assert (row["shapes"], row["keypoints"], row["lost"]) == (3, 12, 0.0)
     assert row["error"] < 5 and set(row["each"]) == {"0", "1", "2"}
+
+
+def test_counterparts_of_one_shape_are_those_of_its_map(
+    some: Specimens, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def found(shape: Shape) -> SimpleNamespace:
+        way = icosphere(3).verts  # specimens are turned, but keep the order of their vertices
+        across = cKDTree(way).query(way * [1, -1, 1])[1]
+        return SimpleNamespace(map=VertexMap.between(shape, shape, across))
+
+    monkeypatch.setattr(symmetry, "find_symmetry", found)
+    row = symmetry.measure("bird", "alone", tmp_path, 0, tmp_path / "work")
+    assert (row["keypoints"], row["lost"]) == (12, 0.0) and row["error"] < 1
 
 
 def test_what_stays_on_its_side_is_lost(some: Specimens, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

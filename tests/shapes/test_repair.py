@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import edges_of, is_watertight, same_rows, unit
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.repair import Repaired, repair
+from meshmatch.shapes.repair import Repaired, repair, turned_outwards
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
 from tests.transfer.rigs import write_tube
@@ -393,3 +393,20 @@ def test_a_scene_names_its_meshes(tmp_path: Path) -> None:
     assert shape.meshes == (("tube", shape.V),)
     save_shape(tmp_path / "tube.ply", shape)
     assert load_shape(tmp_path / "tube.ply").meshes == ()
+
+
+def test_faces_turned_outwards_and_nothing_else() -> None:
+    ball = icosphere(2)
+    assert turned_outwards(ball) is ball
+    apart = Shape(
+        ball.verts[ball.faces.ravel()], np.arange(3 * ball.F).reshape(-1, 3)
+    )  # open everywhere but for its place
+    for shape in (ball, apart):
+        for wrong in (np.arange(shape.F), np.arange(0, shape.F, 3)):
+            faces = shape.faces.copy()
+            faces[wrong] = faces[wrong][:, ::-1]
+            found = turned_outwards(Shape(shape.verts, faces))
+            assert np.array_equal(np.sort(found.faces, axis=1), np.sort(faces, axis=1))
+            assert np.allclose(found.face_vectors, shape.face_vectors)
+    cloud = Shape(ball.verts, np.empty((0, 3), np.int64))
+    assert turned_outwards(cloud) is cloud

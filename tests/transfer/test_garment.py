@@ -48,9 +48,14 @@ def test_detail_stays_where_the_map_is_noisy() -> None:
     assert np.abs(after / before - 1).max() < 0.1
 
 
-def test_what_would_sink_is_pushed_out() -> None:
-    """From a prism of six sides to a round rod, which bulges between the prism's edges."""
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_what_would_sink_is_pushed_out(inside_out: bool) -> None:
+    """From a prism of six sides to a round rod, which bulges between the prism's edges; whichever way faces run, which nodes
+    of negative scale turn.
+    """
     prism, round_rod = tube(RADIUS, LENGTH, 6, 41, "prism", closed=True), rod()
+    if inside_out:
+        prism, round_rod = (replace(each, faces=each.faces[:, ::-1]) for each in (prism, round_rod))
     ring = (24 * np.arange(41)[:, None] + 4 * np.arange(6)).ravel()
     found = VertexMap.between(prism, round_rod, np.append(ring, [round_rod.V - 2, round_rod.V - 1]))
     cloth = tube(1.0, 1.0, 24, 15, "cloth")

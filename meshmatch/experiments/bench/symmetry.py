@@ -5,6 +5,7 @@ between where a keypoint's counterpart is said to be and where it is, in percent
 a tenth of sqrt(area).
 
 - none: ``fit FOLDER --model none``; what lies across from a place of a shape is what lies across from it on the template.
+- alone: ``symmetry SHAPE``, of each shape by itself.
 - pyclarcs: ``clarcs asymmetry``: its plane of symmetry, and its registration of the mirror image, of each shape by itself,
   with 4,000 triangles. Its widths are millimetres of endocasts, so shapes are brought to their size.
 
@@ -23,6 +24,7 @@ from typing import Annotated, Any
 import numpy as np
 from typer import Option
 
+from meshmatch.api.symmetry import find_symmetry
 from meshmatch.arrays import Floats, Int, Ints
 from meshmatch.collections.collection import Collection
 from meshmatch.experiments import runner
@@ -39,7 +41,8 @@ from meshmatch.shapes.files import save_shape
 from meshmatch.templates.sides import laid_mirrored
 
 PYCLARCS = "pyclarcs"
-METHODS = (NO_MODEL, PYCLARCS)
+ALONE = "alone"
+METHODS = (NO_MODEL, ALONE, PYCLARCS)
 SETS = tuple(name for name in BY_KEYPOINTS if name != "chair")
 _TRIANGLES, _SIZE = 4000, 200.0  # of what pyclarcs is given: mm
 _COLUMNS = {"set": "set", "method": "method", "shapes": "shapes:d", "keypoints": "keypoints:d"}
@@ -69,6 +72,16 @@ def by_fits(some: Specimens, scans: Path, work: Path) -> Across:
         image = across.to_world(places.resting[vertices] * [-1.0, 1, 1]).astype(np.float32)
         found = places.nearest(image)
         return interpolate(some.each[name].shape.verts, places.faces[found.face].astype(np.int64), found.barycentric)
+
+    return points
+
+
+def alone(some: Specimens, scans: Path, work: Path) -> Across:
+    """By each shape and its own mirror image."""
+
+    def points(name: str, vertices: Ints) -> Floats:
+        shape = some.each[name].shape
+        return find_symmetry(shape).map.apply(shape.verts)[vertices]
 
     return points
 
@@ -108,7 +121,7 @@ def measure(name: str, method: str, data: Path, seed: int, work: Path) -> dict[s
     make_folder(scans)
     for key, each in some.each.items():
         save_shape(scans / f"{key}.ply", each.shape)
-    ways: dict[str, Callable[[Specimens, Path, Path], Across]] = {NO_MODEL: by_fits, PYCLARCS: clarcs}
+    ways: dict[str, Callable[[Specimens, Path, Path], Across]] = {NO_MODEL: by_fits, ALONE: alone, PYCLARCS: clarcs}
     across, errors = ways[method](some, scans, work / "fits" / f"{name}-{method}"), {}
     for key, each in some.each.items():
         paired, known = pairs_of(some.folder, key), any_shapes.distances(some.folder, key)

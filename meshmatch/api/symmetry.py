@@ -1,0 +1,135 @@
+"""`find_symmetry`: what lies across from what on one shape."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from meshmatch.api.inputs import check_config, checked_threads, validated
+from meshmatch.api.results import maps_of_fits
+from meshmatch.arrays import Brief, Float, Floats
+from meshmatch.fitting.across import image_in, match_across
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.search.planes import MirrorPlane
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.progress import ProgressCallback
+from meshmatch.shapes.files import ShapeLike, as_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.threads import thread_limit, worker_slot
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Symmetry(Brief):
+    """What `find_symmetry` found.
+
+    Attributes
+    ----------
+    map
+        From the shape to itself: ``map.index[i]`` is the vertex that lies across from vertex i, with verdict and confidence.
+    normal
+        (3,) of the plane in which the shape is nearest to its mirror image, of length 1.
+    offset
+        Points x of the plane have x . normal = offset, in the unit of the file.
+    displacement
+        (V, 3) from the mirror image of its counterpart to each vertex; nan where the shape has no surface.
+    along_normal
+        (V,) the same along the outward normal: positive where a place lies further out than its counterpart.
+    seconds
+        Wall time.
+    notes
+        What was changed in the shape before fitting.
+
+    Examples
+    --------
+    >>> found = meshmatch.find_symmetry("templates/samples/laughing.ply")
+    >>> print(found.map.verdict, found.normal, found.offset)
+    """
+
+    map: VertexMap
+    normal: Float[Floats, " 3"]
+    offset: float
+    displacement: Float[Floats, "V 3"]
+    along_normal: Float[Floats, " V"]
+    seconds: float
+    notes: tuple[str, ...]
+
+
+def find_symmetry(
+    shape: ShapeLike,
+    *,
+    config: FitConfig | None = None,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+) -> Symmetry:
+    """Find what lies across from each vertex of a shape that is nearly symmetric: a head, a skull, a bird.
+
+    The shape is matched to its mirror image, from the planes that bring most of its surface near to itself. No model and no
+    other shape is needed; of a collection that is nearly symmetric, see `measure_asymmetry`.
+
+    Parameters
+    ----------
+    shape
+        A mesh, as of `match`.
+    config
+        Its seed is used, and nothing else.
+    threads
+        How many fits are made at once; 2 by default.
+    progress
+        Called with the stage, the name of the shape and the share of the stage that is done (0..1).
+
+    Returns
+    -------
+    Symmetry
+        With the verdict of its map: a shape that is not nearly symmetric in any plane is hardly good.
+
+    Raises
+    ------
+    MeshmatchError
+        The shape cannot be read, or is a cloud of points, or has large parts far apart.
+
+    Examples
+    --------
+    >>> found = meshmatch.find_symmetry("templates/samples/laughing.ply")
+    >>> across = found.map.index  # of each vertex, the one on the other side
+    """
+    began, config, count = time.monotonic(), config or FitConfig(), checked_threads(threads)
+    check_config(config)
+    original = as_shape(shape)
+    clean = validated(original)
+    with thread_limit(1), worker_slot(threading.Semaphore(count)):
+        plane, found = match_across(clean.shape, config, progress)
+    image = replace(clean, shape=image_in(plane, clean.shape), original=image_in(plane, original))
+    fits = replace(found.source, repaired=clean), replace(found.target, repaired=image)
+    with thread_limit(1):
+        to_image = maps_of_fits(fits, fits, count)[0]
+    across = VertexMap.between(
+        original,
+        original,
+        to_image.index,
+        face=to_image.face,
+        barycentric=to_image.barycentric[:, ::-1],  # faces of the image turn the other way
+        confidence=to_image.confidence,
+        verdict=to_image.verdict,
+        reasons=to_image.reasons,
+    )
+    plane, displacement = _plane_of(original, across)
+    return Symmetry(
+        map=across,
+        normal=plane.normal,
+        offset=plane.offset,
+        displacement=displacement,
+        along_normal=np.einsum("vi,vi->v", displacement, original.vertex_normals),
+        seconds=time.monotonic() - began,
+        notes=clean.notes,
+    )
+
+
+def _plane_of(shape: Shape, across: VertexMap) -> tuple[MirrorPlane, Float[Floats, "V 3"]]:
+    """The plane that brings a shape nearest to its mirror image, and (V, 3) from that to the shape."""
+    counterparts = across.apply(shape.verts_or_nan)
+    known = np.isfinite(counterparts).all(axis=1) & np.isfinite(shape.verts_or_nan).all(axis=1)
+    plane = MirrorPlane.between(shape.verts[known], counterparts[known], shape.vertex_areas[known])
+    return plane, shape.verts_or_nan - plane.reflect(counterparts)
