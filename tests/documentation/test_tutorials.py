@@ -6,6 +6,7 @@ import importlib.util
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass, field
@@ -150,6 +151,21 @@ def small_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(without_model, "_ALIGNED_BY", 300)
 
 
+def check_by_r(folder: Path) -> None:
+    """What the page has R alone read is what was written."""
+    page = (ROOT / "docs" / "anatomist.md").read_text(encoding="utf-8")
+    alone = re.search(r"^```r\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    assert alone is not None and "library(" not in alone[1]
+    told = "cat(dim(coords), coords[1, 2, 2], dim(landmarks), landmarks[7, 3, 2], names(effects)[2], sep = '\\n')"
+    *_, effect = lines = run(["Rscript", "-"], f"{alone[1]}\n{told}\n", folder).splitlines()[-9:]
+    with open(folder / "tables" / "coords.csv", encoding="utf-8", newline="") as file:
+        names, *rows = csv.reader(file)
+    last = read_landmark_file(folder / "landmarks" / "bone-02.mrk.json", "bone-02", "LPS").places[6]
+    known = [(len(names) - 1) / 3, 3, 5, float(rows[1][2]), 7, 3, 5, last.where[2]]
+    assert [float(each) for each in lines[:-1]] == pytest.approx(known, rel=1e-4)
+    assert effect == "log(size), x"
+
+
 @pytest.mark.filterwarnings("ignore::meshmatch.errors.MeshmatchWarning")
 def test_a_folder_of_bones_becomes_landmarks_statistics_and_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_fits: None, capsys: pytest.CaptureFixture[str]
@@ -188,6 +204,8 @@ def test_a_folder_of_bones_becomes_landmarks_statistics_and_files(
     assert {"mean.png", "landmarks.tps"} <= {path.name for path in tmp_path.iterdir()}
     tables = [path.name for path in Path("tables").iterdir()]
     assert {"coords.csv", "metadata.csv"} == set(tables)
+    if shutil.which("Rscript") is not None:
+        check_by_r(tmp_path)
     if importlib.util.find_spec("vtkmodules") is None:
         return
     vtk = importlib.import_module("vtkmodules.vtkIOXML")
