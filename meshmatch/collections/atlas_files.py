@@ -135,7 +135,8 @@ def write_folder(
     draw_distances(folder / "distances.png", atlas, turn)
     if find_spec("matplotlib") is not None:
         draw_charts(folder, atlas, findings.measures, findings.charts)
-        draw_scores(folder, atlas, findings.classes(atlas), findings.charts, turn)
+        grouped_by = "" if findings.members or findings.explained is None else findings.explained.grouped_by
+        draw_scores(folder, atlas, findings.classes(atlas), findings.charts, turn, grouped_by)
         if findings.explained is not None and findings.explained.allometry is not None:
             draw_allometry(folder, findings.explained, findings.explained.allometry, findings.charts)
     if findings.samples:

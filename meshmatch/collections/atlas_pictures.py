@@ -169,7 +169,12 @@ def draw_charts(folder: Path, atlas: Atlas, measures: Measures | None, kind: Cha
 
 
 def draw_scores(
-    folder: Path, atlas: Atlas, groups: Sequence[str], kind: ChartFormat, turn: Float[Floats, "3 3"]
+    folder: Path,
+    atlas: Atlas,
+    groups: Sequence[str],
+    kind: ChartFormat,
+    turn: Float[Floats, "3 3"],
+    grouped_by: str = "",
 ) -> None:
     """The share of the variance of each mode, and the shapes along the first two, with the hulls of groups, and what the
     mean becomes towards the ends of both axes.
@@ -180,9 +185,16 @@ def draw_scores(
         return
     points = (atlas.scores * atlas.deviations)[:, :2]
     names = {row: atlas.names[row] for row in furthest(atlas)}
-    axes = [f"PC{k + 1} ({100 * shares[k]:.3g} %), unit of the files" for k in range(2)]
-    dots = Dots(points[:, 0].tolist(), points[:, 1].tolist(), axes[0], axes[1], names, _ends(atlas, turn))
-    draw_dots(folder / f"components.{kind}", [dots], groups, hulls=True)
+    axes = [f"PC{k + 1} ({100 * shares[k]:.3g} %)" for k in range(2)]
+    dots = Dots(
+        points[:, 0].tolist(),
+        points[:, 1].tolist(),
+        f"{axes[0]}, unit of the files",
+        axes[1],
+        names,
+        _ends(atlas, turn),
+    )
+    draw_dots(folder / f"components.{kind}", [dots], groups, hulls=True, grouped_by=grouped_by)
 
 
 def _ends(atlas: Atlas, turn: Float[Floats, "3 3"]) -> list[tuple[str, UInts8]]:
@@ -205,4 +217,5 @@ def draw_allometry(folder: Path, found: Explained, about: Allometry, kind: Chart
         "PC1 of predicted shapes": about.predicted,
     }
     dots = [Dots(about.sizes.tolist(), values.tolist(), about.label, title) for title, values in scores.items()]
-    draw_dots(folder / f"allometry.{kind}", dots, found.groups or [""] * len(found.names), hulls=False)
+    groups = found.groups or [""] * len(found.names)
+    draw_dots(folder / f"allometry.{kind}", dots, groups, hulls=False, grouped_by=found.grouped_by)

@@ -53,6 +53,7 @@ class Explained:
     columns : what each column was taken for: a number, categories
     blocks : the column within whose values shapes were exchanged; "" for none
     groups : (S,) values of the first column of categories; empty if there is none
+    grouped_by : that column
     table : sums of squares, effects and their tests
     allometry : where the model has a size
     """
@@ -64,6 +65,7 @@ class Explained:
     columns: dict[str, str]
     blocks: str
     groups: tuple[str, ...]
+    grouped_by: str
     table: Variances
     allometry: Allometry | None
 
@@ -116,6 +118,7 @@ def explain(
         columns=taken,
         blocks=blocks or "",
         groups=used.column(categories[0].column) if categories else (),
+        grouped_by=categories[0].column if categories else "",
         table=table,
         allometry=_allometry(inside, offsets, terms, singles, categories),
     )

@@ -37,6 +37,7 @@ _METADATA: dict[str, dict[str, None]] = {
 }
 _MOST_TERMS, _MOST_BARS, _MOST_GROUPS = 12, 20, 14
 _END = 58.0  # points: the longest side of the largest picture at the end of an axis
+_FLATTEST = 0.75  # height by width of a chart whose dots lie along a line
 _MARKERS = "os^Dv"  # one for each round through the colors
 _STYLE = Path(__file__).with_name("charts.mplstyle")
 
@@ -146,14 +147,17 @@ def draw_scree(path: str | Path, shares: Sequence[float], most: int) -> None:
         axes.legend(loc="upper right")
 
 
-def draw_dots(path: str | Path, charts: Sequence[Dots], groups: Sequence[str], *, hulls: bool) -> None:
+def draw_dots(
+    path: str | Path, charts: Sequence[Dots], groups: Sequence[str], *, hulls: bool, grouped_by: str = ""
+) -> None:
     """Draw charts of dots side by side, each dot in the color of its group ("" for none), with the convex hull of each
-    group, or its regression line.
+    group, or its regression line. ``grouped_by`` is what tells the groups apart, above their names.
     """
     known = sorted({group for group in groups if group})
     members = {group: np.flatnonzero(np.array(groups) == group) for group in [*known, *([""] if "" in groups else [])]}
     room = _END / 72 if any(dots.ends for dots in charts) else 0.0
-    with saved(path, (4.2 + room) * len(charts) + 1.2, 3.8 + 1.6 * room) as figure:
+    flat = max((_flatness(dots) for dots in charts), default=1.0) if hulls else 1.0
+    with saved(path, (4.2 + room) * len(charts) + 1.2, 3.8 * flat + 1.6 * room) as figure:
         row = figure.subplots(1, len(charts), squeeze=False)[0]
         for axes, dots in zip(row, charts, strict=True):
             points = np.column_stack([dots.x, dots.y])
@@ -183,13 +187,20 @@ def draw_dots(path: str | Path, charts: Sequence[Dots], groups: Sequence[str], *
                 axes.xaxis.label.set_size(8.5)
                 axes.yaxis.label.set_size(8.5)
             _show_ends(axes, dots.ends)
-            if hulls:  # a square in which both axes have one scale
+            if hulls:  # both axes have one scale
                 reach = 0.55 * float((high - low).max()) or 1.0
-                middle = (low + high) / 2
-                axes.set(xlim=middle[0] + [-reach, reach], ylim=middle[1] + [-reach, reach], box_aspect=1)
+                middle, height = (low + high) / 2, flat * reach
+                axes.set(xlim=middle[0] + [-reach, reach], ylim=middle[1] + [-height, height], box_aspect=flat)
         if len(members) > 1:
             handles, labels = row[0].get_legend_handles_labels()
-            figure.legend(handles[:_MOST_GROUPS], labels[:_MOST_GROUPS], loc="outside right upper")
+            shown = handles[:_MOST_GROUPS], labels[:_MOST_GROUPS]
+            figure.legend(*shown, loc="outside right upper", title=short(grouped_by, 24) or None)
+
+
+def _flatness(dots: Dots) -> float:
+    """Height of a chart in which both axes have one scale, by its width: a square at most."""
+    across, up = float(np.ptp(dots.x)), float(np.ptp(dots.y))
+    return min(1.0, max(_FLATTEST, up / across)) if across > 0 else 1.0
 
 
 def _show_ends(axes: Axes, ends: Sequence[tuple[str, UInts8]]) -> None:

@@ -160,7 +160,8 @@ def test_pictures_stand_at_the_ends_of_the_axes(tmp_path: Path) -> None:
     """Each in a color of its own, off the dots, in the order of the ends."""
     inks = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 0, 255]], np.uint8)
     ends = [(f"end {k}", np.tile(np.append(ink, np.uint8(255)), (40, 40, 1))) for k, ink in enumerate(inks)]
-    for y in ([0.0, 1.0, 0.5], [0.0, 1e-6, 5e-7]):
+    heights = []
+    for y in ([0.0, 2.0, 1.0], [0.0, 1.0, 0.5], [0.0, 1e-6, 5e-7]):
         dots = Dots([0.0, 1.0, 2.0], y, "PC1 (62.3 %), unit of the files", "PC2", {}, ends)
         draw_dots(tmp_path / "a.png", [dots], ["a", "a", "a"], hulls=True)
         with Image.open(tmp_path / "a.png") as image:
@@ -171,7 +172,10 @@ def test_pictures_stand_at_the_ends_of_the_axes(tmp_path: Path) -> None:
         places = spots(tmp_path / "a.png", 0, top=0.0, right=1.0)  # column and row of the dots
         assert low[1] < high[1] and low[0] == pytest.approx(high[0], abs=2)
         assert up[0] < down[0] and up[1] == pytest.approx(down[1], abs=2)
-        assert min(found[0][:, 0]) > places[:, 1].max() and max(found[2][:, 1]) < places[:, 0].min()
+        lowest = len(pixels) - places[:, 1].min()  # spots count rows upwards
+        assert min(found[0][:, 0]) > lowest and max(found[2][:, 1]) < places[:, 0].min()
+        heights.append(len(pixels))
+    assert heights[0] > heights[1] == heights[2]  # no taller than dots, pictures and words need
     draw_dots(tmp_path / "a.svg", [dots], ["a", "a", "a"], hulls=True)
     assert (tmp_path / "a.svg").read_text().count("<image") == 4
     draw_dots(tmp_path / "a.pdf", [dots], ["a", "a", "a"], hulls=True)
