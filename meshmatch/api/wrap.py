@@ -24,6 +24,7 @@ from meshmatch.models.registry import AUTO
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
+from meshmatch.shapes.repair import turned_outwards
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.wrap import wrap_onto
@@ -143,7 +144,7 @@ def wrap(
         hint = "mirror one of the files, or match without mirror images (--mirror no)"
         raise OptionError(f"{mesh.name or 'the base'} matches as a mirror image: it would be inside out", hint)
     with thread_limit(1):
-        wrapped = wrap_onto(mesh, near.verts, surface, kept, found.threads)
+        wrapped = wrap_onto(turned_outwards(mesh), near.verts, turned_outwards(surface), kept, found.threads)
     shape = replace(mesh, verts=wrapped.verts)
     binding = carried_along(original, shape, surface.upright)
     turn = turn_of_moved(mesh, shape.verts, surface, found.target_fit)

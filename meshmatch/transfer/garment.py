@@ -22,6 +22,7 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import dot, edge_lengths, edges_of, interpolate, same_rows, unit
 from meshmatch.maps.mapped_mesh import MappedMesh, length_of
 from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.shapes.repair import turned_outwards
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.local_frames import local_frames
 
@@ -69,10 +70,10 @@ def carry_garment(garment: Shape, forward: VertexMap, source: Shape, target: Sha
         verts, none = cloth.solve(places, np.full(len(own), _BOUND)), np.empty(0, np.int64)
         return Carried(verts[back], turns, none, none)
     scale = np.cbrt(np.abs(np.linalg.det(jacobians[own])))
-    before = _Skin(source).heights(cloth.at(cloth.rest), workers)[0] * cloth.at(scale[:, None])[:, 0]
+    before = _Skin(turned_outwards(source)).heights(cloth.at(cloth.rest), workers)[0] * cloth.at(scale[:, None])[:, 0]
     least = np.minimum(before, _CLEAR * length_of(target))
     least[before > 0] = np.maximum(least[before > 0], _LEAST * length_of(target))
-    verts, pushed, heights = _pushed_out(cloth, places, least, _Skin(target), workers)
+    verts, pushed, heights = _pushed_out(cloth, places, least, _Skin(turned_outwards(target)), workers)
     sunk = (heights < 0) & (before[: len(own)] > 0)
     return Carried(verts[back], turns, np.flatnonzero(pushed[back]), np.flatnonzero(sunk[back]))
 
