@@ -70,6 +70,7 @@ def repair(shape: Shape) -> Repaired:
         hint = "all are NaN, infinite or huge: export it again"
         raise InputError(f"{shape.name or 'the shape'}: no vertex has a usable position", hint)
     _note(notes, shape.V - int(valid.sum()), "vertex", "without a usable position dropped")
+    _note_rigid(notes, shape)
     return (_repair_cloud if shape.is_cloud else _repair_mesh)(shape, valid, notes)
 
 
@@ -154,6 +155,19 @@ def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     if not passes:
         return found
     return replace(found, shape=smooth, notes=(*found.notes, f"smoothed {passes} times, because noise hid the surface"))
+
+
+def _note_rigid(notes: list[str], shape: Shape) -> None:
+    """Name the meshes of a character that its skin does not move, unless somebody has chosen already."""
+    counts = [count for _, count in shape.meshes]
+    if shape.skinned is None or shape.weights is not None or sum(counts) != shape.V:
+        return
+    parts = zip(shape.meshes, np.split(shape.skinned, np.cumsum(counts)[:-1]), strict=True)
+    names = list(dict.fromkeys(name for (name, _), moved in parts if name and not moved.any()))
+    if names:
+        listed = ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+        have = "has" if len(names) == 1 else "have"
+        notes.append(f"{listed} {have} no skin, as weapons have: --without (without=) leaves parts out")
 
 
 def _meshes_of(shape: Shape, faces: Int[Ints, "N 3"]) -> str:

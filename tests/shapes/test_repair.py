@@ -1,6 +1,7 @@
 """Repair: each fault by hand, and the one law: every original vertex has an answer, and it is the nearest."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -410,3 +411,13 @@ def test_faces_turned_outwards_and_nothing_else() -> None:
             assert np.allclose(found.face_vectors, shape.face_vectors)
     cloud = Shape(ball.verts, np.empty((0, 3), np.int64))
     assert turned_outwards(cloud) is cloud
+
+
+def test_what_hangs_from_a_character_is_named() -> None:
+    ball, sword = icosphere(3), move(icosphere(1), (0, 1.1, 0), 0.5)
+    shape = join(
+        ball, sword, meshes=(("body", ball.V), ("sword", sword.V)), skinned=np.arange(ball.V + sword.V) < ball.V
+    )
+    assert repair(shape).notes[0] == "sword has no skin, as weapons have: --without (without=) leaves parts out"
+    chosen = replace(shape, weights=np.ones(shape.V))
+    assert not any("skin" in note for each in (chosen, replace(shape, skinned=None)) for note in repair(each).notes)
