@@ -1,12 +1,14 @@
 """Rigs from one character to another: joints and weights of characters that share the names of their bones.
 
 Every ordered pair of a folder of rigged files, as `transfer_rig` does it. The truth is the target's own rig: the share
-of the vertices that it moves whose main joint has the same name; or that of a parent, a child or a sibling; and how far
-joints that move vertices on both lie from where they belong, in centimetres with the target's longest side scaled to
-1.8 m. Beside it the neighbours that two other methods find, from the same alignment; and how far joints lie from the
-bones that meet at the true joint, which tells those that only sit further up or down. Then the target moves, in a clip
-of the source, or sits: how much of its volume stays, and the share of vertices that are over a centimetre further from
-the bone of their joint than at rest, by the new rig and by its own.
+of the vertices that it moves whose main joint has the same name; or that of a neighbour: a parent, a child, a sibling,
+or a joint where a bone of the other ends (feet of inverse kinematics hang from the root). A joint that only one of the
+two rigs has, or moves, counts as its nearest ancestor that both have: no rig of an animal without joints in its ears
+could be right there. Then how far joints that move vertices on both lie from where they belong, in centimetres with the
+target's longest side scaled to 1.8 m. Beside it the neighbours that two other methods find, from the same alignment;
+and how far joints lie from the bones that meet at the true joint, which tells those that only sit further up or down.
+Then the target moves, in a clip of the source, or sits: how much of its volume stays, and the share of vertices that are
+over a centimetre further from the bone of their joint than at rest, by the new rig and by its own.
 """
 
 from __future__ import annotations
@@ -39,6 +41,7 @@ HEIGHT = 180.0
 Names: TypeAlias = NDArray[np.str_]
 _PATTERNS = {"rocketbox": "*.fbx"}
 _FURTHER = 1.0  # cm
+_TOUCHING = 0.01  # of the longest side
 _MEANS = "same", "near", "volume", "volume_own", "further", "further_own", "seconds"
 COLUMNS = {
     "folder": "folder", "pairs": "pairs:d", "good / fair / poor": "verdicts:>", "same joint": "same:.1%",
@@ -59,9 +62,14 @@ class _Character:
         self.rig: Rig = read_rig(path, read_bytes(path))
         self.weights: SkinWeights = load_weights(path, self.shape)
         self.places = dict(zip(self.rig.names, self.rig.worlds()[:, :3, 3], strict=True))
-        names, parents = self.rig.names, self.rig.parents.tolist()
-        above = {name: names[parent] if parent >= 0 else "" for name, parent in zip(names, parents, strict=True)}
-        self.near = {(a, b) for a in above for b in above if a == b or above[a] in (b, above[b]) or above[b] == a}
+        self.above = _parents(self.rig)
+        self.near = neighbours(self.rig, _TOUCHING * float(np.ptp(self.shape.bounds, axis=0).max()))
+
+    def counted_as(self, name: str, shared: set[str]) -> str:
+        """The nearest of a joint and its ancestors that is shared; "" if there is none."""
+        while name and name not in shared:
+            name = self.above[name]
+        return name
 
     def off_the_bone(self, place: Floats, name: str) -> float:
         """How far a place is from the bones that begin or end at a joint."""
@@ -76,6 +84,22 @@ class _Character:
         return {name for name, amount in zip(weights.names, weights.matrix.sum(axis=0), strict=True) if amount >= 3}
 
 
+def _parents(rig: Rig) -> dict[str, str]:
+    return {name: rig.names[parent] if parent >= 0 else "" for name, parent in zip(rig.names, rig.parents, strict=True)}
+
+
+def neighbours(rig: Rig, touching: float) -> set[tuple[str, str]]:
+    """Pairs of joints, each both ways: equal ones, parents and children, siblings, and those as near as `touching` to
+    where a bone of the other ends."""
+    above, places = _parents(rig), rig.worlds()[:, :3, 3]
+    near = {(a, b) for a in above for b in above if a == b or above[a] in (b, above[b]) or above[b] == a}
+    for end, bone in above.items():
+        away = np.linalg.norm(places - places[rig.names.index(end)], axis=1)
+        ends = [name for name, distance in zip(rig.names, away, strict=True) if bone and distance < touching]
+        near |= {(bone, name) for name in ends} | {(name, bone) for name in ends}
+    return near
+
+
 def _from_segment(place: Floats, begin: Floats, end: Floats) -> float:
     along = end - begin
     share = float(np.clip((place - begin) @ along / max(float(along @ along), 1e-300), 0.0, 1.0))
@@ -87,18 +111,19 @@ def measured(source: _Character, target: _Character, matcher: Matcher) -> dict[s
     began = time.process_time()
     made = meshmatch.transfer_rig(source.path, target.path, matcher)
     seconds = time.process_time() - began
-    true = _main(target.weights)
+    shared = source.moving(source.weights) & target.moving(target.weights)
+    true = _main(target, target.weights, shared)
     known = true != ""  # what the target's own rig does not move has no truth
-    mine = _main(made.weights)
+    mine = _main(source, made.weights, shared)
     same = (mine == true)[known]
     aligned = made.maps.forward.points(target.shape)
     others = nearest_and_inpainted(source.shape, aligned, source.weights.matrix, target.shape)
     near, nearest, inpainted = (
         float(np.mean([pair in target.near for pair in zip(names[known].tolist(), true[known].tolist(), strict=True)]))
-        for names in (mine, *(_main(SkinWeights(each, source.weights.names)) for each in others))
+        for names in (mine, *(_main(source, SkinWeights(each, source.weights.names), shared) for each in others))
     )
     carried = dict(zip(made.rig.names, made.rig.worlds()[:, :3, 3], strict=True))
-    common = sorted(source.moving(source.weights) & target.moving(target.weights))
+    common = sorted(shared)
     unit = HEIGHT / float(np.ptp(target.shape.bounds, axis=0).max())
     off = [unit * float(np.linalg.norm(carried[name] - target.places[name])) for name in common]
     beside = [unit * target.off_the_bone(carried[name], name) for name in common]
@@ -117,9 +142,9 @@ def measured(source: _Character, target: _Character, matcher: Matcher) -> dict[s
     return row | {"seconds": seconds}
 
 
-def _main(weights: SkinWeights) -> Names:
-    """The name of each vertex's main joint."""
-    return np.array([*weights.names, ""])[most_votes(weights.matrix)]
+def _main(character: _Character, weights: SkinWeights, shared: set[str]) -> Names:
+    """The name of each vertex's main joint, or of the nearest above it that both rigs have."""
+    return np.array([*(character.counted_as(name, shared) for name in weights.names), ""])[most_votes(weights.matrix)]
 
 
 def _moved(shape: Shape, weights: SkinWeights, rig: Rig, unit: float) -> tuple[float, float]:
