@@ -26,7 +26,7 @@ from meshmatch.shapes.input_files import read_bytes
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.attributes import joint_table, most_votes, pull_weights
 from meshmatch.transfer.carry_rig import UP, carry, upright
-from meshmatch.transfer.clean_weights import clean_weights, rigid
+from meshmatch.transfer.clean_weights import beyond, clean_weights, rigid
 from meshmatch.transfer.retarget_clips import standing_clips
 from meshmatch.transfer.weight_files import SkinWeights, load_weights
 
@@ -156,7 +156,8 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
         ground = float((b.verts[b.valid] @ turn.T)[:, UP].min())
         carried = carry(rig, weights.matrix, a, points @ turn.T, share, ground)
         pulled = pull_weights(maps.backward, weights.matrix, INFLUENCES)
-        found = rigid(clean_weights(pulled, b, INFLUENCES), hanging)
+        unknown = beyond(b, points, a.faces)
+        found = rigid(clean_weights(pulled, b, INFLUENCES, unknown), hanging)
         standing, posed = carried.bind, carried.source_pose
         standing = posed if pose == "source" else replace(standing, clips=standing_clips(standing, posed))
         binding = Binding(standing, carried.bind.worlds(), *joint_table(found), turn)

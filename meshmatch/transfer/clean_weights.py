@@ -9,8 +9,9 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 
-from meshmatch.arrays import Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.trees import cKDTree
+from meshmatch.maps.footpoints import Surface
 from meshmatch.shapes.faces import seams
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import joint_table, largest_weights
@@ -22,16 +23,23 @@ _JOINING, _STRAY, _HOLE = 0.02, 0.25, 0.5
 # Two neighbours of which less than this part of the weight is common are a tear, mended in so many steps.
 _TEAR, _STEPS = 0.1, 3
 _LEAST = 1e-3  # of the weight of a vertex: less moves nothing that can be seen
+# What lies further than this (in diagonals of the target's box) off a source is lacking there; if more does, a map is wrong.
+_BEYOND, _MOST = 0.01, 0.25
 
 
-def clean_weights(weights: csr_array, target: Shape, influences: int = 4) -> csr_array:
+def clean_weights(
+    weights: csr_array, target: Shape, influences: int = 4, unknown: Bool[Bools, " V"] | None = None
+) -> csr_array:
     """Weights (V, J) of the target; every row sums to 1. Vertices of a seam at one place get the same.
 
     Of each joint the main region stays on every connected part of the mesh, holes are filled in from their surroundings, and
     neighbours that have nearly nothing in common are smoothed. Vertices that no joint moves go with the nearest others.
+    Weights of ``unknown`` vertices do not count; those are holes, too.
     """
     graph = vertex_graph(target)
     twin = np.arange(target.V) if target.is_cloud else seams(target.verts, target.faces)
+    if unknown is not None and not unknown.all():
+        weights = csr_array(diags_array((~unknown).astype(np.float64)) @ weights)
     weights = same_at(twin, largest_weights(weights, influences))
     kept = _without_strays(weights, graph)
     sums = np.asarray(kept.sum(axis=1)).ravel()
@@ -39,6 +47,17 @@ def clean_weights(weights: csr_array, target: Shape, influences: int = 4) -> csr
     smooth = largest_weights(same_at(twin, _mended(same_at(twin, filled), graph)), influences)
     smooth.data[smooth.data < _LEAST] = 0.0
     return _nearest_for_empty(largest_weights(smooth, influences), target)
+
+
+def beyond(target: Shape, points: Float[Floats, "V_source 3"], faces: Int[Ints, "F 3"]) -> Bool[Bools, " V_target"]:
+    """Which vertices of the target lie off the source's surface as a map lays it, such as long hair that the source lacks.
+
+    The map takes them to what is nearest, which is the back where hair hangs down on it. None, where the map lays the source
+    far from much of the target.
+    """
+    size = float(np.linalg.norm(np.ptp(target.bounds, axis=0)))
+    far = Surface(points, faces).query(target.verts).distance > _BEYOND * size
+    return np.asarray(far & (far.mean() <= _MOST))
 
 
 def same_at(twin: Int[Ints, " V"], weights: csr_array) -> csr_array:

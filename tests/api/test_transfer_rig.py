@@ -17,7 +17,7 @@ from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_rig import read_rig
 from meshmatch.shapes.shape import Shape
 from tests.shapes.painted import encoded, quarters, write_document
-from tests.transfer.rigs import BEND, KNEE, NODES, played, tube, volume, write_tube
+from tests.transfer.rigs import AROUND, BEND, KNEE, NODES, played, tube, volume, write_tube
 
 UPRIGHT = np.array([[0, 0, 0, 1]] * 2, "f4")
 JOINTS = ("root", "hip", "knee", "foot")
@@ -72,6 +72,26 @@ def test_a_larger_tube_that_lies_and_faces_elsewhere(source: Path) -> None:
         assert np.abs(played(out, "bend", time) - expected).max() < 1e-4
     assert result.unused == ()
     assert np.allclose(result.weights.matrix.sum(axis=1), 1)
+
+
+def test_what_the_source_lacks_goes_with_what_it_hangs_from(source: Path) -> None:
+    """A cape hangs down around the tube from its top, where the map takes it to what is nearest."""
+    shape, target = tube(), source.with_name("target.ply")
+    top = 40 * AROUND + np.arange(AROUND)
+    cape = shape.verts[top] * [1.6, 0, 1.6] + np.linspace(1.9, 0.3, 13)[:, None, None] * [0.0, 1, 0]
+    rows = np.concatenate([[top], shape.V + np.arange(13 * AROUND).reshape(13, AROUND)])
+    one, two, three, four = rows[:-1], np.roll(rows[:-1], -1, 1), rows[1:], np.roll(rows[1:], -1, 1)
+    sides = np.concatenate([np.stack([one, two, three], -1), np.stack([two, four, three], -1)]).reshape(-1, 3)
+    faces = np.concatenate([shape.faces, sides])
+    verts = np.concatenate([shape.verts, cape.reshape(-1, 3)])
+    save_shape(target, Shape(verts, faces, "target"))
+    a, b = load_shape(source), load_shape(target)
+    nearest = np.linalg.norm(verts[:, None] - a.verts, axis=2).argmin(axis=1)
+    forward, backward = VertexMap.between(a, b, np.arange(a.V), verdict="good"), VertexMap.between(b, a, nearest)
+    maps = meshmatch.MapPair(a, b, forward, opposite=backward)
+    found = meshmatch.transfer_rig(source, target, maps).weights
+    foot = found.matrix.toarray()[:, found.names.index("foot")]
+    assert foot[[*top, *range(a.V, b.V)]] == pytest.approx(np.ones(14 * AROUND))
 
 
 def test_a_target_in_another_pose_plays_the_same_clips(source: Path) -> None:

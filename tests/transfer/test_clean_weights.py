@@ -6,7 +6,7 @@ from scipy.sparse import csr_array
 
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import joint_table
-from meshmatch.transfer.clean_weights import clean_weights, rigid
+from meshmatch.transfer.clean_weights import beyond, clean_weights, rigid
 from tests.transfer.rigs import AROUND, tube, weights_of
 
 
@@ -44,6 +44,24 @@ def test_holes_are_filled_from_their_surroundings(good: np.ndarray) -> None:
     holes = good.copy()
     holes[np.array([2, 3]) * AROUND + 3] = 0
     assert np.allclose(cleaned(holes, tube()), good, atol=1e-6)
+
+
+def test_what_is_unknown_is_filled_from_its_surroundings(good: np.ndarray) -> None:
+    shape, wrong = tube(), good.copy()
+    unknown = shape.verts[:, 1] < 0.4
+    wrong[unknown] = [0, 0, 1]  # too many for strays
+    assert not np.allclose(cleaned(wrong, shape), good, atol=1e-6)
+    assert np.allclose(clean_weights(csr_array(wrong), shape, unknown=unknown).toarray(), good, atol=1e-6)
+    everything = np.ones(shape.V, bool)  # says nothing
+    assert np.allclose(clean_weights(csr_array(good), shape, unknown=everything).toarray(), good, atol=1e-6)
+
+
+def test_what_lies_off_the_source_s_surface() -> None:
+    shape = tube()
+    off = np.arange(shape.V) < AROUND
+    target = Shape(shape.verts * np.where(off[:, None], [1.2, 1, 1.2], 1), shape.faces)
+    assert np.array_equal(beyond(target, shape.verts, shape.faces), off)
+    assert not beyond(target, 1.2 * shape.verts, shape.faces).any()  # a map that is off nearly everywhere
 
 
 def test_a_part_without_weights_goes_with_the_nearest(good: np.ndarray) -> None:
