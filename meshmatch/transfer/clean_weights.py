@@ -23,7 +23,8 @@ _JOINING, _STRAY, _HOLE = 0.02, 0.25, 0.5
 # Two neighbours of which less than this part of the weight is common are a tear, mended in so many steps.
 _TEAR, _STEPS = 0.1, 3
 _LEAST = 1e-3  # of the weight of a vertex: less moves nothing that can be seen
-# What lies further than this (in diagonals of the target's box) off a source is lacking there; if more does, a map is wrong.
+# What lies further off a source than this, in diagonals of the target's box, is lacking there; where more than this share
+# of the vertices does, the map is wrong.
 _BEYOND, _MOST = 0.01, 0.25
 
 

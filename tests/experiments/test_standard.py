@@ -8,7 +8,6 @@ import pytest
 
 from meshmatch.arrays import Ints
 from meshmatch.errors import InputError
-from meshmatch.experiments.bench import standard
 from meshmatch.experiments.bench.standard import errors_of, interval_over_shapes, main, split_of
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
@@ -100,4 +99,26 @@ def test_the_command_finds_the_sets_that_are_there(tmp_path: Path, capsys: pytes
     assert (row["set"], row["shapes"], row["pairs"]) == ("SHREC19_r", 3, 6) and row["low"] <= row["mean"] <= row["high"]
     assert main(["--data", str(tmp_path / "egg")]) == 1
     assert "docs/datasets.md" in capsys.readouterr().err
-    assert set(standard.MODELS) == {"FAUST_r", "SCAPE_r", "SHREC19_r", "SMAL_r", "TOPKIDS"}
+
+
+def test_remeshed_shapes_lead_to_the_first_of_faust(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "discretization"
+    for kind in ("iso", "cloud"):
+        (folder / kind).mkdir(parents=True)
+    save_shape(folder / "tr_reg_000.ply", BALL)
+    some = np.arange(0, BALL.V, 3)
+    save_shape(folder / "iso" / "tr_reg_iso_080.ply", BALL)
+    np.savetxt(folder / "iso" / "tr_reg_iso_080.txt", np.roll(np.arange(BALL.V), 1), "%d")
+    save_shape(folder / "cloud" / "tr_reg_cloud_080.ply", Shape(BALL.verts[some], np.empty((0, 3), np.int64)))
+    np.savetxt(folder / "cloud" / "tr_reg_cloud_080.txt", some, "%d")
+    split = split_of("cloud", tmp_path)
+    assert split.pairs == [("tr_reg_cloud_080", "tr_reg_000")] and split.shapes["tr_reg_cloud_080"].is_cloud
+    right, wrong = (errors_of(split, {split.pairs[0]: index}, None)[split.pairs[0]] for index in (some, some[::-1]))
+    assert right.max() == 0 < wrong.max()
+    model = write_model(egg_model(), tmp_path / "egg")
+    assert main(["--data", str(tmp_path), "--model", str(model), "--sets", "iso"]) == 0
+    (row,) = json.loads(capsys.readouterr().out.splitlines()[-1])["rows"]
+    assert (row["set"], row["shapes"], row["pairs"]) == ("iso", 2, 1)
+    np.savetxt(folder / "iso" / "tr_reg_iso_080.txt", np.arange(BALL.V) + 1, "%d")  # counted from 1
+    with pytest.raises(InputError, match="not there"):
+        split_of("iso", tmp_path)

@@ -7,6 +7,9 @@ vertex, counted from 1, of the point k that all shapes of the set have.
 - SHREC19_r: all but shape 40, which is a part.
 - SMAL_r: those that ``test_cat.txt`` names.
 - TOPKIDS: every shape to the first, kid00; line k of ``corres/NAME_ref.vts`` is the vertex of kid00 for vertex k.
+- iso, qes, mc, dense, cloud: the last 20 shapes of FAUST, remeshed or sampled in five ways to measure what triangles change
+  (Sharp et al. 2021), each to FAUST's first, ``discretization/tr_reg_000.ply``; line k of
+  ``discretization/iso/tr_reg_iso_080.txt`` is its vertex, counted from 0, for vertex k of the ply beside it.
 
 All ordered pairs of different shapes count, none left out. The error is the geodesic distance on the target between the
 matched and the true vertex, in units of sqrt(area), times 100: the mean over points, then over pairs. Intervals are of 95 %,
@@ -35,9 +38,11 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.shapes.files import load_shape
 
-REFERENCE = "kid00"
+REMESHED = ("iso", "qes", "mc", "dense", "cloud")
 MODELS = {"FAUST_r": "human", "SCAPE_r": "human", "SHREC19_r": "human", "SMAL_r": "quadruped", "TOPKIDS": "human"}
-_TEST, _PART, _NAMES = 20, "40", "test_cat.txt"
+MODELS |= dict.fromkeys(REMESHED, "human")
+_REFERENCES = {"TOPKIDS": "kid00"} | dict.fromkeys(REMESHED, "tr_reg_000")
+_TEST, _PART, _NAMES, _REMESHED = 20, "40", "test_cat.txt", "discretization"
 _DRAWS = 2000
 _COLUMNS = {
     "set": "set",
@@ -52,16 +57,19 @@ _COLUMNS |= {"median pair": "median:.2f", "worst": "worst:.1f", "over 10": "off:
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Shapes and pairs of a set, and its truth: ``points`` of every shape (N,), or vertices of the reference (V,)."""
+    """Shapes and pairs of a set, and its truth: ``points`` of every shape (N,), or vertices (V,) of the ``reference`` to
+    which all pairs lead, if there is one.
+    """
 
     shapes: Shapes
     pairs: Sequence[Pair]
     points: Mapping[str, Int[Ints, " N"]]
+    reference: str = ""
 
     def of(self, pair: Pair) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
         """Vertices of the source whose partners are known, and these."""
         source, target = pair
-        if target == REFERENCE:
+        if target == self.reference:
             return np.arange(len(self.points[source])), self.points[source]
         return self.points[source], self.points[target]
 
@@ -74,26 +82,37 @@ def split_of(name: str, data: Path) -> Split:
     InputError
         The folder or a list is missing, or a list does not fit its shape.
     """
-    folder, to_reference = data / name, name == "TOPKIDS"
-    files = {path.stem: path for path in sorted(runner.files_in(folder / "off", "*.off"), key=_number)}
-    names = _chosen(name, folder, list(files))
+    reference = _REFERENCES.get(name, "")
+    if name in REMESHED:
+        folder = data / _REMESHED
+        files = {path.stem: path for path in runner.files_in(folder / name, "*.ply")} | {
+            reference: folder / f"{reference}.ply"
+        }
+        lists = {each: (folder / name / f"{each}.txt", 0) for each in files}
+        names = list(files)
+    else:
+        folder = data / name
+        files = {path.stem: path for path in sorted(runner.files_in(folder / "off", "*.off"), key=_number)}
+        names = _chosen(name, folder, list(files))
+        lists = {each: (folder / "corres" / f"{each}{'_ref' if reference else ''}.vts", 1) for each in names}
     if missing := [each for each in names if each not in files]:
         raise InputError(f"{folder / 'off'} has no {missing[0]}.off")
     shapes = {each: load_shape(files[each]) for each in names}
     points = {}
     for each in names:
-        if to_reference and each == REFERENCE:
+        if each == reference:
             continue
-        points[each] = vertices_in(folder / "corres" / f"{each}{'_ref' if to_reference else ''}.vts")
-        within = shapes[REFERENCE].V if to_reference else shapes[each].V
+        points[each] = vertices_in(*lists[each])
+        within = shapes[reference or each].V
         if points[each].min() < 0 or points[each].max() >= within:
-            raise InputError(f"{folder / 'corres'}: the list of {each} names vertices that are not there")
-        if to_reference and len(points[each]) != shapes[each].V:
-            raise InputError(f"{folder / 'corres'}: the list of {each} has not one line for each of its vertices")
-    pairs = [(each, REFERENCE) for each in points] if to_reference else list(permutations(names, 2))
-    if len({len(each) for each in points.values()}) > 1 and not to_reference:
+            raise InputError(f"{lists[each][0].parent}: the list of {each} names vertices that are not there")
+        if reference and len(points[each]) != shapes[each].V:
+            raise InputError(f"{lists[each][0].parent}: the list of {each} has not one line for each of its vertices")
+    if reference:
+        return Split(shapes, [(each, reference) for each in points], points, reference)
+    if len({len(each) for each in points.values()}) > 1:
         raise InputError(f"{folder / 'corres'}: the lists are of different length")
-    return Split(shapes, pairs, points)
+    return Split(shapes, list(permutations(names, 2)), points)
 
 
 def _number(path: Path) -> tuple[int, str]:
@@ -108,22 +127,22 @@ def _chosen(name: str, folder: Path, names: list[str]) -> list[str]:
     if name == "SHREC19_r":
         return [each for each in names if each != _PART]
     if name == "TOPKIDS":
-        return [REFERENCE, *(each for each in names if each != REFERENCE)]
+        return [_REFERENCES[name], *(each for each in names if each != _REFERENCES[name])]
     try:
         return (folder / _NAMES).read_text("utf-8").split()
     except OSError as error:
         raise InputError(f"{folder} has no {_NAMES}", "it names the shapes of the test split, one a line") from error
 
 
-def vertices_in(path: Path) -> Int[Ints, " N"]:
-    """A list of vertices counted from 1, one a line, counted from 0."""
+def vertices_in(path: Path, first: int) -> Int[Ints, " N"]:
+    """A list of vertices, one a line, counted from ``first`` there, and from 0 here."""
     try:
         found = np.loadtxt(path, ndmin=1)
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {path}", "it lists vertices, counted from 1, one a line") from error
+        raise InputError(f"cannot read {path}", f"it lists vertices, counted from {first}, one a line") from error
     if found.ndim != 1 or not len(found) or (found != found.astype(np.int64)).any():
-        raise InputError(f"{path} is no list of vertices", "it lists vertices, counted from 1, one a line")
-    return found.astype(np.int64) - 1
+        raise InputError(f"{path} is no list of vertices", f"it lists vertices, counted from {first}, one a line")
+    return found.astype(np.int64) - first
 
 
 def errors_of(split: Split, indices: Mapping[Pair, Int[Ints, " V"]], cache: Path | None) -> dict[Pair, Floats]:
@@ -131,9 +150,9 @@ def errors_of(split: Split, indices: Mapping[Pair, Int[Ints, " V"]], cache: Path
     found: dict[Pair, Floats] = {}
     for target in runner.track(sorted({pair[1] for pair in indices}), "measuring"):
         mine = [pair for pair in indices if pair[1] == target]
-        known = np.arange(split.shapes[target].V) if target == REFERENCE else split.points[target]
+        known = np.arange(split.shapes[target].V) if target == split.reference else split.points[target]
         distances = TruthDistances(split.shapes[target], known, cache)
-        if target != REFERENCE:
+        if target != split.reference:
             at = distances.errors([indices[pair][split.points[pair[0]]] for pair in mine])
             found |= {pair: 100 * each.astype(np.float64) for pair, each in zip(mine, at, strict=True)}
             continue
@@ -180,7 +199,8 @@ def main(
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
 ) -> runner.Report:
-    names = runner.names_of(sets, MODELS, "set") or [name for name in MODELS if (data / name).is_dir()]
+    there = [name for name in MODELS if (data / (f"{_REMESHED}/{name}" if name in REMESHED else name)).is_dir()]
+    names = runner.names_of(sets, MODELS, "set") or there
     if not names:
         raise InputError(f"{data} has none of {', '.join(MODELS)}", "docs/datasets.md says how they are laid out")
     rows = []
