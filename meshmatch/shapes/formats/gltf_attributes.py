@@ -57,8 +57,41 @@ def _coordinates(document: Document) -> Floats | None:
         if len(faces) and "TEXCOORD_0" not in attributes:
             return None
         if len(faces):
-            parts.append(document.accessor(attributes["TEXCOORD_0"])[faces])
+            parts.append(laid_out(document, primitive)[faces])
     return np.concatenate(parts)
+
+
+def laid_out(document: Document, primitive: dict[str, Any]) -> Float[Floats, "V 2"]:
+    """First texture coordinates of a primitive's vertices, as its base color lies on them."""
+    uv = document.accessor(primitive["attributes"]["TEXCOORD_0"])
+    return _transformed(uv, transform_of(document, primitive))
+
+
+def transform_of(document: Document, primitive: dict[str, Any]) -> dict[str, Any]:
+    """How the base color of a primitive is moved over its first texture coordinates; empty where it is not."""
+    texture = _base(document.json, primitive.get("material", -1))[1] or {}
+    transform = texture.get("extensions", {}).get("KHR_texture_transform", {})
+    return transform if transform.get("texCoord", texture.get("texCoord", 0)) == 0 else {}
+
+
+def _base(json: dict[str, Any], number: int) -> tuple[dict[str, Any], dict[str, Any] | None, tuple[float, ...]]:
+    """A material, its base color texture and its factor."""
+    material = json["materials"][number] if number >= 0 else {}
+    gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
+    if gloss is not None and "pbrMetallicRoughness" not in material:
+        return material, gloss.get("diffuseTexture"), tuple(gloss.get("diffuseFactor", (1.0,) * 4))
+    pbr = material.get("pbrMetallicRoughness", {})
+    return material, pbr.get("baseColorTexture"), tuple(pbr.get("baseColorFactor", (1.0,) * 4))
+
+
+def _transformed(uv: Float[Floats, "V 2"], transform: dict[str, Any]) -> Float[Floats, "V 2"]:
+    if not transform:
+        return uv
+    # Counter-clockwise with v down, as the extension's words and its example have it (its listing does not).
+    angle = float(transform.get("rotation", 0.0))
+    u, v = (uv * np.array(transform.get("scale", (1.0, 1.0)), np.float64)).T
+    turned = np.stack([np.cos(angle) * u + np.sin(angle) * v, np.cos(angle) * v - np.sin(angle) * u], axis=1)
+    return np.asarray(turned + np.array(transform.get("offset", (0.0, 0.0)), np.float64))
 
 
 class Look:
@@ -93,13 +126,8 @@ class Look:
         return found
 
     def base(self, number: int) -> tuple[dict[str, Any], dict[str, Any] | None, tuple[float, ...]]:
-        """A material, its base color texture and its factor."""
-        material = self.json["materials"][number] if number >= 0 else {}
-        gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
-        if gloss is not None and "pbrMetallicRoughness" not in material:
-            return material, gloss.get("diffuseTexture"), tuple(gloss.get("diffuseFactor", (1.0,) * 4))
-        pbr = material.get("pbrMetallicRoughness", {})
-        return material, pbr.get("baseColorTexture"), tuple(pbr.get("baseColorFactor", (1.0,) * 4))
+        """A material, its base color texture and its factor; those of another layer, in a class that reads one."""
+        return _base(self.json, number)
 
     def read(self, number: int, laid: bool) -> Material:
         """A material of the file, with its image if there are coordinates."""
@@ -146,13 +174,7 @@ class Look:
         uv = self.document.accessor(primitive["attributes"][chosen])
         if uv.shape[1] != 2:
             raise damaged(self.document.name, "texture coordinates are not pairs")
-        if not transform:
-            return uv
-        # Counter-clockwise with v down, as the extension's words and its example have it (its listing does not).
-        angle = float(transform.get("rotation", 0.0))
-        u, v = (uv * np.array(transform.get("scale", (1.0, 1.0)), np.float64)).T
-        turned = np.stack([np.cos(angle) * u + np.sin(angle) * v, np.cos(angle) * v - np.sin(angle) * u], axis=1)
-        return np.asarray(turned + np.array(transform.get("offset", (0.0, 0.0)), np.float64))
+        return _transformed(uv, transform)
 
 
 def joint_nodes(document: Document) -> list[int]:

@@ -16,6 +16,7 @@ from meshmatch.geometry.triangles import unit
 from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.formats.gltf import COMPRESSED, Document
+from meshmatch.shapes.formats.gltf_attributes import laid_out, transform_of
 from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor, drawn
 from meshmatch.shapes.formats.gltf_out import smooth_normals
 from meshmatch.shapes.formats.gltf_prune import textures_in
@@ -40,8 +41,8 @@ def dressed(
     uv
         Texture coordinates of each corner of its triangles, in the order of the scene, v down.
     own
-        They are those that it has. Else they become its first ones, and what was the first becomes the last; vertices at
-        seams are copied, behind the others.
+        They are those that it has, as the base color lies on them. If they are not, or that is moved over them, they become
+        the first ones, and what was the first becomes the last; vertices at seams are copied, behind the others.
     material
         Takes the place of color, metal, roughness, light and transparency of the materials of all that is drawn. Names and
         everything else stay, also a normal or an occlusion map where the new material has none.
@@ -63,11 +64,9 @@ def dressed(
                 continue
             primitive = mesh["primitives"][k]
             V = document.count(part["attributes"]["POSITION"])
-            if own:
-                laid = np.arange(V), document.accessor(part["attributes"]["TEXCOORD_0"]), faces
-            else:
-                laid = split_at_seams(V, faces, corners)
-            moved_to = None if own else _lay(editor, document, V, primitive, laid)
+            laid = (np.arange(V), laid_out(document, part), faces) if own else split_at_seams(V, faces, corners)
+            kept = own and not transform_of(document, part)
+            moved_to = None if kept else _lay(editor, document, V, primitive, laid)
             _untint(document, part, primitive)
             if k in normals:
                 _add_tangents(editor, document, part, primitive, normals[k], laid)
@@ -98,8 +97,8 @@ def colored(document: Document, colors: Float[Floats, "V 4"], turn: Float[Floats
 
 def _stored(document: Document) -> Floats:
     """All first texture coordinates of a scene."""
-    parts = [part["attributes"] for parts in drawn(document).values() for part in parts.values()]
-    found = [document.accessor(part["TEXCOORD_0"]) for part in parts if "TEXCOORD_0" in part]
+    parts = [part for parts in drawn(document).values() for part in parts.values()]
+    found = [laid_out(document, part) for part in parts if "TEXCOORD_0" in part["attributes"]]
     return np.concatenate([np.empty((0, 2)), *found])
 
 
