@@ -218,29 +218,32 @@ def match_where_it_lies(
     searches = [_Search.of(source, target, config, None, None) for target in targets]
     own, sides = searches[0].source, [each.target for each in searches]
     at = own.frame.undo(own.fine_mesh.verts)
+    places = [Proposal("guess", side.frame.apply(at)) for side in sides]
 
-    def as_of_first(number: int, found: Tried) -> Tried:
+    def number_of(found: Tried) -> int:
+        return next(k for k, place in enumerate(places) if place is found.proposal)
+
+    def as_of_first(found: Tried) -> Tried:
         """A fit as if the target were the first one."""
+        number = number_of(found)
         back = kabsch(targets[number].verts, targets[0].verts)
         there = sides[number].frame.undo(own.fine.system.moved(found.vectors))
         return replace(found, moved=sides[0].frame.apply(back.to_world(there)))
 
-    def fit(number: int) -> Tried:
-        goals = sides[number].frame.apply(at)
-        return as_of_first(number, finish(own, sides[number], Proposal(f"place {number}", goals), goals))
+    def fit(place: Proposal, side: Side) -> Tried:
+        return as_of_first(finish(own, side, place, place.points))
 
     def go_on(found: Tried) -> Tried:
-        number = int(found.proposal.kind.split()[1])
-        return as_of_first(number, glide(own, sides[number], found))
+        return as_of_first(glide(own, sides[number_of(found)], found))
 
     _ = own.fine  # once, and not by each thread
     report(0.0)
-    tried = parallel_map(fit, range(len(targets)))
+    tried = parallel_map(fit, places, sides)
     report(0.6)
     best = distinct(tried, config.gliding, config.unlike)
     rest = [each for each in tried if each not in best]
     found = sorted([*parallel_map(go_on, best), *rest], key=attrgetter("energy"))
-    chosen = int(found[0].proposal.kind.split()[1])
+    chosen = number_of(found[0])
     turns = turns_onto_itself(own.thin)
     match = replace(searches[chosen], source=own)._match(_Judged(found, config.unlike, DIRECT, turns))
     report(1.0)
