@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -34,6 +34,9 @@ UnitName = Literal["auto", "cm", "file", "x100"]
 
 _PEOPLE = "human"
 _NEXT, _TOGETHER = ("quadruped",), 2  # asked after people, before the others; how many models at a time
+# Trust from which on a shape that its model hardly knows may be of the other shapes' kind; set by hand: a character with a
+# large head and short limbs has 0.48; planes, hearts, bones and dinosaurs have 0.13 at most.
+_PERHAPS = 0.25
 _MOST_READ = 40  # files of a folder whose kind is found out
 _NAME_IT = "name the model (--model NAME, in Python model=NAME) if that is wrong"
 _LEAVE_OUT = "exclude what does not belong to it with --without (`meshmatch info` lists parts), or try --try-harder"
@@ -158,7 +161,8 @@ def choose_model(
 ) -> Choice:
     """The installed model that knows the kind of all the shapes; or ``settled``, if it does.
 
-    A cloud, or a shape that may be a part of something, is of the other shapes' kind where its own cannot be told. Of a
+    A cloud, or a shape that may be a part of something, is of the other shapes' kind where its own cannot be told; so is a
+    mesh that hardly looks like that kind, but more so than like any other. Of a
     mesh of no kind, or of parts far apart, those parts are chosen that are of a kind (`meshmatch.api.apart`).
     `InputError` if two shapes are of different kinds, or one of none; `ModelError` if no model is installed.
     """
@@ -195,7 +199,7 @@ def choose_model(
     chosen = settled or models[min(rows, key=lambda row: readings[row].sum())].load()
     by = "" if chosen.card.name == common else f" (model {chosen.card.name})"
     words = [
-        f"{shape.name}: {each.kind}{by}" if each.kind else f"{shape.name} {_unsure(shape, common + by)}"
+        f"{shape.name}: {each.kind}{by}" if each.kind else f"{shape.name} {_unsure(shape, each, common + by)}"
         for shape, each in zip(shapes, found, strict=True)
     ]
     usable = [
@@ -205,8 +209,10 @@ def choose_model(
     return Choice(chosen, clean, words, usable, tried)
 
 
-def _unsure(shape: Shape, taken: str) -> str:
+def _unsure(shape: Shape, found: Classification, taken: str) -> str:
     why = "may be a part, or a rough cloud" if shape.is_cloud else "may be a part, or several objects"
+    if not shape.is_cloud and found.fit is not None and _perhaps(found, {found.card.category}):
+        why = f"hardly looks like it (trust {found.fit.trust:.2f})"
     hint = _NAME_IT if shape.is_cloud else f"{_NAME_IT}; {_LEAVE_OUT}"
     return f"{why}: treated as {taken}; {hint}"
 
@@ -254,12 +260,19 @@ def _refuse_unknown(
     shapes: Sequence[Shape],
     configs: Sequence[FitConfig],
 ) -> None:
+    kinds = {each.kind for each in found if each.kind is not None}
     for shape, config, each, nearest in zip(shapes, configs, found, readings.min(0), strict=True):
-        if each.kind is None and not shape.is_cloud and not may_show_part(shape, config):
+        unknown = each.kind is None and not shape.is_cloud and not may_show_part(shape, config)
+        if unknown and not _perhaps(each, kinds):
             names = ", ".join(sorted({model.card.category for model in models}))
             problem = f"{shape.name} does not look like anything that the installed models know: {names}"
             error = UnknownKindsError if all(other.kind is None for other in found) else InputError
             raise error(problem, _nearest(each) if np.isfinite(nearest) else _LEAVE_OUT)
+
+
+def _perhaps(found: Classification, kinds: Collection[str]) -> bool:
+    """Whether a mesh of no known kind may be of the only kind that the other shapes are of."""
+    return found.fit is not None and found.fit.trust >= _PERHAPS and set(kinds) == {found.card.category}
 
 
 def _nearest(found: Classification) -> str:

@@ -100,6 +100,26 @@ def test_a_complete_shape_of_no_kind_is_refused() -> None:
     assert caught.value.hint.startswith("nearest: human; if it is one, name the model: --model human")
 
 
+@pytest.mark.usefixtures("models")
+def test_what_hardly_looks_like_the_other_shapes_kind_is_taken_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A character of a large head and short limbs, of which a poor fit still lies right."""
+
+    def fits(trust: float) -> None:
+        poor = SimpleNamespace(verdict="poor", trust=trust, partial=False, model="human")
+        monkeypatch.setattr(classify.Fitter, "fit", lambda *_: poor)
+
+    fits(0.4)
+    name, words = choose(ball("toon 5.5 7 7"), ball("man 3 4 6"))
+    assert name == "human" and words[1] == "man 3 4 6: human"
+    assert words[0].startswith("toon 5.5 7 7 hardly looks like it (trust 0.40): treated as human; name the model")
+    for others in ((), (ball("dog 6 6 4"),)):  # alone, or beside another kind
+        with pytest.raises(InputError, match=r"toon 5\.5 7 7 does not look like"):
+            choose(ball("toon 5.5 7 7"), *others)
+    fits(0.2)
+    with pytest.raises(InputError, match=r"toon 5\.5 7 7 does not look like"):
+        choose(ball("toon 5.5 7 7"), ball("man 3 4 6"))
+
+
 @pytest.mark.parametrize(
     ("name", "verdict", "trust", "mesh", "points"),
     [
