@@ -84,7 +84,7 @@ def test_a_rigged_glb_keeps_its_skin_and_clips(tmp_path: Path) -> None:
 
 
 def test_coordinates_that_a_transform_moves_become_plain_ones(tmp_path: Path) -> None:
-    """Whole numbers that a transform scales, as tools that compress write them; the normal map keeps its own."""
+    """Whole numbers that a transform scales, as tools that compress write them; another map keeps its own."""
     path = tmp_path / "small.glb"
     scaled = {"KHR_texture_transform": {"scale": [1 / 4095, 1 / 4095]}}
     paint = {"baseColorTexture": {"index": 0, "extensions": scaled}}
@@ -92,7 +92,7 @@ def test_coordinates_that_a_transform_moves_become_plain_ones(tmp_path: Path) ->
         path,
         images=[encoded(quarters())],
         primitives=[{"material": 0, "uv": 4095 * UV}],
-        materials=[{"pbrMetallicRoughness": paint, "normalTexture": {"index": 0, "extensions": scaled}}],
+        materials=[{"pbrMetallicRoughness": paint, "occlusionTexture": {"index": 0, "extensions": scaled}}],
         extensionsUsed=["KHR_texture_transform"],
     )
     np.testing.assert_allclose(load_coordinates(path, load_shape(path)), UV[FACES], atol=1e-6)
@@ -101,11 +101,8 @@ def test_coordinates_that_a_transform_moves_become_plain_ones(tmp_path: Path) ->
     after = read(out)
     [material] = after.json["materials"]
     assert "extensions" not in material["pbrMetallicRoughness"]["baseColorTexture"]
-    assert material["normalTexture"] == {
-        "index": material["normalTexture"]["index"],
-        "extensions": scaled,
-        "texCoord": 1,
-    }
+    other = material["occlusionTexture"]
+    assert other == {"index": other["index"], "extensions": scaled, "texCoord": 1}
     attributes = after.json["meshes"][0]["primitives"][0]["attributes"]
     np.testing.assert_array_equal(after.accessor(attributes["TEXCOORD_1"]), 4095 * UV)
     assert load_shape(out).V == 4  # nothing is copied
