@@ -457,6 +457,9 @@ def test_without_a_model_the_shapes_make_their_template(tmp_path: Path) -> None:
     assert collection.template.K == ViscousConfig().finest().nodes > ViscousConfig.nodes
     with pytest.raises(OptionError, match="another model"):
         collection.fit(folder, model="human")
+    frames = meshmatch.Collection(tmp_path / "frames", workers=1)
+    frames.fit(folder, model="none", sequence=True)
+    assert frames.template.K < ViscousConfig().finest().nodes
 
 
 def test_where_no_fit_is_to_be_trusted_maps_can_be_made(tmp_path: Path) -> None:
