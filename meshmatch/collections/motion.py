@@ -1,8 +1,8 @@
 """The frames of a sequence, smoothed in time, and how they move.
 
 Fits of frames lie on their surfaces, but slide along them, each in its own way. Paths are smoothed by least squares with a
-penalty on second differences (Whittaker 1923), whose weight is the one that best predicts frames that are left out, by
-generalised cross-validation (Craven and Wahba, Numerische Mathematik 31, 1979). The motion is a sum of principal
+penalty on second differences (Whittaker 1923), whose weight is the one that best predicts each frame from the others
+(cross-validation; the generalised one would hold a first or last frame to its own noise). The motion is a sum of principal
 components, and each has a weight of its own: a beat stands out of the noise, and needs little. From the first component on
 that may as well move evenly, the rest is taken for noise. Then each vertex is put back onto the surface of its frame: how
 that moves was measured, and stays as it is.
@@ -70,13 +70,14 @@ def _best_filter(paths: Float[Floats, "T N"], known: Bool[Bools, " M"], cycle: b
     rough = some[:, known] - some[:, ~known] @ np.linalg.solve(others[:, ~known], others[:, known])
     eigenvalues, vectors = np.linalg.eigh(rough)
     kept = 1 / (1 + np.outer(_WEIGHTS, np.maximum(eigenvalues, 0.0)))  # of each eigenvector, by each weight
-    left = np.square(1 - kept.mean(axis=1))
+    held = kept @ np.square(vectors).T  # how much of each frame is its own, by each weight
     found = mean = np.full((count, count), 1 / count)
     moved, rest = paths - mean @ paths, np.eye(count) - mean
     energies, components = np.linalg.eigh(moved @ moved.T)
     for component in components.T[energies > _NONE * energies[-1]][::-1]:
         own = vectors.T @ component
-        best = int((np.square((1 - kept) * own).sum(axis=1) / left).argmin())
+        missed = (((1 - kept) * own) @ vectors.T) / np.maximum(1 - held, _NONE)  # of each frame, by the others
+        best = int(np.square(missed).sum(axis=1).argmin())
         if best == len(kept) - 1:
             break
         found = found + np.outer(vectors @ (kept[best] * own), component)

@@ -48,6 +48,15 @@ def test_paths_are_as_smooth_as_the_true_ones_and_nearer_to_them(cycle: bool) ->
     assert np.allclose(np.linalg.norm(found - middle[:, None], axis=2), radius[:, None], rtol=0.02)  # on the surfaces
 
 
+def test_a_first_frame_is_smoothed_as_well() -> None:
+    """It has neighbours on one side alone, and a component of its own if it slid further than they."""
+    true, points = pulsing(), pulsing(0.05)
+    points[0] = pulsing(0.15)[0]
+    found = np.array(list(smoothed(points, BALL.faces, range(FRAMES))))
+    before, after = (np.linalg.norm((some - true)[0], axis=1).mean() for some in (points, found))
+    assert after < 0.6 * before
+
+
 def test_a_short_motion_is_no_noise() -> None:
     """A ball that jerks to the side and back within three frames, and slides at random."""
     aside = np.exp(-(((np.arange(FRAMES) - 8) / 1.5) ** 2))[:, None, None] * [1.0, 0, 0]
