@@ -403,6 +403,14 @@ def standing(template: Template, shape: Shape, seed: int) -> Standing:
     return Standing(best.begin.frame, max(best.features.stretch, _NOTHING), best.alike)
 
 
+def fit_from(template: Template, shape: Shape, start: Fit, config: ViscousConfig) -> Fit | None:
+    """Fit a template to a repaired shape from the pose of a fit of another template with the same vertices; None where the
+    shape stands otherwise."""
+    began, task = time.monotonic(), _Task(template, shape, config)
+    found = task.fitted(task.near(start.frame))
+    return _Judged.of(task, found).fit(0.0, began) if found.alike else None
+
+
 def fit_turned(template: Template, shape: Shape, turn: Float[Floats, "3 3"], config: ViscousConfig) -> Fit:
     """Fit a template to a repaired shape that stands as it does, turned by a rotation from its file to the template."""
     began, task = time.monotonic(), _Task(template, shape, config)

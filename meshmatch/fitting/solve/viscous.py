@@ -56,6 +56,10 @@ class ViscousConfig(Pairing):
         few = cls.choosing()
         return replace(few, schedule=replace(few.schedule, prior=(1e-2, 1e-4)))
 
+    def rough(self) -> ViscousConfig:
+        """For fits of which only the mean is asked."""
+        return replace(self, samples=6000, back_points=4000, schedule=replace(self.schedule, steps=12))
+
     def finest(self) -> ViscousConfig:
         """With more nodes, for the last fits of a kind whose shapes stand alike: they gain what is local. Errors of twenty
         femurs, nine hearts and generated knees are 5 to 11 % less, of generated molars 8 % more.
