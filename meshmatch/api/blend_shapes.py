@@ -26,12 +26,13 @@ from meshmatch.shapes.files import ShapeLike, as_scene, as_shape
 from meshmatch.shapes.formats import gltf
 from meshmatch.shapes.formats.gltf_edit import remembering
 from meshmatch.shapes.formats.gltf_morphs import with_morphs
+from meshmatch.shapes.formats.gltf_vrm import check_character
 from meshmatch.shapes.moved_files import MovedFile
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.blend_shapes import carry_moves
 
-check_suffix = partial(tables.check_suffix, suffixes=(".glb", ".npz"), what="blendshapes")
+check_suffix = partial(tables.check_suffix, suffixes=(".glb", ".vrm", ".npz"), what="blendshapes")
 _PLAIN = re.compile(r"[^\w .+-]")
 _LONGEST = 100  # letters of a file's name
 
@@ -99,6 +100,7 @@ class BlendShapesResult(Brief):
         """
         path = as_path(path)
         suffix = check_shapes_output(path)
+        check_character(self.original, path)
         if suffix:
             with replace_on_success(path) as temporary:
                 if suffix == ".npz":

@@ -26,6 +26,7 @@ from meshmatch.shapes.colors import light, seen
 from meshmatch.shapes.dressed_files import tell_lost
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.formats import gltf
+from meshmatch.shapes.formats.gltf_vrm import check_character
 from meshmatch.shapes.input_files import stem_of
 from meshmatch.shapes.landmark_files import Space, mesh_space
 from meshmatch.shapes.shape import Shape
@@ -248,6 +249,7 @@ def transfer_colors(
 
 
 def _write_colors(colors: Floats, maps: MapPair, file: Path | None, path: Path, final: Path) -> None:
+    check_character(file, final)
     along_y = Path(maps.source.name).suffix.lower() in gltf.SUFFIXES
     turn = turn_upright(maps, along_y) if final.suffix.lower() == ".glb" else None
     save_colors(path, maps.target, colors, file, turn)

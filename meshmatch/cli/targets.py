@@ -99,7 +99,7 @@ def _transfer_all(
         transfer = "transfer_values"
     elif ending is not None and ending.removeprefix(".") in ("ply", "off") and transfer == "transfer_texture":
         transfer = "transfer_colors"
-    endings = ending_of(transfer, ending, garment, found.files)
+    endings = ending_of(transfer, ending, garment, found.files, rest.get("join", False))
     if maps.map is None:
         check_model(maps.model)
     console = Console(run.quiet)

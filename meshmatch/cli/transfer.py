@@ -26,8 +26,8 @@ def transfer_color(
     target: Target,
     output: Path = output_option(
         "FILE",
-        "TGT with colors (.ply, .glb, .obj or .off), or colors alone (.npy or .csv). With --values: .npy or .csv, or TGT "
-        "with them (.ply, .vtp or .vtk).",
+        "TGT with colors (.ply, .glb, .vrm, .obj or .off), or colors alone (.npy or .csv). With --values: .npy or .csv, or "
+        "TGT with them (.ply, .vtp or .vtk).",
     ),
     maps: MapOptions,
     rules: RuleOptions,

@@ -25,7 +25,9 @@ def transfer_garment(
     ),
     maps: MapOptions,
     run: RunOptions,
-    join: bool = Option(False, "--join", help="Write TGT, a .glb, .gltf or .vrm, with GARMENT in it, as one .glb."),
+    join: bool = Option(
+        False, "--join", help="Write TGT, a .glb, .gltf or .vrm, with GARMENT in it, as one .glb or .vrm."
+    ),
     picture: Picture = None,
 ) -> Json:
     """Transfer clothes, hair or other things that are worn.
@@ -34,18 +36,16 @@ def transfer_garment(
     turned and scaled as the body is there, and are pushed out where they would sink below the skin of TGT. Vertex
     order, polygons, texture coordinates, groups and materials stay. In a .glb GARMENT moves with the skeleton of TGT.
     """
-    from meshmatch.shapes.moved_files import MovedFile, check_into
+    from meshmatch.shapes.moved_files import MovedFile
 
     transfer = Transfer(source, target, output, maps, run, picture)
     console = transfer.console
-    if join:
-        check_into(target, output)
+    into = target if join else None
+    plan = MovedFile.planned(output, garment, into)
     worn = meshmatch.load_shape(garment)
-    plan = MovedFile.planned(output, garment)
     plan.make_folders()
     with transfer.outputs(garment, files=plan.files) as temporary:
         result = meshmatch.transfer_garment(garment, source, target, transfer)
-        into = target if join else None
         plan.write(temporary, result.shape, result.turns, result.binding, result.turn, into)
     a, b = result.maps.source, result.maps.target
     if b.is_cloud:
@@ -55,7 +55,7 @@ def transfer_garment(
         console.say(f"{len(result.pushed)} of {worn.V} vertices ({share:.1f} %) were pushed out of {transfer.names[1]}")
     if len(result.sunk):
         console.warn(f"{len(result.sunk)} of {worn.V} vertices are below the skin of {transfer.names[1]}")
-    if result.binding is not None and output.suffix.lower() == ".glb":
+    if result.binding is not None and output.suffix.lower() in (".glb", ".vrm"):
         console.say(f"{len(result.binding.rig.joints)} joints move {garment.name}")
     if not join and plan.is_turned(result.binding, result.turn):
         console.say(f"note: a node turns {garment.name} upright, along y")

@@ -79,7 +79,10 @@ class Transfer:
 
         What cannot be written, and options that do not go together, are told before the work; ``read`` are other inputs.
         """
+        from meshmatch.shapes.formats.gltf_vrm import check_character
+
         files = [self.output] if files is None else files
+        check_character(self.target, self.output)
         self.options.check()
         if self.options.map is not None:
             hint = "it controls matching, but --map supplies the map: leave one of them out"

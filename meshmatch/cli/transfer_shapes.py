@@ -21,8 +21,8 @@ def transfer_shapes(
     target: Target,
     output: Path = output_option(
         "FILE",
-        "TGT with the blendshapes: .glb or, with Blender installed, .fbx, .usdz or .blend. Or .npz for their "
-        "names and displacements; or a new folder (a name without a suffix), which gets an .obj for each shape.",
+        "TGT with the blendshapes: .glb, .vrm of a .vrm or, with Blender installed, .fbx, .usdz or .blend. Or .npz for "
+        "their names and displacements; or a new folder (a name without a suffix), which gets an .obj for each shape.",
     ),
     shapes: list[Path] | None = Option(
         None,

@@ -44,7 +44,7 @@ def transfer_texture(
     target: Target,
     output: Path = output_option(
         "FILE",
-        "TGT with its texture: .glb, or .obj (with an .mtl and images of the same name). As .ply or .off, "
+        "TGT with its texture: .glb, .vrm of a .vrm, or .obj (with an .mtl and images of the same name). As .ply or .off, "
         "and for a point cloud, it gets vertex colors instead.",
     ),
     texture: TextureOptions,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from meshmatch.errors import OptionError
@@ -21,39 +22,43 @@ class Ending:
 
 
 USUAL = {
-    "transfer_colors": Ending(".ply", (".glb", ".obj", ".off")),
+    "transfer_colors": Ending(".ply", (".glb", ".vrm", ".obj", ".off")),
     "transfer_values": Ending(".ply"),  # a shape's own file may not hold them
     "transfer_labels": Ending(".npy"),
     "transfer_weights": Ending(".npz"),
     "transfer_landmarks": Ending(".csv"),
     "transfer_rig": Ending(".glb"),
-    "transfer_shapes": Ending(".glb"),
-    "transfer_texture": Ending(".glb", (".obj",)),
+    "transfer_shapes": Ending(".glb", (".vrm",)),
+    "transfer_texture": Ending(".glb", (".obj", ".vrm")),
     "transfer_garment": Ending(""),  # as its garment
 }
 """By the name of the function."""
 
 
-def ending_of(transfer: str, given: str | None, garment: Path | None, targets: Mapping[str, Path]) -> Ending:
-    """What the files of a transfer end in. `OptionError`, before any target, for what it cannot write, and for a function
-    that is not one of these if nothing is ``given``.
+def ending_of(
+    transfer: str, given: str | None, garment: Path | None, targets: Mapping[str, Path], join: bool = False
+) -> Ending:
+    """What the files of a transfer end in; ``join``: a garment is put into its target. `OptionError`, before any target, for
+    what it cannot write, and for a function that is not one of these if nothing is ``given``.
     """
     found = USUAL.get(transfer)
     if given is not None:
         found = Ending(f".{given.removeprefix('.')}")
     elif found is None:
         raise OptionError(f"what {transfer} writes is not known", "give the suffix of its files")
+    elif join:
+        found = Ending(".glb", (".vrm",))
     elif not found.suffix:
         own = ".obj" if garment is None else garment.suffix.lower()
         found = Ending(".glb" if own in (".gltf", ".vrm") else own)
     for suffix, name in {found(file): name for name, file in reversed(list(targets.items()))}.items():
-        _check(transfer, f"{name.rpartition('/')[2]}{suffix}")
+        _check("join" if join else transfer, f"{name.rpartition('/')[2]}{suffix}")
     return found
 
 
 def _check(transfer: str, name: str) -> None:
     from meshmatch.api import blend_shapes, rig
-    from meshmatch.shapes import files, textured_files
+    from meshmatch.shapes import files, tables, textured_files
     from meshmatch.transfer import label_files, landmarks, value_files, weight_files
 
     if Path(name).name != name:
@@ -68,6 +73,7 @@ def _check(transfer: str, name: str) -> None:
         "transfer_shapes": blend_shapes.check_suffix,
         "transfer_texture": textured_files.check_textured,
         "transfer_garment": files.check_suffix,
+        "join": partial(tables.check_suffix, suffixes=(".glb", ".vrm"), what="a target with a garment in it"),
     }
     if transfer in checks:
         checks[transfer](Path(name))

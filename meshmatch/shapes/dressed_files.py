@@ -17,6 +17,7 @@ from meshmatch.shapes.formats import Textured, gltf, gltf_out, obj, obj_text
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_dressed import colored, dressed
 from meshmatch.shapes.formats.gltf_edit import remembering
+from meshmatch.shapes.formats.gltf_vrm import check_character
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import check_textured, files_of, image_file, tile_file
@@ -48,10 +49,11 @@ class Dressed:
     def save(self, path: Path) -> None:
         """Write a glb, or an obj with its material files; all of them, or none.
 
-        `OptionError` if the suffix is neither .glb nor .obj, or the format has no tiles; `OutputError` if a file cannot be
-        written.
+        `OptionError` if the suffix is neither .glb nor .obj, nor .vrm of a character, or the format has no tiles;
+        `OutputError` if a file cannot be written.
         """
         check_textured(path)
+        check_character(self.file, path)
         if self.tiles:
             check_tiles(path)
         with replace_all_on_success(files_of(path, self.material.layers, self.tiles)) as places:
@@ -144,7 +146,7 @@ def save_colored(path: Path, shape: Shape, file: Path | None, turn: Float[Floats
     """
     suffix, colors = path.suffix.lower(), shape.colors
     assert colors is not None
-    if suffix == ".glb":
+    if suffix in (".glb", ".vrm"):
         name, data, kept = glb_base(file, shape)
         turned = np.eye(3) if kept else turn
         made = gltf.understood(name, data, "scene makes", lambda doc: colored(doc, colors, turned))

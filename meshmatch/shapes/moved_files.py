@@ -26,6 +26,7 @@ from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_join import joined
 from meshmatch.shapes.formats.gltf_moved import moved
 from meshmatch.shapes.formats.gltf_rigged import Binding, rigged
+from meshmatch.shapes.formats.gltf_vrm import SUFFIX, check_character
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import find_appearance
@@ -45,13 +46,16 @@ class MovedFile:
     copies: tuple[tuple[Path, Path], ...] = ()
 
     @classmethod
-    def planned(cls, output: Path, original: Path | None) -> MovedFile:
-        """What will be written. Materials and images that are named and not there are told.
+    def planned(cls, output: Path, original: Path | None, into: Path | None = None) -> MovedFile:
+        """What will be written, or put ``into`` another file. Materials and images that are named and not there are told.
 
         `OptionError`: the suffix cannot be written, or a copy would replace another file. `InputError`: a material file
         cannot be read.
         """
-        check_suffix(output)
+        if into is None:
+            check_suffix(output)
+        else:
+            check_into(into, output)
         if original is None or not (output.suffix.lower() == original.suffix.lower() == ".obj"):
             return cls(output, original)
         here, there = original.parent.resolve(), output.parent.resolve()
@@ -96,8 +100,16 @@ class MovedFile:
         them in a glb, if there is a ``binding``; the glb may be put ``into`` another one, whose joints these are. Without
         either, a node makes the ``turn`` that lets a glb stand upright. What the format does not hold is told.
         """
-        self._write_mesh(places, shape, turns, still=binding is None)
         place = places[0]
+        if place.suffix.lower() == SUFFIX:
+            glb = place.with_suffix(".glb")
+            try:
+                self.write([glb, *places[1:]], shape, turns, binding, turn, into)
+                glb.replace(place)
+            finally:
+                glb.unlink(missing_ok=True)
+            return
+        self._write_mesh(places, shape, turns, still=binding is None)
         if place.suffix.lower() == ".glb" and (binding is not None or into is not None):
             add = partial(_added, shape=shape, binding=binding, into=into)
             place.write_bytes(gltf.understood(self.output, place.read_bytes(), "scene makes", add))
@@ -150,19 +162,20 @@ def save_moved(
     """Write a mesh that was read from a file and has moved; all files appear, or none. Errors as `MovedFile.planned`, and
     `OutputError` if a file cannot be written.
     """
-    plan = MovedFile.planned(Path(path), original)
+    plan = MovedFile.planned(Path(path), original, into)
     plan.make_folders()
     with replace_all_on_success(plan.files) as places:
         plan.write(places, shape, turns, binding, turn, into)
 
 
 def check_into(file: Path | None, output: Path) -> None:
-    """Refuse a file that nothing can be put into, or an output that is no glb (`OptionError`)."""
+    """Refuse a file that nothing can be put into, or an output that is no glb, nor .vrm of a character (`OptionError`)."""
     if file is None or file.suffix.lower() not in gltf.SUFFIXES:
         name = "the target" if file is None else file.name
         raise OptionError(f"nothing can be put into {name}", f"the target must be one of {', '.join(gltf.SUFFIXES)}")
-    if output.suffix.lower() != ".glb":
+    if output.suffix.lower() not in (".glb", SUFFIX):
         raise OptionError(f"{output.name} cannot hold the target and what is put into it", "end the output in .glb")
+    check_character(file, output)
 
 
 def _turned(document: gltf.Document, turn: Float[Floats, "3 3"]) -> bytes:

@@ -17,7 +17,7 @@ from meshmatch.shapes.formats import gltf, gltf_attributes, gltf_finish, obj_loo
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
-TEXTURED_SUFFIXES = (".glb", ".obj")
+TEXTURED_SUFFIXES = (".glb", ".obj", ".vrm")
 _FINISHES = dict.fromkeys(gltf.SUFFIXES, gltf_finish.read_finish) | {".obj": obj_look.read_finish}
 _SHOWN: dict[Layer, tuple[str, ...]] = {"normal": ("normal",), "surface": ("roughness", "metal"), "glow": ("emission",)}
 _READERS = {  # of the look, and of texture coordinates alone

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Ints
+from meshmatch.errors import warn
 from meshmatch.geometry.triangles import unit
 from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
 from meshmatch.shapes.colors import light
@@ -20,6 +21,7 @@ from meshmatch.shapes.formats.gltf_attributes import laid_out, transform_of
 from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor, drawn
 from meshmatch.shapes.formats.gltf_out import smooth_normals
 from meshmatch.shapes.formats.gltf_prune import textures_in
+from meshmatch.shapes.formats.gltf_toon import ToonWear, toon_materials
 from meshmatch.shapes.formats.seams import split_at_seams, vertex_tangents
 
 _LINEAR, _LINEAR_MIPS, _REPEAT, _CLAMP = 9729, 9987, 10497, 33071
@@ -74,13 +76,19 @@ def dressed(
     if not np.array_equal(turn, np.eye(3)):
         editor.turn(turn)
     wardrobe.list_extensions()
+    wardrobe.toon.finish(wardrobe.made)
     editor.prune(document)
     return editor.to_bytes()
 
 
 def colored(document: Document, colors: Float[Floats, "V 4"], turn: Float[Floats, "3 3"]) -> bytes:
-    """The scene as a glb with other colors of its vertices (sRGB and alpha, 0..1), and turned."""
+    """The scene as a glb with other colors of its vertices (sRGB and alpha, 0..1), and turned. Materials that do not show
+    them are told.
+    """
     editor = Editor(document)
+    if toon := toon_materials(document.json):
+        hidden = f"{len(toon)} toon materials" if toon[1:] else f"the toon material {toon[0]}"
+        warn(f"programs show no colors of vertices on {hidden} of {document.name}; they show a texture")
     seen = 0
     for number, parts in drawn(document).items():
         mesh = editor.own_mesh(number)
@@ -187,6 +195,8 @@ class _Wardrobe:
             )
         )
 
+        self.toon = ToonWear(editor.name, editor.json, material, self.color, self.normal, self.glow)
+
     def _texture(self, image: Pixels, what: str) -> int:
         view = self.editor.add_view(png_bytes(image))
         entry = {"bufferView": view, "mimeType": "image/png", "name": f"{self.baked.name}{what}".strip()}
@@ -206,7 +216,9 @@ class _Wardrobe:
                 entry |= {"doubleSided": True} if self.baked.double_sided else {}
             else:
                 entry = copy.deepcopy(self.before[number])
-            self._lay_on(entry, moved_to)
+            self._lay_on(entry, moved_to, self.toon.keeps(number, entry))
+            if number is not None:
+                self.toon.lay_on(entry, self.before[number], moved_to)
             first = number is not None and number not in self.worn_elsewhere
             first &= all(each != number for each, _ in self.made)
             if number is not None and first:
@@ -215,10 +227,10 @@ class _Wardrobe:
                 self.made[key] = self.editor.add("materials", entry)
         return self.made[key]
 
-    def _lay_on(self, entry: dict[str, Any], moved_to: int | None) -> None:
-        """Replace in a material what the baked one has."""
+    def _lay_on(self, entry: dict[str, Any], moved_to: int | None, toon: bool) -> None:
+        """Replace in a material what the baked one has; that a toon material is plain where nobody knows it, stays."""
         baked, extensions = self.baked, entry.setdefault("extensions", {})
-        for key in (_GLOSS, _GLOW, _UNLIT):
+        for key in (_GLOSS, _GLOW) if toon else (_GLOSS, _GLOW, _UNLIT):
             extensions.pop(key, None)
         for key in ("alphaMode", "alphaCutoff", "emissiveTexture", "emissiveFactor"):
             entry.pop(key, None)

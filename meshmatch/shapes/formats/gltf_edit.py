@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, OutputError
+from meshmatch.shapes.formats import gltf_vrm
 from meshmatch.shapes.formats.gltf import INSTANCES, MOST_ORIGINS, ORIGINS, Document, digest, embedded
 from meshmatch.shapes.formats.gltf_compressed import COMPONENTS
 from meshmatch.shapes.formats.gltf_prune import prune, unused
@@ -157,7 +158,9 @@ class Editor:
         node = self.json["nodes"][number]
         if self._uses[node["mesh"]] > 1:
             self._uses[node["mesh"]] -= 1
-            node["mesh"] = self.add("meshes", copy.deepcopy(self.json["meshes"][node["mesh"]]))
+            old = node["mesh"]
+            node["mesh"] = self.add("meshes", copy.deepcopy(self.json["meshes"][old]))
+            gltf_vrm.copy_mesh(self.json, old, node["mesh"])
             self._uses[node["mesh"]] = 1
         found: dict[str, Any] = self.json["meshes"][node["mesh"]]
         return found

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from meshmatch.arrays import Floats
+from meshmatch.shapes.formats import gltf_vrm
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_attributes import joint_nodes
 from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor, drawn
@@ -59,7 +60,9 @@ def joined(document: Document, added: Document, binding: Binding | None) -> byte
             back = np.linalg.inv(binding.bind[binding.rig.joints]) @ frame
             inverse = editor.add_array(back.swapaxes(1, 2).reshape(-1, 16).astype("<f4"))
             entry["skin"] = editor.add("skins", {"joints": joints, "inverseBindMatrices": inverse})
-        editor.draw(document, editor.add("nodes", entry))
+        node = editor.add("nodes", entry)
+        editor.draw(document, node)
+        gltf_vrm.show_mesh(editor.json, node, mesh)
     return editor.to_bytes()
 
 
@@ -89,7 +92,10 @@ def _taken_over(
     for kind in _KINDS:
         if entries := other.json.get(kind):
             editor.json.setdefault(kind, []).extend(entries)
+    gltf_vrm.complete_properties(other.json)
+    gltf_vrm.complete_properties(editor.json, gltf_vrm.properties(other.json))
     for key in ("extensionsUsed", "extensionsRequired"):
-        if listed := [*editor.json.get(key, []), *other.json.get(key, [])]:
+        theirs = [name for name in other.json.get(key, []) if name not in gltf_vrm.ROOTS]
+        if listed := [*editor.json.get(key, []), *theirs]:
             editor.json[key] = list(dict.fromkeys(listed))
     return [offset["meshes"] + k for k in range(len(meshes))], frames

@@ -16,7 +16,7 @@ from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import shortest_turns, unit
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.blend_shapes import BlendShapes, WeightClip, shape_normals
-from meshmatch.shapes.formats import check_places
+from meshmatch.shapes.formats import check_places, gltf_vrm
 from meshmatch.shapes.formats.gltf import Document, understood
 from meshmatch.shapes.formats.gltf_edit import Editor, drawn, frames_of
 from meshmatch.shapes.shape import Shape
@@ -59,8 +59,12 @@ def with_morphs(document: Document, shape: Shape, added: BlendShapes, turn: Floa
         mesh["weights"] = [*(weights[k] for k in kept), *added.weights.tolist()]
         names = {"targetNames": [*(before[k] for k in kept), *added.names]}
         mesh["extras"] = (mesh["extras"] if isinstance(mesh.get("extras"), dict) else {}) | names
+        for own in mesh["primitives"]:
+            if isinstance(own.get("extras"), dict) and "targetNames" in own["extras"]:
+                own["extras"] |= names
         columns = [*kept, *(before.index(name) if name in before else -1 for name in added.names)]
         _follow(editor, document, number, columns, mesh["weights"])
+        gltf_vrm.reorder_targets(editor.json, number, node["mesh"], columns)
         moving[number] = np.array([weights[k] for k in kept])
     for clip in added.clips:
         _add_clip(editor, clip, moving)
@@ -102,9 +106,9 @@ def _morphs(document: Document) -> BlendShapes:
 
 def _names(mesh: dict[str, Any]) -> list[str]:
     """What the targets of a mesh are called, none alike."""
-    extras = mesh.get("extras")
-    given = extras.get("targetNames") if isinstance(extras, dict) else None
-    given = given if isinstance(given, list) else []
+    held = [each.get("extras") for each in (mesh, *mesh["primitives"])]  # those of VRM 0.x have them in primitives
+    told = [extras.get("targetNames") for extras in held if isinstance(extras, dict)]
+    given = next((names for names in told if isinstance(names, list)), [])
     names: list[str] = []
     for k in range(len(mesh["primitives"][0].get("targets", []))):
         name = plain_text(given[k]) if k < len(given) and isinstance(given[k], str) and given[k] else f"shape {k}"

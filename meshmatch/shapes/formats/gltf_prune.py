@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+from meshmatch.shapes.formats import gltf_vrm
+
 # Extensions that refer to nothing but textures of materials, or what is found below; with others nothing is taken out.
 _KNOWN = re.compile(
     r"KHR_(?:materials_\w+|texture_transform|mesh_quantization|lights_punctual|node_visibility)|EXT_texture_webp"
@@ -24,7 +26,7 @@ def unused(json: Json) -> dict[str, set[int]]:
 
 def prune(json: Json, before: dict[str, set[int]]) -> bool:
     """Take out what is not used, but for what was not used ``before``; returns whether there was any."""
-    if not all(_KNOWN.fullmatch(name) for name in json.get("extensionsUsed", [])):
+    if not all(_KNOWN.fullmatch(name) or gltf_vrm.KNOWN.fullmatch(name) for name in _extensions(json)):
         return False
     some = False
     for kind in _KINDS:
@@ -42,7 +44,12 @@ def prune(json: Json, before: dict[str, set[int]]) -> bool:
 
 def nodes_are_ours(json: Json) -> bool:
     """Whether no extension might refer to a node."""
-    return all(_KNOWN.fullmatch(name) for name in (*json.get("extensionsUsed", []), *json.get("extensions", {})))
+    return all(_KNOWN.fullmatch(name) for name in _extensions(json))
+
+
+def _extensions(json: Json) -> tuple[str, ...]:
+    """Those that a document uses, also where it does not say so."""
+    return (*json.get("extensionsUsed", []), *json.get("extensions", {}))
 
 
 def drop_nodes(json: Json, candidates: Iterable[int]) -> None:
@@ -92,6 +99,7 @@ def references(json: Json) -> Iterator[tuple[str, Any, Any]]:
     yield from _inner_references(json)
     for entry in json.get("materials", []):
         yield from (("textures", texture, "index") for texture in textures_in(entry))
+    yield from (each for each in gltf_vrm.references(json) if each[0] in _KINDS)
 
 
 def _inner_references(json: Json) -> Iterator[tuple[str, Any, Any]]:
