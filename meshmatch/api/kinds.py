@@ -162,7 +162,7 @@ def choose_model(
     """The installed model that knows the kind of all the shapes; or ``settled``, if it does.
 
     A cloud, or a shape that may be a part of something, is of the other shapes' kind where its own cannot be told; so is a
-    mesh that hardly looks like that kind, but more so than like any other. Of a
+    mesh that hardly looks like that kind, but more so than like any other, as are several such meshes together. Of a
     mesh of no kind, or of parts far apart, those parts are chosen that are of a kind (`meshmatch.api.apart`).
     `InputError` if two shapes are of different kinds, or one of none; `ModelError` if no model is installed.
     """
@@ -261,6 +261,8 @@ def _refuse_unknown(
     configs: Sequence[FitConfig],
 ) -> None:
     kinds = {each.kind for each in found if each.kind is not None}
+    if not kinds and len(found) > 1:
+        kinds = {each.card.category for each in found}
     for shape, config, each, nearest in zip(shapes, configs, found, readings.min(0), strict=True):
         unknown = each.kind is None and not shape.is_cloud and not may_show_part(shape, config)
         if unknown and not _perhaps(each, kinds):
@@ -271,7 +273,7 @@ def _refuse_unknown(
 
 
 def _perhaps(found: Classification, kinds: Collection[str]) -> bool:
-    """Whether a mesh of no known kind may be of the only kind that the other shapes are of."""
+    """Whether a mesh of no known kind may be of the only kind that the other shapes are of, or may be of."""
     return found.fit is not None and found.fit.trust >= _PERHAPS and set(kinds) == {found.card.category}
 
 

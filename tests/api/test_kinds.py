@@ -112,12 +112,17 @@ def test_what_hardly_looks_like_the_other_shapes_kind_is_taken_for_it(monkeypatc
     name, words = choose(ball("toon 5.5 7 7"), ball("man 3 4 6"))
     assert name == "human" and words[1] == "man 3 4 6: human"
     assert words[0].startswith("toon 5.5 7 7 hardly looks like it (trust 0.40): treated as human; name the model")
-    for others in ((), (ball("dog 6 6 4"),)):  # alone, or beside another kind
+    name, words = choose(
+        ball("toon 5.5 7 7"), ball("toon 5.6 7 7")
+    )  # neither is known, and both come nearest to people
+    assert name == "human" and all("hardly looks like it" in word for word in words)
+    for others in ((), (ball("dog 6 6 4"),), (ball("toon 7 7 5.5"),)):  # alone, or beside another kind, known or not
         with pytest.raises(InputError, match=r"toon 5\.5 7 7 does not look like"):
             choose(ball("toon 5.5 7 7"), *others)
     fits(0.2)
-    with pytest.raises(InputError, match=r"toon 5\.5 7 7 does not look like"):
-        choose(ball("toon 5.5 7 7"), ball("man 3 4 6"))
+    for other in (ball("man 3 4 6"), ball("toon 5.6 7 7")):
+        with pytest.raises(InputError, match=r"toon 5\.5 7 7 does not look like"):
+            choose(ball("toon 5.5 7 7"), other)
 
 
 @pytest.mark.parametrize(
