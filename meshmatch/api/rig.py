@@ -18,8 +18,9 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.shapes import tables
 from meshmatch.shapes.files import ShapeLike, as_scene, as_shape, load_shape
-from meshmatch.shapes.formats import gltf
+from meshmatch.shapes.formats import gltf, gltf_vrm
 from meshmatch.shapes.formats.gltf_edit import remembering
+from meshmatch.shapes.formats.gltf_humanoid import Person, person_of, with_bones
 from meshmatch.shapes.formats.gltf_rig import Rig, read_rig
 from meshmatch.shapes.formats.gltf_rigged import Binding, hanging_groups, rigged
 from meshmatch.shapes.input_files import read_bytes
@@ -32,7 +33,7 @@ from meshmatch.transfer.weight_files import SkinWeights, load_weights
 
 Pose = Literal["rest", "source"]
 """How a rigged target stands: as it came, or as the source does."""
-check_rig_suffix = partial(tables.check_suffix, suffixes=(".glb",), what="rigs")
+check_rig_suffix = partial(tables.check_suffix, suffixes=(".glb", gltf_vrm.SUFFIX), what="rigs")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -56,6 +57,10 @@ class RiggedResult(Brief):
         The maps that were followed.
     glb
         The file.
+    source
+        The source's file.
+    original
+        The target's file, if it came from one.
 
     Examples
     --------
@@ -71,6 +76,8 @@ class RiggedResult(Brief):
     replaced_clips: tuple[str, ...]
     maps: MapPair
     glb: bytes
+    source: Path
+    original: Path | None = None
 
     def _repr_html_(self) -> str:
         from meshmatch.api.notebook import carried_html
@@ -90,19 +97,44 @@ class RiggedResult(Brief):
         Parameters
         ----------
         path
-            Where to.
+            Where to. As .vrm the bones of a target that is one become those of the skeleton that moves it now.
 
         Raises
         ------
         OptionError
-            The suffix is another one.
+            The suffix is another one; or it is .vrm, and the target is none, or nobody knows which bones are which.
         OutputError
             The file cannot be written.
         """
         path = as_path(path)
-        check_rig_suffix(path)
+        person = check_rig_output(path, self.source, self.original)
         with replace_on_success(path) as temporary:
-            temporary.write_bytes(self.glb)
+            temporary.write_bytes(self.glb if person is None else self._character(path, person))
+
+    def _character(self, path: Path, person: Person) -> bytes:
+        name = path if self.original is None else self.original
+        return gltf.understood(name, self.glb, "scene makes", lambda document: with_bones(document, person))
+
+
+def check_rig_output(path: Path, source: Path, target: Path | None) -> Person | None:
+    """The bones of a character, if the output is one. Ask before long work. `OptionError` for a suffix that holds no rig, or
+    where nobody knows which bones are which.
+    """
+    if check_rig_suffix(path) != gltf_vrm.SUFFIX:
+        return None
+    gltf_vrm.check_character(target, path)
+    assert target is not None
+
+    def found(document: gltf.Document) -> Person | None:
+        return gltf.understood(target, read_bytes(target), "scene makes", lambda body: person_of(document, body))
+
+    person = gltf.understood(source, read_bytes(source), "skeleton makes", found)
+    if person is None:
+        problem = f"{path.name} would be no character: which of its bones are a person's, {source.name} does not say"
+        raise OptionError(
+            problem, "end the name in .glb, or give a source that is a .vrm, or has the target's names of bones"
+        )
+    return person
 
 
 def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *, pose: Pose = "rest") -> RiggedResult:
@@ -165,4 +197,6 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     before, after = (np.asarray(each.sum(axis=0)).ravel() > 0 for each in (weights.matrix, found))
     unused = tuple(weights.names[joint] for joint in np.flatnonzero(before & ~after))
     moving = SkinWeights(found, weights.names)
-    return RiggedResult(standing, moving, unused, replaced.joints, replaced.clips, maps, remembering(glb, b))
+    made = remembering(glb, b)
+    original = as_path(target) if isinstance(target, str | Path) else None
+    return RiggedResult(standing, moving, unused, replaced.joints, replaced.clips, maps, made, source, original)

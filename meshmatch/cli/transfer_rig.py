@@ -22,7 +22,7 @@ def transfer_rig(
     source: Source,
     target: Target,
     output: Path = output_option(
-        "FILE", "TGT with the rig: .glb or, with Blender installed, .fbx, .usdz, .dae or .blend."
+        "FILE", "TGT with the rig: .glb, .vrm of a .vrm or, with Blender installed, .fbx, .usdz, .dae or .blend."
     ),
     maps: MapOptions,
     run: RunOptions,
@@ -37,14 +37,14 @@ def transfer_rig(
     skeleton of its own; another TGT is turned upright. The skeleton has the bones and names of SRC; its clips play on TGT
     in whatever pose it came.
     """
-    from meshmatch.api.rig import check_rig_suffix
+    from meshmatch.api.rig import check_rig_output
 
     transfer = Transfer(source, target, output, maps, run, picture)
     console = transfer.console
-    check_rig_suffix(output)
+    check_rig_output(output, source, target)
     with transfer.outputs() as (temporary,):
         result = meshmatch.transfer_rig(source, target, transfer, pose=pose)
-        temporary.write_bytes(result.glb)
+        result.save(temporary)
     joints, clips = len(result.rig.joints), [clip.name for clip in result.rig.clips]
     if result.unused:
         many, names = len(result.unused), _listed(result.unused)

@@ -26,7 +26,7 @@ def write_character(path: Path, version: int, **more: Any) -> None:
         CORNERS.astype("f4"),
         UV.astype("f4"),
         FACES.ravel().astype("u2"),
-        np.tile(np.array([[0, 1, 0, 0]], "u1"), (4, 1)),
+        np.array([[0, 0, 0, 0]] * 2 + [[0, 1, 0, 0]] * 2, "u1"),
         np.array([[1.0, 0, 0, 0]] * 2 + [[0.25, 0.75, 0, 0]] * 2, "f4"),
         np.array([np.eye(4), [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, -0.5, 0, 1]]], "f4").reshape(2, 16),
         *((0.1 * (k + 1) * CORNERS).astype("f4") for k in range(3)),

@@ -52,15 +52,19 @@ def _extensions(json: Json) -> tuple[str, ...]:
     return (*json.get("extensionsUsed", []), *json.get("extensions", {}))
 
 
-def drop_nodes(json: Json, candidates: Iterable[int]) -> None:
-    """Take out those nodes that hold nothing, and that nothing refers to; none where an extension might."""
-    if not nodes_are_ours(json):
+def drop_nodes(json: Json, candidates: Iterable[int], character: bool = False) -> None:
+    """Take out those nodes that hold nothing, and that nothing refers to; none where an extension might, but for those of a
+    ``character``.
+    """
+    known = all(_KNOWN.fullmatch(name) or gltf_vrm.KNOWN.fullmatch(name) for name in _extensions(json))
+    if not (known if character else nodes_are_ours(json)):
         return
+    named = [each for each in gltf_vrm.references(json) if each[0] == "nodes"]
     nodes, left = json["nodes"], set(candidates)
     channels = [channel["target"] for clip in json.get("animations", []) for channel in clip["channels"]]
     skins = json.get("skins", [])
     needed = {target.get("node") for target in channels} | {skin.get("skeleton") for skin in skins}
-    needed |= {joint for skin in skins for joint in skin["joints"]}
+    needed |= {joint for skin in skins for joint in skin["joints"]} | {holder[key] for _, holder, key in named}
     left = {number for number in left - needed if not nodes[number].keys() & {"mesh", "camera", "extensions", "extras"}}
     kept: set[int] = set()
     while left != kept:
@@ -72,6 +76,8 @@ def drop_nodes(json: Json, candidates: Iterable[int]) -> None:
         holder[key] = [number[child] for child in holder[key] if child in number]
         if not holder[key]:
             del holder[key]
+    for _, holder, key in named:
+        holder[key] = number[holder[key]]
     for target in channels:
         if "node" in target:
             target["node"] = number[target["node"]]

@@ -19,8 +19,8 @@ Json = dict[str, Any]
 SUFFIX = ".vrm"
 OLD, NEW = "VRM", "VRMC_vrm"
 """The extension of VRM 0.x, and that of 1.0."""
-_SPRINGS, _CONSTRAINT = "VRMC_springBone", "VRMC_node_constraint"
-ROOTS = (OLD, NEW, _SPRINGS, _CONSTRAINT)
+SPRINGS, CONSTRAINT = "VRMC_springBone", "VRMC_node_constraint"
+ROOTS = (OLD, NEW, SPRINGS, CONSTRAINT)
 """Extensions that say something about a whole character."""
 KNOWN = re.compile(
     r"VRM|VRMC_(?:vrm|springBone|springBone_extended_collider|node_constraint|materials_mtoon|materials_hdr\w+)"
@@ -59,11 +59,11 @@ def references(json: Json) -> Iterator[tuple[str, Any, Any]]:
 
 def copy_mesh(json: Json, old: int, new: int) -> None:
     """Let what is said of a mesh count for a copy of it too."""
-    extension = _part(json, "extensions", OLD)
-    held = [_part(group, "binds") for group in _entries(extension, "blendShapeMaster", "blendShapeGroups")]
-    for some in (*held, _part(extension, "firstPerson", "meshAnnotations")):
+    extension = part(json, "extensions", OLD)
+    held = [part(group, "binds") for group in entries(extension, "blendShapeMaster", "blendShapeGroups")]
+    for some in (*held, part(extension, "firstPerson", "meshAnnotations")):
         if isinstance(some, list):
-            some += [each | {"mesh": new} for each in _entries(some) if each.get("mesh") == old]
+            some += [each | {"mesh": new} for each in entries(some) if each.get("mesh") == old]
 
 
 def reorder_targets(json: Json, node: int, mesh: int, columns: Sequence[int]) -> None:
@@ -82,14 +82,14 @@ def copy_material(json: Json, old: int, new: int) -> None:
         for key in ("materialColorBinds", "textureTransformBinds"):
             held = expression.get(key)
             if isinstance(held, list):
-                held += [each | {"material": new} for each in _entries(held) if each.get("material") == old]
+                held += [each | {"material": new} for each in entries(held) if each.get("material") == old]
 
 
 def complete_properties(json: Json, added: Sequence[Json] = ()) -> None:
     """Say of materials that are new in a document of VRM 0.x how to draw them: of the last ones what is ``added``, of others
     that glTF has it.
     """
-    extension = _part(json, "extensions", OLD)
+    extension = part(json, "extensions", OLD)
     if isinstance(extension, dict):
         held = extension.setdefault("materialProperties", [])
         for material in json.get("materials", [])[len(held) : len(json.get("materials", [])) - len(added)]:
@@ -106,13 +106,13 @@ def plain_properties(material: Json) -> Json:
 
 def properties(json: Json) -> list[Json]:
     """How VRM 0.x draws each material; shorter, or empty, where nothing is said."""
-    return _entries(_part(json, "extensions", OLD), "materialProperties")
+    return entries(part(json, "extensions", OLD), "materialProperties")
 
 
 def show_mesh(json: Json, node: int, mesh: int) -> None:
     """Let a new mesh be seen from inside the head as the others are, where the document says so of each."""
     for name, entry in ((OLD, {"mesh": mesh, "firstPersonFlag": "Auto"}), (NEW, {"node": node, "type": "auto"})):
-        held = _part(json, "extensions", name, "firstPerson", "meshAnnotations")
+        held = part(json, "extensions", name, "firstPerson", "meshAnnotations")
         if isinstance(held, list):
             held.append(entry)
 
@@ -120,44 +120,44 @@ def show_mesh(json: Json, node: int, mesh: int) -> None:
 def moving_textures(json: Json, materials: Mapping[int, str]) -> list[str]:
     """Names of expressions that move the textures of these materials, by number, over their surface."""
     found = []
-    for group in _entries(_part(json, "extensions", OLD), "blendShapeMaster", "blendShapeGroups"):
-        values = [each for each in _entries(group, "materialValues") if each.get("materialName") in materials.values()]
+    for group in entries(part(json, "extensions", OLD), "blendShapeMaster", "blendShapeGroups"):
+        values = [each for each in entries(group, "materialValues") if each.get("materialName") in materials.values()]
         if any(str(each.get("propertyName")).startswith("_MainTex") for each in values):
             found.append(str(group.get("name", "")))
     for kind in ("preset", "custom"):
-        named = _part(json, "extensions", NEW, "expressions", kind)
+        named = part(json, "extensions", NEW, "expressions", kind)
         for name, expression in named.items() if isinstance(named, dict) else ():
-            if any(each.get("material") in materials for each in _entries(expression, "textureTransformBinds")):
+            if any(each.get("material") in materials for each in entries(expression, "textureTransformBinds")):
                 found.append(str(name))
     return found
 
 
-def _part(held: Any, *keys: str) -> Any:
+def part(held: Any, *keys: str) -> Any:
     """What lies at the end of these keys; None where there is nothing."""
     for key in keys:
         held = held.get(key) if isinstance(held, dict) else None
     return held
 
 
-def _entries(held: Any, *keys: str) -> list[Json]:
+def entries(held: Any, *keys: str) -> list[Json]:
     """The objects of a list, or the values of an object, at the end of these keys."""
-    found = _part(held, *keys)
+    found = part(held, *keys)
     found = list(found.values()) if isinstance(found, dict) else found
     return [each for each in found if isinstance(each, dict)] if isinstance(found, list) else []
 
 
 def _expressions(json: Json) -> list[Json]:
     """Those of VRM 1.0."""
-    held = _part(json, "extensions", NEW, "expressions")
-    return [*_entries(held, "preset"), *_entries(held, "custom")]
+    held = part(json, "extensions", NEW, "expressions")
+    return [*entries(held, "preset"), *entries(held, "custom")]
 
 
 def _morph_binds(json: Json) -> Iterator[tuple[str, Any, Json]]:
     """What each bind names its morph targets by, "mesh" or "node", its number, and the bind."""
-    for group in _entries(_part(json, "extensions", OLD), "blendShapeMaster", "blendShapeGroups"):
-        yield from (("mesh", bind.get("mesh"), bind) for bind in _entries(group, "binds"))
+    for group in entries(part(json, "extensions", OLD), "blendShapeMaster", "blendShapeGroups"):
+        yield from (("mesh", bind.get("mesh"), bind) for bind in entries(group, "binds"))
     for expression in _expressions(json):
-        yield from (("node", bind.get("node"), bind) for bind in _entries(expression, "morphTargetBinds"))
+        yield from (("node", bind.get("node"), bind) for bind in entries(expression, "morphTargetBinds"))
 
 
 def _named(kind: str, holders: Sequence[Json], key: str) -> Iterator[tuple[str, Json, str]]:
@@ -166,39 +166,39 @@ def _named(kind: str, holders: Sequence[Json], key: str) -> Iterator[tuple[str, 
 
 def _old(json: Json) -> Iterator[tuple[str, Any, Any]]:
     """Those of VRM 0.x."""
-    extension = _part(json, "extensions", OLD)
-    springs = _entries(extension, "secondaryAnimation", "boneGroups")
-    single = {key: [held] for key in ("meta", "firstPerson") if isinstance(held := _part(extension, key), dict)}
+    extension = part(json, "extensions", OLD)
+    springs = entries(extension, "secondaryAnimation", "boneGroups")
+    single = {key: [held] for key in ("meta", "firstPerson") if isinstance(held := part(extension, key), dict)}
     yield from _named("textures", single.get("meta", []), "texture")
     yield from _named("nodes", single.get("firstPerson", []), "firstPersonBone")
-    yield from _named("nodes", _entries(extension, "humanoid", "humanBones"), "node")
-    yield from _named("meshes", _entries(extension, "firstPerson", "meshAnnotations"), "mesh")
-    for group in _entries(extension, "blendShapeMaster", "blendShapeGroups"):
-        yield from _named("meshes", _entries(group, "binds"), "mesh")
+    yield from _named("nodes", entries(extension, "humanoid", "humanBones"), "node")
+    yield from _named("meshes", entries(extension, "firstPerson", "meshAnnotations"), "mesh")
+    for group in entries(extension, "blendShapeMaster", "blendShapeGroups"):
+        yield from _named("meshes", entries(group, "binds"), "mesh")
     yield from _named("nodes", springs, "center")
-    yield from _named("nodes", _entries(extension, "secondaryAnimation", "colliderGroups"), "node")
+    yield from _named("nodes", entries(extension, "secondaryAnimation", "colliderGroups"), "node")
     for spring in springs:
         bones = spring.get("bones")
         yield from (("nodes", bones, k) for k in range(len(bones) if isinstance(bones, list) else 0))
     for entry in properties(json):
-        textures = _part(entry, "textureProperties")
+        textures = part(entry, "textureProperties")
         yield from (("textures", textures, key) for key in (textures if isinstance(textures, dict) else ()))
 
 
 def _new(json: Json) -> Iterator[tuple[str, Any, Any]]:
     """Those of VRM 1.0."""
-    extension, springs = (_part(json, "extensions", name) for name in (NEW, _SPRINGS))
-    meta = _part(extension, "meta")
+    extension, springs = (part(json, "extensions", name) for name in (NEW, SPRINGS))
+    meta = part(extension, "meta")
     yield from _named("images", [meta] if isinstance(meta, dict) else [], "thumbnailImage")
-    yield from _named("nodes", _entries(extension, "humanoid", "humanBones"), "node")
-    yield from _named("nodes", _entries(extension, "firstPerson", "meshAnnotations"), "node")
+    yield from _named("nodes", entries(extension, "humanoid", "humanBones"), "node")
+    yield from _named("nodes", entries(extension, "firstPerson", "meshAnnotations"), "node")
     for expression in _expressions(json):
-        yield from _named("nodes", _entries(expression, "morphTargetBinds"), "node")
+        yield from _named("nodes", entries(expression, "morphTargetBinds"), "node")
         for key in ("materialColorBinds", "textureTransformBinds"):
-            yield from _named("materials", _entries(expression, key), "material")
-    yield from _named("nodes", _entries(springs, "colliders"), "node")
-    for spring in _entries(springs, "springs"):
-        yield from _named("nodes", _entries(spring, "joints"), "node")
+            yield from _named("materials", entries(expression, key), "material")
+    yield from _named("nodes", entries(springs, "colliders"), "node")
+    for spring in entries(springs, "springs"):
+        yield from _named("nodes", entries(spring, "joints"), "node")
         yield from _named("nodes", [spring], "center")
     for node in json.get("nodes", []):
-        yield from _named("nodes", _entries(node, "extensions", _CONSTRAINT, "constraint"), "source")
+        yield from _named("nodes", entries(node, "extensions", CONSTRAINT, "constraint"), "source")
