@@ -1,6 +1,7 @@
 """``meshmatch fit`` and ``map``: many shapes fitted once, and maps of any two of them."""
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,7 +14,7 @@ from meshmatch.cli.options import FitOptions, grouped, optional, output_option
 from meshmatch.cli.words import Console, map_record, print_json
 from meshmatch.errors import OptionError, PoorFit
 from meshmatch.models.registry import AUTO, check_model
-from meshmatch.outputs import replace_on_success
+from meshmatch.outputs import plain_text, replace_on_success
 
 if TYPE_CHECKING:
     from meshmatch.collections.collection import Collection
@@ -29,6 +30,8 @@ Scheduler = Annotated[
     ),
 ]
 
+
+_NAMED = 5  # files that are no shapes, in one line
 
 # The residual is in % of sqrt(area), the distance of the surfaces in the unit of the files.
 _ROW = "{:<28} {:<7} {:>6} {:>9} {:>9} {:>4} {:>6} {:>11} {:>8}"
@@ -65,7 +68,7 @@ def fit(
     found. FITS/fits.csv lists the result of every shape.
     """
     from meshmatch.collections.fit_all import elsewhere_words
-    from meshmatch.collections.setting import FAILED
+    from meshmatch.collections.setting import FAILED, LEFT_OUT
     from meshmatch.models.registry import NO_MODEL
 
     how.check()
@@ -83,7 +86,9 @@ def fit(
     counts = made.counts
     told = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
     chosen = f" (model {made.model})" if how.model == AUTO else ""
-    console.say(f"wrote {len(made.records) - counts[FAILED]} fits to {output}{chosen}: {told}")
+    console.say(f"wrote {sum(record.fitted for record in made.records)} fits to {output}{chosen}: {told}")
+    if others := [record.name for record in made.records if record.verdict == LEFT_OUT]:
+        console.say(f"not taken, for they are no shapes: {_some(others)}; see {output}/fits.csv")
     console.say(*elsewhere_words(made.elsewhere))
     if counts["poor"] and not how.try_harder:
         console.say("the same command with --try-harder searches for longer where a fit is poor")
@@ -97,6 +102,14 @@ def fit(
         print_json({"output": output, "model": made.model, "seed": how.seed, "agreed": made.agreed, "verdicts": counts})
     if strict and (counts["poor"] or counts[FAILED]):
         raise PoorFit(f"not every fit is to be trusted: {told}", f"see {output}/fits.csv")
+
+
+def _some(files: Sequence[str]) -> str:
+    """Names of files; how many there are of each suffix, where they are more than a few."""
+    if len(files) <= _NAMED:
+        return ", ".join(plain_text(file) for file in files)
+    counts = Counter(Path(file).suffix.lower() or "without a suffix" for file in files)
+    return ", ".join(f"{number} {plain_text(suffix)}" for suffix, number in counts.most_common())
 
 
 def _table(console: Console) -> Callable[["Record"], None]:

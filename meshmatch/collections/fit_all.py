@@ -16,6 +16,7 @@ from meshmatch.collections.setting import (
     ALONE,
     FAILED,
     FIRST,
+    LEFT_OUT,
     SECOND,
     SECOND_TEMPLATE,
     TEMPLATE,
@@ -235,7 +236,8 @@ def files_of(store: Store) -> dict[str, str]:
     """The file of each shape, by its name, as ``fits.csv`` has them; `InputError` if it is missing or damaged."""
     try:
         with store.reading(TABLE) as path, path.open(encoding="utf-8", newline="") as file:
-            return {str(row.get("name")): str(row.get("file")) for row in csv.DictReader(file)}
+            rows = [row for row in csv.DictReader(file) if row.get("verdict") != LEFT_OUT]
+            return {str(row.get("name")): str(row.get("file")) for row in rows}
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(f"{store.location}/{TABLE} cannot be read", "run `meshmatch fit` again") from error
 

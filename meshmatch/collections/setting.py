@@ -35,6 +35,8 @@ TEMPLATE, FIRST_TEMPLATE, SECOND_TEMPLATE = "template.safetensors", "first.safet
 SUFFIX = ".safetensors"
 FAILED = "failed"
 """In place of a verdict, for a shape that could not be fitted."""
+LEFT_OUT = "left out"
+"""The same for a file beside shapes whose format is that of no shape, such as a table or an image."""
 
 
 def digest_of(*parts: str | bytes) -> str:
@@ -111,7 +113,7 @@ class Record:
 
     @property
     def fitted(self) -> bool:
-        return self.verdict != FAILED
+        return self.verdict not in (FAILED, LEFT_OUT)
 
 
 @dataclass(frozen=True)

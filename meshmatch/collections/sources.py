@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePath, PurePosixPath
 
 from meshmatch import blender
-from meshmatch.collections.setting import Record, Source
+from meshmatch.collections.setting import LEFT_OUT, Record, Source
 from meshmatch.collections.stores import Store, is_url
 from meshmatch.errors import InputError, warn
 from meshmatch.outputs import as_path, plain_text
@@ -35,8 +35,9 @@ def find_sources(
     """The shapes of files, folders, patterns and URLs of folders, sorted by name; and what was left out, with the reason.
 
     A shape of a folder is called by its path in it, without the suffix; any other by its file's name. Left out, which is
-    told, are files of unknown formats, and those that Blender reads of a folder that holds other shapes. No shapes are what
-    lies in the folder of the fits, and arrays (.npy), images, tables and the like beside shapes.
+    told, are files of unknown formats, and those that Blender reads of a folder that holds other shapes. Arrays (.npy),
+    images, tables and the like beside shapes have records too, but those of the same name as a shape. What lies in the
+    folder of the fits does not count.
 
     `InputError` if there is nothing, or two shapes have one name.
     """
@@ -102,8 +103,9 @@ def _find(given: str | Path, output: Store | None, found: list[Source], left_out
         plain = [file for file in shapes if suffix_of(file) not in blender.SUFFIXES] or shapes
         taken = [file for file in plain if suffix_of(file) != ".npy"] or plain
         known = {file.with_name(stem_of(file)) for file in (*taken, *plain)}
-        projects = (file for file in shapes if file.with_name(stem_of(file)) not in known)
+        projects = [file for file in shapes if file.with_name(stem_of(file)) not in known]
         _leave_out(folder.location, "files for Blender beside other shapes", projects, left_out, f"{folder.location}/")
+        left_out += _beside(inside, taken, projects, f"{folder.location}/")
         found += [Source(str(file.with_name(stem_of(file))), folder, str(file)) for file in taken]
         return
     files = [path]
@@ -111,13 +113,30 @@ def _find(given: str | Path, output: Store | None, found: list[Source], left_out
         files = [Path(match) for match in glob.glob(str(path), recursive=True)]
         unknown = (file for file in files if _is_unknown(file) and file.is_file())
         _leave_out(str(given), "files of unknown format", unknown, left_out)
-        files = [file for file in files if suffix_of(file) in SUFFIXES]
+        matches, files = files, [file for file in files if suffix_of(file) in SUFFIXES]
+        left_out += _beside([file for file in matches if file.is_file()], files, [], "")
     found += [Source(stem_of(file), Store.of(file.parent), file.name) for file in files]
 
 
 def _is_unknown(file: PurePath) -> bool:
     """Slices of a scanner often have no suffix."""
     return suffix_of(file) not in (*SUFFIXES, *_COMPANIONS) if file.suffix else file.name.lower() not in _ABOUT
+
+
+def _beside(
+    files: Sequence[PurePath], taken: Sequence[PurePath], told: Sequence[PurePath], folder: str
+) -> list[Record]:
+    """A record of each file that is neither taken nor told already, nor belongs to a shape, whose name it has."""
+    known, owners = {*taken, *told}, {file.with_name(stem_of(file)) for file in taken}
+    found = []
+    for file in files:
+        words = file.name.split(".")
+        belongs = any(file.with_name(".".join(words[:count])) in owners for count in range(1, len(words)))
+        if file not in known and not belongs and not _is_unknown(file):
+            is_array = suffix_of(file) == ".npy"
+            why = "an array beside shapes" if is_array else "a format of no shapes"
+            found.append(Record(str(file), f"{folder}{file}", LEFT_OUT, reasons=why))
+    return found
 
 
 def _leave_out(given: str, why: str, files: Iterable[PurePath], left_out: list[Record], folder: str = "") -> None:

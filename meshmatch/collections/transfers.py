@@ -14,7 +14,7 @@ import numpy as np
 from meshmatch.api.results import MapPair
 from meshmatch.collections.collection import Collection
 from meshmatch.collections.endings import ending_of
-from meshmatch.collections.setting import FAILED
+from meshmatch.collections.setting import FAILED, LEFT_OUT
 from meshmatch.collections.sources import find_sources
 from meshmatch.collections.stores import Store
 from meshmatch.collections.transfer_table import TransferRecord, transfer_each, words_of
@@ -59,7 +59,7 @@ class Targets:
         fits, held = Path(given[0], _FITS), False
         if len(given) == 1 and fits.is_file():
             with fits.open(encoding="utf-8", newline="") as file:
-                rows = [row for row in csv.DictReader(file) if row.get("verdict") != FAILED]
+                rows = [row for row in csv.DictReader(file) if row.get("verdict") not in (FAILED, LEFT_OUT)]
             found = {_inner(str(row.get("name")), fits): Path(str(row.get("file"))) for row in rows}
             held = Collection(fits.parent).holds(source)
         else:

@@ -15,7 +15,10 @@ from scipy.spatial.transform import Rotation
 
 import meshmatch
 from meshmatch.cli import main
+from meshmatch.collections.fit_all import files_of
 from meshmatch.collections.setting import Record
+from meshmatch.collections.sources import find_sources
+from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError, MeshmatchWarning, OptionError, OutputError
 from meshmatch.experiments.hostile.learned import write_eggs
 from meshmatch.fitting.fit import Fit
@@ -489,6 +492,36 @@ def test_a_shape_of_another_kind_is_called_so(tmp_path: Path) -> None:
         == told
         == (*(other.name, other.file, other.verdict, other.reasons),)
     )
+
+
+def test_every_file_of_a_folder_has_a_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """But what belongs to a shape; and nothing takes the others for shapes, nor for failures."""
+    scans, fits = tmp_path / "scans", tmp_path / "fits"
+    (scans / "more").mkdir(parents=True)
+    for name in ("dancer", "climber"):
+        shutil.copy(SAMPLES / f"{name}.ply", scans)
+    for name in ("README", "stack.tif", "more/notes.docx", "dancer.mtl", "dancer.landmarks.csv", "climber.npy"):
+        (scans / name).write_text("no shape")
+    np.save(scans / "points.npy", np.eye(3))
+    command = ["fit", str(scans), "-o", str(fits), "--model", "human", "--refine", "none", "--alone", "--jobs", "1"]
+    assert main(command) == 0
+    err = capsys.readouterr().err
+    assert f"not taken, for they are no shapes: README, more/notes.docx, points.npy, stack.tif; see {fits}" in err
+    assert "wrote 2 fits" in err and "failed" not in err
+    with (fits / "fits.csv").open(newline="") as table:
+        rows = {row["name"]: (row["verdict"], row["reasons"]) for row in csv.DictReader(table)}
+    others = {name: rows.pop(name) for name in ("README", "more/notes.docx", "points.npy", "stack.tif")}
+    assert set(rows) == {"dancer", "climber"} == set(files_of(Store.of(fits)))
+    assert others.pop("points.npy") == ("left out", "an array beside shapes")
+    assert set(others.values()) == {("left out", "a format of no shapes")}
+    assert set(meshmatch.Transfers(meshmatch.transfer_landmarks, scans / "dancer.ply", fits).files) == {"climber"}
+    for number in range(3):
+        (scans / f"{number}.png").write_bytes(b"no shape")
+    assert main(command) == 0
+    err = capsys.readouterr().err
+    assert "they are no shapes: 3 .png, 1 without a suffix, 1 .docx, 1 .npy, 1 .tif; see" in err
+    _, left_out = find_sources([f"{scans}/*.[pt]*"])
+    assert sorted(Path(each.file).name for each in left_out) == ["0.png", "1.png", "2.png", "stack.tif"]
 
 
 def test_each_shape_of_a_mixed_folder_gets_the_model_of_its_kind(tmp_path: Path) -> None:
