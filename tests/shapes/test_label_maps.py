@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import InputError, MeshmatchWarning
 from meshmatch.shapes.files import load_shape, mesh_list
@@ -21,7 +22,7 @@ from meshmatch.shapes.shape import Shape
 SIZES = 22, 18, 14
 CENTER, RADIUS = np.array([9.0, 8.0, 7.0]), 5.0
 SPACING = np.array([0.5, 0.75, 1.25])
-AXES = np.array([[0.6, 0.8, 0.0], [0.8, -0.6, 0.0], [0.0, 0.0, 1.0]])  # left-handed
+AXES = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [-0.48, -0.64, -0.6]])  # left-handed, and no other way round
 ORIGIN = np.array([10.0, -20.0, 30.0])
 STEPS = AXES * SPACING[:, None]
 INDEX = np.stack(np.meshgrid(*map(np.arange, SIZES), indexing="ij"), axis=-1)
@@ -55,16 +56,25 @@ def nrrd(kind: str = "uint8", encoding: str = "raw", more: str = "", space: str 
     return text.encode()
 
 
-def nifti(order: str = "<", code: int = 2, dims: tuple[int, ...] = (3, *SIZES), offset: float = 352.0) -> bytes:
-    """In RAS: x and y with the other sign."""
+def nifti(
+    order: str = "<", code: int = 2, dims: tuple[int, ...] = (3, *SIZES), offset: float = 352.0, turn: bool = False
+) -> bytes:
+    """In RAS: x and y with the other sign. Axes as a matrix, or as spacings and a turn, the last of them backwards."""
     head = bytearray(352)
     head[:4] = struct.pack(f"{order}i", 348)
     head[40:56] = struct.pack(f"{order}8h", *dims, *[1] * (8 - len(dims)))
     head[70:72] = struct.pack(f"{order}h", code)
     head[108:112] = struct.pack(f"{order}f", offset)
     affine = np.column_stack([STEPS.T, ORIGIN]) * np.array([[-1.0], [-1.0], [1.0]])
-    head[252:256] = struct.pack(f"{order}2h", 0, 1)
-    head[280:328] = struct.pack(f"{order}12f", *affine.ravel())
+    if turn:
+        right = affine[:, :3] / SPACING * [1.0, 1.0, -1.0]
+        x, y, z, w = Rotation.from_matrix(right).as_quat()
+        head[76:108] = struct.pack(f"{order}8f", -1.0, *SPACING, *[0.0] * 4)
+        head[252:256] = struct.pack(f"{order}2h", 1, 0)
+        head[256:280] = struct.pack(f"{order}6f", *(np.array([x, y, z]) * np.sign(w)), *affine[:, 3])
+    else:
+        head[252:256] = struct.pack(f"{order}2h", 0, 1)
+        head[280:328] = struct.pack(f"{order}12f", *affine.ravel())
     head[344:348] = b"n+1\0"
     return bytes(head)
 
@@ -83,6 +93,7 @@ FILES: dict[str, Callable[[], tuple[str, bytes]]] = {
     "nrrd, RAS": lambda: ("a.nrrd", nrrd(space="right-anterior-superior") + voxels()),
     "nii": lambda: ("a.nii", nifti() + voxels()),
     "nii, the other way": lambda: ("a.NII", nifti(">", 16) + voxels(">f4")),
+    "nii by a turn": lambda: ("a.nii", nifti(turn=True) + voxels()),
     "nii.gz": lambda: ("a.nii.gz", gzip.compress(nifti(code=1024, dims=(4, *SIZES, 1)) + voxels("<i8"))),
     "nii.gz of members": lambda: ("a.nii.gz", gzip.compress(nifti()) + gzip.compress(voxels())),
 }
