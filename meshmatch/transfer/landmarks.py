@@ -37,6 +37,9 @@ from meshmatch.shapes.shape import Shape
 
 # A landmark this far from the surface, in diagonals of the shape, belongs to another shape.
 _ELSEWHERE = 0.25
+_OTHER_FRAME = np.array([-1.0, -1.0, 1.0])  # of 3D Slicer: LPS or RAS
+# Landmarks are in the other frame if they lie this far from the surface, in diagonals of it, and then so many times nearer.
+_ASTRAY, _MUCH_NEARER = 0.01, 4.0
 LANDMARK_SUFFIXES = (".csv", ".json", ".pp", ".fcsv", ".mrk.json", ".tps")
 check_landmarks_suffix = partial(tables.check_suffix, suffixes=LANDMARK_SUFFIXES, what="landmarks")
 check_table_suffix = partial(
@@ -159,7 +162,8 @@ def load_landmarks(path: str | Path, shape: Shape, space: Space = "") -> tuple[L
     shape
         The shape that they are on.
     space
-        The frame that 3D Slicer gave the shape's file (`mesh_space`): landmarks in its other frame are turned.
+        The frame that 3D Slicer gave the shape's file (`mesh_space`): landmarks in its other frame are turned. Where it is
+        not known, landmarks that state theirs are turned if they lie on the surface only then.
 
     Returns
     -------
@@ -172,10 +176,31 @@ def load_landmarks(path: str | Path, shape: Shape, space: Space = "") -> tuple[L
     InputError
         The file holds no landmark, or one is not on `shape`.
     """
-    readers = dict.fromkeys(
-        LANDMARK_READERS, lambda path: _on_shape(read_landmark_file(path, shape.name, space), shape)
+
+    def read(path: Path) -> tuple[Landmarks, float]:
+        found = read_landmark_file(path, shape.name, space)
+        return _on_shape(found if space else _in_frame_of(shape, found, path.name), shape)
+
+    return tables.read_by_suffix(path, dict.fromkeys(LANDMARK_READERS, read), "landmarks", _HINT)
+
+
+def _in_frame_of(shape: Shape, found: LandmarkFile, name: str) -> LandmarkFile:
+    """Landmarks that state a frame of 3D Slicer, on a mesh that states none: in the other one if that brings them to its
+    surface."""
+    given = np.array([place.where for place in found.places if place.kind == "position"], np.float64)
+    if not found.space or not len(given) or not (np.abs(given) < 1e60).all():
+        return found
+    as_they_are, turned = (
+        MappedMesh.of(shape).query(points).distance.max() for points in (given, given * _OTHER_FRAME)
     )
-    return tables.read_by_suffix(path, readers, "landmarks", _HINT)
+    if as_they_are < _ASTRAY * shape.diagonal or as_they_are < _MUCH_NEARER * turned:
+        return found
+    places = tuple(
+        replace(place, where=(place.where * _OTHER_FRAME).tolist()) if place.kind == "position" else place
+        for place in found.places
+    )
+    why = f"{name} is in {found.space}: x and y change their signs, for then its landmarks lie on {shape.name}"
+    return replace(found, places=places, turned=why)
 
 
 def _on_shape(found: LandmarkFile, shape: Shape) -> tuple[Landmarks, float]:

@@ -2,6 +2,7 @@
 
 import json
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.landmark_files import mesh_space, read_landmark_file
 from meshmatch.shapes.repair import repair
+from meshmatch.shapes.shape import Shape
 from meshmatch.templates.prepared_folder import KnownPoints, in_one_order, read_known_points, read_landmarks
 from meshmatch.transfer.landmarks import at_vertices, load_landmarks, push_landmarks, save_landmarks
 from tests.conftest import icosphere
@@ -141,6 +143,20 @@ def test_frames_of_slicer(tmp_path: Path, stated: str, space: str) -> None:
     ):
         known = read_known_points(tmp_path / "a.mrk.json", repair(SHAPE), mesh_space(tmp_path / "a.ply"))
     assert np.allclose(known.points[:3], POINTS) and known.names == (*NAMES, "unset")
+
+
+@pytest.mark.parametrize("space", ["LPS", "RAS"])
+def test_a_mesh_that_states_no_frame_has_that_of_landmarks_on_it(tmp_path: Path, space: str) -> None:
+    """Else the nearest points of the other side would be taken, or none."""
+    for place in ([0.0, 0.0, 0.0], [3.0, 9.0, 0.0]):
+        there = Shape(SHAPE.verts * [1.0, 0.7, 1.0] + [0.2, 0.1, 0.0] + place, SHAPE.faces, "a.ply")
+        points = there.verts[VERTICES]
+        for signs in ([1.0, 1.0, 1.0], [-1.0, -1.0, 1.0]):
+            save_landmarks(tmp_path / "a.mrk.json", replace(at_vertices(there, VERTICES), points=points * signs), space)
+            found, distance = load_landmarks(tmp_path / "a.mrk.json", there)
+            assert np.allclose(found.points, points) and distance < 1e-9
+            why = f"a.mrk.json is in {space}: x and y change their signs, for then its landmarks lie on a.ply"
+            assert found.notes == ((why,) if signs[0] < 0 else ())
 
 
 @pytest.mark.parametrize("suffix", [".fcsv", ".mrk.json"])
