@@ -1,15 +1,18 @@
 """Why the paper's network stalls: what each change leaves of it, and what is measured, on bent eggs."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from meshmatch.experiments.paper import stalling
+from meshmatch.errors import ModelError
+from meshmatch.experiments.paper import narrow, stalling
 from meshmatch.experiments.paper.stalling import CHANGES, Change, encoder_of, measure, network_of, scans_of
 from meshmatch.models.network import PAPER
+from meshmatch.models.registry import load_model
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
 from meshmatch.templates.template import Template
@@ -51,3 +54,16 @@ def test_the_mean_body_spreads_by_nothing_and_training_lowers_the_error(eggs: Te
     assert 0 <= short["spread"] and np.isfinite(long["spread"])
     turned = measure(replace(easy, yaw=True), eggs, scans, 8, 20, 0)
     assert turned["mean_body"] != short["mean_body"] == long["mean_body"]
+
+
+def test_a_narrow_network_is_kept_as_a_model_with_its_curve(
+    eggs: Template, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(narrow, "CHANGE", Change(yaw=False, dropout=0.0))
+    found = narrow.trained(tmp_path / "model", eggs, 8, 120, 40, 0)
+    assert list(found["curve"]) == list(range(6, 121, 6)) and found["curve"][120] < found["curve"][6]
+    assert found["held_out"] == pytest.approx(found["curve"][120], rel=0.3)  # of averaged weights, where there are any
+    model = load_model(tmp_path / "model", encoder=encoder_of(narrow.CHANGE, 1024 // 8))
+    assert model.card.steps == 120 and model.card.network["width"] == PAPER.width // 8
+    with pytest.raises(ModelError, match="encoder of its author's own"):
+        load_model(tmp_path / "model")

@@ -34,7 +34,7 @@ from meshmatch.threads import set_threads
 from meshmatch.training.datasets import Batch
 from meshmatch.training.loop import Trainer
 from meshmatch.training.losses import LossPoints
-from meshmatch.training.recipes import paper
+from meshmatch.training.recipes import Recipe, paper
 from meshmatch.training.scans import yaw_rotations
 from meshmatch.training.train import build_dataset, build_deformer, build_loss_points
 
@@ -116,9 +116,9 @@ class Scans:
             return Batch(points, targets, model.encoder.features(points))
 
 
-def scans_of(template: Template, count: int) -> Scans:
-    """Upright and clean, in the unit sphere, as the paper's; turned by nothing."""
-    recipe = replace(paper().scan, points=_POINTS, yaw=False)
+def scans_of(template: Template, count: int, sphere: bool = True) -> Scans:
+    """Upright and clean, in the unit sphere, as the paper's, or of area 1; turned by nothing."""
+    recipe = replace(paper().scan, points=_POINTS, yaw=False, sphere=sphere)
     seen, unseen = (human_source(template, people, seed) for people, seed in ((1024, 0), (64, _UNSEEN)))
     points, targets = [], []
     for source, wanted in ((seen, count), (unseen, _HELD_OUT)):
@@ -134,15 +134,33 @@ def _distance(a: Tensor, b: Tensor) -> float:
     return float(CM_PER_UNIT * (a - b).norm(dim=-1).mean())
 
 
-def measure(change: Change, template: Template, scans: Scans, narrow: int, steps: int, seed: int) -> dict[str, Any]:
-    """A row: trained from the beginning, with the rate falling to nothing at the last step as `paper` says."""
-    recipe = paper()
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """A network that was trained: its trainer, the loss points, and the recipe that it was made by; ``at_work`` are errors
+    of the last batches in cm, ``curve`` held-out ones now and then on the way, by steps; CPU seconds of all steps.
+    """
+
+    trainer: Trainer
+    points: LossPoints
+    recipe: Recipe
+    at_work: list[float]
+    curve: dict[int, float]
+    seconds: float
+
+
+def learn(
+    change: Change, template: Template, scans: Scans, narrow: int, steps: int, seed: int, every: int = 0
+) -> Learned:
+    """Train from the beginning, with the rate falling to nothing at the last step as `paper` says. The error of bodies that
+    it has not seen is asked after ``every`` so many steps."""
+    recipe = replace(paper(), network=network_of(change, narrow))
     source = human_source(template, 1024, 0)
-    model = build_deformer(template, source, network_of(change, narrow), recipe.scan, recipe.kernel, seed)
+    model = build_deformer(template, source, recipe.network, recipe.scan, recipe.kernel, seed)
     points: LossPoints = build_loss_points(template, recipe.kernel, model)
     loss = replace(recipe.train.loss, reconstruction=1 / template_radius(template) ** 2)
     config = replace(recipe.train, loss=loss, steps=steps, rate=change.rate, seed=seed, workers=0)
     trainer, generator, last, spent = Trainer(model, points, config), torch.Generator().manual_seed(seed), [], 0.0
+    curve: dict[int, float] = {}
     model.train()
     for step in range(steps):
         at = torch.randint(scans.learned, (config.shapes,), generator=generator)
@@ -153,15 +171,29 @@ def measure(change: Change, template: Template, scans: Scans, narrow: int, steps
         worked = time.process_time()
         trainer.iterate(batch)
         spent += time.process_time() - worked
+        if every and (step + 1) % every == 0:
+            curve[step + 1] = _distance(*unseen(model, points, scans, change))
+            model.train()
+            runner.tell(f"step {step + 1}: {curve[step + 1]:.2f} cm held out")
+    return Learned(trainer, points, replace(recipe, train=config), last, curve, spent)
+
+
+def unseen(model: Deformer, points: LossPoints, scans: Scans, change: Change) -> tuple[Tensor, Tensor]:
+    """Where a network puts the loss points on bodies that it has not seen, and where they belong."""
     model.eval()
     at = torch.arange(scans.learned, len(scans.points))
     held_out = scans.batch(model, at, yaw_rotations(len(at), torch.Generator().manual_seed(1)) if change.yaw else None)
     with torch.no_grad():
-        found = points.moved(model(held_out.points))
-    truth = held_out.targets
+        return points.moved(model(held_out.points)), held_out.targets
+
+
+def measure(change: Change, template: Template, scans: Scans, narrow: int, steps: int, seed: int) -> dict[str, Any]:
+    """A row: how far a network is, trained from the beginning."""
+    learned = learn(change, template, scans, narrow, steps, seed)
+    found, truth = unseen(learned.trainer.model, learned.points, scans, change)
     spread = float((found - found.mean(0)).norm(dim=-1).mean() / (truth - truth.mean(0)).norm(dim=-1).mean())
-    row = {"held_out": _distance(found, truth), "at_work": statistics.fmean(last), "spread": spread}
-    return row | {"mean_body": _distance(truth.mean(0), truth), "cpu_ms": 1e3 * spent / steps}
+    row = {"held_out": _distance(found, truth), "at_work": statistics.fmean(learned.at_work), "spread": spread}
+    return row | {"mean_body": _distance(truth.mean(0), truth), "cpu_ms": 1e3 * learned.seconds / steps}
 
 
 @runner.command
