@@ -105,7 +105,7 @@ def save_values(path: Path, values: Values, shape: Shape) -> None:
     else:
         words = ["".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in name) for name in names]
         own = _different([word or "value" for word in words], _RESERVED)
-        with np.errstate(over="ignore"):  # VTK, and so ParaView, does not read data of a ply that are double
+        with np.errstate(over="ignore"):  # which more programs read; VTK, and so ParaView, reads none of a ply
             written = table.astype(np.float32)
             off = np.abs(written - table)
         whole = (table == np.rint(table)) & (np.abs(table) < 2**53)

@@ -54,7 +54,7 @@ def test_a_ply_has_a_property_for_each_number(tmp_path: Path) -> None:
     save_values(tmp_path / "v.ply", Values(NUMBERS, ("heat", "x", "loss in %")), SHAPE)
     data = trimesh.load(tmp_path / "v.ply", process=False).metadata["_ply_raw"]["vertex"]["data"]
     for k, name in enumerate(("heat", "x_", "loss_in__")):
-        assert data[name].dtype == np.float32  # what VTK reads of a ply
+        assert data[name].dtype == np.float32
         assert np.array_equal(np.ravel(data[name]), NUMBERS[:, k].astype(np.float32))
     assert np.array_equal(load_shape(tmp_path / "v.ply").verts, SHAPE.verts)
 
