@@ -114,6 +114,11 @@ def registered_meshes(folder: str | Path, leave_out: Sequence[str] = ()) -> Iter
         shape = load_shape(files[number])
         if shape.V != first.V or not np.array_equal(shape.faces, first.faces):
             what = f"{files[number].name} does not have the vertices and faces of {files[0].name}"
+            if shape.V == first.V and np.array_equal(np.sort(shape.faces, axis=1), np.sort(first.faces, axis=1)):
+                hint = (
+                    "faces look the other way, as of a mirror image: meshmatch export --place template turns those over"
+                )
+                raise InputError(what, hint)
             raise InputError(what, "register the shapes first: meshmatch fit")
         return shape.verts
 

@@ -79,6 +79,18 @@ def test_other_meshes_are_refused(folder: Path) -> None:
         pass
 
 
+def test_a_mirror_image_is_told_where_meshes_were_exported_as_their_files_have_them(folder: Path) -> None:
+    given = ellipsoids(4, splits=1)
+    save_shape(folder / "b2.ply", Shape(given.points[1] * [-1.0, 1.0, 1.0], given.faces[:, [0, 2, 1]]))
+    with pytest.raises(InputError, match=r"b2\.ply does not have") as caught, registered_meshes(folder):
+        pass
+    assert "--place template" in caught.value.hint
+    save_shape(folder / "b2.ply", Shape(given.points[1], given.faces[:-1]))
+    with pytest.raises(InputError, match=r"b2\.ply does not have") as caught, registered_meshes(folder):
+        pass
+    assert "--place template" not in caught.value.hint
+
+
 def test_a_group_is_a_list_of_names(tmp_path: Path) -> None:
     shapes = Registered(np.empty((2, 1, 3)), np.empty((0, 3), np.int64), ("a.b", "é c"), None, {"worse": "poor"})
     file = tmp_path / "group.txt"
