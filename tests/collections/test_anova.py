@@ -223,6 +223,28 @@ def test_shape_goes_with_size(planted: tuple[Explained, np.ndarray]) -> None:
     assert np.abs(about.axis[POLE]).argmax() == 2
 
 
+def test_common_allometry_is_that_within_groups() -> None:
+    """Scores are those of a plain reference, where one group is larger and has a bump."""
+    given = ellipsoids(20, splits=1, spread=np.array([0.02, 0.02, 0.02]))
+    random = np.random.default_rng(5)
+    size = np.concatenate([random.uniform(0.8, 1.0, 10), random.uniform(1.1, 1.4, 10)])
+    points = given.points + 0.005 * random.standard_normal(given.points.shape)
+    points[:, :, 2] *= (size**0.3)[:, None]
+    bump = np.exp(-10 * np.square(given.points[0] / given.axes[0] - [1, 0, 0]).sum(axis=1))
+    points[10:, :, 0] += 0.3 * bump
+    atlas = Atlas.of(points * size[:, None, None], given.faces, scale="remove")
+    kind = np.repeat([0, 1], 10)
+    found = atlas.anova("shape ~ log(size) + kind", {"kind": ["ab"[k] for k in kind]}, permutations=9).allometry
+    assert found is not None
+    flat = (atlas.offsets(atlas.scores) * np.sqrt(atlas.weights)[:, None]).reshape(20, -1)
+    x = np.log(atlas.sizes)
+    within = np.eye(20) - np.where(kind[:, None] == kind, 0.1, 0.0)
+    common = (within @ x) @ flat
+    alone = (x - x.mean()) @ flat
+    assert found.cac == pytest.approx(flat @ common / np.linalg.norm(common))
+    assert found.regression_scores == pytest.approx(flat @ alone / np.linalg.norm(alone))
+
+
 def test_what_cannot_be_explained() -> None:
     given = ellipsoids(6)
     atlas = Atlas.of(given.points, given.faces)
