@@ -26,8 +26,8 @@ def transfer_color(
     target: Target,
     output: Path = output_option(
         "FILE",
-        "TGT with colors (.ply, .glb, .vrm, .obj or .off), or colors alone (.npy or .csv). With --values: .npy or .csv, or "
-        "TGT with them (.ply, .vtp or .vtk).",
+        "TGT with colors (.ply, .glb, .vrm, .obj, .off, .vtp or .vtk), or colors alone (.npy or .csv). With --values: .npy "
+        "or .csv, or TGT with them (.ply, .vtp or .vtk).",
     ),
     maps: MapOptions,
     rules: RuleOptions,
@@ -90,7 +90,7 @@ def transfer_labels(
     *,
     source: Source,
     target: Target,
-    output: Path = output_option("FILE", "Labels: .npy, .csv, .txt or .json, or TGT as .ply."),
+    output: Path = output_option("FILE", "Labels: .npy, .csv, .txt or .json, or TGT as .ply or .vtp."),
     labels: Path = Option(
         ..., metavar="FILE", help="A whole number or a word per vertex or face of SRC: .npy, .csv, .txt or .json."
     ),

@@ -1,6 +1,6 @@
 """Labels of vertices or faces, from files and to files: "Data on a shape" in docs/formats.md says how.
 
-A label is a whole number or a word. Files of shapes with a label, .ply, are written only.
+A label is a whole number or a word. Files of shapes with labels, .ply and .vtp, are written only.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from meshmatch.shapes.tables import is_missing, is_number, number, read_table, u
 
 On = Literal["vertices", "faces"]
 Label = int | str
-LABEL_SUFFIXES = (".npy", ".csv", ".txt", ".json", ".ply")
+LABEL_SUFFIXES = (".npy", ".csv", ".txt", ".json", ".ply", ".vtp")
 check_labels_suffix = partial(tables.check_suffix, suffixes=LABEL_SUFFIXES, what="labels")
 _AS_FLOAT = re.compile(r"[+-]?[0-9]+[.,][0-9]*(?:[eE][+-]?[0-9]+)?")
 _HINT = "one label for each vertex or triangle of the source, in the order of its file; polygons are fans of triangles"
@@ -229,7 +229,7 @@ def save_labels(path: Path, labels: Labels, shape: Shape) -> None:
     number for the format.
     """
     suffix = check_labels_suffix(path)
-    largest = {".npy": 2**63, ".ply": 2**31}.get(suffix)
+    largest = {".npy": 2**63, ".ply": 2**31, ".vtp": 2**63}.get(suffix)
     if largest and not labels.are_words and any(not -largest <= int(name) < largest for name in labels.names):
         bits = largest.bit_length()
         raise OptionError(f"{path.name}: this format holds labels of at most {bits} bits", "choose .csv or .json")
@@ -244,19 +244,25 @@ def save_labels(path: Path, labels: Labels, shape: Shape) -> None:
         record = {"format": "meshmatch labels 1", "on": labels.on, "shape": shape.name, "labels": cells}
         tables.write_json(path, record)
     else:
-        _write_ply(path, labels, shape)
+        _write_shape(path, labels, shape, suffix)
 
 
-def _write_ply(path: Path, labels: Labels, shape: Shape) -> None:
-    """Whole numbers as they are; words by their number, which comments in the header explain."""
-    from meshmatch.shapes.formats import ply
+def _write_shape(path: Path, labels: Labels, shape: Shape, suffix: str) -> None:
+    """Whole numbers as they are; words by their number, which comments at the beginning explain."""
+    from meshmatch.shapes.formats import ply, vtk
 
     numbers = [k if labels.are_words else int(name) for k, name in enumerate(labels.names)]
     comments = [f"label {k} {name}" for k, name in enumerate(labels.names)] if labels.are_words else []
     known = [k if name not in ("", -1) else -1 for k, name in enumerate(labels.names)]
     colors = np.rint(255 * label_colors(known)).astype(np.uint8)[labels.codes]
+    plain = Shape(shape.verts, shape.faces, shape.name, None, shape.invalid)
+    if suffix == ".vtp":
+        wide = max(map(abs, numbers)) >= 2**31
+        arrays = {"label": np.array(numbers, np.int64 if wide else np.int32)[labels.codes], "Colors": colors}
+        on = {"arrays": arrays} if labels.on == "vertices" else {"of_faces": arrays}
+        vtk.write_vtp(path, plain, comments=comments, **on)
+        return
     columns: dict[str, Any] = {"label": np.array(numbers, np.int32)[labels.codes]}
     columns |= {channel: colors[:, k] for k, channel in enumerate(("red", "green", "blue"))}
-    plain = Shape(shape.verts, shape.faces, shape.name, None, shape.invalid)
     where: Any = {"vertex" if labels.on == "vertices" else "face": columns}
     ply.write(path, plain, comments=comments, **where)

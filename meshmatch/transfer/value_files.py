@@ -25,7 +25,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import read_table
 
 VALUE_SUFFIXES = (".npy", ".csv", ".ply", ".vtp", ".vtk")
-_COLOR_SUFFIXES = (".ply", ".glb", ".vrm", ".obj", ".off", ".npy", ".csv")
+_COLOR_SUFFIXES = (".ply", ".glb", ".vrm", ".obj", ".off", ".vtp", ".vtk", ".npy", ".csv")
 check_values_suffix = partial(tables.check_suffix, suffixes=VALUE_SUFFIXES, what="values")
 check_color_suffix = partial(tables.check_suffix, suffixes=_COLOR_SUFFIXES, what="vertex colors")
 _VISIBLE = 1e-7  # share of a number, unless it is whole, that a 32-bit one may differ by

@@ -1,9 +1,11 @@
 """Labels: written and read in every format, what they belong to, and what files get wrong."""
 
+import base64
 import json
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -29,7 +31,7 @@ def some(on: On, words: bool) -> Labels:
     return Labels(codes, ("left hand", "right, hand", "Fuß") if words else (-4, 0, 17), on)
 
 
-@pytest.mark.parametrize("suffix", LABEL_SUFFIXES[:-1])
+@pytest.mark.parametrize("suffix", LABEL_SUFFIXES[:-2])
 @pytest.mark.parametrize("on", ["vertices", "faces"])
 @pytest.mark.parametrize("words", [False, True])
 def test_write_then_read(tmp_path: Path, suffix: str, on: On, words: bool) -> None:
@@ -58,6 +60,33 @@ def test_a_ply_has_labels_and_colors(tmp_path: Path, on: On, words: bool) -> Non
         assert np.abs(shape.colors[:, :3] - expected).max() < 0.5 / 255 + 1e-9
 
 
+@pytest.mark.parametrize("on", ["vertices", "faces"])
+@pytest.mark.parametrize("words", [False, True])
+def test_a_vtp_has_labels_and_colors(tmp_path: Path, on: On, words: bool) -> None:
+    given = some(on, words)
+    save_labels(tmp_path / "l.vtp", given, SHAPE)
+    shape = load_shape(tmp_path / "l.vtp")
+    assert np.array_equal(shape.verts, SHAPE.verts) and np.array_equal(shape.faces, SHAPE.faces)
+    text = (tmp_path / "l.vtp").read_text(encoding="utf-8")
+    data = ElementTree.fromstring(text).find(f".//{'PointData' if on == 'vertices' else 'CellData'}")
+    assert data is not None
+    labels, colors = data
+    assert [each.get("Name") for each in data] == ["label", "Colors"]
+    assert (labels.get("type"), colors.get("NumberOfComponents")) == ("Int32", "3")
+    found = np.frombuffer(base64.b64decode(labels.text or "")[8:], "<i4")
+    assert np.array_equal(found, given.codes if words else cells(given))
+    assert ("<!-- label 2 Fuß -->" in text) is words
+    if on == "vertices":
+        assert shape.colors is not None
+        expected = label_colors([0, 1, 2])[given.codes]
+        assert np.abs(shape.colors[:, :3] - expected).max() < 0.5 / 255 + 1e-9
+    odd = Labels(np.arange(SHAPE.V) % 2, ("--> <a/>", "b--"), "vertices")
+    save_labels(tmp_path / "odd.vtp", odd, SHAPE)
+    assert load_shape(tmp_path / "odd.vtp").V == SHAPE.V
+    save_labels(tmp_path / "wide.vtp", Labels(np.zeros(SHAPE.V, int), (2**40,), "vertices"), SHAPE)
+    assert 'type="Int64" Name="label"' in (tmp_path / "wide.vtp").read_text(encoding="utf-8")
+
+
 def test_labels_in_a_ply_are_the_numbers_themselves(tmp_path: Path) -> None:
     import trimesh
 
@@ -83,7 +112,7 @@ def test_words_and_names_that_are_no_text(tmp_path: Path, suffix: str) -> None:
     (tmp_path / "in.json").write_text(json.dumps(["arm", "\ud800"] * (SHAPE.V // 2)))
     given = load_labels(tmp_path / "in.json", SHAPE)
     save_labels(tmp_path / f"l{suffix}", given, SHAPE)
-    if suffix != ".ply":
+    if suffix not in (".ply", ".vtp"):
         assert cells(load_labels(tmp_path / f"l{suffix}", SHAPE))[:2] == ["arm", "\ufffd"]
 
 
@@ -223,7 +252,9 @@ def test_a_suffix_that_cannot_hold_labels_is_refused(tmp_path: Path) -> None:
     assert load_labels(tmp_path / "l.npy", SHAPE).names == (2**40,)
 
 
-@pytest.mark.parametrize(("suffix", "fine"), [(".npy", False), (".ply", False), (".csv", True), (".json", True)])
+@pytest.mark.parametrize(
+    ("suffix", "fine"), [(".npy", False), (".ply", False), (".vtp", False), (".csv", True), (".json", True)]
+)
 def test_labels_of_more_than_64_bits(tmp_path: Path, suffix: str, fine: bool) -> None:
     huge = 99999999999999999999999
     (tmp_path / "a.txt").write_text(f"{huge}\n" * SHAPE.V)

@@ -145,7 +145,7 @@ def painted() -> Shape:
     return Shape(SHAPE.verts, SHAPE.faces, "painted", shade)
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".npy", ".csv"])
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".vtp", ".vtk", ".npy", ".csv"])
 def test_colors_are_written_as_they_were(tmp_path: Path, suffix: str) -> None:
     shape = painted()
     path = tmp_path / f"c{suffix}"

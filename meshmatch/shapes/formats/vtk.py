@@ -192,19 +192,24 @@ def write_vtk(path: Path, shape: Shape, arrays: Arrays | None = None) -> None:
     path.write_bytes(b"".join(parts))
 
 
-def write_vtp(path: Path, shape: Shape, arrays: Arrays | None = None) -> None:
-    """PolyData in XML, its numbers in base64."""
+def write_vtp(
+    path: Path, shape: Shape, arrays: Arrays | None = None, of_faces: Arrays | None = None, comments: Iterable[str] = ()
+) -> None:
+    """PolyData in XML, its numbers in base64: data of vertices, and of faces."""
     cells = np.arange(shape.V)[:, None] if shape.is_cloud else shape.faces
     ends = np.arange(1, len(cells) + 1) * cells.shape[1]
     group, counts = ("Verts", (len(cells), 0)) if shape.is_cloud else ("Polys", (0, len(cells)))
     data = [] if shape.colors is None else [_element("Colors", _bytes(shape.colors))]
     data += [_element(name, values) for name, values in _plain(arrays or {})]
+    own = [_element(name, values) for name, values in _plain(of_faces or {})]
     lines = [
         '<?xml version="1.0"?>',
+        *(f"<!-- {html.escape(comment).replace('--', '- -').rstrip('-')} -->" for comment in comments),
         '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
         f'<PolyData><Piece NumberOfPoints="{shape.V}" NumberOfVerts="{counts[0]}" NumberOfLines="0" NumberOfStrips="0" '
         f'NumberOfPolys="{counts[1]}">',
         *("<PointData>", *data, "</PointData>"),
+        *(("<CellData>", *own, "</CellData>") if own else ()),
         *("<Points>", _element("Points", shape.verts_or_nan), "</Points>"),
         *(f"<{group}>", _element("connectivity", cells.ravel()), _element("offsets", ends), f"</{group}>"),
         "</Piece></PolyData></VTKFile>",
