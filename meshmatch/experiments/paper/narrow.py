@@ -1,4 +1,4 @@
-"""The paper's own network, so many times narrower, trained until it is flat, and how well it matches.
+"""The paper's own network, so many times narrower, trained for longer, and how well it matches.
 
 It learns from bodies that are drawn and scanned once, without turns about the vertical, from which it hardly learns
 (`stalling`), and of area 1, as the orientation and size of a shape are given when errors are measured: both are that of the
