@@ -18,6 +18,7 @@ from meshmatch.shapes.formats.gltf_attributes import joint_nodes
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_prune import drop_nodes
 from meshmatch.shapes.formats.gltf_rig import nodes_of_skeleton
+from meshmatch.shapes.formats.gltf_rigged import drop_channels
 from meshmatch.shapes.formats.gltf_vrm import CONSTRAINT, NEW, OLD, SPRINGS, entries, part
 
 _SINCE = {  # what bones of VRM 0.x are called in 1.0
@@ -140,16 +141,7 @@ def _untwisted(editor: Editor, document: Document, nodes: range) -> dict[int, Fl
             stand = document.bones(skin)
             back = np.linalg.inv(np.stack([worlds[joint] for joint in own["joints"]])) @ stand
             own["inverseBindMatrices"] = editor.add_array(back.swapaxes(1, 2).reshape(-1, 16).astype("<f4"))
-    moved = []
-    for number, clip in enumerate(editor.json.get("animations", [])):
-        kept = [each for each in clip["channels"] if each["target"].get("node") not in nodes]
-        if len(kept) < len(clip["channels"]):
-            moved.append(str(clip.get("name") or f"clip {number}"))
-        clip["channels"] = kept
-    if "animations" in editor.json:
-        editor.json["animations"] = [clip for clip in editor.json["animations"] if clip["channels"]]
-        if not editor.json["animations"]:
-            del editor.json["animations"]
+    moved = drop_channels(editor, lambda target: target.get("node") in nodes)
     if moved:
         many = f"{len(moved)} clips" if moved[1:] else f"the clip {moved[0]}"
         warn(f"{document.name} does not have {many} of its skeleton: bones of VRM 0.x are not turned")

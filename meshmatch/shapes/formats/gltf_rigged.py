@@ -207,11 +207,11 @@ def _drop_skins(editor: Editor, before: set[int]) -> tuple[set[int], tuple[str, 
         if "skin" in node:
             node["skin"] = number[node["skin"]]
     editor.json["skins"] = [skins[k] for k in kept]
-    clips = _drop_channels(editor, lambda target: target.get("node") in joints)
+    clips = drop_channels(editor, lambda target: target.get("node") in joints)
     return joints, clips
 
 
-def _drop_channels(editor: Editor, gone: Callable[[dict[str, Any]], bool]) -> tuple[str, ...]:
+def drop_channels(editor: Editor, gone: Callable[[dict[str, Any]], bool]) -> tuple[str, ...]:
     """Let clips move some targets no more, and go where they move nothing; returns the names of those that did."""
     names = []
     for number, animation in enumerate(editor.json.get("animations", [])):
@@ -275,7 +275,7 @@ def _lift(editor: Editor, document: Document) -> None:
             above.add(parents[number])
     if any(target.get("node") in above and target["path"] != "weights" for target in clips):
         warn(f"clips of {document.name} that moved a mesh as a whole do so no more, for its skeleton moves it")
-    _drop_channels(editor, lambda target: target.get("node") in whole and target["path"] != "weights")
+    drop_channels(editor, lambda target: target.get("node") in whole and target["path"] != "weights")
 
 
 def _add_clip(editor: Editor, clip: Clip, names: list[int], arrays: dict[bytes, int]) -> None:
