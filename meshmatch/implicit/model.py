@@ -33,6 +33,7 @@ _AT_ONCE = 8192  # points
 _DOUBTED = 0.2  # distance on the template, in the cube, from which a match has no confidence; set by hand
 _NORMAL = 0.2  # chosen among 0.05 to 0.2 on generated furniture
 _NEWTON, _ONTO, _STEP = 12, 3, 0.1  # steps back to a shape, steps onto its surface, and their longest
+_DAMPING = 1e-6  # of a step back, in the square of a stretch
 _COARSE = 48  # resolution of the surface that a fit is judged by
 _MOST = {"code": 1024, "width": 2048, "depth": 16, "inner": 512, "layers": 16, "maker": 4096}  # that a card may ask for
 _LONGEST = 100.0  # code at first
@@ -276,7 +277,9 @@ class ImplicitModel:
         for _ in range(_NEWTON):
             off = network.distance(at[None], code[None])[1][0] - places
             F = network(at[None], code[None]).F[0]
-            at = (at - _at_most(torch.linalg.lstsq(F, off[..., None]).solution[..., 0])).clamp(-1, 1)
+            # damped, for where the deformation folds; lstsq rounds the same numbers differently from call to call
+            step = torch.linalg.solve(F.mT @ F + _DAMPING * torch.eye(3), F.mT @ off[..., None])
+            at = (at - _at_most(step[..., 0])).clamp(-1, 1)
         for _ in range(_ONTO):
             found = network(at[None], code[None])
             slope = found.gradient[0]
