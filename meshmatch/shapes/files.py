@@ -311,7 +311,7 @@ def as_shape(source: ShapeLike, name: str = "") -> Shape:
     found = None if isinstance(source, np.ndarray | tuple | list) else arrays_of(source, name)
     if found is not None:
         return _from_arrays(found.verts, found.faces, name, found.colors)
-    if isinstance(source, tuple | list) and len(source) == 2 and _array(source[0]).ndim == 2:
+    if isinstance(source, tuple | list) and len(source) == 2 and _array(source[0]).ndim in (2, 3):
         return _from_arrays(source[0], as_faces(source[1], source[0], name or "the shape"), name)
     if hasattr(source, "__array__") or isinstance(source, tuple | list):
         return _from_arrays(source, None, name)

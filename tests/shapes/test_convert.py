@@ -189,6 +189,7 @@ def test_clouds_of_other_libraries_are_clouds(cloud: Any) -> None:
         (thing(points=VERTS, simplices=np.array(FANS)), r"\.simplices"),
         (thing(vertices=VERTS, faces=[[[0, 1], [2, 3]], [[0, 1, 2]]]), "list of vertices"),
         (thing(vertices=VERTS[None]), r"batch of \(1, 8, 3\)"),
+        ((VERTS[None], np.array([[0, 1, 2]])), r"batch of \(1, 8, 3\)"),
         (thing(vertices=7), r"\(V, 3\)"),
         (Batch(2, VERTS), "batch of 2"),
         ((VERTS, CELLS[:1]), "quads or tetrahedra"),
