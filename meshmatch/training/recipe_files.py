@@ -13,6 +13,7 @@ from typing import Any, TypeVar, get_args
 
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.geometry.kernels import KERNELS
+from meshmatch.models.card import ModelCard
 from meshmatch.models.checkpoint import Storage
 from meshmatch.models.network import NetworkConfig
 from meshmatch.shapes.input_files import read_json
@@ -23,6 +24,7 @@ _LOSSES: dict[str, type[Objective]] = {
     f"{each.__module__}.{each.__qualname__}": each for each in (CorrespondenceLoss, ChamferLoss)
 }
 _OF_THE_MACHINE = ("minutes", "checkpoint_minutes", "threads", "device")
+_PARTS = {"network", "field", "recipe"}
 _OWN = ("deform", "storage", "template", "characters", "bodies")
 _MOST: dict[str, float] = {
     "shapes": 4096,
@@ -57,6 +59,10 @@ def read_recipe(path: str | Path, usual: Recipe) -> Recipe:
         record = read_json(path)
         if not isinstance(record, dict):
             raise InputError("it is not an object")
+        if unknown := sorted(record.keys() - {each.name for each in fields(ModelCard)}):
+            raise InputError(f"{unknown[0]} is unknown")
+        if not record.keys() & _PARTS:
+            raise InputError("it says nothing of a training")
         own = _object(record.get("recipe", {}), "recipe")
         train = _object(own.get("train", {}), "recipe.train")
         loss = _loss(record, own, usual)
