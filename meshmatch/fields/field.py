@@ -24,7 +24,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints, as_numbers, is_tensor
+from meshmatch.errors import InputError
+from meshmatch.fields.local_fits import namespace
 from meshmatch.fields.shape_functions import ShapeFunctions
 
 # (points (B, P, 3), code (B, D)) -> displacements (B, P, 3); what happens to a point depends on no other point.
@@ -135,25 +137,62 @@ def _tensor(matrix: Any) -> torch.Tensor:
         return torch.sparse_csr_tensor(start, column, values, matrix.shape, check_invariants=True)
 
 
-def determinant(F: Float[torch.Tensor, "*B 3 3"]) -> Float[torch.Tensor, "*B"]:
-    """Determinant written out: several times faster than a batched LU."""
-    a, b, c = F[..., 0], F[..., 1], F[..., 2]
-    result: torch.Tensor = (torch.linalg.cross(a, b) * c).sum(-1)
-    return result
+def volume_energy(F: Any) -> Any:
+    """How far a deformation is from keeping volumes, at each point: (det F - 1)^2.
+
+    Parameters
+    ----------
+    F
+        (..., 3, 3) deformation gradients, an array or a tensor.
+
+    Returns
+    -------
+    (...)
+        As F is; a tensor keeps its gradient.
+
+    Raises
+    ------
+    InputError
+        F are not 3 x 3 numbers.
+    """
+    a, b, c = _columns(F)
+    # written out: several times faster than a batched LU
+    return ((namespace(a).linalg.cross(a, b) * c).sum(-1) - 1) ** 2
 
 
-def volume_energy(F: Float[torch.Tensor, "*B 3 3"]) -> Float[torch.Tensor, "*B"]:
-    """(det F - 1)^2 of every point: volume preservation (the NeurIPS 2022 paper, section 4)."""
-    return (determinant(F) - 1).square()
+def arap_energy(F: Any) -> Any:
+    """How far a deformation is from a rigid one, at each point: the Frobenius norm of F^T F - I.
 
+    Parameters
+    ----------
+    F
+        (..., 3, 3) deformation gradients, an array or a tensor.
 
-def arap_energy(F: Float[torch.Tensor, "*B 3 3"]) -> Float[torch.Tensor, "*B"]:
-    """|F^T F - I| (Frobenius) of every point: as rigid as possible (ibidem)."""
+    Returns
+    -------
+    (...)
+        As F is; a tensor keeps its gradient.
+
+    Raises
+    ------
+    InputError
+        F are not 3 x 3 numbers.
+    """
     # Six dot products of columns: a batched 3 x 3 matmul is several times slower on a CPU.
-    a, b, c = F[..., 0], F[..., 1], F[..., 2]
-    diagonal = ((a * a).sum(-1) - 1).square() + ((b * b).sum(-1) - 1).square() + ((c * c).sum(-1) - 1).square()
-    mixed = (a * b).sum(-1).square() + (a * c).sum(-1).square() + (b * c).sum(-1).square()
-    return (diagonal + 2 * mixed + 1e-12).sqrt()
+    a, b, c = _columns(F)
+    diagonal = ((a * a).sum(-1) - 1) ** 2 + ((b * b).sum(-1) - 1) ** 2 + ((c * c).sum(-1) - 1) ** 2
+    mixed = (a * b).sum(-1) ** 2 + (a * c).sum(-1) ** 2 + (b * c).sum(-1) ** 2
+    return namespace(a).sqrt(diagonal + 2 * mixed + 1e-12)
+
+
+def _columns(F: Any) -> tuple[Any, Any, Any]:
+    """The columns of matrices (..., 3, 3); `InputError` for anything else."""
+    given: Any = F
+    if not (is_tensor(F) or (isinstance(F, np.ndarray) and F.dtype.kind == "f")):
+        given = as_numbers(F, "deformation gradients")
+    if tuple(given.shape[-2:]) != (3, 3):
+        raise InputError(f"deformation gradients must be (..., 3, 3), not {tuple(given.shape)}")
+    return given[..., 0], given[..., 1], given[..., 2]
 
 
 def code_rows(D: int) -> int:

@@ -8,7 +8,7 @@ import torch
 
 from meshmatch import fields
 from meshmatch.errors import InputError, MeshmatchError, MeshmatchWarning, OptionError, TemplateError
-from meshmatch.fields import NodeField, node_field
+from meshmatch.fields import NodeField, arap_energy, node_field, volume_energy
 from meshmatch.fields.shape_functions import build_field
 
 RNG = np.random.default_rng(0)
@@ -164,3 +164,15 @@ def test_vectors_must_be_one_for_each_node() -> None:
             of(VECTORS[:, :2])
     with pytest.raises(AttributeError, match="no attribute"):
         _ = fields.nothing  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("energy", [volume_energy, arap_energy])
+def test_energies_are_of_arrays_and_of_tensors(energy: Any) -> None:
+    F = node_field(POINTS, NODES, 0.8).deformation_gradient(VECTORS)
+    found, tensor = energy(F), torch.tensor(F, requires_grad=True)
+    assert isinstance(found, np.ndarray) and found.shape == (12,) and energy(np.eye(3, dtype=int)) < 1e-5
+    assert energy(F.astype(np.float32)).dtype == np.float32
+    assert torch.autograd.gradcheck(energy, tensor) and energy(tensor).detach().numpy() == pytest.approx(found)
+    for wrong in (F[:, :2], torch.zeros(3, 2), "a", 1.0, np.zeros((0, 3))):
+        with pytest.raises(InputError, match="deformation gradients"):
+            energy(wrong)

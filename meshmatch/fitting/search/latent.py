@@ -49,7 +49,8 @@ class PaperEnergy:
         if not self.config.volume and not self.config.arap:
             return chamfer
         F = field.deformation_gradient(vectors)[0]
-        return chamfer + self.config.volume * volume_energy(F).mean() + self.config.arap * arap_energy(F).mean()
+        stiff: torch.Tensor = self.config.volume * volume_energy(F).mean() + self.config.arap * arap_energy(F).mean()
+        return chamfer + stiff
 
     def value(self, vectors: Float[Floats, "K 3"]) -> float:
         """The same of an array."""
