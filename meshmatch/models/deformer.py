@@ -13,6 +13,7 @@ import torch
 from torch import nn
 
 from meshmatch.arrays import Float, Floats, Floats32
+from meshmatch.errors import InputError
 from meshmatch.fields import field as fields
 from meshmatch.fields.field import TURN_ROWS, PointField, PointwiseField
 from meshmatch.fields.shape_functions import has_nodes, shape_functions
@@ -131,8 +132,15 @@ class Deformer(nn.Module):
         result: torch.Tensor = vectors + change
         return result
 
-    def forward(self, points: Float[torch.Tensor, "B P 3"]) -> Float[torch.Tensor, "B R 3"]:
-        """The rows of scans in the core frame; with nodes, these are their vectors."""
+    def forward(self, points: torch.Tensor) -> Float[torch.Tensor, "B R 3"]:
+        """The rows of scans (B, P, 3) in the core frame; with nodes, these are their vectors.
+
+        `InputError` if this is not what the points are.
+        """
+        if points.ndim != 3 or points.shape[2] != 3 or 0 in points.shape:
+            raise InputError(
+                f"points must be (B, P, 3), not {tuple(points.shape)}", "one cloud is a batch: points[None]"
+            )
         vectors = self.decoder(self.encoder(self.encoder.features(points)))
         for _ in range(self.config.corrections):
             vectors = self.correct(vectors, points)

@@ -1,6 +1,7 @@
 """The networks: what must not matter does not, and what goes in one by one comes out as in a batch."""
 
 import shutil
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from meshmatch.errors import ModelError
+from meshmatch.errors import InputError, ModelError
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.models.checkpoint import save_weights
@@ -130,6 +131,19 @@ def test_a_batch_of_one_equals_one_of_a_batch(networks: dict[str, Deformer], con
         assert torch.allclose(model(points[n : n + 1])[0], together[n], atol=1e-5)
     assert (together[0] - together[1]).abs().max() > 1e-3
     assert together.shape == (3, model.K, 3)
+
+
+@CONFIGS
+def test_points_are_a_batch_of_clouds(networks: dict[str, Deformer], config) -> None:
+    for wrong in (clouds()[0], clouds()[..., :2], clouds()[:0], clouds()[:, :0]):
+        with pytest.raises(InputError, match="points must be"):
+            networks[config.encoder](wrong)
+
+
+@CONFIGS
+def test_it_is_differentiable_up_to_the_points(networks: dict[str, Deformer], config) -> None:
+    model = deepcopy(networks[config.encoder]).double().eval()
+    assert torch.autograd.gradcheck(model, clouds(2).double().requires_grad_(), fast_mode=True)
 
 
 def test_the_positional_encoding_lies_on_a_sphere() -> None:
