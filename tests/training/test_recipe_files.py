@@ -1,7 +1,7 @@
 """Recipes on cards, read back: the same, or refused in a line."""
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +10,20 @@ import pytest
 from meshmatch.errors import InputError, OptionError
 from meshmatch.models.inference import training_device
 from meshmatch.templates.location import bundled_folder
+from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import CorrespondenceLoss
 from meshmatch.training.recipe_files import read_recipe, recipe_record
-from meshmatch.training.recipes import Recipe, clouds, compact, default, paper, paper_clouds, people, small_data
+from meshmatch.training.recipes import (
+    Recipe,
+    clouds,
+    compact,
+    default,
+    paper,
+    paper_clouds,
+    people,
+    recipe_for,
+    small_data,
+)
 
 
 def written(folder: Path, record: object) -> Path:
@@ -37,6 +48,15 @@ def test_the_cards_that_ship_can_be_read(name: str) -> None:
     assert asdict(found.train)["loss"] == card["recipe"]["train"]["loss"]
     assert (found.train.steps, found.train.seed) == (card["recipe"]["train"]["steps"], card["recipe"]["train"]["seed"])
     assert found.network.to_dict() == card["network"]
+    # a card that left a setting out would be read as what is usual today
+    assert {each.name for each in fields(TrainConfig)} - card["recipe"]["train"].keys() == {"device"}
+
+
+@pytest.mark.parametrize(("name", "options"), [("head", {"steps": 1800}), ("hand", {"align_steps": 0})])
+def test_hands_and_heads_learn_again_as_their_cards_say(name: str, options: dict[str, int]) -> None:
+    """The commands of docs/models.md."""
+    usual, path = recipe_for(kind=name), bundled_folder() / "models" / name / "card.json"
+    assert read_recipe(path, usual) == usual.changed(workers=0, **options)
 
 
 def test_a_part_changes_a_part(tmp_path: Path) -> None:
