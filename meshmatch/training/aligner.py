@@ -13,6 +13,7 @@ from torch import Tensor
 
 from meshmatch.arrays import Float
 from meshmatch.models.deformer import Deformer
+from meshmatch.progress import Progress
 from meshmatch.training import scans
 from meshmatch.training.datasets import BatchDataset, step_generator
 
@@ -28,7 +29,7 @@ class _Unread:
         return points[:, :_POINTS]
 
 
-def train_aligner(model: Deformer, data: BatchDataset, steps: int) -> float:
+def train_aligner(model: Deformer, data: BatchDataset, steps: int, progress: Progress | None = None) -> float:
     """Train the aligner of a model in place, on the CPU; the mean distance of its last rotations. A function of the data's
     seed."""
     aligner = model.aligner
@@ -61,4 +62,6 @@ def train_aligner(model: Deformer, data: BatchDataset, steps: int) -> float:
         loss.backward()
         optimiser.step()
         recent += (float(off.detach()) - recent) / min(step + 1, 50)
+        if progress is not None:
+            progress((step + 1) / steps)
     return recent

@@ -186,13 +186,13 @@ class Trainer:
         )  # fmt: skip
         began = saved = time.monotonic()
         before = self.seconds
-        sums: dict[str, Tensor] = {}
+        sums: dict[str, Tensor | float] = {}
         summed = 0
         self.model.train()
         for batch in loader:
             terms = self.iterate(batch)
             for name, value in terms.items():
-                sums[name] = sums.get(name, torch.zeros(())) + value.detach().cpu()
+                sums[name] = sums.get(name, 0.0) + value.detach().float()  # there: no step waits for a GPU's numbers
             summed += 1
             now = time.monotonic()
             self.seconds = before + now - began

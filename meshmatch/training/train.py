@@ -150,24 +150,25 @@ def train(
             progress(now.words, "training", now.step / now.steps)
 
     making = Progress(progress, "shapes").stage("making shapes (once)")
+    aligning = Progress(progress, "training").stage("orientations alone (once)")
 
     def make() -> Lessons:
         return measured_on(validation, lessons(shapes, kind, recipe, making))
 
-    return _learn(output, facts, recipe, resume, in_turn(told, report), tensorboard, make)
+    return _learn(output, facts, recipe, resume, in_turn(told, report), tensorboard, make, aligning)
 
 
 @alone
 def _learn(
     output: str | Path, facts: CardFacts, recipe: Recipe, resume: bool, report: Report, tensorboard: bool,
-    make: Callable[[], Lessons],
+    make: Callable[[], Lessons], aligning: Progress,
 ) -> Path:  # fmt: skip
     """What `train` does once its folder is its own."""
     learned = make()
     facts = replace(facts, category=facts.category or learned.category or facts.name, data=facts.data or learned.data)
     facts = replace(facts, frame=facts.frame or learned.frame, mirror=facts.mirror or learned.mirror)
     return train_model(
-        learned.template, learned.source, output, recipe, facts, resume, report, learned.unseen, tensorboard
+        learned.template, learned.source, output, recipe, facts, resume, report, learned.unseen, tensorboard, aligning
     )
 
 
@@ -181,6 +182,7 @@ def train_model(
     report: Callable[[StepReport], None] | None = None,
     unseen: Source | None = None,
     tensorboard: bool = False,
+    aligning: Progress | None = None,
 ) -> Path:
     """`train` on shapes with the template's vertices, validated on ``unseen`` ones or on more of the same, or on samples
     without correspondence; returns the folder.
@@ -218,7 +220,7 @@ def train_model(
     resumed = resume and checkpoint.is_file()
     if config.align_steps and not resumed and isinstance(data, BatchDataset) and model.aligner is not None:
         torch.set_num_threads(config.threads)
-        train_aligner(model, data, config.align_steps)
+        train_aligner(model, data, config.align_steps, aligning)
     held_out = replace(data, seed=VALIDATION_SEED, **few)[0]
     trainer = Trainer(model, points, config)
     if resumed:

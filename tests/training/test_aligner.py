@@ -9,6 +9,7 @@ import torch
 
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.registry import load_model
+from meshmatch.progress import Progress
 from meshmatch.training import aligner as stage
 from meshmatch.training.aligner import train_aligner
 from meshmatch.training.datasets import BatchDataset
@@ -56,7 +57,11 @@ def test_it_is_a_function_of_the_seed() -> None:
 
 def test_a_training_begins_with_it_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
-    monkeypatch.setattr("meshmatch.training.train.train_aligner", lambda model, data, steps: asked.append(steps))
+
+    def train_aligner(model: Deformer, data: BatchDataset, steps: int, progress: Progress | None) -> None:
+        asked.append(steps)
+
+    monkeypatch.setattr("meshmatch.training.train.train_aligner", train_aligner)
     template = egg_template()
     config = TrainConfig(steps=2, shapes=4, scans_per_shape=1, workers=0, warm_up=1, align_steps=7)
     recipe = Recipe(NETWORK, config, SCAN, "smooth")

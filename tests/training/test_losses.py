@@ -9,11 +9,13 @@ import torch
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import FIELDS, FieldName, build_field
 from meshmatch.models.deformer import Deformer
+from meshmatch.models.network import NetworkConfig
 from meshmatch.templates.template import Template
 from meshmatch.training.datasets import Batch
 from meshmatch.training.losses import CorrespondenceLoss, LossPoints, distance
+from meshmatch.training.scans import ScanConfig
 from meshmatch.training.train import loss_vertices
-from tests.training.small import NETWORK, POINTS, UPRIGHT, egg_template, small_data, small_network, small_points
+from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, egg_template, small_data, small_network, small_points
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +115,19 @@ def test_every_part_of_the_network_learns(egg: Template, field: FieldName) -> No
     assert {name for name in still if ".widen." not in name and ".norm." not in name} == set()
     off = CorrespondenceLoss(align=0.0)(model, batch, points, torch.Generator().manual_seed(0))
     assert float(off["align"].detach()) == 0
+
+
+@pytest.mark.parametrize(("network", "scan"), [(NETWORK, SCAN), (POINTS, UPRIGHT)], ids=["default", "paper"])
+def test_a_step_on_another_device_waits_for_no_number_of_it(
+    egg: Template, network: NetworkConfig, scan: ScanConfig
+) -> None:
+    """On torch's meta device, which has shapes alone: whatever asks for a value fails, as it would hold up a GPU."""
+    there, model = torch.device("meta"), small_network(egg, network, scan)
+    batch, points = small_data(egg, model, scan)[0], small_points(egg, model=model)
+    found = CorrespondenceLoss()(model.to(there), batch.to(there), points.to(there), torch.Generator())
+    found["total"].backward()
+    assert all(value.is_meta and not value.shape for value in found.values())
+    assert all(each.grad is not None and each.grad.shape == each.shape for each in model.parameters())
 
 
 def test_blends_come_from_the_generator(egg: Template, points: LossPoints) -> None:

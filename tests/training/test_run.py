@@ -113,6 +113,14 @@ def test_a_folder_becomes_a_model(prepared: Path, tmp_path: Path, chosen: Recipe
     assert not model.network.training
 
 
+def test_orientations_that_are_learned_first_are_told_of(prepared: Path, tmp_path: Path) -> None:
+    told: list[tuple[str, float]] = []
+    first = replace(SMALL, train=replace(SMALL.train, align_steps=2))
+    trained(prepared, tmp_path / "model", first, progress=lambda stage, name, share: told.append((stage, share)))
+    at = told.index(("orientations alone (once)", 0.5))
+    assert told[at + 1] == ("orientations alone (once)", 1.0) and told[at + 2][0].startswith("step 4 of 4")
+
+
 def test_the_best_model_so_far_is_kept_beside_the_last(prepared: Path, tmp_path: Path, monkeypatch: Any) -> None:
     scores = iter([0.3, 0.2, 0.25, 0.5])  # of three validations on the way, and at the end
     monkeypatch.setattr("meshmatch.training.train.held_out_error", lambda *_: next(scores))
