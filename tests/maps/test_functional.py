@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pyFM import spectral
 
 from meshmatch.api.results import evaluate
 from meshmatch.errors import InputError
@@ -46,8 +47,6 @@ def test_weighted_by_areas_it_is_the_functional_map_of_the_literature() -> None:
 
 
 def test_it_is_that_of_pyfm_both_ways() -> None:
-    """Where pyFM is installed (the extra `bench`)."""
-    spectral = pytest.importorskip("pyFM.spectral")
     other = shuffled(bumpy_sphere(20, 30))[0]
     here, there = laplacian_basis(BUMPY, 12), laplacian_basis(other, 9)
     p2p = np.random.default_rng(1).integers(0, other.V, BUMPY.V)
