@@ -7,13 +7,14 @@ are smoothly deformed, a little turned, scaled and roughened.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from meshmatch.arrays import Float, Floats, Int
+from meshmatch.errors import InputError
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.generators.generator import Source
@@ -100,7 +101,7 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
     @torch.no_grad()
     def __getitem__(self, step: int) -> Batch:
         generator = step_generator(self.seed, step)
-        verts = self.source(self.shapes, generator)
+        verts = _drawn(self.source(self.shapes, generator), self.shapes, int(self.faces.max()) + 1)
         scale = verts.flatten(1).std(1)[:, None, None]
         verts = scans.bump(verts / scale * 0.3, self.scan.bumps, generator)
         verts, areas = scans.normalise(verts, self.faces)
@@ -152,6 +153,19 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
             foreign = foreign * (torch.rand(B, 1, 1, generator=generator) < scan.strays)
         shown = areas.sum(1)[:, None, None]
         return areas, ((1 - foreign) / shown).sqrt(), foreign
+
+
+def _drawn(found: Any, count: int, V: int) -> Float[Tensor, "N V 3"]:
+    """What a source drew, in float32; `InputError` if these are not so many shapes of at least V vertices."""
+    verts: Tensor = torch.as_tensor(found).float()
+    if verts.ndim != 3 or len(verts) != count or verts.shape[1] < V or verts.shape[2] != 3:
+        wanted = f"({count}, V, 3) with the template's vertices"
+        raise InputError(
+            f"a source must give vertices {wanted}, not {tuple(verts.shape)}", "it is asked for `count` shapes"
+        )
+    if not verts.isfinite().all():
+        raise InputError("a source gave vertices that are nan or infinite", "look at the shapes that it draws")
+    return verts
 
 
 @dataclass(frozen=True, eq=False)

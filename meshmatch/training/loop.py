@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -62,8 +63,9 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         for name in ("steps", "shapes", "scans_per_shape", "threads"):
-            if getattr(self, name) < 1:
-                raise OptionError(f"{name} must be 1 or more, not {getattr(self, name)}")
+            value = getattr(self, name)
+            if not isinstance(value, Integral) or value < 1:
+                raise OptionError(f"{name} must be 1 or more, a whole number, not {value!r}")
         if not (self.rate > 0 and 0 <= self.decay <= 1 and self.workers >= 0):
             raise OptionError("a training needs a positive rate, a decay in 0..1 and workers of 0 or more")
         if self.minutes is not None and not self.minutes > 0:
@@ -222,6 +224,7 @@ class Trainer:
             group["lr"] = learning_rate(self.step, config)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=config.bf16):
             terms = config.loss(self.model, batch.to(self.device), self.points, generator)
+        _check_terms(terms, self.step)
         self.optimiser.zero_grad(set_to_none=True)
         terms["total"].backward()
         if self.world > 1:
@@ -276,6 +279,17 @@ class Trainer:
         """State dict of the model with the averaged weights, on the CPU."""
         state = {n: t.detach().cpu().clone() for n, t in self.model.state_dict().items()}
         return state | {n: t.cpu().clone() for n, t in self.average.items()}
+
+
+def _check_terms(terms: Any, step: int) -> None:
+    """What a loss gave: `OptionError` if nothing can be learned from it, `ModelError` if its total is no longer finite."""
+    if not (isinstance(terms, dict) and all(isinstance(each, Tensor) and not each.shape for each in terms.values())):
+        raise OptionError("a loss must give a dictionary of tensors, each of one number", "Objective describes losses")
+    if "total" not in terms or not terms["total"].requires_grad:
+        raise OptionError("a loss must give a term 'total' that has a gradient", "Objective describes losses")
+    if not terms["total"].isfinite():
+        strange = ", ".join(sorted(name for name, each in terms.items() if not each.isfinite()))
+        raise ModelError(f"the training diverged: not finite at step {step + 1:,} are {strange}", "take a lower rate")
 
 
 def _keep_memory() -> None:

@@ -1,13 +1,15 @@
 """Batches: functions of (seed, step), and true to the frames that they speak of."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from meshmatch.errors import TemplateError
+from meshmatch.errors import InputError, TemplateError
 from meshmatch.geometry.frames import kabsch
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.layers import BasisEncoder
@@ -131,6 +133,20 @@ def test_several_scans_of_one_shape_differ(egg: Template, network: Deformer) -> 
     same = spread[0] / spread[0].mean() - spread[1] / spread[1].mean()
     other = spread[0] / spread[0].mean() - spread[2] / spread[2].mean()
     assert np.abs(same).max() < 1e-4 < np.abs(other).max()
+
+
+def test_a_source_gives_shapes_on_the_templates_vertices(egg: Template, network: Deformer) -> None:
+    data = small_data(egg, network)
+
+    def drawing(change: Callable[[torch.Tensor], Any]) -> Batch:
+        return replace(data, source=lambda count, generator: change(data.source(count, generator)))[0]
+
+    assert torch.equal(drawing(lambda verts: verts.double().numpy()).points, data[0].points)
+    for change in (lambda v: v[0], lambda v: v[:3], lambda v: v[:, :9], lambda v: v[..., :2]):
+        with pytest.raises(InputError, match="a source must give"):
+            drawing(change)
+    with pytest.raises(InputError, match="nan or infinite"):
+        drawing(lambda verts: verts / 0)
 
 
 def test_registered_shapes_are_drawn_wherever_they_lie() -> None:

@@ -7,8 +7,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -268,6 +269,8 @@ def test_a_damaged_checkpoint_changes_nothing(
         {"threads": 0},
         {"workers": -1},
         {"rate": 0.0},
+        {"steps": 5.5},
+        {"shapes": "8"},
         {"decay": 1.5},
         {"minutes": 0.0},
     ],
@@ -275,6 +278,32 @@ def test_a_damaged_checkpoint_changes_nothing(
 def test_impossible_settings_are_refused(values: dict) -> None:
     with pytest.raises(OptionError):
         TrainConfig(**values)
+
+
+@dataclass(frozen=True)
+class Spoilt(CorrespondenceLoss):
+    """A loss of one's own, gone wrong."""
+
+    how: Callable[[Any], Any] = dict
+
+    def __call__(self, *given: Any) -> Any:
+        return self.how(super().__call__(*given))
+
+
+@pytest.mark.parametrize(("how", "error", "words"), [
+    (lambda terms: terms["total"], OptionError, "a dictionary of tensors"),
+    (lambda terms: {**terms, "mine": 1.0}, OptionError, "a dictionary of tensors"),
+    (lambda terms: {**terms, "mine": terms["total"].expand(3)}, OptionError, "each of one number"),
+    (lambda terms: {"mine": terms["total"]}, OptionError, "'total'"),
+    (lambda terms: {"total": terms["total"].detach()}, OptionError, "gradient"),
+    (lambda terms: {**terms, "total": terms["total"] / 0}, ModelError, "not finite at step 1 are total"),
+])  # fmt: skip
+def test_a_loss_that_nothing_can_be_learned_from_is_told(egg: Template, how: Any, error: Any, words: str) -> None:
+    run = trainer(egg, replace(CONFIG, loss=Spoilt(how=how)))
+    before = state(run)
+    with pytest.raises(error, match=words) as caught:
+        run.run(small_data(egg, run.model, length=10))
+    assert caught.value.hint and same(state(run), before)
 
 
 _TWO = replace(CONFIG, steps=4, minutes=60.0, loss=CorrespondenceLoss(robust=True, blend=0.0))
