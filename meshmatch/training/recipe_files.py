@@ -5,13 +5,14 @@ A file may come from anywhere: it holds plain numbers and words, all of them che
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-from meshmatch.errors import InputError, MeshmatchError
+from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.geometry.kernels import KERNELS
 from meshmatch.models.card import ModelCard
 from meshmatch.models.checkpoint import Storage
@@ -42,10 +43,19 @@ T = TypeVar("T")
 
 
 def recipe_record(recipe: Recipe) -> dict[str, Any]:
-    """What a card says of a recipe, besides its network and kernel; with the class of the loss by its name."""
+    """What a card says of a recipe, besides its network and kernel; with the class of the loss by its name.
+
+    `OptionError` if a loss of somebody's own has fields that are no plain numbers and words.
+    """
     loss = type(recipe.train.loss)
-    record = {"train": asdict(recipe.train), "scan": asdict(recipe.scan)}
-    return record | {"loss": f"{loss.__module__}.{loss.__qualname__}"} | {name: getattr(recipe, name) for name in _OWN}
+    record: dict[str, Any] = {"train": asdict(recipe.train), "scan": asdict(recipe.scan)}
+    record |= {"loss": f"{loss.__module__}.{loss.__qualname__}"} | {name: getattr(recipe, name) for name in _OWN}
+    try:
+        json.dumps(record, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        hint = "fields of a loss are numbers and words, which the model's card holds"
+        raise OptionError(f"a card cannot hold this recipe: {error}", hint) from error
+    return record
 
 
 def read_recipe(path: str | Path, usual: Recipe) -> Recipe:

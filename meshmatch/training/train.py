@@ -190,6 +190,7 @@ def train_model(
     `InputError` of a single shape; `OptionError` if the model to start from has another template, network or kernel.
     """
     checkpoint = (output := Path(output)) / CHECKPOINT
+    recipe_record(recipe)  # what the card could not hold is refused now, not at the end
     make_folder(checkpoint.parent)
     config, kernel = recipe.train, recipe.kernel
     if recipe.scan.sphere and getattr(source, "scale", "sphere") == "sphere":  # the paper's lengths are in it

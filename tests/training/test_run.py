@@ -3,7 +3,7 @@
 import json
 import pickle
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -119,6 +119,21 @@ def test_orientations_that_are_learned_first_are_told_of(prepared: Path, tmp_pat
     trained(prepared, tmp_path / "model", first, progress=lambda stage, name, share: told.append((stage, share)))
     at = told.index(("orientations alone (once)", 0.5))
     assert told[at + 1] == ("orientations alone (once)", 1.0) and told[at + 2][0].startswith("step 4 of 4")
+
+
+@dataclass(frozen=True)
+class Masked(CorrespondenceLoss):
+    """A loss of one's own with something that no card can hold."""
+
+    mask: object = None
+
+
+def test_what_no_card_could_hold_is_refused_before_the_work(prepared: Path, tmp_path: Path) -> None:
+    for mask in (torch.ones(3), float("inf")):
+        recipe = replace(SMALL, train=replace(SMALL.train, loss=Masked(mask=mask)))
+        with pytest.raises(OptionError, match="a card cannot hold"):
+            trained(prepared, tmp_path / "model", recipe)
+    assert not (tmp_path / "model" / "metrics.jsonl").exists()
 
 
 def test_the_best_model_so_far_is_kept_beside_the_last(prepared: Path, tmp_path: Path, monkeypatch: Any) -> None:
