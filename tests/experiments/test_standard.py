@@ -27,14 +27,18 @@ def write(folder: Path, name: str, corres: Ints | None, suffix: str = "") -> Sha
     return BALL
 
 
+def write_pair(folder: Path, name: str, corres: Ints) -> None:
+    """The balls 1 and 2 and the part 40, and a list for a pair of them, counted from 1."""
+    for each in ("1", "2", "40"):
+        write(folder, each, None)
+    np.savetxt(folder / "corres" / f"{name}.map", corres + 1, "%d")
+
+
 def test_the_splits_are_the_published_ones(tmp_path: Path) -> None:
     for number in range(78, 100):
         write(tmp_path / "FAUST_r", f"tr_reg_{number:03d}", np.arange(5))
     found = split_of("FAUST_r", tmp_path)
     assert list(found.shapes) == [f"tr_reg_{number:03d}" for number in range(80, 100)] and len(found.pairs) == 380
-    for number in (1, 2, 10, 40):
-        write(tmp_path / "SHREC19_r", str(number), np.arange(5))
-    assert list(split_of("SHREC19_r", tmp_path).shapes) == ["1", "2", "10"]  # without the part
     for name in ("cow_a", "cow_b", "dog"):
         write(tmp_path / "SMAL_r", name, np.arange(3))
     with pytest.raises(InputError, match=r"has no test_cat\.txt"):
@@ -44,17 +48,17 @@ def test_the_splits_are_the_published_ones(tmp_path: Path) -> None:
 
 
 def test_lists_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    folder = tmp_path / "SHREC19_r"
+    folder = tmp_path / "FAUST_r"
     write(folder, "1", np.arange(4))
     write(folder, "2", np.arange(3))
     with pytest.raises(InputError, match="different length"):
-        split_of("SHREC19_r", tmp_path)
+        split_of("FAUST_r", tmp_path)
     write(folder, "2", np.array([0, 1, 2, BALL.V]))
     with pytest.raises(InputError, match="not there"):
-        split_of("SHREC19_r", tmp_path)
+        split_of("FAUST_r", tmp_path)
     (folder / "corres" / "2.vts").write_text("a\n")
     with pytest.raises(InputError, match="cannot read"):
-        split_of("SHREC19_r", tmp_path)
+        split_of("FAUST_r", tmp_path)
     write(tmp_path / "TOPKIDS", "kid00", None)
     write(tmp_path / "TOPKIDS", "kid01", np.arange(4), "_ref")
     with pytest.raises(InputError, match="one line for each"):
@@ -62,9 +66,9 @@ def test_lists_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 
 
 def test_errors_are_at_the_points_of_the_truth(tmp_path: Path) -> None:
-    write(tmp_path / "SHREC19_r", "1", np.array([3, 4, 5]))
-    write(tmp_path / "SHREC19_r", "2", np.array([7, 8, 9]))
-    split = split_of("SHREC19_r", tmp_path)
+    write(tmp_path / "FAUST_r", "1", np.array([3, 4, 5]))
+    write(tmp_path / "FAUST_r", "2", np.array([7, 8, 9]))
+    split = split_of("FAUST_r", tmp_path)
     index = np.zeros(BALL.V, np.int64)
     index[[3, 4, 5]] = 7, 8, 8
     errors = errors_of(split, {("1", "2"): index}, tmp_path)["1", "2"]
@@ -76,6 +80,23 @@ def test_errors_are_at_the_points_of_the_truth(tmp_path: Path) -> None:
     right = errors_of(split, {("kid01", "kid00"): np.roll(np.arange(BALL.V), 1)}, tmp_path)["kid01", "kid00"]
     wrong = errors_of(split, {("kid01", "kid00"): np.arange(BALL.V)}, tmp_path)["kid01", "kid00"]
     assert right.max() == 0 < wrong.min()
+
+
+def test_pairs_of_shrec19_are_those_of_its_maps_measured_as_others_do(tmp_path: Path) -> None:
+    """Vertex k of 1 is vertex turned[k] of 2: maps are from 2 to 1, and errors on 1."""
+    folder, turned = tmp_path / "SHREC19_r", np.roll(np.arange(BALL.V), 5)
+    write_pair(folder, "1_2", turned)
+    write_pair(folder, "40_1", turned[:9])
+    write_pair(folder, "2_40", turned[:9])
+    split = split_of("SHREC19_r", tmp_path)
+    assert split.pairs == [("2", "1")] and list(split.shapes) == ["1", "2"]
+    right, wrong = (errors_of(split, {("2", "1"): each}, tmp_path)["2", "1"] for each in (np.argsort(turned), turned))
+    assert right.shape == (BALL.V,) and right.max() == 0 < wrong.min()
+    for name, corres in (("1_3", turned), ("1", turned), ("2_1", turned[:9]), ("2_1", turned + 1), ("2_1", turned - 1)):
+        write_pair(folder, name, corres)
+        with pytest.raises(InputError, match=name):
+            split_of("SHREC19_r", tmp_path)
+        (folder / "corres" / f"{name}.map").unlink()
 
 
 def test_intervals_are_of_shapes() -> None:
@@ -92,11 +113,12 @@ def test_intervals_are_of_shapes() -> None:
 def test_the_command_finds_the_sets_that_are_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     model = write_model(egg_model(), tmp_path / "egg")
     for name in ("1", "2", "3"):
-        write(tmp_path / "SHREC19_r", name, np.arange(10))
+        write(tmp_path / "FAUST_r", name, np.arange(10))
     words = ["--data", str(tmp_path), "--cache", str(tmp_path / "cache"), "--model", str(model)]
     assert main(words) == 0
     (row,) = json.loads(capsys.readouterr().out.splitlines()[-1])["rows"]
-    assert (row["set"], row["shapes"], row["pairs"]) == ("SHREC19_r", 3, 6) and row["low"] <= row["mean"] <= row["high"]
+    assert (row["set"], row["shapes"], row["pairs"]) == ("FAUST_r", 3, 6) and row["low"] <= row["mean"] <= row["high"]
+    assert row["minutes"] > 0
     assert main(["--data", str(tmp_path / "egg")]) == 1
     assert "docs/datasets.md" in capsys.readouterr().err
 

@@ -4,22 +4,24 @@ Folders are laid out as others keep them, ``FAUST_r/off/*.off`` and ``FAUST_r/co
 vertex, counted from 1, of the point k that all shapes of the set have.
 
 - FAUST_r: the last 20 shapes (tr_reg_080 to 099); SCAPE_r: the last 20 (mesh052 to 071).
-- SHREC19_r: all but shape 40, which is a part.
+- SHREC19_r: the pairs of ``corres/I_J.map`` without shape 40, which is a part: from J to I, as others measure; line k is the
+  vertex of J for vertex k of I.
 - SMAL_r: those that ``test_cat.txt`` names.
 - TOPKIDS: every shape to the first, kid00; line k of ``corres/NAME_ref.vts`` is the vertex of kid00 for vertex k.
 - iso, qes, mc, dense, cloud: the last 20 shapes of FAUST, remeshed or sampled in five ways to measure what triangles change
   (Sharp et al. 2021), each to FAUST's first, ``discretization/tr_reg_000.ply``; line k of
   ``discretization/iso/tr_reg_iso_080.txt`` is its vertex, counted from 0, for vertex k of the ply beside it.
 
-All ordered pairs of different shapes count, none left out. The error is the geodesic distance on the target between the
-matched and the true vertex, in units of sqrt(area), times 100: the mean over points, then over pairs. Intervals are of 95 %,
-by drawing shapes with replacement. No shape of any of these sets was used to train a model that ships.
+Of other sets all ordered pairs of different shapes count, none left out. The error is the geodesic distance on the target
+between the matched and the true vertex, in units of sqrt(area), times 100: the mean over points, then over pairs. Intervals
+are of 95 %, by drawing shapes with replacement. No shape of any of these sets was used to train a model that ships.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import permutations
 from pathlib import Path
 from typing import Annotated, Any
@@ -52,26 +54,35 @@ _COLUMNS = {
     "mean": "mean:.2f",
     "95 %": "interval",
 }
-_COLUMNS |= {"median pair": "median:.2f", "worst": "worst:.1f", "over 10": "off:.1%", "CPU s a pair": "cpu:.2f"}
+_COLUMNS |= {
+    "median pair": "median:.2f",
+    "worst": "worst:.1f",
+    "over 10": "off:.1%",
+    "CPU s a pair": "cpu:.2f",
+    "minutes": "minutes:.1f",
+}
 
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Shapes and pairs of a set, and its truth: ``points`` of every shape (N,), or vertices (V,) of the ``reference`` to
-    which all pairs lead, if there is one.
+    """Shapes and pairs of a set, and its truth: ``points`` of every shape (N,); vertices (V,) of the ``reference`` to which
+    all pairs lead, if there is one; or ``partners`` (V,) in the source of each pair, for all vertices of its target.
     """
 
     shapes: Shapes
     pairs: Sequence[Pair]
     points: Mapping[str, Int[Ints, " N"]]
     reference: str = ""
+    partners: Mapping[Pair, Int[Ints, " V"]] = field(default_factory=dict)
 
-    def of(self, pair: Pair) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
-        """Vertices of the source whose partners are known, and these."""
-        source, target = pair
-        if target == self.reference:
-            return np.arange(len(self.points[source])), self.points[source]
-        return self.points[source], self.points[target]
+    def asked(self, pair: Pair) -> Int[Ints, " N"]:
+        """Vertices of the source whose partners are known: of all pairs with this target those of `known`, in order."""
+        return self.partners[pair] if self.partners else self.points[pair[0]]
+
+    def known(self, target: str) -> Int[Ints, " N"]:
+        """The true vertices of a target."""
+        everywhere = self.partners or target == self.reference
+        return np.arange(self.shapes[target].V) if everywhere else self.points[target]
 
 
 def split_of(name: str, data: Path) -> Split:
@@ -98,6 +109,8 @@ def split_of(name: str, data: Path) -> Split:
     if missing := [each for each in names if each not in files]:
         raise InputError(f"{folder / 'off'} has no {missing[0]}.off")
     shapes = {each: load_shape(files[each]) for each in names}
+    if name == "SHREC19_r":
+        return _by_pairs(shapes, folder / "corres")
     points = {}
     for each in names:
         if each == reference:
@@ -113,6 +126,22 @@ def split_of(name: str, data: Path) -> Split:
     if len({len(each) for each in points.values()}) > 1:
         raise InputError(f"{folder / 'corres'}: the lists are of different length")
     return Split(shapes, list(permutations(names, 2)), points)
+
+
+def _by_pairs(shapes: Shapes, folder: Path) -> Split:
+    """The pairs that a folder has files ``I_J.map`` of, from J to I, without the part."""
+    partners: dict[Pair, Int[Ints, " V"]] = {}
+    for path in runner.files_in(folder, "*.map"):
+        target, _, source = path.stem.partition("_")
+        if _PART in (source, target):
+            continue
+        if missing := [each for each in (source, target) if each not in shapes]:
+            raise InputError(f"{path.name} is of a shape that is not there: {missing[0] or 'its name is no pair'}")
+        found = partners[source, target] = vertices_in(path, 1)
+        if len(found) != shapes[target].V or found.min() < 0 or found.max() >= shapes[source].V:
+            problem = f"{path} does not list a vertex of {source} for each of {target}"
+            raise InputError(problem, "counted from 1, one a line")
+    return Split(shapes, list(partners), {}, partners=partners)
 
 
 def _number(path: Path) -> tuple[int, str]:
@@ -150,10 +179,9 @@ def errors_of(split: Split, indices: Mapping[Pair, Int[Ints, " V"]], cache: Path
     found: dict[Pair, Floats] = {}
     for target in runner.track(sorted({pair[1] for pair in indices}), "measuring"):
         mine = [pair for pair in indices if pair[1] == target]
-        known = np.arange(split.shapes[target].V) if target == split.reference else split.points[target]
-        distances = TruthDistances(split.shapes[target], known, cache)
+        distances = TruthDistances(split.shapes[target], split.known(target), cache)
         if target != split.reference:
-            at = distances.errors([indices[pair][split.points[pair[0]]] for pair in mine])
+            at = distances.errors([indices[pair][split.asked(pair)] for pair in mine])
             found |= {pair: 100 * each.astype(np.float64) for pair, each in zip(mine, at, strict=True)}
             continue
         for pair in mine:
@@ -205,6 +233,7 @@ def main(
         raise InputError(f"{data} has none of {', '.join(MODELS)}", "docs/datasets.md says how they are laid out")
     rows = []
     for name in names:
+        began = time.perf_counter()
         split, chosen = split_of(name, data), model or MODELS[name]
         pairs = runner.spread(list(split.pairs), limit_pairs)
         runner.tell(f"{name}: {len(split.shapes)} shapes, {len(pairs)} pairs")
@@ -218,5 +247,5 @@ def main(
             ]
         errors = errors_of(split, {pair: each.map.index for pair, each in found.items()}, cache)
         cpu = float(np.mean([each.seconds for each in found.values()]))
-        rows.append(row_of(name, chosen, split, errors, cpu))
+        rows.append(row_of(name, chosen, split, errors, cpu) | {"minutes": (time.perf_counter() - began) / 60})
     return runner.Report({"rows": rows}, [runner.table("Standard splits, error x 100 / sqrt(area)", rows, _COLUMNS)])
