@@ -89,8 +89,9 @@ class Brief:
 
     def _shown(self, field: Field[Any]) -> str:
         value = getattr(self, field.name)
-        if isinstance(value, np.ndarray):
-            return f"{field.name}: {' x '.join(map(str, value.shape))}"
+        shape = getattr(value, "shape", ())
+        if shape and isinstance(shape, tuple):  # of arrays, sparse ones too, and tensors
+            return f"{field.name}: {' x '.join(map(str, shape))}"
         if isinstance(value, tuple | list | dict) and len(value) > 3:
             return f"{field.name}: {len(value)} items"
         return f"{field.name}={value!r}"

@@ -97,8 +97,8 @@ class InterpolationOptions:
                 raise OptionError(f"invalid {name} {getattr(self, name)!r}", f"choose one of {', '.join(choices)}")
 
 
-@dataclass(frozen=True, eq=False)
-class Step:
+@dataclass(frozen=True, eq=False, repr=False)
+class Step(Brief):
     """A shape of a sequence, at 0 the source, at 1 the target; ``rotation`` (3, 3) leads to the axes of the template. An
     implicit model knows neither that nor a deviation.
     """

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
+from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.direct import MIRROR
 from meshmatch.fitting.kind_templates import mean_shape, template_of, with_more_nodes
@@ -43,8 +43,8 @@ _AVERAGED = 60  # of which the mean is made
 _MOST_ALIKE = 0.8  # so many stand as the template does, or none is turned as if they did; set by hand
 
 
-@dataclass(frozen=True)
-class PrepareConfig:
+@dataclass(frozen=True, repr=False)
+class PrepareConfig(Brief):
     """How shapes are prepared.
 
     The template is a shape of the folder, by its name, or any file; by default the first mesh where all are registered,
@@ -64,8 +64,8 @@ class PrepareConfig:
     labels: Int[Ints, " V"] | None = None  # part of every vertex of a single shape's file, from 0; for "parts"
 
 
-@dataclass(frozen=True, eq=False)
-class Prepared:
+@dataclass(frozen=True, eq=False, repr=False)
+class Prepared(Brief):
     """The template, and the shapes that share its connectivity (or none)."""
 
     template: Template

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats, Int, Ints, frozen
+from meshmatch.arrays import Brief, Float, Floats, Int, Ints, frozen
 from meshmatch.collections.anova import Effect, Variances, analyse
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.covariates import Columns, Covariates, DesignTerm, covariates, some
@@ -32,8 +32,8 @@ _ROUNDS = 10
 _SYMMETRIC = 0.015  # root mean square distance of a mean from its mirror image, in roots of its area: more is none
 
 
-@dataclass(frozen=True, eq=False)
-class Asymmetry:
+@dataclass(frozen=True, eq=False, repr=False)
+class Asymmetry(Brief):
     """How shapes differ from their mirror images, or right ones from left ones.
 
     Attributes

@@ -23,8 +23,8 @@ from meshmatch.fitting.fit import Fit, facing_out
 from meshmatch.shapes.shape import Shape
 
 
-@dataclass(frozen=True, eq=False)
-class Projection:
+@dataclass(frozen=True, eq=False, repr=False)
+class Projection(Brief):
     """A shape as the atlas sees it.
 
     ``scores`` (M,) are in standard deviations. ``shape`` is what the modes make of it, and ``distance`` (V,) how far its

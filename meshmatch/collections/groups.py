@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, frozen
+from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, frozen
 from meshmatch.collections.permutation import HAIR, tested, whitened
 from meshmatch.errors import OptionError
 
@@ -21,8 +21,8 @@ STATISTICS: tuple[Statistic, ...] = ("normal", "hotelling")
 _CHUNK = 2_000_000  # numbers at a time
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Brief):
     """Where two groups of shapes, A and B, differ.
 
     Attributes

@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Brief, Float, Floats, Int, Ints
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.modes import inner_products, principal, rounding, weighted_sums
 from meshmatch.collections.superimpose import Shapes, Superimposed
@@ -34,8 +34,8 @@ _LONGER = 0.6  # of the time, for generalisation
 _NEAREST = 2  # shapes of the collection, by their points, to which a random shape's distance is measured
 
 
-@dataclass(frozen=True, eq=False)
-class Measures:
+@dataclass(frozen=True, eq=False, repr=False)
+class Measures(Brief):
     """The three measures for K numbers of modes; distances are means over the surface, in the unit of the shapes.
 
     Attributes

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Brief, Float, Floats, Int, Ints
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.covariates import some
 from meshmatch.collections.named_parts import WHOLE, Masks, groups_of, parts_of_file
@@ -32,8 +32,8 @@ _ONE_A_LINE = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Registered:
+@dataclass(frozen=True, eq=False, repr=False)
+class Registered(Brief):
     """S shapes with the same vertices and faces, and their names.
 
     ``rotation`` leads into y up, z to the front, where it is known. ``left_out`` are names of shapes that do not count, and

@@ -17,7 +17,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.shapes.shape import LARGEST
@@ -31,8 +31,8 @@ MOST_GROUPS = 256
 _ROUNDS, _CLOSE = 200, 1e-10  # at most; a change, as a share of the size, that ends them
 
 
-@dataclass(frozen=True, eq=False)
-class Poses:
+@dataclass(frozen=True, eq=False, repr=False)
+class Poses(Brief):
     """How G groups of vertices of S shapes were moved: ``factor * rotation (point - center) + place``.
 
     ``sizes`` are root mean square distances from the centers of groups, in the unit of the shapes, before. ``groups`` (V,)
@@ -74,8 +74,8 @@ class Poses:
             yield group, np.maximum(self.groups, 0) == group
 
 
-@dataclass(frozen=True, eq=False)
-class Superimposed:
+@dataclass(frozen=True, eq=False, repr=False)
+class Superimposed(Brief):
     """Shapes laid over one another: their ``consensus``, the ``weights`` of vertices (V,), which sum to 1, and the common
     size to which each is scaled, or None where sizes are kept. ``groups`` (V,) are those of vertices that are moved
     together, none where whole shapes are.

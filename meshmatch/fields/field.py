@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from meshmatch.arrays import Float, Floats, Int, Ints, as_numbers, is_tensor
+from meshmatch.arrays import Brief, Float, Floats, Int, Ints, as_numbers, is_tensor
 from meshmatch.errors import InputError
 from meshmatch.fields.local_fits import namespace
 from meshmatch.fields.shape_functions import ShapeFunctions
@@ -222,8 +222,8 @@ def turned_rows(rows: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float
     return turned
 
 
-@dataclass(frozen=True, eq=False)
-class PointwiseField:
+@dataclass(frozen=True, eq=False, repr=False)
+class PointwiseField(Brief):
     """A network's motion on fixed points, with gradients at ``gradient_points``; codes have D numbers."""
 
     points: Float[torch.Tensor, "P 3"]

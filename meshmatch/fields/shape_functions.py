@@ -22,7 +22,7 @@ that their matrices are dense; a rigid motion of the nodes is rigid nearly, not 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal, get_args
 
@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_matrix
 
-from meshmatch.arrays import Float, Floats, Int, Ints, as_numbers
+from meshmatch.arrays import Brief, Float, Floats, Int, Ints, as_numbers
 from meshmatch.errors import InputError, OptionError, TemplateError, warn
 from meshmatch.fields.local_fits import LocalFits
 from meshmatch.geometry.kernels import KERNELS, Kernel
@@ -51,8 +51,8 @@ def has_nodes(name: FieldName) -> bool:
     return name != "pointwise"
 
 
-@dataclass(frozen=True, eq=False)
-class ShapeFunctions:
+@dataclass(frozen=True, eq=False, repr=False)
+class ShapeFunctions(Brief):
     """Shape functions of K nodes on P fixed points.
 
     ``phi`` (P, K) and ``gradient`` (3 P, K), made when it is asked for, are float32, sparse (CSR) or dense. With moving
@@ -61,7 +61,7 @@ class ShapeFunctions:
     """
 
     phi: Any
-    gradient_rows: Any  # the gradient, or a function that gives its rows at some points
+    gradient_rows: Any = field(repr=False)  # the gradient, or a function that gives its rows at some points
 
     @cached_property
     def gradient(self) -> Any:

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import torch
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Brief, Float, Floats, Int, Ints
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.card import ImplicitCard
@@ -31,8 +31,8 @@ class Owner(Protocol):
     def match(self, a: ImplicitFit, b: ImplicitFit, source: Shape, target: Shape) -> VertexMap: ...
 
 
-@dataclass(frozen=True, eq=False)
-class ImplicitFit:
+@dataclass(frozen=True, eq=False, repr=False)
+class ImplicitFit(Brief):
     """A shape as a model has it.
 
     Attributes

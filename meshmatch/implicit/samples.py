@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats, Floats32
+from meshmatch.arrays import Brief, Float, Floats, Floats32
 from meshmatch.errors import InputError
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.trees import cKDTree
@@ -34,8 +34,8 @@ _NEAR = 0.05  # deviation of the free points that lie near a surface
 _KINDS = {*PLAIN_SUFFIXES, ".npz"} - {".npy"}  # arrays beside shapes are labels or landmarks
 
 
-@dataclass(frozen=True, eq=False)
-class ImplicitSamples:
+@dataclass(frozen=True, eq=False, repr=False)
+class ImplicitSamples(Brief):
     """N samples of each of S shapes in the cube, the first half on the surface or nearest to it: point, signed distance (NaN
     where only known to be off the surface), normal (0 where it is not known).
     """

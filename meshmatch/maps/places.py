@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csr_matrix, identity, vstack
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, Ints32
+from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, Floats32, Int, Ints, Ints32
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import blend, triangle_areas, vertex_areas, vertex_normals
@@ -34,8 +34,8 @@ _NOISE_RANGE = 0.006, 0.03  # units of sqrt(area)
 _CHUNK = 8192  # points at a time
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Places:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class Places(Brief):
     """Where the vertices of one shape belong on the template. Two of them, of one template, make a map.
 
     Vertices and faces are those of the shape's file, lengths in units of sqrt(area).

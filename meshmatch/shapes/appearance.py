@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from meshmatch.arrays import Float, Floats, Int, Ints, UInts8
+from meshmatch.arrays import Brief, Float, Floats, Int, Ints, UInts8
 from meshmatch.errors import InputError, warn
 from meshmatch.shapes.colors import INVISIBLE, light
 from meshmatch.shapes.shape import Shape
@@ -141,8 +141,8 @@ class BakedMaterial:
         return tuple(layer for layer, image in shown.items() if image is not None)
 
 
-@dataclass(frozen=True, eq=False)
-class Appearance:
+@dataclass(frozen=True, eq=False, repr=False)
+class Appearance(Brief):
     """What lies on the faces of one shape.
 
     There is at least one material; each face has one. `uv` are the texture coordinates of each corner: u to the right,

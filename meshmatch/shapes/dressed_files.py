@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Brief, Float, Floats
 from meshmatch.errors import OptionError, warn
 from meshmatch.outputs import replace_all_on_success
 from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
@@ -23,8 +23,8 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import check_textured, files_of, image_file, tile_file
 
 
-@dataclass(frozen=True, eq=False)
-class Dressed:
+@dataclass(frozen=True, eq=False, repr=False)
+class Dressed(Brief):
     """A mesh that wears a baked material.
 
     ``file`` is what it was read from, None where it came from arrays; ``uv`` are texture coordinates of each corner, v down,

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
+from meshmatch.arrays import Brief, Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.oriented import OrientedPoints
@@ -55,8 +55,8 @@ class ShapeSamples:
     scale: Scale
 
 
-@dataclass(frozen=True, eq=False)
-class RegisteredShapes:
+@dataclass(frozen=True, eq=False, repr=False)
+class RegisteredShapes(Brief):
     """N shapes on the vertices of a template, which stand as it does: what fits found, of a trained model or of none.
 
     ``orientation`` is how far fits without a model are turned, for the card of what is learned from them; ``mirror``

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Brief, Float, Floats, Int, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.flat_layout import joined
@@ -33,8 +33,8 @@ _NEW = "leave out --uv keep: new ones are made"
 _MAX_EDGE = 500.0
 
 
-@dataclass(frozen=True, eq=False)
-class Atlas:
+@dataclass(frozen=True, eq=False, repr=False)
+class Atlas(Brief):
     """Texture coordinates that give every place of a surface its own place in an image."""
 
     uv: Float[Floats, "F 3 2"]  # within 0..1, u to the right, v down; zeros for a face without area

@@ -1,6 +1,7 @@
 """The public names: all there, and described. That they have types, mypy asks of `client.py`."""
 
 import ast
+import dataclasses
 import importlib
 import inspect
 import re
@@ -10,9 +11,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
+from scipy.sparse import csr_matrix
 
 import meshmatch
+from meshmatch.fields.field import PointwiseField
+from meshmatch.fields.shape_functions import ShapeFunctions
 
 ROOT = Path(__file__).resolve().parents[2]
 PUBLIC = {name: getattr(meshmatch, name) for name in meshmatch.__all__ if name != "__version__"}
@@ -79,6 +85,28 @@ def test_every_type_of_a_public_signature_is_in_the_reference() -> None:
         if not (any(found is each for each in known) or (not inspect.isclass(found) and word in words))
     }
     assert sorted(missing) == []
+
+
+def test_values_of_arrays_are_shown_by_their_sizes() -> None:
+    """A class of the reference whose repr is that of dataclasses would print all numbers."""
+    arrays = re.compile(r"(Float|Int|Bool|UInt8)\[|ndarray|Tensor")
+    shown = [thing for thing in map(imported, listed()) if dataclasses.is_dataclass(thing)]
+    printing = [
+        f"{thing.__name__}.{each.name}"
+        for thing in shown
+        if hasattr(thing.__repr__, "__wrapped__")  # made by dataclass
+        for each in dataclasses.fields(thing)
+        if each.repr and arrays.search(str(each.type))
+    ]
+    assert len(shown) > 40 and printing == []
+    sizes = (
+        ShapeFunctions(csr_matrix(np.zeros((4, 2))), None),
+        PointwiseField(torch.zeros(5, 3), torch.zeros(2, 3), id, 3),
+    )
+    assert [repr(each) for each in sizes] == [
+        "ShapeFunctions(phi: 4 x 2)",
+        "PointwiseField(points: 5 x 3, gradient_points: 2 x 3, motion=<built-in function id>, D=3)",
+    ]
 
 
 def imported(name: str) -> Any:
