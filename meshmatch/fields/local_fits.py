@@ -171,4 +171,4 @@ def check_support(moment: Float[Floats, "P 4 4"]) -> None:
     if len(bad):
         some = ", ".join([*map(str, bad[:5]), *(["..."] if len(bad) > 5 else [])])
         problem = f"{len(bad)} points have fewer than four non-coplanar nodes in reach (points {some})"
-        raise TemplateError(problem, "use more nodes or a larger radius")
+        raise TemplateError(problem, "use more nodes or another radius, in the unit of the points")
