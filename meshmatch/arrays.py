@@ -124,7 +124,7 @@ def off_torch(values: Any) -> Any:
 
 def is_tensor(values: Any) -> bool:
     """Whether this is a tensor of torch, which is not loaded for it."""
-    return callable(getattr(values, "detach", None)) and callable(getattr(values, "numpy", None))
+    return hasattr(values, "detach") and hasattr(values, "numpy")
 
 
 def as_numbers(values: ArrayLike, name: str, finite: bool = False) -> Floats:

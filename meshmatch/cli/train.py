@@ -136,10 +136,21 @@ class TrainOptions(Options):
     )
     mhr_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies that are of --mhr.")
     bf16: bool | None = Option(None, "--bf16/--no-bf16", help="bfloat16 arithmetic; default: the preset's choice.")
+    tf32: bool | None = Option(
+        None,
+        "--tf32/--no-tf32",
+        help="Products with TensorFloat-32, on GPUs that have it; default: the preset's choice.",
+    )
+    compile: bool | None = Option(
+        None, "--compile/--no-compile", help="Compile the loss by torch, which takes a minute. Default: no."
+    )
     device: Literal["auto", "cpu", "cuda", "mps"] = Option(
         "auto", help="Where the network is trained. auto: a GPU of CUDA if there is one, else the CPU."
     )
-    workers: int | None = Option(None, min=0, help="Processes that generate batches; default: the preset's.")
+    draw: Literal["auto", "cpu", "device"] = Option(
+        "auto", help="Where batches are drawn: by --workers on the CPU, or on the device. auto: on a GPU of CUDA."
+    )
+    workers: int | None = Option(None, min=0, help="Processes that draw batches on the CPU; default: the preset's.")
     threads: Threads = 1
     seed: Seed = 0
     validate: Path | None = optional(
@@ -231,8 +242,8 @@ def _by_template(output: Path, how: TrainOptions, console: Console) -> tuple[int
     from meshmatch.training.recipes import going_on, recipe_for, small_data
 
     settings = (
-        "field", "volume", "arap", "blend", "rate", "points", "steps", "minutes", "bf16", "workers", "threads", "device",
-        "seed",
+        "field", "volume", "arap", "blend", "rate", "points", "steps", "minutes", "bf16", "tf32", "compile", "workers",
+        "threads", "device", "draw", "seed",
     )  # fmt: skip
     fitted, start = _fits(how, console)
     if fitted is None:
@@ -245,7 +256,7 @@ def _by_template(output: Path, how: TrainOptions, console: Console) -> tuple[int
 
         how.refuse(("preset",), "--recipe")
         recipe = read_recipe(how.recipe, recipe)
-        changes = {name: value for name, value in changes.items() if name in (*how.given, "threads", "device")}
+        changes = {name: value for name, value in changes.items() if name in (*how.given, "threads", "device", "draw")}
     recipe = recipe.changed(**changes)
     training_device(wanted=recipe.train.device)  # before shapes are made
     facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, start or how.start)

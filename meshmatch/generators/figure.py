@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -96,11 +98,25 @@ class Figure:
 
     def smooth(self, values: Float[Tensor, "B V C"], rounds: int) -> Float[Tensor, "B V C"]:
         """Values so many times replaced by halfway to the mean of their neighbours."""
-        flat = values.transpose(0, 1).flatten(1).numpy()
+        flat = values.transpose(0, 1).flatten(1)
         for _ in range(rounds):
-            flat = 0.5 * flat + 0.5 * (self.mean_of_neighbours @ flat)
-        result: Tensor = torch.from_numpy(flat).unflatten(1, (len(values), -1)).transpose(0, 1)
+            flat = 0.5 * flat + 0.5 * self._means(flat)
+        result: Tensor = flat.unflatten(1, (len(values), -1)).transpose(0, 1)
         return result
+
+    def _means(self, values: Float[Tensor, "V C"]) -> Float[Tensor, "V C"]:
+        if values.device.type == "cpu":  # where SciPy is faster, and as exact
+            return torch.from_numpy(self.mean_of_neighbours @ values.numpy())
+        result: Tensor = self._sparse @ values
+        return result
+
+    @cached_property
+    def _sparse(self) -> Tensor:
+        held = self.mean_of_neighbours
+        starts, columns, values = map(torch.from_numpy, (held.indptr, held.indices, held.data))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that its format is young
+            return torch.sparse_csr_tensor(starts, columns, values, held.shape, device=self.share.device)
 
     def normals(self, verts: Float[Tensor, "B V 3"]) -> Float[Tensor, "B V 3"]:
         """Smoothed unit normals."""

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from copy import deepcopy
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -62,15 +65,43 @@ def shipped_template(kind: str) -> Template | None:
     return read_template(shipped) if shipped.is_file() else None
 
 
+def any_of(shapes: Float[Tensor, "N V 3"], count: int, generator: torch.Generator) -> Float[Tensor, "B V 3"]:
+    """Some of a fixed set of shapes, drawn with replacement."""
+    return shapes[torch.randint(len(shapes), (count,), generator=generator)]
+
+
 def mixed(first: Source, second: Source, share: float) -> Source:
     """Draws shapes of the first source and, in random places, a share of the second."""
+    return partial(_of_both, first, second, share)
 
-    def draw(count: int, generator: torch.Generator) -> Tensor:
-        other = torch.rand(count, generator=generator) < share
-        drawn = [
-            source(int(rows.sum()), generator) for source, rows in ((first, ~other), (second, other)) if rows.any()
-        ]
-        order = torch.argsort(torch.cat([torch.nonzero(~other)[:, 0], torch.nonzero(other)[:, 0]]))
-        return torch.cat(drawn)[order]
 
-    return draw
+def _of_both(
+    first: Source, second: Source, share: float, count: int, generator: torch.Generator
+) -> Float[Tensor, "B V 3"]:
+    other = torch.rand(count, generator=generator) < share
+    drawn = [source(int(rows.sum()), generator) for source, rows in ((first, ~other), (second, other)) if rows.any()]
+    order = torch.argsort(torch.cat([torch.nonzero(~other)[:, 0], torch.nonzero(other)[:, 0]]))
+    return torch.cat(drawn)[order]
+
+
+def source_on(source: Source, device: torch.device) -> Source | None:
+    """A source of ours that draws on a device, from a generator there; None of others', drawn where they like."""
+    made = source.func if isinstance(source, partial) else type(source)
+    return moved(source, device) if made.__module__.partition(".")[0] == __name__.partition(".")[0] else None
+
+
+def moved(held: Any, device: torch.device) -> Any:
+    """The same value, every tensor in it on a device: in dataclasses, tuples, modules and calls that are partly given."""
+    if isinstance(held, Tensor):
+        return held.to(device)
+    if isinstance(held, torch.nn.Module):
+        return deepcopy(held).to(device)
+    if isinstance(held, partial):
+        given = {name: moved(value, device) for name, value in held.keywords.items()}
+        return partial(held.func, *moved(held.args, device), **given)
+    if type(held) is tuple:
+        return tuple(moved(each, device) for each in held)
+    if is_dataclass(held) and not isinstance(held, type):
+        inside = (each.name for each in fields(held) if each.init)
+        return replace(held, **{name: moved(getattr(held, name), device) for name in inside})
+    return held

@@ -100,7 +100,7 @@ class GivenPoses:
         taken = torch.rand(B, generator=generator) < self.share
         pick = torch.randint(self.P, (B,), generator=generator)
         vectors = torch.zeros(B, J, 3)
-        vectors[:, self.columns(rig)] = torch.from_numpy(self.vectors)[pick]
+        vectors[:, self.columns(rig)] = torch.tensor(self.vectors)[pick]
         own_world, own_offset = forward_kinematics(rig, heads, rotation_from_vector(vectors))
         taken = taken[:, None, None]
         return torch.where(taken[..., None], own_world, world), torch.where(taken, own_offset, offset)

@@ -9,12 +9,14 @@ of the dog, Apache-2.0.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.generators.generator import Generator, Resting
+from meshmatch.generators.generator import Generator, Resting, any_of
 from meshmatch.generators.quadruped_rig import LIMITS, AnimalRig, group_of, load_rig, ramp, skinned, smooth_step
 from meshmatch.generators.quadruped_traits import EXTRAS, TRAITS, draw_traits
 from meshmatch.geometry.triangles import vertex_normals
@@ -259,9 +261,4 @@ def quadruped_generator(identities: int, seed: int, progress: Progress | None = 
     words = (
         f"{identities} four-legged animals generated from the dog of dm_control (Apache-2.0), of random kinds and poses"
     )
-    return Generator(
-        "quadruped",
-        resting.template(),
-        lambda count, generator: animals[torch.randint(len(animals), (count,), generator=generator)],
-        words,
-    )
+    return Generator("quadruped", resting.template(), partial(any_of, animals), words)

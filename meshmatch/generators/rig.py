@@ -12,6 +12,7 @@ import os
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,15 @@ class Rig:
 
     def joint(self, name: str) -> int:
         return self.names.index(name)
+
+    @cached_property
+    def generations(self) -> tuple[tuple[list[int], list[int]], ...]:
+        """Joints that are equally far from a root, the roots first, and their parents: a GPU takes each at once."""
+        depth: list[int] = []
+        for parent in self.parents:
+            depth.append(depth[parent] + 1 if parent >= 0 else 0)
+        rows = [[joint for joint, own in enumerate(depth) if own == each] for each in range(max(depth) + 1)]
+        return tuple((joints, [self.parents[joint] for joint in joints if each]) for each, joints in enumerate(rows))
 
     def restricted(self, keep: Int[Ints, " K"], faces: Int[Ints, "F 3"]) -> Rig:
         """The same bodies on some of the vertices, joined by other triangles of these."""
@@ -188,17 +198,15 @@ def forward_kinematics(
     rig: Rig, heads: Float[Tensor, "B J 3"], rotations: Float[Tensor, "B J 3 3"]
 ) -> tuple[Float[Tensor, "B J 3 3"], Float[Tensor, "B J 3"]]:
     """World rotation R and offset t of every joint: x -> R x + t for a rest point x."""
-    world: list[Tensor] = []
-    offset: list[Tensor] = []
-    for index, parent in enumerate(rig.parents):
-        R, head = rotations[:, index], heads[:, index]
-        shift = head - (R @ head[..., None])[..., 0]
-        if parent >= 0:
-            shift = (world[parent] @ shift[..., None])[..., 0] + offset[parent]
-            R = world[parent] @ R
-        world.append(R)
-        offset.append(shift)
-    return torch.stack(world, 1), torch.stack(offset, 1)
+    world, offset = torch.empty_like(rotations), heads - (rotations @ heads[..., None])[..., 0]
+    for joints, parents in rig.generations:
+        R = rotations[:, joints]
+        if parents:
+            above = world[:, parents]
+            offset[:, joints] = (above @ offset[:, joints, :, None])[..., 0] + offset[:, parents]
+            R = above @ R
+        world[:, joints] = R
+    return world, offset
 
 
 def skin(

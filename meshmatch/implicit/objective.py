@@ -47,7 +47,7 @@ class ImplicitLoss(Objective):
     prior: float = 1e-3
     published: bool = False
 
-    def __call__(self, model: Any, batch: ImplicitBatch, points: None, generator: torch.Generator) -> Terms:
+    def __call__(self, model: Any, batch: ImplicitBatch, points: None, generator: torch.Generator | None) -> Terms:
         return self.of(model, model.codes[batch.shape], batch.rows, generator)
 
     def of(
@@ -55,7 +55,7 @@ class ImplicitLoss(Objective):
         model: ImplicitNetwork,
         code: Float[torch.Tensor, "B D"],
         rows: Float[torch.Tensor, "B P 7"],
-        generator: torch.Generator,
+        generator: torch.Generator | None,
     ) -> Terms:
         """The weighted terms for samples of shapes with these codes; their sum under ``total``."""
         at, distance, normals = rows.split((3, 1, 3), -1)

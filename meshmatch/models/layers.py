@@ -12,12 +12,15 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+import torch.distributed as dist
 from torch import nn
+from torch.distributed.nn.functional import all_reduce as over_processes
 
 from meshmatch.arrays import Float, Int
 from meshmatch.fields.field import pack
 from meshmatch.geometry.oriented import quick_tree
 
+_MOST_PAIRS = 1 << 29  # that are compared at once: 2 GiB of distances
 _FREQUENCY = 1.5  # standard deviation of the encoding's frequencies, in waves per sqrt(area); set by hand
 
 
@@ -26,12 +29,28 @@ def nearest_index(
 ) -> Int[torch.Tensor, "B Q"]:
     """Index of the nearest of ``points``: trees on a CPU, where comparing all pairs is far slower."""
     if queries.device.type != "cpu":
-        return torch.cdist(queries, points).argmin(-1)
+        return nearest_of_all(queries, points)
     found = [
         quick_tree(cloud).query(query)[1]
         for query, cloud in zip(queries.detach().numpy(), points.detach().numpy(), strict=True)
     ]
     return torch.from_numpy(np.stack(found))
+
+
+def nearest_of_all(
+    queries: Float[torch.Tensor, "B Q D"], points: Float[torch.Tensor, "B P D"]
+) -> Int[torch.Tensor, "B Q"]:
+    """`nearest_index` by comparing all pairs, some clouds at a time: squares of differences, coordinate by coordinate, which
+    no setting rounds as it may round products of matrices."""
+    queries, points = queries.float(), points.float()
+    at_once = max(1, _MOST_PAIRS // max(1, queries.shape[1] * points.shape[1]))
+    found = []
+    for some, cloud in zip(queries.split(at_once), points.split(at_once), strict=True):
+        squared = (some[:, :, None, 0] - cloud[:, None, :, 0]).square()
+        for k in range(1, some.shape[2]):
+            squared = squared + (some[:, :, None, k] - cloud[:, None, :, k]).square()
+        found.append(squared.argmin(-1))
+    return torch.cat(found)
 
 
 def nearest(
@@ -75,6 +94,30 @@ class ResidualBlock(nn.Module):
         return result
 
 
+class BatchNorm(nn.BatchNorm1d):
+    """Of the batches of all processes together, where several train: torch's own does so on GPUs alone."""
+
+    def forward(self, x: Float[torch.Tensor, "N C"]) -> Float[torch.Tensor, "N C"]:
+        if not (self.training and dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1):
+            result: torch.Tensor = super().forward(x)
+            return result
+        assert self.running_mean is not None and self.running_var is not None and self.num_batches_tracked is not None
+        assert self.momentum is not None
+        rows = x.float()
+        *sums, count = over_processes(torch.cat([rows.sum(0), rows.new_full((1,), len(rows))])).split(
+            [rows.shape[1], 1]
+        )
+        centred = rows - sums[0] / count
+        variance = over_processes(centred.square().sum(0)) / count
+        with torch.no_grad():
+            self.num_batches_tracked += 1
+            self.running_mean.lerp_(sums[0] / count, self.momentum)
+            self.running_var.lerp_(variance * (count / (count - 1)), self.momentum)
+        normal = centred * (variance + self.eps).rsqrt() * self.weight + self.bias
+        result = normal.to(x.dtype)
+        return result
+
+
 def residual_mlp(inputs: int, width: int, depth: int, outputs: int) -> nn.Sequential:
     """inputs -> width, ``depth`` residual blocks, -> outputs."""
     blocks = [ResidualBlock(width) for _ in range(depth)]
@@ -102,7 +145,7 @@ class Encoder(nn.Module):
     """What a network asks of its encoder.
 
     One's own is made with basis points (M, 3), spread where the shapes of the category are, and the length D of a code.
-    Batches are drawn with `features`, by other processes and without a gradient; `forward` is what is trained.
+    Batches are drawn with `features`, by other processes or on a GPU, without a gradient; `forward` is what is trained.
     """
 
     def features(self, points: Float[torch.Tensor, "B P 3"]) -> Float[torch.Tensor, "B ..."]:
@@ -151,7 +194,7 @@ class PointEncoder(Encoder):
         sizes = [2 * frequencies, latent // 8, latent // 4, latent // 2, latent]
         layers: list[nn.Module] = []
         for i, (a, b) in enumerate(pairwise(sizes)):
-            layers += [nn.Linear(a, b), nn.BatchNorm1d(b)]
+            layers += [nn.Linear(a, b), BatchNorm(b)]
             layers += [nn.ReLU()] if i < len(sizes) - 2 else []
         self.points = nn.Sequential(*layers)
         self.head = nn.Sequential(nn.Linear(latent, latent), nn.ReLU(), nn.Dropout(dropout), nn.Linear(latent, outputs))
@@ -193,7 +236,7 @@ class NodeDecoder(nn.Module):
         self.register_buffer("nodes", nodes)
         self.from_code = nn.Linear(code, width)
         self.from_node = nn.Linear(3, width, bias=False)
-        self.network = _shared_mlp(width, nn.BatchNorm1d)
+        self.network = _shared_mlp(width, BatchNorm)
 
     def forward(self, code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B K 3"]:
         """Node vectors of codes."""

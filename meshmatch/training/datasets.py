@@ -7,6 +7,7 @@ are smoothly deformed, a little turned, scaled and roughened.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -17,7 +18,7 @@ from meshmatch.arrays import Float, Floats, Int
 from meshmatch.errors import InputError
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import build_field
-from meshmatch.generators.generator import Source
+from meshmatch.generators.generator import Source, any_of
 from meshmatch.models.layers import BasisEncoder, Encoder
 from meshmatch.progress import Progress
 from meshmatch.templates.prepared_folder import ShapeSamples
@@ -35,8 +36,7 @@ _MAX_POINTS = 400_000  # for which a lattice is kept ready; with more shapes the
 
 def registered_source(shapes: Float[Tensor, "N V 3"]) -> Source:
     """A fixed set of registered shapes, drawn with replacement."""
-    shapes = shapes - shapes.mean(1, keepdim=True)
-    return lambda count, generator: shapes[torch.randint(len(shapes), (count,), generator=generator)]
+    return partial(any_of, shapes - shapes.mean(1, keepdim=True))
 
 
 def drawn_once(source: Source, count: int, seed: int, progress: Progress) -> Source:
@@ -48,9 +48,12 @@ def drawn_once(source: Source, count: int, seed: int, progress: Progress) -> Sou
     return registered_source(torch.cat(blocks))
 
 
-def step_generator(seed: int, step: int) -> torch.Generator:
-    """The random stream of one training step. A large odd multiplier keeps those of different seeds apart."""
-    return torch.Generator().manual_seed((seed * 2_654_435_761 + step) % (2**63))
+def step_generator(seed: int, step: int, device: torch.device | str = "cpu") -> torch.Generator:
+    """The random stream of one training step. A large odd multiplier keeps those of different seeds apart.
+
+    Every sort of device has streams of its own.
+    """
+    return torch.Generator(device).manual_seed((seed * 2_654_435_761 + step) % (2**63))
 
 
 class OnDevice:
@@ -75,7 +78,7 @@ class Batch(OnDevice):
 
 @dataclass(frozen=True, eq=False)
 class BatchDataset(torch.utils.data.Dataset[Batch]):
-    """Item s is the batch of training step s.
+    """Item s is the batch of training step s, drawn on the CPU; see `training.batches` for other devices.
 
     ``template_core`` are the template's vertices of the core, ``core`` their indices; ``loss_points`` the indices of
     supervised vertices. Each drawn shape is scanned ``scans_per_shape`` times, and scaled to ``radius`` or to area 1.
@@ -98,10 +101,19 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
     def __len__(self) -> int:
         return self.length
 
-    @torch.no_grad()
     def __getitem__(self, step: int) -> Batch:
-        generator = step_generator(self.seed, step)
-        verts = _drawn(self.source(self.shapes, generator), self.shapes, int(self.faces.max()) + 1)
+        return self.batch(step_generator(self.seed, step))
+
+    @torch.no_grad()
+    def drawn(self, generator: torch.Generator) -> Float[Tensor, "N V 3"]:
+        """Shapes of the source, which is ours if it draws on a GPU, and looked at nowhere else."""
+        found = self.source(self.shapes, generator)
+        return found if self.faces.device.type != "cpu" else _checked(found, self.shapes, int(self.faces.max()) + 1)
+
+    @torch.no_grad()
+    def batch(self, generator: torch.Generator, verts: Float[Tensor, "N V 3"] | None = None) -> Batch:
+        """The batch of a random stream, of shapes that it draws or of given ones, where the tensors of this are."""
+        verts = self.drawn(generator) if verts is None else verts
         scale = verts.flatten(1).std(1)[:, None, None]
         verts = scans.bump(verts / scale * 0.3, self.scan.bumps, generator)
         verts, areas = scans.normalise(verts, self.faces)
@@ -145,9 +157,11 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
         B, scan = len(verts), self.scan
         foreign = torch.zeros(B, 1, 1)
         if scan.outside:
-            chosen = torch.nonzero(torch.rand(B, generator=generator) < scan.outside)[:, 0]
-            seen = scans.seen_from_outside(verts[chosen], self.faces, generator)
-            areas = areas.index_copy(0, chosen, areas[chosen] * torch.where(seen, 1.0, 1e-3))
+            chosen = torch.rand(B, generator=generator) < scan.outside
+            # a GPU sooner looks at all than that somebody waits until it knows which
+            at = torch.nonzero(chosen)[:, 0] if areas.device.type == "cpu" else torch.arange(B)
+            seen = scans.seen_from_outside(verts[at], self.faces, generator) | ~chosen[at, None]
+            areas = areas.index_copy(0, at, areas[at] * torch.where(seen, 1.0, 1e-3))
         if scan.strays:
             foreign = 0.3 * torch.rand(B, 1, 1, generator=generator)
             foreign = foreign * (torch.rand(B, 1, 1, generator=generator) < scan.strays)
@@ -155,7 +169,7 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
         return areas, ((1 - foreign) / shown).sqrt(), foreign
 
 
-def _drawn(found: Any, count: int, V: int) -> Float[Tensor, "N V 3"]:
+def _checked(found: Any, count: int, V: int) -> Float[Tensor, "N V 3"]:
     """What a source drew, in float32; `InputError` if these are not so many shapes of at least V vertices."""
     verts: Tensor = torch.as_tensor(found).float()
     if verts.ndim != 3 or len(verts) != count or verts.shape[1] < V or verts.shape[2] != 3:
@@ -226,12 +240,14 @@ def deformed_source(shapes: Float[Tensor, "N V 3"], deform: float = DEFORM) -> S
     shapes = shapes - shapes.mean(1, keepdim=True)
     shapes = 0.3 * shapes / shapes.flatten(1).std(1)[:, None, None]  # about area 1
     phi = _lattice_field(shapes.reshape(-1, 3).double().numpy()).phi.to_dense().reshape(N, V, -1)
+    return partial(_deformed, shapes, phi, deform)
 
-    def draw(count: int, generator: torch.Generator) -> Tensor:
-        which = torch.randint(N, (count,), generator=generator)
-        return shapes[which] + phi[which] @ lattice_vectors(deform, count, phi.shape[2], generator)
 
-    return draw
+def _deformed(
+    shapes: Float[Tensor, "N V 3"], phi: Float[Tensor, "N V L"], deform: float, count: int, generator: torch.Generator
+) -> Float[Tensor, "B V 3"]:
+    which = torch.randint(len(shapes), (count,), generator=generator)
+    return shapes[which] + phi[which] @ lattice_vectors(deform, count, phi.shape[2], generator)
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,9 +268,12 @@ class CloudDataset(torch.utils.data.Dataset[CloudBatch]):
     def __len__(self) -> int:
         return self.length
 
-    @torch.no_grad()
     def __getitem__(self, step: int) -> CloudBatch:
-        generator = step_generator(self.seed, step)
+        return self.batch(step_generator(self.seed, step))
+
+    @torch.no_grad()
+    def batch(self, generator: torch.Generator) -> CloudBatch:
+        """The batch of a random stream, where the tensors of this are."""
         N, total, _ = self.points.shape
         # Every shape once before one comes again, as far as a batch goes.
         order = [torch.randperm(N, generator=generator) for _ in range(-(-self.shapes // N))]

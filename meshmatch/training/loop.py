@@ -8,11 +8,11 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from numbers import Integral
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 import torch.distributed as dist
@@ -24,10 +24,10 @@ from meshmatch.errors import ModelError, OptionError
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.inference import training_device
 from meshmatch.outputs import replace_on_success
+from meshmatch.training.batches import Draw, batches
 from meshmatch.training.losses import CorrespondenceLoss, Objective
 
 _OF_TEMPLATE = ("nodes", "anchors")  # what a checkpoint must share with the training that goes on from it
-_STATISTICS = ("running_mean", "running_var")  # of batch norms
 _MOMENTS, _COUNT = ("exp_avg", "exp_avg_sq"), {"step": torch.Size()}  # of Adam: what it knows of each parameter
 
 
@@ -37,8 +37,9 @@ class TrainConfig:
 
     ``steps`` fixes the schedule: warm-up, a constant rate, then a cosine to zero over the last ``decay`` share.
     ``minutes`` only stops the run (with a checkpoint to go on from). ``align_steps``: so many steps of the aligner alone
-    come first. ``device``: "auto" (a GPU of CUDA if there is one), "cpu", "cuda" or "mps". `OptionError` if a number cannot
-    be.
+    come first. ``device``: "auto" (a GPU of CUDA if there is one), "cpu", "cuda" or "mps"; ``draw``: where batches are
+    drawn: "cpu", "device", or "auto" (on a GPU of CUDA). ``bf16``, and on GPUs that have it ``tf32``, round the factors of
+    products; torch may ``compile`` the loss. `OptionError` if a number cannot be.
     """
 
     steps: int = 20_000
@@ -56,9 +57,12 @@ class TrainConfig:
     workers: int = 1
     threads: int = 1
     bf16: bool = False
+    tf32: bool = False
+    compile: bool = False
     seed: int = 0
     align_steps: int = 0
     device: str = "auto"
+    draw: Draw = "auto"
     loss: Objective = field(default_factory=CorrespondenceLoss)
 
     def __post_init__(self) -> None:
@@ -66,6 +70,8 @@ class TrainConfig:
             value = getattr(self, name)
             if not isinstance(value, Integral) or value < 1:
                 raise OptionError(f"{name} must be 1 or more, a whole number, not {value!r}")
+        if self.draw not in get_args(Draw):
+            raise OptionError(f"batches are drawn on {', '.join(get_args(Draw))}, not {self.draw!r}")
         if not (self.rate > 0 and 0 <= self.decay <= 1 and self.workers >= 0):
             raise OptionError("a training needs a positive rate, a decay in 0..1 and workers of 0 or more")
         if self.minutes is not None and not self.minutes > 0:
@@ -114,10 +120,13 @@ class Trainer:
         self.average = {n: p.detach().clone() for n, p in model.named_parameters()}
         settings: dict[str, Any] = {"betas": (0.9, config.momentum), "weight_decay": config.weight_decay, "fused": True}
         self.optimiser = torch.optim.AdamW(model.parameters(), config.rate, **settings)
+        self.loss: Any = torch.compile(config.loss) if config.compile else config.loss
         self.step, self.seconds = 0, 0.0
+        self._unchecked: tuple[dict[str, Tensor], int] | None = None  # terms of a step, which a GPU still computes
 
     def save(self, path: Path) -> None:
         """Write everything that the next step depends on (rank 0 only)."""
+        self._check_last()
         if self.rank:
             return
         arrays = {f"model.{n}": t for n, t in self.model.state_dict().items()}
@@ -182,16 +191,15 @@ class Trainer:
         torch.set_num_threads(config.threads)
         _keep_memory()
         ours = range(self.rank, config.steps * self.world, self.world)[self.step : config.steps]
-        loader = torch.utils.data.DataLoader(
-            data, batch_size=None, sampler=ours, num_workers=config.workers,
-            prefetch_factor=4 if config.workers else None, worker_init_fn=_one_thread,
-        )  # fmt: skip
         began = saved = time.monotonic()
         before = self.seconds
         sums: dict[str, Tensor | float] = {}
         summed = 0
         self.model.train()
-        for batch in loader:
+        if self.world > 1:  # which begin with the same weights
+            for held in (*self.model.state_dict().values(), *self.average.values()):
+                dist.broadcast(held.detach(), 0)
+        for batch in batches(data, ours, self.device, config.workers, config.draw):
             terms = self.iterate(batch)
             for name, value in terms.items():
                 sums[name] = sums.get(name, 0.0) + value.detach().float()  # there: no step waits for a GPU's numbers
@@ -222,11 +230,19 @@ class Trainer:
         torch.manual_seed(seed + 1)
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.step, config)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=config.bf16):
-            terms = config.loss(self.model, batch.to(self.device), self.points, generator)
-        _check_terms(terms, self.step)
-        self.optimiser.zero_grad(set_to_none=True)
-        terms["total"].backward()
+        with _products("high" if config.tf32 else torch.get_float32_matmul_precision()):
+            with torch.autocast(self.device.type, torch.bfloat16) if config.bf16 else nullcontext():
+                # torch compiles draws from its global stream alone
+                terms: dict[str, Tensor] = self.loss(
+                    self.model, batch.to(self.device), self.points, None if config.compile else generator
+                )
+            _check_terms(terms)
+            self._check_last()
+            self._unchecked = terms, self.step
+            if self.device.type == "cpu":
+                self._check_last()
+            self.optimiser.zero_grad(set_to_none=True)
+            terms["total"].backward()
         if self.world > 1:
             self._exchange()
         if config.clip is not None:
@@ -236,11 +252,15 @@ class Trainer:
         self._update_average()
         return terms
 
+    def _check_last(self) -> None:
+        """`ModelError` if the total of the last step is not finite. Where that waits for a GPU it is asked a step later."""
+        if self._unchecked is not None:
+            _check_finite(*self._unchecked)
+            self._unchecked = None
+
     def _exchange(self) -> None:
-        """Gradients, and the statistics of batch norms, become the means over all processes: all at once, for each exchange
-        takes time of its own."""
+        """Gradients become the means over all processes: all at once, for each exchange takes time of its own."""
         held = [each.grad for each in self.model.parameters() if each.grad is not None]
-        held += [each for name, each in self.model.named_buffers() if name.endswith(_STATISTICS)]
         flat = torch.cat([each.flatten() for each in held])
         dist.all_reduce(flat)
         for each, mean in zip(held, (flat / self.world).split([each.numel() for each in held]), strict=True):
@@ -281,12 +301,26 @@ class Trainer:
         return state | {n: t.cpu().clone() for n, t in self.average.items()}
 
 
-def _check_terms(terms: Any, step: int) -> None:
-    """What a loss gave: `OptionError` if nothing can be learned from it, `ModelError` if its total is no longer finite."""
+@contextmanager
+def _products(precision: str) -> Iterator[None]:
+    """How exact products of float32 matrices are within the block: scans are always drawn with exact ones."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision(precision)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def _check_terms(terms: Any) -> None:
+    """What a loss gave: `OptionError` if nothing can be learned from it."""
     if not (isinstance(terms, dict) and all(isinstance(each, Tensor) and not each.shape for each in terms.values())):
         raise OptionError("a loss must give a dictionary of tensors, each of one number", "Objective describes losses")
     if "total" not in terms or not terms["total"].requires_grad:
         raise OptionError("a loss must give a term 'total' that has a gradient", "Objective describes losses")
+
+
+def _check_finite(terms: dict[str, Tensor], step: int) -> None:
     if not terms["total"].isfinite():
         strange = ", ".join(sorted(name for name, each in terms.items() if not each.isfinite()))
         raise ModelError(f"the training diverged: not finite at step {step + 1:,} are {strange}", "take a lower rate")
@@ -298,7 +332,3 @@ def _keep_memory() -> None:
     if sys.platform == "linux" and hasattr(library := ctypes.CDLL(None), "mallopt"):
         for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
             library.mallopt(option, 2**30)
-
-
-def _one_thread(_: int) -> None:
-    torch.set_num_threads(1)

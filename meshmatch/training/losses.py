@@ -54,20 +54,28 @@ class Objective(ABC):
     correct_points: int = 1024
 
     @abstractmethod
-    def __call__(self, model: Deformer, batch: Any, points: Any, generator: torch.Generator) -> Terms:
-        """Weighted terms by name; their sum under ``total``. Errors without weight start with ``error``."""
+    def __call__(self, model: Deformer, batch: Any, points: Any, generator: torch.Generator | None) -> Terms:
+        """Weighted terms by name; their sum under ``total``. Errors without weight start with ``error``.
+
+        Random numbers come from the generator, or from torch's global stream if that is None.
+        """
 
     def rigidity(self, F: Float[Tensor, "B G 3 3"]) -> Terms:
         """Weighted volume and as-rigid-as-possible energies of deformation gradients."""
         return {"volume": self.volume * volume_energy(F).mean(), "arap": self.arap * arap_energy(F).mean()}
 
     def between(
-        self, model: Deformer, code: Float[Tensor, "B D"], shift: int, points: LossPoints, generator: torch.Generator
+        self,
+        model: Deformer,
+        code: Float[Tensor, "B D"],
+        shift: int,
+        points: LossPoints,
+        generator: torch.Generator | None,
     ) -> Terms:
         """The weighted energies of random blends of every code with the one ``shift`` places before it."""
         if not self.blend:
             return {}
-        share = torch.rand(len(code), 1, generator=generator).to(code.device)
+        share = torch.rand(len(code), 1, generator=generator, device=_home(generator, code)).to(code.device)
         F = points.field.deformation_gradient(model.decoder(share * code + (1 - share) * code.roll(shift, 0)))
         return {"blend": self.blend * (volume_energy(F).mean() + arap_energy(F).mean())}
 
@@ -83,7 +91,7 @@ class CorrespondenceLoss(Objective):
     align: float = 0.3
     robust: bool = False
 
-    def __call__(self, model: Deformer, batch: Batch, points: LossPoints, generator: torch.Generator) -> Terms:
+    def __call__(self, model: Deformer, batch: Batch, points: LossPoints, generator: torch.Generator | None) -> Terms:
         code = model.encoder(batch.encode_features)
         rows = model.decoder(code)
         moved = points.moved(rows)
@@ -121,6 +129,10 @@ class CorrespondenceLoss(Objective):
         return self.rigidity(points.field.deformation_gradient(rows))
 
 
+def _home(generator: torch.Generator | None, like: Tensor) -> torch.device:
+    return like.device if generator is None else generator.device
+
+
 def distance(a: Float[Tensor, "*N 3"], b: Float[Tensor, "*N 3"]) -> Float[Tensor, ""]:
     """Mean Euclidean distance of corresponding points."""
     return ((a - b).square().sum(-1) + 1e-8).sqrt().mean()
@@ -146,7 +158,9 @@ class ChamferLoss(Objective):
     landmarks: float = 1.0
     plain: bool = False
 
-    def __call__(self, model: Deformer, batch: CloudBatch, points: SurfacePoints, generator: torch.Generator) -> Terms:
+    def __call__(
+        self, model: Deformer, batch: CloudBatch, points: SurfacePoints, generator: torch.Generator | None
+    ) -> Terms:
         code = model.encoder(batch.encode_features)
         rows = model.decoder(code)
         terms, fit = self._energies(rows, batch, points)

@@ -24,7 +24,7 @@ from meshmatch.training.recipes import Recipe
 _LOSSES: dict[str, type[Objective]] = {
     f"{each.__module__}.{each.__qualname__}": each for each in (CorrespondenceLoss, ChamferLoss)
 }
-_OF_THE_MACHINE = ("minutes", "checkpoint_minutes", "threads", "device")
+_OF_THE_MACHINE = ("minutes", "checkpoint_minutes", "threads", "device", "draw", "compile")
 _PARTS = {"network", "field", "recipe"}
 _OWN = ("deform", "storage", "template", "characters", "bodies")
 _MOST: dict[str, float] = {
@@ -61,8 +61,8 @@ def recipe_record(recipe: Recipe) -> dict[str, Any]:
 def read_recipe(path: str | Path, usual: Recipe) -> Recipe:
     """The recipe of a card, or of a file that has parts of one; what it does not say is as in the usual one.
 
-    What belongs to the machine (minutes, threads, device) is not taken from a file. `InputError` if it is none, names
-    something unknown, or was learned by a loss that is not meshmatch's own.
+    What belongs to the machine (minutes, threads, device, where batches are drawn, compiling) is not taken from a file.
+    `InputError` if it is none, names something unknown, or was learned by a loss that is not meshmatch's own.
     """
     path = Path(path)
     try:

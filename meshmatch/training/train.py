@@ -6,6 +6,7 @@ How a folder is learned is decided by `meshmatch.training.recipes.recipe_for`.
 from __future__ import annotations
 
 import datetime
+import os
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
@@ -27,6 +28,7 @@ from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.card import ModelCard, check_name, write_card
 from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.deformer import Deformer
+from meshmatch.models.inference import training_device
 from meshmatch.models.network import NetworkConfig
 from meshmatch.models.registry import CARD, NO_MODEL, TEMPLATE, WEIGHTS, load_model
 from meshmatch.models.trained import TrainedModel
@@ -221,7 +223,8 @@ def train_model(
     resumed = resume and checkpoint.is_file()
     if config.align_steps and not resumed and isinstance(data, BatchDataset) and model.aligner is not None:
         torch.set_num_threads(config.threads)
-        train_aligner(model, data, config.align_steps, aligning)
+        model.to(training_device(int(os.environ.get("LOCAL_RANK", 0)), config.device))
+        train_aligner(model, data, config.align_steps, aligning, config.draw)
     held_out = replace(data, seed=VALIDATION_SEED, **few)[0]
     trainer = Trainer(model, points, config)
     if resumed:
@@ -342,7 +345,7 @@ def build_dataset(
 ) -> BatchDataset:
     """Batches of a source for a model, or for none as yet, supervised on evenly spread template vertices.
 
-    Batches are drawn on the CPU, by processes of their own, wherever the model goes: so they have its encoders' copies.
+    It stays on the CPU, wherever the model goes: so it has its encoders' copies.
     """
     verts = torch.from_numpy(np.array(template.shape.verts)).float()
     core = torch.from_numpy(template.core)

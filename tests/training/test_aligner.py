@@ -58,7 +58,7 @@ def test_it_is_a_function_of_the_seed() -> None:
 def test_a_training_begins_with_it_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
 
-    def train_aligner(model: Deformer, data: BatchDataset, steps: int, progress: Progress | None) -> None:
+    def train_aligner(model: Deformer, data: BatchDataset, steps: int, progress: Progress | None, draw: str) -> None:
         asked.append(steps)
 
     monkeypatch.setattr("meshmatch.training.train.train_aligner", train_aligner)

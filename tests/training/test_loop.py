@@ -17,6 +17,7 @@ from safetensors.torch import load_file, save_file
 
 from meshmatch.errors import ModelError, OptionError, OutputError
 from meshmatch.models.deformer import Deformer
+from meshmatch.models.layers import BatchNorm
 from meshmatch.models.network import NetworkConfig
 from meshmatch.templates.template import Template
 from meshmatch.training.datasets import Batch, BatchDataset
@@ -316,7 +317,7 @@ from tests.training.test_loop import _TWO, egg_template, small_data, trainer
 egg = egg_template()
 run = trainer(egg, _TWO)
 run.run(small_data(egg, run.model, length=8))
-save_file(run.averaged_state(), f"{sys.argv[1]}/rank{run.rank}.safetensors")
+save_file(run.averaged_state(), f"{sys.argv[1]}/{run.rank}.safetensors")
 dist.destroy_process_group()
 """
 
@@ -332,17 +333,22 @@ class Joined(torch.utils.data.Dataset):
         return Batch(*(torch.cat(both) for both in pair))
 
 
-@pytest.mark.slow
-def test_two_processes_learn_as_one_that_sees_both_their_batches(egg: Template, tmp_path: Path) -> None:
+def in_two_processes(program: str, folder: Path) -> list[dict[str, torch.Tensor]]:
+    """What each leaves in the folder, under the number of its rank."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
     words = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "CUDA_VISIBLE_DEVICES": ""}
-    command = [sys.executable, "-c", _ONE_OF_TWO, str(tmp_path)]
+    command = [sys.executable, "-c", program, str(folder)]
     root = Path(__file__).resolve().parents[2]
     both = [subprocess.Popen(command, env=os.environ | words | {"RANK": rank}, cwd=root) for rank in "01"]
     assert [process.wait(timeout=300) for process in both] == [0, 0]
-    ranks = [load_file(tmp_path / f"rank{rank}.safetensors") for rank in (0, 1)]
+    return [load_file(folder / f"{rank}.safetensors") for rank in "01"]
+
+
+@pytest.mark.slow
+def test_two_processes_learn_as_one_that_sees_both_their_batches(egg: Template, tmp_path: Path) -> None:
+    ranks = in_two_processes(_ONE_OF_TWO, tmp_path)
     assert same(ranks[0], ranks[1])
 
     alone = trainer(egg, _TWO)
@@ -352,3 +358,100 @@ def test_two_processes_learn_as_one_that_sees_both_their_batches(egg: Template, 
     for name, _ in alone.model.named_parameters():
         learned = (found[name] - fresh[name]).abs().mean()
         assert (found[name] - ranks[0][name]).abs().mean() <= 0.02 * learned + 1e-7, name
+
+
+def test_a_step_on_another_device_waits_for_no_number_of_it(
+    egg: Template, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On torch's meta device, which has shapes alone: whether a total is finite is asked a step later, and before a save."""
+    monkeypatch.setattr("meshmatch.training.loop.training_device", lambda *_: torch.device("meta"))
+    run = trainer(egg, CONFIG)
+    run.optimiser = torch.optim.AdamW(run.model.parameters())  # its fused steps know no such device
+    batch = small_data(egg, small_network(egg), length=8)[0]
+    assert all(term.is_meta for term in run.iterate(batch).values()) and run.step == 1
+    for ask in (lambda: run.iterate(batch), lambda: run.save(tmp_path / "last.safetensors")):
+        with pytest.raises(RuntimeError, match="meta"):
+            ask()
+    assert run.step == 1 and not list(tmp_path.iterdir())
+
+
+@dataclass(frozen=True)
+class Told(CorrespondenceLoss):
+    """The usual one; it writes down how exact products are, and whose numbers are drawn."""
+
+    seen: tuple[list[Any], ...] = ([],)
+
+    def __call__(self, model: Any, batch: Any, points: Any, generator: Any) -> Any:
+        self.seen[0].append((torch.get_float32_matmul_precision(), generator is None))
+        return super().__call__(model, batch, points, generator)
+
+
+@pytest.mark.parametrize("how", [{}, {"tf32": True}, {"compile": True}])
+def test_products_are_rounded_in_steps_alone(egg: Template, how: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "compile", lambda loss: loss)
+    usual, drawn, loss = torch.get_float32_matmul_precision(), [], Told(seen=([],))
+    run = trainer(egg, replace(CONFIG, steps=2, loss=loss, **how))
+    data = small_data(egg, run.model, length=2)
+
+    def source(count: int, generator: torch.Generator) -> torch.Tensor:
+        drawn.append(torch.get_float32_matmul_precision())
+        return data.source(count, generator)
+
+    run.run(replace(data, source=source))
+    assert loss.seen[0] == 2 * [("high" if "tf32" in how else usual, "compile" in how)]
+    assert drawn == 2 * [usual] and torch.get_float32_matmul_precision() == usual
+
+
+def test_a_compiled_loss_learns_the_same(egg: Template, monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled, found = torch.compile, []
+    monkeypatch.setattr(torch, "compile", lambda loss: compiled(loss, backend="aot_eager"))  # what it needs no C++ for
+    for compile_it in (False, True):
+        config = replace(CONFIG, steps=3, compile=compile_it, loss=CorrespondenceLoss(blend=0.0))
+        run = trainer(egg, config, replace(NETWORK, align_basis=0, corrections=0))
+        run.run(small_data(egg, run.model, length=3))
+        found.append(run.averaged_state())
+    for name, plain in found[0].items():
+        assert torch.allclose(found[1][name], plain, atol=1e-6), name
+
+
+_NORMS = """
+import sys
+import torch
+import torch.distributed as dist
+from safetensors.torch import save_file
+from tests.training.test_loop import normed, ROWS
+
+dist.init_process_group("gloo")
+rank = dist.get_rank()
+layer, out = normed(ROWS[:10] if rank == 0 else ROWS[10:])
+grads = layer.weight.grad, layer.bias.grad
+for each in grads:
+    dist.all_reduce(each)
+save_file({**layer.state_dict(), "weight.grad": grads[0], "bias.grad": grads[1], **out}, f"{sys.argv[1]}/{rank}.safetensors")
+dist.destroy_process_group()
+"""
+ROWS = torch.randn(30, 4, generator=torch.Generator().manual_seed(0)) * 3 + 5
+
+
+def normed(rows: torch.Tensor) -> tuple[BatchNorm, dict[str, torch.Tensor]]:
+    """A layer after a step, what it gave, and the gradient of its input."""
+    layer, rows = BatchNorm(4), rows.clone().requires_grad_()
+    with torch.no_grad():
+        layer.weight += torch.arange(4)
+    out = layer(rows)
+    (out * out.detach().sin()).sum().backward()
+    assert rows.grad is not None
+    return layer, {"out": out.detach(), "in.grad": rows.grad}
+
+
+@pytest.mark.slow
+def test_processes_norm_their_batches_together(tmp_path: Path) -> None:
+    """As one process does that has all rows, gradients included; the processes have different numbers of them."""
+    both = in_two_processes(_NORMS, tmp_path)
+    layer, whole = normed(ROWS)
+    assert layer.weight.grad is not None and layer.bias.grad is not None
+    for name in ("out", "in.grad"):
+        assert torch.allclose(torch.cat([each[name] for each in both]), whole[name], atol=1e-5), name
+    wanted = {**layer.state_dict(), "weight.grad": layer.weight.grad, "bias.grad": layer.bias.grad}
+    for each in both:
+        assert all(torch.allclose(each[name], value, rtol=1e-5, atol=1e-4) for name, value in wanted.items())

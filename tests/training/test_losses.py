@@ -130,6 +130,17 @@ def test_a_step_on_another_device_waits_for_no_number_of_it(
     assert all(each.grad is not None and each.grad.shape == each.shape for each in model.parameters())
 
 
+@pytest.mark.parametrize(("network", "scan"), [(NETWORK, SCAN), (POINTS, UPRIGHT)], ids=["default", "paper"])
+def test_off_the_cpu_a_loss_is_one_graph(egg: Template, network: NetworkConfig, scan: ScanConfig) -> None:
+    """torch can compile it as a whole, its draws included."""
+    there, model = torch.device("meta"), small_network(egg, network, scan)
+    batch, points = small_data(egg, model, scan)[0], small_points(egg, model=model)
+    loss = torch.compile(CorrespondenceLoss(), backend="aot_eager", fullgraph=True)
+    found = loss(model.to(there), batch.to(there), points.to(there), None)
+    found["total"].backward()
+    assert found["blend"].is_meta and all(each.grad is not None for each in model.parameters())
+
+
 def test_blends_come_from_the_generator(egg: Template, points: LossPoints) -> None:
     model = small_network(egg)
     torch.nn.init.normal_(model.decoder.network[-1].weight, std=0.3)  # a fresh one hardly moves anything
