@@ -52,6 +52,23 @@ def test_every_ordered_pair_counts_with_the_worse_verdict(tmp_path: Path) -> Non
     row = characters.row_of("clothed", [ball(bones, name) for name in "abc"], Stub(), tmp_path)  # type: ignore[arg-type]
     assert (row["pairs"], row["bone"], row["mean_cm"], row["verdicts"]) == (6, 1.0, 0.0, "0 / 2 / 4")
     assert row["slowest"] >= row["seconds"] > 0
+    assert row["wrong_good"] == 0
+
+
+def test_a_pair_that_is_far_off_and_called_good_is_counted(tmp_path: Path) -> None:
+    bones, shape = np.zeros(icosphere(2).V, np.int64), icosphere(2)
+    opposite = np.argmin(shape.verts @ shape.verts.T, axis=1)
+    verdicts = iter(["good", "good", "fair"])
+
+    class Stub:
+        def fit(self, shape: Shape) -> SimpleNamespace:
+            return SimpleNamespace(verdict=next(verdicts), reasons=())
+
+        def map(self, source: SimpleNamespace, target: SimpleNamespace) -> VertexMap:
+            return VertexMap("a", "b", opposite)
+
+    row = characters.row_of("fused", [ball(bones, name) for name in "abc"], Stub(), tmp_path)  # type: ignore[arg-type]
+    assert (row["verdicts"], row["wrong_good"]) == ("2 / 4 / 0", 2)
 
 
 @pytest.mark.slow
