@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from meshmatch.experiments.bench.sets import load_set
-from meshmatch.experiments.paper import ablation_errors, ablation_training, ablations
+from meshmatch.experiments.paper import ablation_errors, ablation_training, ablations, blends
 from meshmatch.experiments.paper.ablation_errors import (
     Measure,
     begin,
@@ -21,7 +21,7 @@ from meshmatch.experiments.paper.ablation_errors import (
 )
 from meshmatch.experiments.paper.ablation_results import Sample, claims_table, difference, rising
 from meshmatch.experiments.paper.ablation_training import SCANS, Setting, fewer, new_network, pool_of, timed, train_run
-from meshmatch.experiments.paper.ablation_views import BASE, CODED, CONSTRAINTS, VIEWS, Run, all_runs
+from meshmatch.experiments.paper.ablation_views import BASE, CODED, CONSTRAINTS, TABLE3, VIEWS, Run, all_runs
 from meshmatch.experiments.runner import words_of
 from meshmatch.fields.shape_functions import FIELDS
 from meshmatch.fitting.fit_config import FitConfig, LatentRefineConfig
@@ -331,3 +331,27 @@ def test_cells_take_turns(setting: Setting) -> None:
     found = timed(setting, [replace(BASE, field=field) for field in FIELDS], 2)
     assert set(found) == {"base", "field-rbf", "field-pointwise"}
     assert all(record["rounds"] == 2 and record["ms"] > 0 and record["cpu_ms"] > 0 for record in found.values())
+
+
+def test_table_3_is_trained_from_the_beginning_and_its_codes_are_blended(
+    setting: Setting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    papers = setting.recipe(replace(BASE, constraint=TABLE3)).train.loss
+    assert (papers.volume, papers.arap, papers.blend) == (1e-4, 1e-2, 1.0)
+    monkeypatch.setattr(blends, "pool_of", pool_of.__wrapped__)
+    words = ["--steps", "3", "--seeds", "2", "--work", str(tmp_path)]
+    assert blends.main(words) == 0
+    first = capsys.readouterr()
+    rows = json.loads(first.out.splitlines()[-1])["rows"]
+    assert list(rows) == list(blends.WEIGHTS) and "training" in first.err
+    for each in rows.values():
+        assert [one["steps"] for one in each] == [3, 3] and each[0]["model"] != each[1]["model"]
+        found = [
+            one[f"{name}_{where}"] for one in each for name in ("volume", "rigidity") for where in ("ends", "halfway")
+        ]
+        assert min(found) > 0 and len(set(found)) == 8
+    assert blends.main(words) == 0  # all of it is kept
+    again = capsys.readouterr()
+    assert json.loads(again.out.splitlines()[-1])["rows"] == rows and "training" not in again.err
+    row = blends.row_of("words", rows["table 3"])
+    assert row["held_out_cm"].count("±") == 1 and "±" not in blends.row_of("words", rows["table 3"][:1])["held_out_cm"]

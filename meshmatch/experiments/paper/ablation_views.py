@@ -14,6 +14,8 @@ from meshmatch.fields.shape_functions import FIELDS, FieldName
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.templates.make import STRATEGIES, Strategy
 
+TABLE3 = "vol+arap+Z of table 3"
+"""The weights that are meant for interpolation; others are of table 1."""
 CONSTRAINTS = ("none", "arap", "vol", "vol+arap", "vol+arap+Z")
 PAPER_SETS = ("shrec19", "scape-pcn")
 HELD_OUT = "held out"
@@ -29,7 +31,7 @@ class Run:
     Parameters
     ----------
     field, kernel : of the deformation
-    constraint : one of `CONSTRAINTS`
+    constraint : one of `CONSTRAINTS`, or `TABLE3`
     nodes, radius : K, and r in the paper's unit
     strategy : how nodes are chosen
     pose : of the template, one of `POSES`
@@ -54,7 +56,7 @@ class Run:
     def name(self) -> str:
         """Of its folder: in what it differs from the base."""
         parts = [
-            f"{each.name}-{getattr(self, each.name)}".replace("+", "-").lower()
+            f"{each.name}-{getattr(self, each.name)}".replace("+", "-").replace(" ", "-").lower()
             for each in fields(self)
             if getattr(self, each.name) != each.default
         ]
