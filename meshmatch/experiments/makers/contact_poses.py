@@ -22,10 +22,11 @@ from meshmatch.generators.rotations import DEGREE
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import vertex_normals
 
-_STEPS, _EVERY, _RATE = 120, 4, 2.5  # of the descent: steps, steps between two searches for contacts, degrees a step
+_STEPS, _EVERY, _RATE = 240, 6, 2.5  # of the descent: steps, steps between two searches for contacts, degrees a step
 _APART = 0.15  # metres between two points of the resting skin that are no neighbours
 _NEIGHBOURS = 40  # among which the nearest point that is no neighbour is looked for
 _REACH = 0.06  # metres: what is farther inside has come in from another side
+_TOUCHES = 0.015  # metres between vertices of parts that touch
 _GIVES = 0.004  # metres that skin gives way
 _TOUCH, _SOFT, _STAY = 100.0, 300.0, 2e-5  # weights: of square metres, and of square degrees from where a pose began
 _HAND = 0.03  # metres from the palm to the back of a hand
@@ -81,7 +82,7 @@ POSES = {
         {"bend": 25, "nod": 10},
         (("hollow R", "thigh L"), ("palm L", "knee R"), ("palm R", "cheek R")),
     ),
-    "knees drawn up, hands on the shins": ContactPose(
+    "bent forward, hands on the shins": ContactPose(
         _DRAWN_UP | _HAND_DOWN | {"elbow": 60}, _DRAWN_UP | _HAND_DOWN | {"elbow": 60}, {"bend": 40, "nod": 10},
         (("palm L", "shin L"), ("palm R", "shin R")),
     ),
@@ -97,9 +98,9 @@ POSES = {
         _TAILOR | {"knee": 138} | _HAND_UP, _TAILOR | _HAND_UP, {"bend": 40, "nod": 20},
         (("palm L", "cheek L"), ("palm R", "cheek R"), ("ankle R", "calf L"), ("elbow L", "thigh L")),
     ),
-    "squatting, a hand on the other arm": ContactPose(
+    "a hand on the other arm, one on the knee": ContactPose(
         _DRAWN_UP | {"hip_abduction": 14} | _FOLDED, _DRAWN_UP | {"hip_abduction": 14} | _HAND_DOWN, {"bend": 25},
-        (("palm L", "forearm R"), ("palm R", "shin L")),
+        (("palm L", "forearm R"), ("palm R", "knee R")),
     ),
 }  # fmt: skip
 
@@ -192,11 +193,12 @@ def far_neighbours(verts: Float[Floats, "V 3"], rest: Float[Floats, "V 3"]) -> I
 def contact_depths(
     verts: Float[Floats, "V 3"], rest: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]
 ) -> tuple[Bool[Bools, " V"], Float[Floats, " V"]]:
-    """Which vertices touch a part of the body that is far from them, within a centimetre; and how deep each lies in one."""
+    """Which vertices touch a part of the body that is far from them, to the distance of neighbours; and how deep each lies
+    in one, metres."""
     other = far_neighbours(verts, rest)
     away = np.where(other[:, None] >= 0, verts[other] - verts, np.inf)
     depth = np.where(other >= 0, (np.nan_to_num(away, posinf=0.0) * vertex_normals(verts, faces)[other]).sum(1), 0.0)
-    return np.linalg.norm(away, axis=1) < 0.01, depth.clip(0)
+    return np.linalg.norm(away, axis=1) < _TOUCHES, depth.clip(0)
 
 
 def _array(values: Tensor) -> Floats:
