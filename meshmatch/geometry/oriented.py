@@ -18,6 +18,7 @@ NORMAL_WEIGHT = 0.15
 _REACH = 0.5
 _GROUPS = 16  # of points whose nearest neighbours are about equally far
 _COMPARED = 65536  # distances at a time, which stay in a core's cache
+_SPARE, _CLASH = 16, 256  # rows a multiple of 256 apart push one another out of the cache: spare numbers part them
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +61,13 @@ class OrientedPoints:
         return replace(self, points=frame.apply(self.points), normals=self.normals @ frame.rotation.T)
 
     def first(self, count: int) -> OrientedPoints:
-        """The first samples."""
-        return self.rows(slice(count))
+        """The first samples; itself, with its trees, where there are no more."""
+        return self if count >= len(self.points) else self.rows(slice(count))
 
     def thinned(self, P: int) -> OrientedPoints:
         """About P of the samples, evenly taken from their order, which must be random."""
-        return self.rows(slice(None, None, max(1, len(self.points) // P)))
+        step = len(self.points) // P
+        return self if step <= 1 else self.rows(slice(None, None, step))
 
     def drawn(self, count: int, rng: np.random.Generator) -> Float[Floats, "N 3"]:
         """Points of at most ``count`` different samples, drawn evenly, or by their weights if they have some."""
@@ -129,10 +131,14 @@ def nearest(points: Float[Floats | Floats32, "P D"], queries: Float[Floats | Flo
     """
     middle = points.mean(0)  # where numbers are small, they are exact
     points, queries = (np.asarray(each - middle, np.float32) for each in (points, queries))
-    against = np.ascontiguousarray(np.concatenate([-2 * points, np.square(points).sum(1, keepdims=True)], 1).T)
+    P, D = points.shape
+    against = np.empty((D + 1, P if P % _CLASH else P + _SPARE), np.float32)
+    against[:D, :P], against[D, :P] = -2 * points.T, np.square(points).sum(1)
+    against[:D, P:], against[D, P:] = 0.0, np.inf  # nothing is nearest to what is spare
     lifted = np.concatenate([queries, np.ones((len(queries), 1), np.float32)], 1)
-    rows = max(1, _COMPARED // len(points))
-    compared = np.empty((rows, len(points)), np.float32)  # written again and again, rather than asked of the system
+    rows = max(1, _COMPARED // P)
+    # written again and again, rather than asked of the system
+    compared = np.empty((rows, against.shape[1]), np.float32)
     found = np.empty(len(lifted), np.int64)
     for low in range(0, len(lifted), rows):
         some = lifted[low : low + rows]

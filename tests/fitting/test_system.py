@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from meshmatch.fitting.solve import banded
-from meshmatch.fitting.solve.banded import solved_band
+from meshmatch.fitting.solve.banded import Envelope, solved_band
 from meshmatch.fitting.solve.system import NodeSystem, _EveryPair, node_system
 from meshmatch.geometry.kernels import KERNELS
 from meshmatch.models.trained import TrainedModel
@@ -163,8 +163,8 @@ def test_the_system_of_a_model_is_built_once(model: TrainedModel) -> None:
 @pytest.mark.parametrize("exported", [True, False])
 def test_a_band_is_solved_as_the_whole_matrix_is(exported: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not exported:
-        monkeypatch.setattr(banded, "_DPBSV", None)
-    elif banded._DPBSV is None:
+        monkeypatch.setattr(banded, "_LAPACK", None)
+    elif banded._LAPACK is None:
         pytest.skip("SciPy exports it with other types")
     rng, N, above = np.random.default_rng(0), 30, 6
     band = rng.normal(size=(N, above + 1))
@@ -179,3 +179,31 @@ def test_a_band_is_solved_as_the_whole_matrix_is(exported: bool, monkeypatch: py
     band[12, 0] = -50.0
     with pytest.raises(np.linalg.LinAlgError):
         solved_band(band, right)
+
+
+@pytest.mark.parametrize("exported", [True, False])
+@pytest.mark.parametrize("reaches", [(3, 3, 3), (2, 41, 6), (0, 0, 0), (7, 99, 99)], ids=str)
+def test_an_envelope_is_solved_as_the_whole_matrix_is(
+    exported: bool, reaches: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not exported:
+        monkeypatch.setattr(banded, "_LAPACK", None)
+    elif banded._LAPACK is None:
+        pytest.skip("SciPy exports it with other types")
+    rng, N = np.random.default_rng(0), 100
+    reach = np.repeat(reaches, [40, 30, 30])
+    ends = np.maximum.accumulate(np.minimum(np.arange(N) + reach + 1, N))
+    envelope = Envelope(ends)
+    band, whole = np.zeros((N, envelope.columns)), np.zeros((N, N))
+    for i in range(N):
+        band[i, : ends[i] - i] = rng.normal(size=ends[i] - i)
+        band[i, 0] = 50.0
+        whole[i : ends[i], i] = whole[i, i : ends[i]] = band[i, : ends[i] - i]
+    right = rng.normal(size=N)
+    np.testing.assert_allclose(envelope.solve(band.copy(), right.copy()), np.linalg.solve(whole, right), rtol=1e-10)
+    band[67, 0] = -50.0
+    with pytest.raises(np.linalg.LinAlgError, match="68"):
+        envelope.solve(band.copy(), right)
+    if exported:
+        with pytest.raises(ValueError, match="envelope"):
+            envelope.solve(np.zeros((N, envelope.columns + 1)), right)

@@ -82,7 +82,7 @@ def test_normals_without_a_sign_are_compared_both_ways() -> None:
     assert [len(each) for each in nearest_unsigned(tree, points[:0], normals[:0], 0.2)] == [0, 0, 0]
 
 
-@pytest.mark.parametrize(("P", "Q"), [(1, 5), (300, 2000), (3000, 768)])
+@pytest.mark.parametrize(("P", "Q"), [(1, 5), (300, 2000), (512, 900), (3000, 768)])
 @pytest.mark.parametrize("D", [3, 6])
 def test_comparing_all_with_all_answers_as_a_tree_does_up_to_rounding(P: int, Q: int, D: int) -> None:
     rng = np.random.default_rng(0)

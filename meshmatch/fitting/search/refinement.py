@@ -220,7 +220,7 @@ class WholeComparison:
         if self._landmarks is not None:
             fixed = self._landmarks[0], candidate.pose.to_local(self._landmarks[1])
         local = candidate.local(self.scorers[in_full].samples)
-        facing = local.facing(task.system.surface(candidate.vectors))
+        facing = local if local.signed else local.facing(task.system.surface(candidate.vectors))
         vectors = refine_nodes(task.system, facing, candidate.vectors, self.schedule(in_full), fixed)
         return replace(candidate, vectors=vectors, residual=two_way_residual(task.system, local, vectors))
 

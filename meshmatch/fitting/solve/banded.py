@@ -9,31 +9,45 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from scipy.linalg import cython_lapack, solveh_banded
+from scipy.linalg import cython_blas, cython_lapack, solveh_banded
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Float, Floats, Int, Ints
 
-_DOUBLE = "__pyx_t_5scipy_6linalg_13cython_lapack_d *"
-_SIGNATURE = f"void (char *, int *, int *, int *, {_DOUBLE}, int *, {_DOUBLE}, int *, int *)"
+_ROUTINES = {
+    "dpbsv": (cython_lapack, "char, int, int, int, double, int, double, int, int"),
+    "dpbtrs": (cython_lapack, "char, int, int, int, double, int, double, int, int"),
+    "dpotrf": (cython_lapack, "char, int, double, int, int"),
+    "dtrsm": (cython_blas, "char, char, char, char, int, int, double, double, int, double, int"),
+    "dsyrk": (cython_blas, "char, char, int, int, double, double, int, double, double, int"),
+}
+"""The modules that export them, and what their arguments point to."""
+_AT_ONCE = 32  # columns that `Envelope` eliminates at once
 
 
-def _exported() -> Callable[..., None] | None:
-    """LAPACK's dpbsv, if SciPy exports it with the types that are expected."""
-    python, exported = getattr(ctypes, "pythonapi", None), getattr(cython_lapack, "__pyx_capi__", {}).get("dpbsv")
-    if python is None or exported is None:
+def _exported() -> dict[str, Callable[..., None]] | None:
+    """The routines, if SciPy exports all with the types that are expected."""
+    python = getattr(ctypes, "pythonapi", None)
+    if python is None:
         return None
     name = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)(("PyCapsule_GetName", python))
     pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(("PyCapsule_GetPointer", python))
-    signature = name(exported)
-    if signature != _SIGNATURE.encode():
-        return None
-    arguments = (ctypes.c_char_p, *[ctypes.c_void_p] * 8)
-    return ctypes.CFUNCTYPE(None, *arguments)(pointer(exported, signature))
+    found: dict[str, Callable[..., None]] = {}
+    for routine, (module, kinds) in _ROUTINES.items():
+        double = f"__pyx_t_5scipy_6linalg_{'13cython_lapack' if module is cython_lapack else '11cython_blas'}_d"
+        types = [double if kind == "double" else kind for kind in kinds.split(", ")]
+        signature = f"void ({', '.join(f'{each} *' for each in types)})".encode()
+        exported = getattr(module, "__pyx_capi__", {}).get(routine)
+        if exported is None or name(exported) != signature:
+            return None
+        arguments = [ctypes.c_char_p if kind == "char" else ctypes.c_void_p for kind in types]
+        found[routine] = ctypes.CFUNCTYPE(None, *arguments)(pointer(exported, signature))
+    return found
 
 
-_DPBSV = _exported()
+_LAPACK = _exported()
 
 
 def solved_band(band: Float[Floats, "N B"], right: Float[Floats, "*R N"]) -> Float[Floats, "*R N"]:
@@ -44,17 +58,82 @@ def solved_band(band: Float[Floats, "N B"], right: Float[Floats, "*R N"]) -> Flo
     numpy.linalg.LinAlgError
         A is not positive definite.
     """
-    if _DPBSV is None:
+    if _LAPACK is None:
         return np.asarray(solveh_banded(band.T, right.T, overwrite_ab=True, lower=True, check_finite=False).T)
-    for each in (band, right):  # LAPACK reads and writes where these lie
-        if not each.flags.c_contiguous or each.dtype != np.float64:
-            raise ValueError("a band and its right sides are contiguous 64-bit floats")
+    _check(band, right)
     if right.shape[-1] != len(band) or right.ndim > 2:
         raise ValueError(f"right sides of {right.shape} do not belong to a band of {len(band)} rows")
     sides = len(right) if right.ndim == 2 else 1
     N, above, columns, rows, failed = map(ctypes.c_int, (len(band), band.shape[1] - 1, sides, band.shape[1], 0))
     sizes = [ctypes.byref(each) for each in (N, above, columns, rows, N, failed)]
-    _DPBSV(b"L", *sizes[:3], band.ctypes.data, sizes[3], right.ctypes.data, *sizes[4:])
-    if failed.value:
-        raise np.linalg.LinAlgError(f"the leading block of {failed.value} rows is not positive definite")
+    _LAPACK["dpbsv"](b"L", *sizes[:3], band.ctypes.data, sizes[3], right.ctypes.data, *sizes[4:])
+    _refuse(failed.value)
     return right
+
+
+class Envelope:
+    """Which part of a band a matrix and its Cholesky factor fill: unknowns of limbs meet few others, and only those of a
+    torso as many as the band is wide.
+
+    Column i has nothing from row ``ends[i]`` on, and no column ends before the one that precedes it. LAPACK's banded routine
+    eliminates all columns as far as the widest reaches; this does the same with each block of columns as far as its own do.
+    """
+
+    def __init__(self, ends: Int[Ints, " N"]) -> None:
+        N = len(ends)
+        self.above = int((ends - np.arange(N)).max()) - 1
+        self.columns = self.above + 1 + _AT_ONCE
+        """Of the array of the band: `above` the diagonal, the diagonal, and room for the corners of a block."""
+        step, size = self.columns - 1, np.dtype(np.float64).itemsize  # from a column to the next, in the same row
+        self._sizes = [_integer(each) for each in (N, self.above, 1, self.columns)]
+        self._step, self._blocks = _integer(step), []
+        for first in range(0, N, _AT_ONCE):
+            after = min(first + _AT_ONCE, N)
+            below, width, start = int(ends[after - 1]) - after, after - first, first * self.columns
+            places = (size * start, size * (start + width), size * after * self.columns)
+            self._blocks.append((first, _integer(width), _integer(below) if below > 0 else None, places))
+
+    def solve(self, band: Float[Floats, "N B"], right: Float[Floats, " N"]) -> Float[Floats, " N"]:
+        """Solve A x = b, with A[i + k, i] in ``band[i, k]`` for k up to `above`, and zeros then; both arrays are used up.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            A is not positive definite.
+        """
+        if _LAPACK is None:
+            return solved_band(band[:, : self.above + 1], right)
+        _check(band, right)
+        if band.shape != (len(right), self.columns):
+            raise ValueError(f"a band of {band.shape} and right sides of {right.shape} are not those of this envelope")
+        failed, array, step = ctypes.c_int(0), band.ctypes.data, self._step
+        code = ctypes.byref(failed)
+        for first, width, below, places in self._blocks:
+            diagonal, under, rest = (array + place for place in places)
+            _LAPACK["dpotrf"](b"L", width, diagonal, step, code)
+            _refuse(failed.value and first + failed.value)
+            if below is not None:
+                _LAPACK["dtrsm"](b"R", b"L", b"T", b"N", below, width, _ONE, diagonal, step, under, step)
+                _LAPACK["dsyrk"](b"L", b"N", below, width, _MINUS_ONE, under, step, _ONE, rest, step)
+        N, above, sides, columns = self._sizes
+        _LAPACK["dpbtrs"](b"L", N, above, sides, array, columns, right.ctypes.data, N, code)
+        return right
+
+
+_ONE, _MINUS_ONE = (ctypes.byref(ctypes.c_double(value)) for value in (1.0, -1.0))
+
+
+def _integer(value: int) -> Any:
+    return ctypes.byref(ctypes.c_int(value))
+
+
+def _check(*arrays: Floats) -> None:
+    """LAPACK reads and writes where arrays lie."""
+    for each in arrays:
+        if not each.flags.c_contiguous or each.dtype != np.float64:
+            raise ValueError("a band and its right sides are contiguous 64-bit floats")
+
+
+def _refuse(failed: int) -> None:
+    if failed:
+        raise np.linalg.LinAlgError(f"the leading block of {failed} rows is not positive definite")

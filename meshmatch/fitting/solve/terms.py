@@ -19,7 +19,7 @@ from meshmatch.fitting.fit_config import Pairing
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.oriented import OrientedPoints, feature_tree, with_normals
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.geometry.triangles import vertex_areas
+from meshmatch.geometry.triangles import row_sums, vertex_areas
 from meshmatch.shapes.rims import RimPoints, at_rim
 
 _SAME_SIDE = 0.2  # cosine of the angle between directions out of two rims that are paired
@@ -119,7 +119,7 @@ class RimTerm:
         to = np.concatenate([to_rim, np.arange(len(theirs))])
         share = np.concatenate([lengths, np.full(len(theirs), lengths.sum() / len(theirs))])
         weight = 0.5 * self.width * share * robust_weight(moved[vertex[at]] - rim.points[to], scale)
-        weight *= _row_sums(outward[at] * rim.outward[to]) > _SAME_SIDE
+        weight *= row_sums(outward[at] * rim.outward[to]) > _SAME_SIDE
         across = np.concatenate([rim.outward[to], np.cross(rim.outward, rim.along)[to]])
         point = np.tile(rim.points[to], (2, 1))
         return _summed(np.tile(vertex[at], 2), point, across, np.tile(weight, 2), 0.0, len(moved))
@@ -148,7 +148,7 @@ def _nearest_pairs(
     partner, partner_normal = samples.points.take(to_samples, 0), samples.normals.take(to_samples, 0)
     area = vertex_areas(moved, system.faces)
     forward = area / area.sum() * robust_weight(moved - partner, scale)
-    forward *= _row_sums(normals * partner_normal) > config.normal_cosine
+    forward *= row_sums(normals * partner_normal) > config.normal_cosine
     if one_sided == "strictly":
         forward *= 0.0
     elif one_sided:
@@ -157,7 +157,7 @@ def _nearest_pairs(
     some = samples.thinned(config.back_points)
     to_template = feature_tree(features).query(with_normals(some.points, some.normals, config.pair_normals))[1]
     back = robust_weight(moved.take(to_template, 0) - some.points, scale) / len(some.points)
-    back *= _row_sums(normals.take(to_template, 0) * some.normals) > config.normal_cosine
+    back *= row_sums(normals.take(to_template, 0) * some.normals) > config.normal_cosine
     if one_sided == "strictly":
         back *= ~system.rim[to_template]
     if samples.weights is not None and some.weights is not None:
@@ -210,7 +210,7 @@ def _summed(
     axes, places = np.ascontiguousarray(normal.T), np.ascontiguousarray(point.T)
     x, y, z = axes
     entries = x * x + share, x * y, x * z, y * y + share, y * z, z * z + share
-    along = _row_sums(normal * point)
+    along = row_sums(normal * point)
     pulls = (axis * along + share * place for axis, place in zip(axes, places, strict=True))
     return _sums(at, (entry * weight for entry in entries), V), _sums(at, (weight * pull for pull in pulls), V)
 
@@ -222,9 +222,4 @@ def _sums(at: Int[Ints, " N"], columns: Iterable[Float[Floats, " N"]], V: int) -
 
 def robust_weight(offset: Float[Floats, "N 3"], scale: float) -> Float[Floats, " N"]:
     """Geman and McClure's weight of offsets."""
-    return 1.0 / np.square(1.0 + _row_sums(np.square(offset)) / scale**2)
-
-
-def _row_sums(rows: Float[Floats, "N 3"]) -> Float[Floats, " N"]:
-    """A quarter of the time of ``rows.sum(1)``, and the same bits."""
-    return rows[:, 0] + rows[:, 1] + rows[:, 2]
+    return 1.0 / np.square(1.0 + row_sums(np.square(offset)) / scale**2)
