@@ -11,6 +11,8 @@ from functools import wraps
 from threading import RLock
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
+from meshmatch.gathering import asking_alone
+
 Owner = TypeVar("Owner")
 P = ParamSpec("P")
 Value = TypeVar("Value")
@@ -33,7 +35,8 @@ def derived(derive: Callable[Concatenate[Owner, P], Value]) -> Callable[Concaten
         store, key = _store_of(owner), (derive, args, tuple(sorted(kwargs.items())))
         with store.lock:
             if key not in store.values:
-                store.values[key] = derive(owner, *args, **kwargs)
+                with asking_alone():  # others may wait for the lock
+                    store.values[key] = derive(owner, *args, **kwargs)
             value: Value = store.values[key]
             return value
 

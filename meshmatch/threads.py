@@ -60,6 +60,20 @@ def worker_slot(threads: threading.Semaphore) -> Iterator[None]:
             _of_thread.shared = before
 
 
+@contextmanager
+def lent_slot() -> Iterator[None]:
+    """Give others the thread that the `worker_slot` around this block took, if there is one, and take one again after it."""
+    threads: threading.Semaphore | None = getattr(_of_thread, "shared", None)
+    if threads is None:
+        yield
+        return
+    threads.release()
+    try:
+        yield
+    finally:
+        threads.acquire()
+
+
 def parallel_map(
     function: Callable[..., Result],
     *arguments: Iterable[Any],

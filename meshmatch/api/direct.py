@@ -114,3 +114,9 @@ def direct_notes(clean: Sequence[Repaired], configs: Sequence[FitConfig], unknow
         notes.append(_UNUSED)
     notes += [f"{each.shape.name}: {note}" for each in clean for note in each.notes]
     return tuple(dict.fromkeys(notes))
+
+
+def both_whole(clean: Sequence[Repaired], fits: Sequence[Fit]) -> bool:
+    """Whether both are meshes of one whole shape, of which nothing was left out: these can be matched directly as well."""
+    alone = all(not (each.shape.is_cloud or each.far_parts or each.left_out) for each in clean)
+    return alone and not any(fit.partial for fit in fits)

@@ -6,14 +6,14 @@ import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import CancelledError
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, overload
 
 import numpy as np
 
-from meshmatch.api.direct import match_without_model
+from meshmatch.api.direct import both_whole, match_without_model
 from meshmatch.api.inputs import (
     LandmarkPairs,
     UnknownKindsError,
@@ -32,6 +32,7 @@ from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter, check_landmarks, fits_with_landmarks
+from meshmatch.gathering import Gathering
 from meshmatch.maps.build import judged_by_pairs
 from meshmatch.maps.places import PlacedFit
 from meshmatch.maps.vertex_map import VertexMap
@@ -42,6 +43,10 @@ from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes, check_list
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map, thread_limit, worker_slot
+
+# So many fits ask the network together, and more would save little, of shapes of so many vertices at most: of larger ones no
+# more are in progress than there are threads, for these take memory.
+_TOGETHER, _SMALL = 8, 50_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +205,10 @@ class Matcher:
         clean = [usable(shape) for shape in as_shapes(shapes)]
         # one fit alone may have all threads that were asked for; several have one each
         inner = self._asked_threads if len(clean) == 1 else 1
-        return self._fit_chosen(clean, configs_for(config or self.config, len(clean)), self.threads, inner)
+        configs = configs_for(config or self.config, len(clean))
+        clean, kinds, begun = self._choose(clean, configs)
+        fits = self._fit_all(clean, configs, begun, Gathering(len(clean), self.threads, _TOGETHER), inner)
+        return [replace(fit, notes=(*kind, *fit.notes)) for kind, fit in zip(kinds, fits, strict=True)]
 
     def follow(self, shape: ShapeLike, last: Fit) -> Fit:
         """Fit the next frame of a sequence, starting from the fit of the last one; from nothing where tracking is lost.
@@ -324,7 +332,7 @@ class Matcher:
             check_landmarks(self.model)
             pairs = landmark_vertices(clean, landmarks, configs)  # before the long work
         with thread_limit(1):
-            fits = self._fit_all(clean, configs, begun, self.threads)
+            fits = self._fit_all(clean, configs, begun, Gathering(2, self.threads))
             known = None
             if landmarks is not None:
                 clean = [shape_of(fit) for fit in fits]
@@ -337,7 +345,7 @@ class Matcher:
                 found = judged_by_pairs(found, clean[1].original, pairs, agreed[1].frame.scale)
         notes = tuple(dict.fromkeys((*(words for kind in kinds for words in kind), *fits[0].notes, *fits[1].notes)))
         result = MatchResult(found, *agreed, time.monotonic() - began, notes, before, self.threads, opposite)
-        if self._auto and landmarks is None and found.verdict != "good" and _both_whole(clean, agreed):
+        if self._auto and landmarks is None and found.verdict != "good" and both_whole(clean, agreed):
             with suppress(InputError):  # one that cannot be matched directly has the model's map
                 result = match_without_model(clean, configs, None, self.threads, self.progress, guess=result)
         return replace(result, seconds=time.monotonic() - began)
@@ -384,15 +392,20 @@ class Matcher:
     def _fit_each(self, shapes: Sequence[ShapeLike], configs: Sequence[FitConfig]) -> list[Fit | MeshmatchError]:
         """What becomes of each shape: a fit or an error."""
         done, counting, stop = 0, threading.Lock(), threading.Event()
+        gathering = Gathering(len(shapes), self.threads, _TOGETHER)
 
-        def one(number: int) -> Fit | MeshmatchError:
+        def one(number: int, config: FitConfig) -> Fit | MeshmatchError:
             nonlocal done
             found: Fit | MeshmatchError
-            try:
-                clean = usable(as_shape(shapes[number], f"shape {number + 1}"))
-                found = self._fit_chosen([clean], [configs[number]], 1, stop=stop)[0]
-            except MeshmatchError as error:
-                found = error
+            with gathering.task():
+                try:
+                    clean, kinds, begun = self._choose(
+                        [usable(as_shape(shapes[number], f"shape {number + 1}"))], [config]
+                    )
+                    found = self._fit_one(clean[0], config, begun[0], gathering, stop, clean[0].shape.name)
+                    found = replace(found, notes=(*kinds[0], *found.notes))
+                except MeshmatchError as error:
+                    found = error
             with counting:
                 done += 1
                 if self.progress is not None:
@@ -400,50 +413,42 @@ class Matcher:
             return found
 
         with thread_limit(1):
-            return parallel_map(one, range(len(shapes)), threads=self.threads, stop=stop)
-
-    def _fit_chosen(
-        self,
-        clean: Sequence[Repaired],
-        configs: Sequence[FitConfig],
-        threads: int,
-        inner: int = 1,
-        stop: threading.Event | None = None,
-    ) -> list[Fit]:
-        """Fits by the model that the shapes choose, with what is to be said of the choice."""
-        clean, kinds, begun = self._choose(clean, configs)
-        fits = self._fit_all(clean, configs, begun, threads, inner, stop)
-        return [replace(fit, notes=(*kind, *fit.notes)) for kind, fit in zip(kinds, fits, strict=True)]
+            return parallel_map(one, range(len(shapes)), configs, threads=gathering.in_progress, stop=stop)
 
     def _fit_all(
         self,
         clean: Sequence[Repaired],
         configs: Sequence[FitConfig],
         begun: Sequence[_Begun],
-        threads: int,
+        gathering: Gathering,
         inner: int = 1,
-        stop: threading.Event | None = None,
     ) -> list[Fit]:
-        """Fits by so many threads, each with ``inner`` of the numerical libraries, until ``stop`` is set."""
-        stop, slots = stop or threading.Event(), threading.Semaphore(threads)
-        names = [part.shape.name for part in clean]
+        """Fits of a gathering, each with ``inner`` threads of the numerical libraries."""
+        stop, names = threading.Event(), [part.shape.name for part in clean]
         labels = [f"{name} ({number + 1})" if names.count(name) > 1 else name for number, name in enumerate(names)]
 
-        def one(number: int) -> Fit:
-            def report(stage: str, name: str, share: float) -> None:
-                if stop.is_set():
-                    raise CancelledError
-                if self.progress is not None:
-                    self.progress(stage, labels[number], share)
-
-            with worker_slot(slots):
-                here, config = clean[number], configs[number]
-                found = begun[number].fit or Fitter(self.model, config, report).fit(here.shape)
-                best = (found, here) if begun[number].tried else self._best(found, here, config, report)
-            return self._finer(self._finished(*best, config), config, report)
+        def one(here: Repaired, config: FitConfig, begun: _Begun, label: str) -> Fit:
+            with gathering.task():
+                return self._fit_one(here, config, begun, gathering, stop, label)
 
         with thread_limit(inner):  # after an error, or Ctrl-C, the other fits end at their next report
-            return parallel_map(one, range(len(clean)), threads=threads, stop=stop)
+            return parallel_map(one, clean, configs, begun, labels, threads=gathering.in_progress, stop=stop)
+
+    def _fit_one(
+        self, here: Repaired, config: FitConfig, begun: _Begun, gathering: Gathering, stop: threading.Event, label: str
+    ) -> Fit:
+        """The fit of a task of the gathering, until ``stop`` is set."""
+
+        def report(stage: str, name: str, share: float) -> None:
+            if stop.is_set():
+                raise CancelledError
+            if self.progress is not None:
+                self.progress(stage, label, share)
+
+        with gathering.together() if here.shape.V <= _SMALL else nullcontext():
+            found = begun.fit or Fitter(self.model, config, report).fit(here.shape)
+        best = (found, here) if begun.tried else self._best(found, here, config, report)
+        return self._finer(self._finished(*best, config), config, report)
 
     def _finished(self, fit: Fit, clean: Repaired, config: FitConfig) -> Fit:
         """The fit with its shape, and with what its user should know."""
@@ -488,9 +493,3 @@ class Matcher:
         from meshmatch.fitting.alike import finer
 
         return finer(self.model, shape_of(fit).shape, fit, config, progress, turned)
-
-
-def _both_whole(clean: Sequence[Repaired], fits: Sequence[Fit]) -> bool:
-    """Whether both are meshes of one whole shape, of which nothing was left out: these can be matched directly as well."""
-    alone = all(not (each.shape.is_cloud or each.far_parts or each.left_out) for each in clean)
-    return alone and not any(fit.partial for fit in fits)

@@ -2,7 +2,9 @@
 where it is trained.
 
 The layers are few, dense and small: their weights are read from memory once for a batch, so that twenty clouds cost about
-as much as four. `models.deformer` is the same network in torch; a test holds both to the same answers.
+as much as four. Fits of many shapes ask about few clouds each, and together (`meshmatch.gathering`); the answers are those
+that each would have alone, bit for bit. `models.deformer` is the same network in torch;
+a test holds both to the same answers.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from scipy.special import erf
 
 from meshmatch.arrays import Float, Floats, Floats32
 from meshmatch.errors import OptionError, needs
+from meshmatch.gathering import gathered
 from meshmatch.geometry.oriented import nearest, quick_tree
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.checkpoint import load_weights
@@ -30,6 +33,11 @@ if TYPE_CHECKING:
 
 _EPSILON = np.float32(1e-5)  # of layer and batch norms, as in torch
 _SINGLE_ROWS, _FEW_ROWS = 3, 32  # how many rows are multiplied one by one, and how many as columns
+# Fewer weights stay in the cache, and BLAS may add up the products of a small matrix in another order where there are more
+# rows: questions are then multiplied one by one.
+_MIN_WEIGHTS = 2**18
+
+Clouds = Sequence[Float[Floats, "P 3"]]
 
 
 def load_network(path: str | Path, config: NetworkConfig, K: int) -> Network:
@@ -92,35 +100,45 @@ class NodeNetwork:
         return self.weights["aligner.basis"]
 
     def predict(self, clouds: Sequence[Float[Floats, "P 3"]]) -> Float[Floats, "B K 3"]:
-        points = [np.asarray(cloud, np.float32) for cloud in clouds]
-        vectors = self._decode(self._encode(points))
+        return gathered(self.predict_each, clouds)
+
+    def predict_each(self, questions: Sequence[Clouds]) -> list[Float[Floats, "B K 3"]]:
+        """What `predict` says of each of several questions.
+
+        Each has the answer that it would have alone: bit for bit where a column of a matrix product does not depend on how
+        many columns there are, as with OpenBLAS; otherwise to the rounding of 32-bit numbers.
+        """
+        sizes = [len(clouds) for clouds in questions]
+        points = [np.asarray(cloud, np.float32) for clouds in questions for cloud in clouds]
+        vectors = self._decode(self._encode(points, sizes), sizes)
         trees = parallel_map(quick_tree, points) if self.config.corrections else []
         for _ in range(self.config.corrections):
-            vectors = self._correct(vectors, points, trees)
-        return vectors.astype(np.float64)
+            vectors = self._correct(vectors, points, trees, sizes)
+        return np.split(vectors.astype(np.float64), np.cumsum(sizes)[:-1])
 
     def read_frames(self, offsets: Float[Floats32, "B M 3"]) -> tuple[Float[Floats, "B 3 3"], Float[Floats, "B 3"]]:
-        out = self._residual_mlp("aligner.network", 5 * offsets.reshape(len(offsets), -1)).astype(np.float64)
+        flat = 5 * offsets.reshape(len(offsets), -1)
+        out = self._residual_mlp("aligner.network", flat, [len(flat)]).astype(np.float64)
         return rotation_from_six(out[:, :6]), out[:, 6:]
 
     def encode(self, cloud: Float[Floats, "P 3"]) -> Float[Floats, " D"]:
         points = np.asarray(cloud, np.float32)
-        return np.asarray(self._encode([points])[0].astype(np.float64))
+        return np.asarray(self._encode([points], [1])[0].astype(np.float64))
 
     def decode(self, code: Float[Floats, " D"]) -> Float[Floats, "K 3"]:
-        return np.asarray(self._decode(code[None].astype(np.float32))[0].astype(np.float64))
+        return np.asarray(self._decode(code[None].astype(np.float32), [1])[0].astype(np.float64))
 
     def rotate_rows(self, rows: Float[Floats, "K 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "K 3"]:
         nodes = self.weights["nodes"].astype(np.float64)
         # A node at q moves to Q^T (q + u), so its vector in the turned frame is that minus q.
         return (nodes + rows) @ turn - nodes
 
-    def _encode(self, clouds: Sequence[Floats32]) -> Float[Floats32, "B D"]:
+    def _encode(self, clouds: Sequence[Floats32], sizes: Sequence[int]) -> Float[Floats32, "B D"]:
         if self.config.encoder == "point":
             return np.stack([self._encode_points(cloud) for cloud in clouds])
         basis = self.weights["encoder.basis"]
         seen = parallel_map(lambda cloud: 5 * (cloud[nearest(cloud, basis)] - basis), clouds)
-        return self._residual_mlp("encoder.network", np.stack(seen).reshape(len(clouds), -1))
+        return self._residual_mlp("encoder.network", np.stack(seen).reshape(len(clouds), -1), sizes)
 
     def _encode_points(self, cloud: Float[Floats32, "P 3"]) -> Float[Floats32, " D"]:
         frequencies = self.weights["encoder.frequencies"]
@@ -132,11 +150,11 @@ class NodeNetwork:
             x = self._batch_norm(f"encoder.points.{layer + 1}", self._linear(f"encoder.points.{layer}", x))
         return self._linear("encoder.head.3", np.maximum(self._linear("encoder.head.0", x.max(0)), 0))
 
-    def _decode(self, codes: Float[Floats32, "B D"]) -> Float[Floats32, "B K 3"]:
+    def _decode(self, codes: Float[Floats32, "B D"], sizes: Sequence[int]) -> Float[Floats32, "B K 3"]:
         if self.config.decoder == "flat":
-            return self._residual_mlp("decoder.network", codes).reshape(len(codes), -1, 3)
+            return self._residual_mlp("decoder.network", codes, sizes).reshape(len(codes), -1, 3)
         nodes = self.weights["decoder.nodes"]
-        x = self._linear("decoder.from_code", codes)[:, None] + self._linear("decoder.from_node", nodes)
+        x = self._linear("decoder.from_code", codes, sizes)[:, None] + self._linear("decoder.from_node", nodes)
         x = np.maximum(self._batch_norm("decoder.network.0", x), 0)
         for layer in (2, 5):
             x = self._linear(f"decoder.network.{layer}", x)
@@ -144,19 +162,30 @@ class NodeNetwork:
         return 2 * np.tanh(self._linear("decoder.network.8", x))
 
     def _correct(
-        self, vectors: Float[Floats32, "B K 3"], clouds: Sequence[Floats32], trees: Sequence[cKDTree]
+        self,
+        vectors: Float[Floats32, "B K 3"],
+        clouds: Sequence[Floats32],
+        trees: Sequence[cKDTree],
+        sizes: Sequence[int],
     ) -> Float[Floats32, "B K 3"]:
         """One learned registration step."""
-        anchors, phi = self.weights["anchors"], self.weights["anchor_phi"]
-        B, K, _ = vectors.shape
-        moved = (phi @ vectors.transpose(1, 0, 2).reshape(K, -1)).reshape(len(phi), B, 3).transpose(1, 0, 2)
+        anchors, B = self.weights["anchors"], len(vectors)
+        moved = np.concatenate([self._moved_anchors(some) for some in np.split(vectors, np.cumsum(sizes)[:-1])])
         seen = np.stack(parallel_map(_two_way_offsets, anchors + moved, clouds, trees))
         features = np.concatenate([10 * seen[..., :6], seen[..., 6:], 3 * moved], -1)
-        change = self._residual_mlp("corrector", features.reshape(B, -1))
+        change = self._residual_mlp("corrector", features.reshape(B, -1), sizes)
         return vectors + np.float32(0.1) * change.reshape(B, -1, 3)
 
-    def _linear(self, name: str, x: Floats32) -> Floats32:
-        out = _product(x, self.weights[f"{name}.weight"])
+    def _moved_anchors(self, vectors: Float[Floats32, "B K 3"]) -> Float[Floats32, "B A 3"]:
+        """How node vectors displace the anchors."""
+        phi, (B, K, _) = self.weights["anchor_phi"], vectors.shape
+        moved = phi @ vectors.transpose(1, 0, 2).reshape(K, -1)
+        return np.asarray(moved.reshape(len(phi), B, 3).transpose(1, 0, 2))
+
+    def _linear(self, name: str, x: Floats32, sizes: Sequence[int] | None = None) -> Floats32:
+        """Of rows ``x``; those of several questions have these ``sizes``."""
+        weight = self.weights[f"{name}.weight"]
+        out = _product(x, weight) if sizes is None else _products(x, weight, sizes)
         bias = self.weights.get(f"{name}.bias")
         return np.asarray(out if bias is None else out + bias)
 
@@ -170,15 +199,15 @@ class NodeNetwork:
         scale = self.weights[f"{name}.weight"] / np.sqrt(variance + _EPSILON)
         return np.asarray((x - mean) * scale + self.weights[f"{name}.bias"])
 
-    def _residual_mlp(self, name: str, x: Float[Floats32, "B I"]) -> Float[Floats32, "B O"]:
+    def _residual_mlp(self, name: str, x: Float[Floats32, "B I"], sizes: Sequence[int]) -> Float[Floats32, "B O"]:
         """`models.layers.residual_mlp`."""
         numbers = (key[len(name) + 1 :].split(".")[0] for key in self.weights if key.startswith(f"{name}."))
         last = max(map(int, numbers))
-        x = self._linear(f"{name}.0", x)
+        x = self._linear(f"{name}.0", x, sizes)
         for block in range(1, last - 2):
-            hidden = self._linear(f"{name}.{block}.widen", self._layer_norm(f"{name}.{block}.norm", x))
-            x = x + self._linear(f"{name}.{block}.narrow", _gelu(hidden))
-        return self._linear(f"{name}.{last}", _gelu(self._layer_norm(f"{name}.{last - 2}", x)))
+            hidden = self._linear(f"{name}.{block}.widen", self._layer_norm(f"{name}.{block}.norm", x), sizes)
+            x = x + self._linear(f"{name}.{block}.narrow", _gelu(hidden), sizes)
+        return self._linear(f"{name}.{last}", _gelu(self._layer_norm(f"{name}.{last - 2}", x)), sizes)
 
 
 def rotation_from_six(six: Float[Floats, "B 6"]) -> Float[Floats, "B 3 3"]:
@@ -197,6 +226,21 @@ def _product(x: Floats32, weight: Float[Floats32, "O I"]) -> Floats32:
     if len(x) <= _SINGLE_ROWS:
         return np.stack([weight @ row for row in x])
     return np.ascontiguousarray((weight @ x.T).T)
+
+
+def _products(x: Floats32, weight: Float[Floats32, "O I"], sizes: Sequence[int]) -> Floats32:
+    """`_product` of each question, whose rows stand one after another; of all at once where that gives the same bits."""
+    if len(sizes) == 1:
+        return _product(x, weight)
+    rows = np.repeat(sizes, sizes)
+    together = (rows > _SINGLE_ROWS) & (rows <= _FEW_ROWS) & (weight.size >= _MIN_WEIGHTS)
+    out = np.empty((len(x), len(weight)), np.float32)
+    if together.any():
+        out[together] = (weight @ x[together].T).T
+    for end, size in zip(np.cumsum(sizes), sizes, strict=True):
+        if not together[end - 1]:
+            out[end - size : end] = _product(x[end - size : end], weight)
+    return out
 
 
 def _gelu(x: Floats32) -> Floats32:

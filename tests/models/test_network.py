@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import threadpoolctl
 import torch
 
 from meshmatch.errors import InputError, ModelError
@@ -306,6 +307,24 @@ def test_the_model_that_ships_answers_the_same_in_arrays_and_in_torch(human: Tra
     for times in (1, 2, 11):  # few rows, some and many are multiplied in ways of their own
         apart = np.abs(human.inference.predict(times * several) - np.tile(wanted, (times, 1, 1)))
         assert apart.max() < 1e-5
+
+
+def test_questions_that_are_asked_together_are_answered_as_each_alone(human: TrainedModel) -> None:
+    """Bit for bit with OpenBLAS, whatever their sizes and neighbours: a fit must not depend on what is fitted beside it."""
+    network, rng = human.inference, np.random.default_rng(0)
+    assert isinstance(network, NodeNetwork)
+    verts = human.template.shape.verts
+    questions = [
+        [rng.permutation(verts)[:300] + 0.02 * rng.standard_normal(3) for _ in range(size)]
+        for size in (2, 12, 1, 4, 6, 3, 24, 40, 2, 12)
+    ]
+    alone = [network.predict(question) for question in questions]
+    blas = {each["internal_api"] for each in threadpoolctl.threadpool_info() if each["user_api"] == "blas"}
+    for together in (questions, questions[::-1], questions[3:5], questions[:1]):
+        for question, found in zip(together, network.predict_each(together), strict=True):
+            wanted = alone[next(k for k, each in enumerate(questions) if each is question)]
+            assert np.abs(found - wanted).max() < 1e-5
+            assert blas != {"openblas"} or np.array_equal(found, wanted)
 
 
 def test_configs_survive_their_card_and_unknown_options_do_not() -> None:
