@@ -5,11 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from meshmatch.api.matcher import Matcher
 from meshmatch.experiments.bench import many_bodies
 from meshmatch.experiments.bench.many_bodies import error_of, main, row_of
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template, read_template
@@ -24,6 +26,23 @@ def test_an_error_is_in_centimetres_of_a_person_whatever_the_unit() -> None:
     row = row_of("all", [(1.0, "good"), (9.0, "poor"), (2.0, "good")], 3.0, 6.0)
     assert (row["cpu"], row["wall"], row["mean"], row["median"]) == (1.0, 2.0, 4.0, 2.0)
     assert (row["off"], row["good"], row["fair"], row["poor"]) == (1 / 3, 2, 0, 1)
+
+
+def test_bodies_have_about_as_many_vertices_as_is_said_and_lie_where_they_are_said_to(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The body at rest, whose dense mesh is decimated: the template's vertices lie on it."""
+    template = read_template("human-T")
+    rest = torch.tensor(template.dense.verts, dtype=torch.float32)
+    rig = SimpleNamespace(restricted=lambda keep, faces: rest[torch.from_numpy(keep)])
+    monkeypatch.setattr(many_bodies, "cached_rig", lambda *_: rig)
+    monkeypatch.setattr(many_bodies, "sample_bodies", lambda drawn, count, _: drawn.expand(count, -1, -1))
+    (both,) = many_bodies.bodies(template, 2, 0)
+    for shape, places in both:
+        assert abs(shape.V - many_bodies.VERTICES) < 100
+        assert cKDTree(shape.verts).query(places)[0].max() < 0.05 * np.sqrt(shape.area)
+        assert abs(Shape(places, template.shape.faces).area / shape.area - 1) < 0.02
+    assert np.ptp(both[0][1] - both[1][1], axis=0).max() > 0.1  # turned each its own way
 
 
 def test_both_searches_fit_the_same_bodies(monkeypatch: pytest.MonkeyPatch) -> None:
