@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
+from meshmatch.errors import ModelError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.reasons import Verdict
@@ -47,8 +48,12 @@ def agreed_fits(
         known = None if landmarks is None else landmarks[number]
         return member_of(system, shapes[number], fits[number], config, how, known)
 
+    if model.pairs is not None and model.pairs.components.shape[1] != 6 * len(system.gradient_points):
+        raise ModelError(
+            f"the statistics of pairs of {model.card.name} are of another template", "fetch the model again"
+        )
     members = parallel_map(member, range(len(fits)), threads=threads)
-    refined = agree(system, members, threads)
+    refined = agree(system, members, threads, model.pairs)
     return [with_vectors(system, fit, vectors) for fit, vectors in zip(fits, refined, strict=True)]
 
 

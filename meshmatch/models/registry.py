@@ -1,7 +1,8 @@
 """Models by name: those that ship with the package, and the user's own.
 
-A model is a folder with ``card.json`` (written last), ``weights.safetensors`` and ``template.safetensors``; an implicit
-model one with ``implicit.json`` (written last) and ``weights.safetensors``.
+A model is a folder with ``card.json`` (written last), ``weights.safetensors`` and ``template.safetensors``, and maybe
+``pairs.safetensors`` (`meshmatch.models.pair_statistics`); an implicit model one with ``implicit.json`` (written last) and
+``weights.safetensors``.
 Listing models loads neither NumPy nor torch.
 """
 
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
 
 CARD, WEIGHTS, TEMPLATE = "card.json", "weights.safetensors", "template.safetensors"
+PAIRS = "pairs.safetensors"
 HOME_VARIABLE = "MESHMATCH_HOME"
 AUTO = "auto"
 """In place of a model's name: the shapes decide which of the installed models fits them."""
@@ -183,7 +185,7 @@ def load_model(name: str | Path = "human", encoder: type | None = None) -> Train
     folder, card = find_model(name)
     known_as = folder.name if _is_registered(folder) else os.path.abspath(folder)
     again = partial(_unpickled, known_as, card, encoder)
-    return trained_model(card, folder / TEMPLATE, folder / WEIGHTS, again, encoder)
+    return trained_model(card, folder / TEMPLATE, folder / WEIGHTS, again, encoder, folder / PAIRS)
 
 
 def load_once(name: str | Path, encoder: type | None = None) -> TrainedModel:
@@ -250,7 +252,10 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
     card = read_any_card(source)
     if card.name in (AUTO, NO_MODEL):
         raise ModelError(f"no model can be called {card.name}", "change the name on its card")
-    large, last = ((WEIGHTS,), IMPLICIT) if isinstance(card, ImplicitCard) else ((TEMPLATE, WEIGHTS), CARD)
+    large: tuple[str, ...] = (WEIGHTS,) if isinstance(card, ImplicitCard) else (TEMPLATE, WEIGHTS)
+    last = IMPLICIT if isinstance(card, ImplicitCard) else CARD
+    if last == CARD and (source / PAIRS).is_file():
+        large = (*large, PAIRS)
     for file in large:
         read_header(source / file)  # before a huge file is copied
     if (built_in_folder() / card.name).exists():

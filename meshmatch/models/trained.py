@@ -15,6 +15,7 @@ from meshmatch.geometry.kernels import KERNELS
 from meshmatch.models.card import ModelCard
 from meshmatch.models.inference import NodeNetwork, in_torch, load_network
 from meshmatch.models.network import Network, NetworkConfig
+from meshmatch.models.pair_statistics import PairStatistics, load_pair_statistics
 from meshmatch.templates.template import Template, load_template
 
 if TYPE_CHECKING:
@@ -38,6 +39,8 @@ class TrainedModel:
         The mesh that is deformed, its control nodes, labels and core.
     inference
         The network as fits ask it, in arrays; `network` is the same in torch.
+    pairs
+        How fits of two shapes differ, if that is known of its kind: see `meshmatch.models.pair_statistics`.
     load_again
         What a pickle of it calls; None for a model that was not loaded.
 
@@ -52,6 +55,7 @@ class TrainedModel:
     card: ModelCard
     template: Template
     inference: Network
+    pairs: PairStatistics | None = None
     load_again: Callable[[], TrainedModel] | None = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -83,7 +87,7 @@ class TrainedModel:
     def __reduce__(self) -> tuple[Callable[..., TrainedModel], tuple[Any, ...]]:
         if self.load_again is not None:
             return self.load_again, ()
-        return TrainedModel, (self.card, self.template, self.inference)
+        return TrainedModel, (self.card, self.template, self.inference, self.pairs)
 
     def __repr__(self) -> str:
         size = f"{self.template.shape.V} vertices, {self.template.K} nodes"
@@ -166,11 +170,12 @@ def trained_model(
     weights_file: Path,
     load_again: Callable[[], TrainedModel] | None = None,
     encoder: type | None = None,
+    pairs_file: Path | None = None,
 ) -> TrainedModel:
     """The model of a card, from files that are safe to read; `meshmatch.models.registry.load_model` finds them.
 
-    ``load_again`` is what a pickle of the model holds, a function that survives it; ``encoder`` is the class that the card
-    names, if it has one of its author's own.
+    ``pairs_file`` need not be there. ``load_again`` is what a pickle of the model holds, a function that survives it;
+    ``encoder`` is the class that the card names, if it has one of its author's own.
 
     `ModelError` for a kernel that is not known here, weights that are not those of the card's network, or a template that
     is not the one the model was trained with; `TemplateError` if its file is damaged.
@@ -184,6 +189,7 @@ def trained_model(
         problem = f"model {card.name} has the kernel {card.field['kernel']!r}, not {' or '.join(KERNELS)}"
         raise ModelError(problem, "it may need a newer meshmatch: update it")
     network = load_network(weights_file, NetworkConfig.from_dict(card.network, encoder), template.K)
-    made = TrainedModel(card, template, network)
+    pairs = load_pair_statistics(pairs_file) if pairs_file is not None and pairs_file.is_file() else None
+    made = TrainedModel(card, template, network, pairs)
     object.__setattr__(made, "load_again", load_again)
     return made

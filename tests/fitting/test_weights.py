@@ -56,7 +56,7 @@ def test_what_is_not_trusted_pulls_at_no_fit(monkeypatch: pytest.MonkeyPatch) ->
     assert away(np.where(top, 0.0, 1.0)) < 0.8 * away(None)
     heard: list[OrientedPoints] = []
 
-    def agree(system, members, threads):
+    def agree(system, members, threads, pairs):
         heard.extend(member.samples for member in members)
         return [member.vectors for member in members]
 

@@ -8,6 +8,10 @@ Pairs of points hold tighter across the surface than along it, where the stretch
 
 Shapes that are not alike, such as people in different clothes, do not stretch the template alike: the more the fits
 differ, the more each keeps the stretch that it had alone.
+
+Where a model knows how fits of its kind differ (`meshmatch.models.pair_statistics`), two fits are asked whether they are
+of one individual. If so, their common stretch follows them freely; if not, it is held, and each keeps of their difference
+what is expected to be true.
 """
 
 from __future__ import annotations
@@ -25,45 +29,64 @@ from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.solve.terms import Landmarks, terms_of
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.symmetric import entries_of, exponential, logarithm, matrices_of
+from meshmatch.models.pair_statistics import PairStatistics
 from meshmatch.models.trained import TrainedModel
 
 _MIN_STRETCH = 1e-3  # smaller ones count as this: a logarithm must stay finite
 _STEEP = 8  # how suddenly shapes cease to be alike; set by hand
 _SAME = 0.99  # shapes so much alike share the stretch
+_KNOWN_STEPS = 12
 
 
 @dataclass(frozen=True, kw_only=True)
 class AgreeConfig(Pairing):
-    """How fits are refined together. Set by hand, on 24 pairs each of SCAPE and FAUST, ``alike`` on generated people in
-    clothes.
+    """How fits are refined together. Set by hand, on 24 to 30 pairs each of SCAPE and FAUST, ``alike`` on generated people
+    in clothes.
     """
 
     # The prior is the common stretch. What slides along the surface has far to go, hence the momentum.
     schedule: Schedule = field(default=Schedule(steps=8, prior=(1e-4, 1e-4), scale=(0.05, 0.05), momentum=0.6))
     drift: float = 0.4  # how far the common stretch follows the fits as they move, against where they began
     alike: float = 0.4  # two whose logarithms of stretch lie so far apart (median) follow their mean half way
+    known: float = 0.0  # how far (0..1) what the model knows of pairs is followed: the next four
+    drift_same: float = 1.0  # of one individual, instead of ``drift``
+    drift_different: float = 0.6
+    alike_different: float = 1.5  # times ``alike``, of two individuals
+    differ: float = 0.5  # how much of the expected difference two individuals keep
     point_share: float = 0.01
     pair_normals: float = 0.012
     back_points: int = 8000
 
     @classmethod
     def for_model(cls, model: TrainedModel) -> AgreeConfig:
-        """As stiff as the model's card says."""
-        stiff = model.card.stiffness
-        return cls(schedule=cls.schedule.grown(1, prior=(stiff, stiff)))
+        """As stiff as the model's card says; where the model knows of pairs, by that, in more steps."""
+        stiff, known = model.card.stiffness, model.pairs is not None
+        schedule = replace(cls.schedule, steps=_KNOWN_STEPS) if known else cls.schedule
+        return cls(schedule=schedule.grown(1, prior=(stiff, stiff)), known=float(known))
 
     @classmethod
     def for_collection(cls, model: TrainedModel) -> AgreeConfig:
         """The same for many shapes, whose mean hardly moves: they come to it later than a pair meets half way."""
         own = cls.for_model(model)
-        return replace(own, schedule=replace(own.schedule, steps=12))
+        return replace(own, schedule=replace(own.schedule, steps=12), known=0.0)
+
+    def between(self, known: float, different: float) -> AgreeConfig:
+        """The same for two shapes that are of different individuals with such a chance, as far as that is followed."""
+        drift = different * self.drift_different + (1 - different) * self.drift_same
+        alike = self.alike * (1 + known * different * (self.alike_different - 1))
+        return replace(self, drift=self.drift + known * (drift - self.drift), alike=alike)
 
     def for_noise(self, roughness: float) -> AgreeConfig:
         """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): all samples, shared, a stiffer template."""
         schedule = self.schedule.grown(roughness, prior=(80, 80))
         return replace(
             self,
-            schedule=replace(schedule, momentum=schedule.momentum * (1 - roughness)),
+            schedule=replace(
+                schedule,
+                momentum=schedule.momentum * (1 - roughness),
+                steps=round(schedule.steps + self.known * roughness * (AgreeConfig.schedule.steps - schedule.steps)),
+            ),
+            known=self.known * (1 - roughness),
             alike=self.alike / max(1 - roughness, 1e-9),  # noise stretches too
             point_share=geometric_between(self.point_share, max(self.point_share, 3.0), roughness),
             pair_normals=geometric_between(self.pair_normals, 5 * self.pair_normals, roughness),
@@ -88,11 +111,14 @@ class Member:
         return Problem(system=system, terms=terms, schedule=self.config.schedule)
 
 
-def agree(system: NodeSystem, members: Sequence[Member], threads: int = 1) -> list[Float[Floats, "K 3"]]:
-    """Refine the fits of several shapes together, so many beside each other: better node vectors for each."""
+def agree(
+    system: NodeSystem, members: Sequence[Member], threads: int = 1, pairs: PairStatistics | None = None
+) -> list[Float[Floats, "K 3"]]:
+    """Refine the fits of several shapes together, so many beside each other: better node vectors for each. Of two, by what
+    is known of ``pairs``."""
     vectors = [member.vectors for member in members]
     logs = [log_stretch(system.deformation_gradient(each)) for each in vectors]
-    prior = CommonStretch(logs, [member.config for member in members])
+    prior = CommonStretch(logs, [member.config for member in members], pairs)
     found = minimise_together([member.problem(system) for member in members], prior, vectors, threads)
     return [system.unfolded(each) for each in found]
 
@@ -103,16 +129,27 @@ class CommonStretch:
     ``logs`` are the logarithms of the fits' stretches before they agree.
     """
 
-    def __init__(self, logs: Sequence[Float[Floats, "G 3 3"]], configs: Sequence[AgreeConfig]) -> None:
+    def __init__(
+        self,
+        logs: Sequence[Float[Floats, "G 3 3"]],
+        configs: Sequence[AgreeConfig],
+        pairs: PairStatistics | None = None,
+    ) -> None:
+        self._own = [np.zeros_like(log) for log in logs]  # what each is expected to keep against the mean
+        if pairs is not None and len(logs) == 2:
+            known, apart = min(config.known for config in configs), logs[0] - logs[1]
+            different = pairs.different(apart)
+            configs = [config.between(known, different) for config in configs]
+            keep = 0.5 * known * different * configs[0].differ * pairs.expected(apart)
+            self._own = [keep, -keep]
         self._logs, self._config, self._first = logs, configs[0], mean_log(logs)
         self._follow = [likeness(log, logs, config.alike) for log, config in zip(logs, configs, strict=True)]
 
     def __call__(self, gradients: Sequence[Float[Floats, "G 3 3"]]) -> list[Prior]:
         mean = held_mean(self._first, mean_log([log_stretch(F) for F in gradients]), self._config)
-        shared = stretch_of(mean)
         return [
-            RotatedReference(shared if share > _SAME else stretch_of(log + share * (mean - log)))
-            for log, share in zip(self._logs, self._follow, strict=True)
+            RotatedReference(stretch_of(mean + own if share > _SAME else log + share * (mean + own - log)))
+            for log, share, own in zip(self._logs, self._follow, self._own, strict=True)
         ]
 
 

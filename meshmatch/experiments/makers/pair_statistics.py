@@ -1,0 +1,97 @@
+"""How the fits of two people differ, for the model of people: `meshmatch.models.pair_statistics`.
+
+Generated people whom no training drew, each in two poses, are fitted; where the template belongs on them is known. The
+differences of the fits' logarithms of stretch, of one person and of two, are described by their largest components. True
+stretches are those of the fields that best take the template to its true places while they stay as rigid as these let them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+from scipy.linalg import eigh
+from typer import Option
+
+from meshmatch.api.inputs import as_model
+from meshmatch.api.matcher import Matcher
+from meshmatch.arrays import Float, Floats
+from meshmatch.experiments import runner
+from meshmatch.fitting.solve.agreement import log_stretch
+from meshmatch.fitting.solve.system import NodeSystem, node_system
+from meshmatch.generators.bodies import draw_identities, sample_free_pose, template_rig
+from meshmatch.generators.rig import skin
+from meshmatch.geometry.frames import kabsch
+from meshmatch.models.pair_statistics import PairStatistics, flat, save_pair_statistics
+from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.shape import Shape
+
+_UNSEEN = 77  # seed of the rig's identities; trainings have 0
+_FACES = 10_000
+_RIGID, _ROUNDS = 1e-3, 4  # weight of rigidity, and how often rotations are read off anew
+_PAIRS = 4000  # of two people, that are looked at
+_SHRINK = 0.1  # of covariances, towards their diagonals
+
+
+def true_vectors(system: NodeSystem, begin: Float[Floats, "K 3"], places: Float[Floats, "V 3"]) -> Float[Floats, "K 3"]:
+    """Node vectors that take the template to places, as rigidly as these let them; they begin near."""
+    weights, vectors = np.tile([1.0, 0.0, 0.0, 1.0, 0.0, 1.0], (len(places), 1)), begin
+    for _ in range(_ROUNDS):
+        u, _, v = np.linalg.svd(system.deformation_gradient(vectors))
+        u[:, :, 2] *= np.sign(np.linalg.det(u @ v))[:, None]
+        vectors = system.solve(weights, places, _RIGID, u @ v, 1e-6, np.zeros_like(vectors))
+    return vectors
+
+
+def statistics_of(
+    fitted: Float[Floats, "N 2 D"], true: Float[Floats, "N 2 D"], components: int, telling: int, seed: int
+) -> PairStatistics:
+    """Of N individuals, each in two poses: the largest ``components`` of true stretch, of which the first ``telling`` tell
+    two individuals from one."""
+    every = true.reshape(-1, true.shape[2])
+    basis = np.linalg.svd(every - every.mean(0), full_matrices=False)[2][:components]
+    seen, truth = fitted @ basis.T, true @ basis.T
+    apart = (seen[:, 0] - seen[:, 1])[:, :telling]
+    same = apart.T @ apart / len(apart)
+    different = 2 * np.cov(seen.reshape(-1, len(basis))[:, :telling].T, bias=True)
+    same, different = (each + _SHRINK * (np.diag(np.diag(each)) - each) for each in (same, different))
+    ratios, discriminant = eigh(different, same)
+    rng = np.random.default_rng(seed)
+    (a, b), (i, j) = rng.integers(0, len(seen), (2, _PAIRS)), rng.integers(0, 2, (2, _PAIRS))
+    off, wanted = ((each[a, i] - each[b, j])[a != b] for each in (seen, truth))
+    return PairStatistics(basis, discriminant.T, ratios, (off * wanted).mean(0) / (off**2).mean(0))
+
+
+@runner.command
+def main(
+    output: Annotated[Path, Option(help="the file; a model that has it in its folder goes by it")],
+    people: Annotated[int, Option(min=8, help="whom to fit, each in two poses")] = 200,
+    components: Annotated[int, Option(min=1, help="of differences")] = 64,
+    telling: Annotated[int, Option(min=1, help="of them, that tell two people from one")] = 40,
+    model: runner.Model = "human",
+    threads: runner.Threads = 1,
+    seed: runner.Seed = 0,
+) -> runner.Report:
+    trained, matcher = as_model(model), Matcher(model, threads=threads)
+    template, system = trained.template, node_system(trained)
+    rig, generator = template_rig(template, 256, _UNSEEN), torch.Generator().manual_seed(seed)
+    rest, heads = (each.repeat_interleave(2, 0) for each in draw_identities(rig, people, generator))
+    posed = skin(rig, rest, *sample_free_pose(rig, heads, generator)).double().numpy()
+    fitted, true = [], []
+    for number, verts in enumerate(runner.track(posed, "fitting")):
+        body = Shape(verts, template.shape.faces, str(number))
+        fit = matcher.fit(decimate(body, _FACES))
+        placed = verts / np.sqrt(body.area)
+        turn = kabsch(placed, fit.points)
+        vectors = true_vectors(system, fit.vectors, placed @ turn.rotation.T + turn.center)
+        fitted.append(flat(log_stretch(system.deformation_gradient(fit.vectors))))
+        true.append(flat(log_stretch(system.deformation_gradient(vectors))))
+    seen, truth = (np.stack(each).reshape(people, 2, -1) for each in (fitted, true))
+    found = statistics_of(seen, truth, components, telling, seed)
+    words = {"model": trained.card.name, "people": str(people), "seed": str(seed)}
+    save_pair_statistics(found, output, words)
+    rows = [{"people": people, "gain": float(found.gains.mean()), "ratio": float(np.median(found.ratios))}]
+    columns = {"people": "people:d", "mean gain": "gain:.2f", "median ratio": "ratio:.2f"}
+    return runner.Report({"rows": rows}, [runner.table("How fits of people differ", rows, columns)])
