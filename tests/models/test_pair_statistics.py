@@ -9,7 +9,7 @@ from safetensors.numpy import save_file
 
 from meshmatch.errors import ModelError
 from meshmatch.experiments.makers.pair_statistics import statistics_of
-from meshmatch.fitting.solve.agreement import AgreeConfig, CommonStretch, log_stretch
+from meshmatch.fitting.solve.agreement import AgreeConfig, CommonStretch, as_pair, log_stretch
 from meshmatch.geometry.symmetric import entries_of
 from meshmatch.models import registry
 from meshmatch.models.pair_statistics import PairStatistics, flat, load_pair_statistics, save_pair_statistics, unflat
@@ -48,6 +48,15 @@ def test_two_individuals_are_told_from_one() -> None:
     assert found.different(5 * second) == pytest.approx(1 / 11)  # poses say nothing of it
     assert found.different(1e9 * first) <= 1
     assert np.allclose(found.expected(3 * first + second), 2.4 * first + 0.2 * second)
+
+
+def test_what_no_two_individuals_have_is_of_no_concern() -> None:
+    found = statistics()
+    first, other = unflat(found.components[0]), np.tile(np.diag([1.0, 0.0, 0.0]), (G, 1, 1))
+    usual = 10 * np.sqrt(2 * 1.25) / 2  # of the first: the mean square over both is 1.25
+    assert found.concern(0.1 * first) == 1
+    assert found.concern(0.39 * other) == 1 and 0 < found.concern(0.43 * other) < 1 and found.concern(0.47 * other) == 0
+    assert found.concern(2 * usual * first) == 0
 
 
 def test_statistics_come_back_from_their_file_and_with_their_model(
@@ -91,14 +100,18 @@ def test_a_damaged_file_is_refused(tmp_path: Path, wrong: dict[str, np.ndarray |
         load_pair_statistics(path)
 
 
-def test_one_individual_shares_what_two_do_not() -> None:
+def test_one_individual_shares_what_two_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
     """The common stretch follows two fits of one; two individuals keep half of the difference that is expected."""
     found, config = statistics(), AgreeConfig(known=1.0, alike=1e9)
     first, moved = unflat(found.components[0]), np.tile(np.diag(np.exp([0.1, 0.0, 0.0])), (G, 1, 1))
 
+    monkeypatch.setattr(PairStatistics, "concern", lambda *_: 1.0)
+
     def kept(size: float, pairs: PairStatistics | None = found, config: AgreeConfig = config) -> list[np.ndarray]:
         """Logarithms of the stretch that each of two keeps to, who were so far apart and now are equal."""
-        priors = CommonStretch([0.5 * size * first, -0.5 * size * first], [config, config], pairs)([moved, moved])
+        logs = [0.5 * size * first, -0.5 * size * first]
+        known = ([config, config],) if pairs is None else as_pair(logs, [config, config], pairs)
+        priors = CommonStretch(logs, *known)([moved, moved])
         return [log_stretch(each.reference) for each in priors]  # type: ignore[attr-defined]
 
     one = kept(0.0)
@@ -114,7 +127,8 @@ def test_noise_is_not_asked_who_it_is() -> None:
     config = AgreeConfig(known=1.0, schedule=AgreeConfig.schedule)
     noisy = config.for_noise(1.0)
     assert noisy.known == 0 and config.for_noise(0.5).known == 0.5
-    assert noisy.between(noisy.known, 1.0).drift == config.drift
+    assert noisy.between(noisy.known, 1.0) == noisy
+    assert config.between(1.0, 1.0).schedule.steps == 12 and config.between(0.5, 1.0).schedule.steps == 10
 
 
 def test_statistics_of_known_variations() -> None:

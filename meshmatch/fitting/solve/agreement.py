@@ -59,33 +59,30 @@ class AgreeConfig(Pairing):
 
     @classmethod
     def for_model(cls, model: TrainedModel) -> AgreeConfig:
-        """As stiff as the model's card says; where the model knows of pairs, by that, in more steps."""
-        stiff, known = model.card.stiffness, model.pairs is not None
-        schedule = replace(cls.schedule, steps=_KNOWN_STEPS) if known else cls.schedule
-        return cls(schedule=schedule.grown(1, prior=(stiff, stiff)), known=float(known))
+        """As stiff as the model's card says, and by what the model knows of pairs."""
+        stiff = model.card.stiffness
+        return cls(schedule=cls.schedule.grown(1, prior=(stiff, stiff)), known=float(model.pairs is not None))
 
     @classmethod
     def for_collection(cls, model: TrainedModel) -> AgreeConfig:
         """The same for many shapes, whose mean hardly moves: they come to it later than a pair meets half way."""
         own = cls.for_model(model)
-        return replace(own, schedule=replace(own.schedule, steps=12), known=0.0)
+        return replace(own, schedule=replace(own.schedule, steps=12))
 
     def between(self, known: float, different: float) -> AgreeConfig:
         """The same for two shapes that are of different individuals with such a chance, as far as that is followed."""
+        steps = round(self.schedule.steps + known * (_KNOWN_STEPS - self.schedule.steps))
         drift = different * self.drift_different + (1 - different) * self.drift_same
         alike = self.alike * (1 + known * different * (self.alike_different - 1))
-        return replace(self, drift=self.drift + known * (drift - self.drift), alike=alike)
+        schedule = replace(self.schedule, steps=steps)
+        return replace(self, schedule=schedule, drift=self.drift + known * (drift - self.drift), alike=alike)
 
     def for_noise(self, roughness: float) -> AgreeConfig:
         """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): all samples, shared, a stiffer template."""
         schedule = self.schedule.grown(roughness, prior=(80, 80))
         return replace(
             self,
-            schedule=replace(
-                schedule,
-                momentum=schedule.momentum * (1 - roughness),
-                steps=round(schedule.steps + self.known * roughness * (AgreeConfig.schedule.steps - schedule.steps)),
-            ),
+            schedule=replace(schedule, momentum=schedule.momentum * (1 - roughness)),
             known=self.known * (1 - roughness),
             alike=self.alike / max(1 - roughness, 1e-9),  # noise stretches too
             point_share=geometric_between(self.point_share, max(self.point_share, 3.0), roughness),
@@ -118,30 +115,43 @@ def agree(
     is known of ``pairs``."""
     vectors = [member.vectors for member in members]
     logs = [log_stretch(system.deformation_gradient(each)) for each in vectors]
-    prior = CommonStretch(logs, [member.config for member in members], pairs)
+    configs = [member.config for member in members]
+    if pairs is not None and len(members) == 2:
+        configs, own = as_pair(logs, configs, pairs)
+        members = [replace(member, config=config) for member, config in zip(members, configs, strict=True)]
+        prior = CommonStretch(logs, configs, own)
+    else:
+        prior = CommonStretch(logs, configs)
     found = minimise_together([member.problem(system) for member in members], prior, vectors, threads)
     return [system.unfolded(each) for each in found]
+
+
+def as_pair(
+    logs: Sequence[Float[Floats, "G 3 3"]], configs: Sequence[AgreeConfig], pairs: PairStatistics
+) -> tuple[list[AgreeConfig], list[Float[Floats, "G 3 3"]]]:
+    """How two fits with such logarithms of stretch agree, by what is known of pairs; and what each is expected to keep
+    against the mean of both."""
+    apart = logs[0] - logs[1]
+    known = min(config.known for config in configs) * pairs.concern(apart)
+    different = pairs.different(apart)
+    keep = 0.5 * known * different * configs[0].differ * pairs.expected(apart)
+    return [config.between(known, different) for config in configs], [keep, -keep]
 
 
 class CommonStretch:
     """The joint prior of fits that agree: each keeps to the mean stretch of all, as far as it is like them.
 
-    ``logs`` are the logarithms of the fits' stretches before they agree.
+    ``logs`` are the logarithms of the fits' stretches before they agree; ``own`` what each is expected to keep against the
+    mean, if anything.
     """
 
     def __init__(
         self,
         logs: Sequence[Float[Floats, "G 3 3"]],
         configs: Sequence[AgreeConfig],
-        pairs: PairStatistics | None = None,
+        own: Sequence[Float[Floats, "G 3 3"]] | None = None,
     ) -> None:
-        self._own = [np.zeros_like(log) for log in logs]  # what each is expected to keep against the mean
-        if pairs is not None and len(logs) == 2:
-            known, apart = min(config.known for config in configs), logs[0] - logs[1]
-            different = pairs.different(apart)
-            configs = [config.between(known, different) for config in configs]
-            keep = 0.5 * known * different * configs[0].differ * pairs.expected(apart)
-            self._own = [keep, -keep]
+        self._own = [np.zeros_like(log) for log in logs] if own is None else own
         self._logs, self._config, self._first = logs, configs[0], mean_log(logs)
         self._follow = [likeness(log, logs, config.alike) for log, config in zip(logs, configs, strict=True)]
 
