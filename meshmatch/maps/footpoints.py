@@ -51,6 +51,10 @@ _NEIGHBOURS, _NEIGHBOUR_RANGE = 0.005, (9, 64)
 _MEDIANS = 16_384  # points at a time whose neighbours' median is taken
 # A piece with at least this share of the surface is not an island. Set by hand.
 _MAINLAND = 0.06
+# An island as large as a hand (share of the surface) that would come to lie near (units of sqrt(area)), and to face another
+# way (by how much the mean cosine falls), is a limb that a scan has fused with what it lies on, and stays. One that would
+# lie far away was fitted wrong, and a smaller one may be a sheet in doubt. Set by hand.
+_LIMB, _AGAINST, _FACES_WORSE = 0.01, 0.04, 0.35
 # Steps from the rim into an island over which images of the surroundings are extended.
 _STEPS = 120
 Found = TypeVar("Found", bound="Footpoints")
@@ -77,6 +81,10 @@ class Footpoints:
             corners = corners_of(faces, self.face[part], self.vertex[part])
             found[part] = interpolate(values, corners, self.barycentric[part])
         return found
+
+    def rows(self, rows: Int[Ints, " M"]) -> Self:
+        """M of the points."""
+        return replace(self, **{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
     def updated(self, rows: Int[Ints, " M"], other: Self) -> Self:
         """These points with M rows taken from `other`."""
@@ -174,6 +182,15 @@ def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footp
     found = Surface(fit.points, fit.faces, facing).query(points, normals, workers)
     surface = Surface(fit.points, fit.faces, facing, fit.resting)
 
+    def fused(rows: Ints, island: Ints, before: Footpoints, after: Footpoints) -> Bools:
+        """Of islands by their numbers, which are fused with what is around them."""
+        areas = shape.vertex_areas[rows]
+        alike = [(normals[rows] * foot.values(fit.faces, facing)).sum(1) for foot in (after, before)]
+        sums = [np.bincount(island, areas * each) for each in (after.distance, alike[1] - alike[0])]
+        area = np.bincount(island, areas)
+        limb = area >= _LIMB * shape.vertex_areas.sum()
+        return np.asarray(limb & (sums[0] < _AGAINST * area) & (sums[1] > _FACES_WORSE * area))
+
     def resting(foot: Footpoints) -> Floats:
         return foot.values(fit.faces, fit.resting)
 
@@ -182,7 +199,9 @@ def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footp
         def search(rows: Ints, near: Floats) -> Footpoints:
             return surface.query(points[rows], normals[rows], workers, near)
 
-        return reassign_islands(points, shape.edges.vertices, shape.vertex_areas, found, resting, search, _ROUNDS)
+        return reassign_islands(
+            points, shape.edges.vertices, shape.vertex_areas, found, resting, search, _ROUNDS, fused
+        )
     near = neighbours(points, shape.roughness)
     for _ in range(_ROUNDS):
         found = surface.query(points, normals, workers, neighbour_medians(resting(found), near))
@@ -224,44 +243,49 @@ def reassign_islands(
     images: Callable[[Found], Float[Floats, "N 3"]],
     search: Callable[[Int[Ints, " M"], Float[Floats, "M 3"]], Found],
     rounds: int,
+    stay: Callable[[Int[Ints, " M"], Int[Ints, " M"], Found, Found], Bool[Bools, " I"]] | None = None,
 ) -> tuple[Found, Float[Floats, "V 3"]]:
     """Search again for the vertices on small islands of a map of a mesh, whose edges are as `Edges` has them.
 
     The mesh is in units of sqrt(area), `areas` are those around its vertices in any unit. Each vertex lies at a place in
     `found`; `images` are the points themselves, in units of their own surface's sqrt(area), and `search` gives
-    footpoints of some vertices near such points. Returns the footpoints and their images.
+    footpoints of some vertices near such points. ``stay`` says which islands stay as they are, of vertices, the number of
+    the island of each, and their footpoints before and after. Returns the footpoints and their images.
     """
     length = edge_lengths(verts, edges)
     image = images(found)
     for _ in range(rounds):
         island = small_islands(edges, length, image, areas)
-        if not island.any():
-            break
-        around = surrounding_values(edges, image, island)
-        rows = np.flatnonzero(island & np.isfinite(around).all(axis=1))
+        around = surrounding_values(edges, image, island >= 0)
+        rows = np.flatnonzero((island >= 0) & np.isfinite(around).all(axis=1))
         if not len(rows):
             break
         again = search(rows, around[rows])
+        if stay is not None:
+            moves = ~stay(rows, island[rows], found.rows(rows), again)[island[rows]]
+            rows, again = rows[moves], again.rows(np.flatnonzero(moves))
         found, image[rows] = found.updated(rows, again), images(again)
     return found, image
 
 
 def small_islands(
     edges: Int[Ints32, "E 2"], length: Float[Floats, " E"], image: Float[Floats, "V 3"], areas: Float[Floats, " V"]
-) -> Bool[Bools, " V"]:
-    """True on small pieces between discontinuities: edges whose ends have images much further apart than they are.
+) -> Int[Ints, " V"]:
+    """Numbers of small pieces between discontinuities, edges whose ends have images much further apart than they are; -1 on
+    all else.
 
     Edges are sorted by their first vertex. Lengths are in units of sqrt(area); ``areas`` are those around the vertices.
     """
     V = len(image)
     continuous = ~is_discontinuous(edge_lengths(image, edges), length)
     if continuous.all():
-        return np.zeros(V, bool)
+        return np.full(V, -1)
     begins = np.zeros(V + 1, np.int32)
     np.cumsum(np.bincount(edges[continuous, 0], minlength=V), out=begins[1:])
     graph = csr_matrix((np.ones(begins[-1], np.int8), edges[continuous, 1], begins), (V, V))
     piece = connected_components(graph, directed=False)[1]
-    return np.asarray((np.bincount(piece, areas) < _MAINLAND * areas.sum())[piece])
+    small = np.bincount(piece, areas) < _MAINLAND * areas.sum()
+    return np.where(small[piece], piece, -1).astype(np.int64)
 
 
 def surrounding_values(

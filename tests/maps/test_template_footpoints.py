@@ -12,7 +12,7 @@ from meshmatch.maps.footpoints import (
     template_footpoints,
 )
 from meshmatch.shapes.shape import Shape
-from tests.conftest import some_fit
+from tests.conftest import icosphere, some_fit
 from tests.maps.solids import grid
 
 # A chain of ten vertices, one apart; where they belong is where they are.
@@ -23,14 +23,13 @@ ALONG = np.stack([np.arange(10.0), np.zeros(10), np.zeros(10)], 1)
 def test_a_small_piece_between_tears_is_doubted() -> None:
     area, length = np.full(10, 0.1), np.full(9, 0.01)
     resting = 0.01 * ALONG
-    assert not small_islands(CHAIN, length, resting, area).any()
+    assert (small_islands(CHAIN, length, resting, area) == -1).all()
     astray = resting.copy()
     astray[4] += 1.0
-    assert small_islands(CHAIN, length, astray, 0.05 * area / area.sum() + (np.arange(10) != 4)).tolist() == [
-        k == 4 for k in range(10)
-    ]
+    found = small_islands(CHAIN, length, astray, 0.05 * area / area.sum() + (np.arange(10) != 4))
+    assert (found >= 0).tolist() == [k == 4 for k in range(10)]
     # a piece as large as a tenth of the surface is believed
-    assert not small_islands(CHAIN, length, astray, area).any()
+    assert (small_islands(CHAIN, length, astray, area) == -1).all()
 
 
 def test_surroundings_fill_from_the_rim() -> None:
@@ -80,3 +79,37 @@ def test_points_that_noise_carries_across_return() -> None:
     foot, belongs = template_footpoints(shape, fit)
     assert (belongs[:, 2] > 0.9).all()
     assert np.allclose(fit.points[fit.faces[foot.face]].mean(1)[:, 2], 0.1)
+
+
+def plate_with(other: Shape) -> Fit:
+    """A plate of area 1 around the origin, and something on it that belongs far above."""
+    sheet = grid(60, 60, 1 / 60)
+    verts = sheet.verts - np.array([0.5, 0.5, 0.0])
+    points = np.concatenate([verts, other.verts])
+    resting = np.concatenate([verts, other.verts + np.array([0, 0, 1.0])])
+    return some_fit(points, np.concatenate([sheet.faces, other.faces + sheet.V]), resting=resting)
+
+
+def test_a_limb_that_is_fused_with_what_it_lies_on_stays_a_limb() -> None:
+    """A ball that is sunk into a plate, as a scan has it: one surface, turned about the ball's axis."""
+    ball, radius, up = icosphere(3), 0.05, 0.02
+    fit = plate_with(Shape(radius * ball.verts + np.array([0, 0, up]), ball.faces))
+    angle = np.linspace(0.05, np.arccos(-up / radius), 20)
+    away = np.concatenate([radius * np.sin(angle), np.linspace(0.055, 0.45, 40)])
+    height = np.concatenate([up + radius * np.cos(angle), np.zeros(40)])
+    turns = np.linspace(0, 2 * np.pi, 48, endpoint=False)[:, None]
+    verts = np.stack([away * np.cos(turns), away * np.sin(turns), np.tile(height, (48, 1))], -1).reshape(-1, 3)
+    a, b = (np.arange(60) + 60 * np.array([[k], [(k + 1) % 48]]) for k in range(48)), np.arange(59)
+    faces = np.concatenate([np.stack([one[b], one[b + 1], two[b + 1]], 1) for one, two in a])
+    back = np.concatenate([faces, np.stack([faces[:, 0], faces[:, 2], faces[:, 2] - 1], 1)])
+    _, belongs = template_footpoints(Shape(verts, back, "scan"), fit)
+    limb = np.tile(np.arange(60) < 18, 48)
+    assert (belongs[limb, 2] > 0.9).all() and (belongs[np.tile(np.arange(60) > 22, 48), 2] < 0.1).all()
+
+
+def test_a_piece_of_a_plate_below_a_sheet_returns_to_the_plate() -> None:
+    sheet = grid(12, 12, 1 / 60)
+    fit = plate_with(Shape(sheet.verts + np.array([-0.1, -0.1, 0.01]), sheet.faces))
+    scan = grid(60, 60, 1 / 60)
+    _, belongs = template_footpoints(Shape(scan.verts + np.array([-0.5, -0.5, 0.006]), scan.faces, "scan"), fit)
+    assert (belongs[:, 2] < 0.1).all()
