@@ -1,6 +1,6 @@
 """How the fits of two shapes of a kind differ: of one individual in two poses, and of two individuals.
 
-Measured on generated shapes by `meshmatch.experiments.makers.pair_statistics`, and kept beside the weights of a model.
+Measured on generated shapes (docs/method.md), and kept beside the weights of a model.
 """
 
 from __future__ import annotations
@@ -49,6 +49,9 @@ class PairStatistics:
     discriminant: Float[Floats, "L L"]
     ratios: Float[Floats, " L"]
     gains: Float[Floats, " K"]
+
+    def __repr__(self) -> str:
+        return f"PairStatistics({len(self.gains)} components, of which {len(self.ratios)} tell individuals)"
 
     def different(self, apart: Float[Floats, "G 3 3"]) -> float:
         """The chance (0..1) that two fits with such a difference are of two individuals, where both are as likely."""
