@@ -48,6 +48,7 @@ class Row(NamedTuple):
 _CM = ("mean", "median", "over 15 cm", "flips", "pairs")
 _PART = ("mean", "median", "over 15 cm", "", "pairs")
 _BODY = ("mean cm", "", "", "", "pairs")
+_CONTACT = ("mean cm", "median", "", "", "pairs")
 _X100 = ("mean", "median", "off", "", "pairs")
 SUMMARY = (
     Row("SCAPE", "accuracy", {"set": "scape"}, _CM, "cm"),
@@ -61,6 +62,8 @@ SUMMARY = (
     Row("SHREC'19, cut", "partial", {"set": "shrec19", "part": "cut"}, _PART, "cm"),
     Row("people in clothes, generated", "characters", {"group": "clothed"}, _BODY, "cm"),
     Row("stylised people, generated", "characters", {"group": "stylised"}, _BODY, "cm"),
+    Row("touching themselves, generated", "characters", {"group": "touching"}, _CONTACT, "cm"),
+    Row("these, fused", "characters", {"group": "fused"}, _CONTACT, "cm"),
     Row("animals", "animals", {"of": "all"}, _X100, "% of √area"),
     Row("hands, generated", "hands", {"of": "all"}, _X100, "% of the length"),
     Row("heads, generated", "heads", {"of": "all"}, _X100, "% of the length"),
