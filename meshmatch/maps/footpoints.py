@@ -200,8 +200,9 @@ def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footp
             return surface.query(points[rows], normals[rows], workers, near)
 
         return reassign_islands(
-            points, shape.edges.vertices, shape.vertex_areas, found, resting, search, _ROUNDS, fused
-        )
+            points, shape.edges.vertices, shape.vertex_areas, found, resting, search, _ROUNDS,
+            fused if fit.verdict != "poor" else None,  # whose limbs may be on others as well
+        )  # fmt: skip
     near = neighbours(points, shape.roughness)
     for _ in range(_ROUNDS):
         found = surface.query(points, normals, workers, neighbour_medians(resting(found), near))
