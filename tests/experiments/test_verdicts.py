@@ -26,12 +26,7 @@ def cases() -> Cases:
 
 
 @pytest.mark.parametrize(
-    "family",
-    [
-        pytest.param(name, marks=pytest.mark.slow if name in SLOW else ())
-        for name in FAMILIES
-        if name not in ("dressed", "stylised")
-    ],
+    "family", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in FAMILIES]
 )
 def test_a_case_is_drawn_again_alike_with_its_truth(cases: Cases, family: str) -> None:
     case, again = cases.draw(family, 0), cases.draw(family, 0)

@@ -322,10 +322,11 @@ class Cases:
         return self._character(number, (TOON, CHILD)[number % 2])
 
     def _character(self, number: int, kind: int) -> tuple[Shape, Ints]:
-        drawn = self._casts.setdefault(kind, [])
+        drawn, faces = self._casts.setdefault(kind, []), self.template.shape.faces
+        corners = np.concatenate([np.arange(self.template.shape.V), faces[:, 0]])  # of the body's other triangles
         while len(drawn) <= number:
             made = people(self.template, 10, kind, 100 + self.seed + len(drawn))
-            drawn += [(each.shape, np.asarray(each.places)) for each in made]
+            drawn += [(each.shape, corners[np.asarray(each.places)]) for each in made]
         return drawn[number]
 
     @cached_property
