@@ -30,8 +30,9 @@ _LEAST = {"seed": 0, "variants": 0, "screening": 0} | dict.fromkeys(
 )
 
 
-_QUICK = {"copies": 16, "hypotheses": 1, "careful": 1, "variants": 2, "finalists": 2}
-_QUICK |= {"samples": 4096, "coarse_samples": 1024}
+_QUICK = {"copies": 16, "hypotheses": 1, "careful": 1, "variants": 0, "finalists": 1}
+_QUICK |= {"samples": 3500, "coarse_samples": 1024}
+_QUICK_STEPS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,6 +154,8 @@ class FitConfig:
     try_harder
         Where a fit is poor, search for longer: for a part from more orientations, and for separate
         parts of the file that are the shape and that the network alone does not recognise.
+    again
+        Where a fit is not good, make it again with all of the search.
     samples
         Points drawn on the surface.
     coarse_samples
@@ -199,6 +202,7 @@ class FitConfig:
     partial: Partial = "auto"
     mirror: Mirroring | None = None
     try_harder: bool = False
+    again: bool = False
     samples: int = 8000
     coarse_samples: int = 2048
     copies: int = 48
@@ -239,14 +243,29 @@ class FitConfig:
         Returns
         -------
         FitConfig
-            With fewer orientations, interpretations and samples.
+            With fewer orientations, interpretations, samples and steps; where a fit is then not good, it is made `again`.
 
         Examples
         --------
         >>> matcher = meshmatch.Matcher("human", meshmatch.FitConfig.quick())
         >>> found = matcher.fit_all(["templates/samples/climber.ply", "templates/samples/dancer.ply"], errors="return")
         """
-        return cls(**_QUICK | settings)
+        usual = NodeRefineConfig()
+        nodes = replace(usual, schedule=replace(usual.schedule, steps=_QUICK_STEPS))
+        return cls(**{"again": True, "nodes": nodes} | _QUICK | settings)
+
+    def with_all_of_the_search(self) -> FitConfig:
+        """The same without what `quick` leaves out.
+
+        Returns
+        -------
+        FitConfig
+            With as many orientations, interpretations, samples and steps as there are by default, or more.
+        """
+        usual, own = FitConfig(), self.nodes.schedule
+        most = {name: max(getattr(self, name), getattr(usual, name)) for name in _QUICK}
+        schedule = replace(own, steps=max(own.steps, usual.nodes.schedule.steps))
+        return replace(self, again=False, nodes=replace(self.nodes, schedule=schedule), **most)
 
     @property
     def moves_nodes(self) -> bool:

@@ -64,24 +64,31 @@ class Fitter:
         """
         if landmarks is not None:
             check_landmarks(self.model)
-        began, progress, card = time.monotonic(), Progress(self.progress, shape.name), self.model.card
+        began = time.monotonic()
+        found = self._fit(self.config, shape, landmarks, began)
+        if self.config.again and found.verdict != "good":
+            found = self._fit(self.config.with_all_of_the_search(), shape, landmarks, began)
+        return found
+
+    def _fit(self, config: FitConfig, shape: Shape, landmarks: Landmarks | None, began: float) -> Fit:
+        progress, card = Progress(self.progress, shape.name), self.model.card
         doubts: list[Reason] = []
-        both = (self.config.mirror or card.mirror) != "no" and mirror_of(self.model) is None
+        both = (config.mirror or card.mirror) != "no" and mirror_of(self.model) is None
         stretches = [progress.between(k / 2, (k + 1) / 2) for k in range(2)] if both else [progress]
 
-        def whole(config: FitConfig, mirrored: bool) -> Registration:
-            return fit_whole(FitTask.of(self.model, config, shape, landmarks, stretches[mirrored], mirrored))
+        def whole(how: FitConfig, mirrored: bool) -> Registration:
+            return fit_whole(FitTask.of(self.model, how, shape, landmarks, stretches[mirrored], mirrored))
 
         # What is said to be a part is tried as a whole with little effort, and in full only where it is none.
-        said = self.config.partial == "yes"
-        quick = replace(self.config, finalists=1) if said else self.config
-        wholes = [whole(quick, mirrored) for mirrored in ((False, True) if both else (False,))]
+        said = config.partial == "yes"
+        little = replace(config, finalists=1) if said else config
+        wholes = [whole(little, mirrored) for mirrored in ((False, True) if both else (False,))]
         # If either handedness fits the whole shape, the other is not tried as a part.
         parts = landmarks is None and _may_be_part(min(wholes, key=_cost))
         sides = [_as_part_if_closer(each) if parts else (each, False) for each in wholes]
         (found, partial), *others = sorted(sides, key=lambda side: _cost(side[0]))
         if said and not partial:
-            found = whole(self.config, found.core_frame.mirrored)
+            found = whole(config, found.core_frame.mirrored)
         notes = with_side((), shape.name, card, found.core_frame.mirrored)
         if others and _cost(found) > _SURE_SIDE * _cost(others[0][0]):
             doubts.append(Reason("side", SIDE_IN_DOUBT))

@@ -179,11 +179,27 @@ def test_a_landmark_lies_where_the_fits_put_it(model: TrainedModel, fits: dict[R
     assert template_vertices(template, still, mixed).tolist() == [middle]
 
 
+def test_a_fit_that_is_not_good_is_made_again(model: TrainedModel, egg: Shape) -> None:
+    few = FitConfig.quick(samples=400, coarse_samples=200, copies=4)
+    first, again, full = (
+        Fitter(model, config).fit(egg) for config in (replace(few, again=False), few, few.with_all_of_the_search())
+    )
+    assert first.verdict != "good"
+    assert np.array_equal(again.vectors, full.vectors) and not np.array_equal(again.vectors, first.vectors)
+
+
 def test_quick_is_less_search_and_the_same_refinement() -> None:
-    usual, quick = FitConfig(), FitConfig.quick(seed=3, finalists=1)
-    fewer = ("samples", "coarse_samples", "copies", "hypotheses", "careful", "variants")
+    usual, quick = FitConfig(), FitConfig.quick(seed=3)
+    fewer = ("samples", "coarse_samples", "copies", "hypotheses", "careful", "variants", "finalists")
     assert all(getattr(quick, name) < getattr(usual, name) for name in fewer)
-    assert quick == replace(usual, seed=3, finalists=1, **{name: getattr(quick, name) for name in fewer})
+    assert all(
+        getattr(quick, name) == value
+        for name, value in vars(usual).items()
+        if name not in (*fewer, "seed", "again", "nodes")
+    )
+    assert quick.again and quick.nodes.schedule.steps < usual.nodes.schedule.steps
+    assert quick.with_all_of_the_search() == replace(usual, seed=3)
+    assert FitConfig.quick(samples=9000).with_all_of_the_search() == replace(usual, samples=9000)
     with pytest.raises(OptionError):
         FitConfig.quick(samples=0)
 
