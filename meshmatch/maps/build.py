@@ -14,12 +14,12 @@ from meshmatch.maps.vertex_map import VERDICTS, VertexMap
 from meshmatch.shapes.shape import Shape
 
 # Where confidence is the probability that a vertex is within 5 cm of its true partner on a person. Distances, and how far
-# agreement moved the two fits (where it moved them much, one shape alone says something else), at which it is 1/e = 0.37
-# (units of sqrt(area)):
-_DISTANCE_SCALE, _AGREEMENT_SCALE = 0.042, 0.081
+# agreement moved the two places against each other (where it moved them much, one shape alone says something else), at
+# which it is 1/e = 0.37 (units of sqrt(area)):
+_DISTANCE_SCALE, _AGREEMENT_SCALE = 0.0353, 0.0487
 # the share that is near without distance, of wrong fits and of right ones; and what turns odds of being right to odds of it:
-# the most likely values on 75 right and wrong fits, seeds 60 and 61 of docs/results.md, which measures it on others
-_BY_CHANCE, _MOST, _ODDS, _MAX_TRUST = 0.064, 0.968, 0.098, 0.999
+# the most likely values on 82 right and wrong fits, seeds 60 and 61 of docs/results.md, which measures it on others
+_BY_CHANCE, _MOST, _ODDS, _MAX_TRUST = 0.072, 0.968, 0.091, 0.999
 # Known pairs further apart than this on the target (units of sqrt(area); 5 and 14 cm on a person) are missed, or tell that
 # the map is wrong; so many are told.
 _MISSED, _LOST, _TOLD = 0.036, 0.1, 3
@@ -31,7 +31,7 @@ def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
     Where both shapes are put together from separate parts, parts go to their counterparts (`meshmatch.maps.parts`).
     Confidence is the probability that the error is at most 5 cm on a person, or 3.6 % of sqrt(area). It is low where a
     vertex, or the one that it is matched to, lies far from its fitted template; where the places are far apart, as on what
-    one shape lacks; where fits moved much to agree; and everywhere if a fit is not to be trusted. `OptionError` if the
+    one shape lacks; where agreement changed the map much; and everywhere if a fit is not to be trusted. `OptionError` if the
     places are on different templates.
     """
     if source.template_hash != target.template_hash:
@@ -41,8 +41,8 @@ def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
     along = np.square(found.distance) - np.square(source.height - target.height[found.vertex])
     apart = np.square(source.distance) + np.square(target.distance[found.vertex]) + np.maximum(along, 0.0)
     doubt = apart / _DISTANCE_SCALE**2
-    if source.shift is not None and target.shift is not None:
-        doubt += np.square((source.shift + target.shift[found.vertex]) / _AGREEMENT_SCALE)
+    if source.moved is not None and target.moved is not None:
+        doubt += np.square(source.moved - target.moved[found.vertex]).sum(1) / _AGREEMENT_SCALE**2
     confidence = _confidence(doubt, source.trust * target.trust)
     verdict = max(source.verdict, target.verdict, key=VERDICTS.index)
     return VertexMap(

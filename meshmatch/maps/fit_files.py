@@ -38,7 +38,7 @@ _FIT_WORDS = {
 }
 _PLACES = ("resting", "height", "distance", "stands", "faces", "fitted")
 _FAR = 1e6  # units of sqrt(area)
-_OPTIONAL = ("shift", "spread")
+_OPTIONAL = ("moved", "spread")
 Words = dict[str, Any]
 
 
@@ -175,8 +175,8 @@ def _places(arrays: dict[str, np.ndarray], about: Words, fit: Fit) -> Places | N
         return None
     V, F = len(arrays["resting"]), len(arrays["faces"])
     kinds: dict[str, tuple[Any, tuple[int, ...]]] = {
-        **dict.fromkeys(("height", "distance", *_OPTIONAL), (np.float32, (V,))),
-        **{"resting": (np.float32, (V, 3)), "stands": (np.int32, (V,))},
+        **dict.fromkeys(("height", "distance", "spread"), (np.float32, (V,))),
+        **{"resting": (np.float32, (V, 3)), "moved": (np.float32, (V, 3)), "stands": (np.int32, (V,))},
         **{"faces": (np.int32, (F, 3)), "fitted": (np.bool_, (F,))},
     }
     found = {name: _checked(arrays, name, *kinds[name]) for name in kinds if name in arrays}

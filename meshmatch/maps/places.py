@@ -20,7 +20,7 @@ from scipy.sparse import csr_matrix, identity, vstack
 from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, Floats32, Int, Ints, Ints32
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.geometry.triangles import blend, triangle_areas, vertex_areas, vertex_normals
+from meshmatch.geometry.triangles import blend, share_areas, triangle_areas, vertex_areas, vertex_normals
 from meshmatch.maps.footpoints import Footpoints, Surface, closest_footpoints, in_core_frame, template_footpoints
 from meshmatch.maps.mapped_mesh import MappedMesh
 from meshmatch.shapes.repair import Repaired
@@ -47,7 +47,7 @@ class Places(Brief):
     resting : (V, 3) where each vertex belongs on, or just above, the resting template, template frame
     height : (V,) how far above it
     distance : (V,) how far each vertex lies from the fitted template
-    shift : (V,) how far the template moved there when it had to agree with other fits; None if it had not
+    moved : (V, 3) how each place moved on the resting template when the fit had to agree with others; None if it had not
     spread : (V,) of a noisy cloud, standard deviation of the place; None for other shapes
     stands : (V,) which vertex stands for each: itself, its twin, or the nearest that was fitted
     faces : (F, 3) all triangles; fitted : (F,) whether each was fitted, or dropped as broken
@@ -60,7 +60,7 @@ class Places(Brief):
     resting: Float[Floats32, "V 3"]
     height: Float[Floats32, " V"]
     distance: Float[Floats32, " V"]
-    shift: Float[Floats32, " V"] | None
+    moved: Float[Floats32, "V 3"] | None
     spread: Float[Floats32, " V"] | None
     stands: Int[Ints32, " V"]
     faces: Int[Ints32, "F 3"]
@@ -73,7 +73,7 @@ class Places(Brief):
     def of(cls, part: Repaired, fit: Fit, before: Fit | None = None, workers: int = 1) -> Places:
         """The places of a repaired shape; ``before`` is its fit before it agreed with others."""
         foot, resting = template_footpoints(part.shape, fit, workers)
-        distance, spread, shift = foot.distance, None, None
+        distance, spread, moved = foot.distance, None, None
         height = heights(part.shape, fit, foot)
         if is_noisy(part.shape):
             distance = closest_footpoints(part.shape, fit, workers).distance
@@ -84,7 +84,7 @@ class Places(Brief):
             normals = vertex_normals(fit.resting, fit.faces)
             resting += height[:, None] * foot.values(fit.faces, normals)
         if before is not None:
-            shift = np.linalg.norm(foot.values(fit.faces, fit.points - before.points), axis=1)
+            moved = foot.values(fit.faces, _places_moved(before, fit))
 
         def of_file(values: Floats) -> Floats32:
             return values.astype(np.float32)[part.original_to_repaired]
@@ -102,7 +102,7 @@ class Places(Brief):
             resting=of_file(resting),
             height=of_file(height),
             distance=of_file(distance) + away.astype(np.float32),
-            shift=None if shift is None else of_file(shift),
+            moved=None if moved is None else of_file(moved),
             spread=None if spread is None else of_file(spread),
             stands=stands.astype(np.int32),
             faces=original.faces.astype(np.int32),
@@ -199,6 +199,21 @@ def surface_distance(shape: Shape, fitted: Shape, one_way: bool = False) -> tupl
         ways.append((MappedMesh.of(shape).query(fitted.verts).distance, fitted.vertex_areas))
     mean = np.mean([np.average(distance, weights=weights) for distance, weights in ways])
     return float(mean), float(max(distance.max() for distance, _ in ways))
+
+
+def _places_moved(before: Fit, after: Fit) -> Float[Floats, "V 3"]:
+    """How places on the resting template move when the fitted one slides: as far, and back, as each triangle has it."""
+    faces = after.faces
+    slid = (before.points - after.points)[faces].mean(1)
+    edges, resting = ((verts[faces[:, 1:]] - verts[faces[:, :1]]) for verts in (after.points, after.resting))
+    gram = edges @ edges.transpose(0, 2, 1)
+    gram += 1e-9 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(2) + 1e-30 * np.eye(2)
+    along = np.linalg.solve(gram, (edges @ slid[..., None]))[..., 0]
+    moves = (along[:, None] @ resting)[:, 0]
+    area = triangle_areas(after.resting, faces)
+    total = share_areas(area, faces, len(after.points))
+    sums = np.stack([share_areas(area * column, faces, len(after.points)) for column in moves.T], 1)
+    return np.asarray(sums / np.maximum(total, 1e-300)[:, None])
 
 
 def heights(shape: Shape, fit: Fit, foot: Footpoints) -> Float[Floats, " V"]:

@@ -29,7 +29,7 @@ def beads(*lengths: float, shift: float = 0.0, dropped: int = 0, name: str = "be
     own = {"resting": resting, "height": np.zeros(V, np.float32), "distance": np.zeros(V, np.float32)}
     own |= {"stands": np.arange(V, dtype=np.int32), "faces": faces, "fitted": np.arange(F) < F - dropped}
     words = {"name": name, "hash": name, "template_hash": "t", "verdict": "good"}
-    places = Places(**words, **own, shift=None, spread=None)
+    places = Places(**words, **own, moved=None, spread=None)
     return places, np.repeat(np.arange(len(lengths)), BALL.V)
 
 
