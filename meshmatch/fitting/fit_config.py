@@ -252,7 +252,8 @@ class FitConfig:
         """
         usual = NodeRefineConfig()
         nodes = replace(usual, schedule=replace(usual.schedule, steps=_QUICK_STEPS))
-        return cls(**{"again": True, "nodes": nodes} | _QUICK | settings)
+        less: dict[str, Any] = {"again": True, "nodes": nodes, **_QUICK}
+        return cls(**less | settings)
 
     def with_all_of_the_search(self) -> FitConfig:
         """The same without what `quick` leaves out.

@@ -177,7 +177,7 @@ def test_fits_alone_do_not_move(shapes: Path, tmp_path: Path) -> None:
     assert made.agreed == 0 and collection.names == ["climber", "dancer"]
     alone = meshmatch.register(SAMPLES / "climber.ply", model="human")
     assert np.array_equal(collection.fit_of("climber").points, alone.points)
-    assert collection.places_of("climber").shift is None
+    assert collection.places_of("climber").moved is None
 
 
 def test_maps_are_written_once(made: tuple[Path, tuple[Record, ...]], tmp_path: Path) -> None:

@@ -95,7 +95,7 @@ def parts_to_parts(n: int, _: Path) -> Step:
             resting=at,
             height=zeros,
             distance=zeros,
-            shift=None,
+            moved=None,
             spread=None,
             stands=stands,
             faces=corners,
