@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import NoReturn
 
 import numpy as np
 
@@ -84,20 +85,29 @@ def find_alone(
         return None
     found = _readings(models, [each.shape for each in clean], config, order or [range(len(models))])
     value = found.min(axis=0)
+
+    def trusted(k: int) -> Fit | None:
+        """The fit of a set that reads strangely, if it shows that this is such a shape."""
+        model = models[int(found[:, k].argmin())]()
+        of_kind, fit = classify(model, clean[k].shape, value[k], config, progress)
+        return fit if of_kind and fit is not None and fit.trust >= BELONGS and not fit.partial else None
+
     known = [k for k in range(len(sets)) if value[k] <= FAMILIAR]
     if known:
-        best = _fullest(parts, sets, value, known)
-        _refuse_others(whole, parts, sets, best, known)
-        chosen, fit = best, None
+        chosen, fit = _fullest(parts, sets, value, known), None
     else:
         most, least_known = (_MOST_FITS, STRANGE) if config.try_harder else (1, _PROMISING)
         for chosen in [int(k) for k in value.argsort(kind="stable")[:most] if value[k] <= least_known]:
-            model = models[int(found[:, chosen].argmin())]()
-            of_kind, fit = classify(model, clean[chosen].shape, value[chosen], config, progress)
-            if of_kind and fit is not None and fit.trust >= BELONGS and not fit.partial:
+            if (fit := trusted(chosen)) is not None:
                 break
         else:
             return None
+    others = _rivals(parts, sets, chosen, known)
+    if not others:  # another one may be in a pose that reads strangely
+        promising = [k for k in range(len(sets)) if FAMILIAR < value[k] <= _PROMISING]
+        others = [k for k in _rivals(parts, sets, chosen, promising, beside=True)[:1] if trusted(k) is not None]
+    if others:
+        _refuse_to_choose(whole, parts, [sets[k] for k in (chosen, *others)])
     left_out = parts.others(sets[chosen])
     notes = [note for note in clean[chosen].notes if not note.endswith(NOT_TRUSTED)]
     rest = replace(clean[chosen], notes=(left_out_words(parts, left_out), *notes), left_out=left_out)
@@ -163,13 +173,26 @@ def _fullest(parts: Parts, sets: Sequence[frozenset[int]], value: Floats, known:
     return max((k for k in known if sets[k] >= sets[best] and value[k] <= as_well), key=lambda k: parts.share(sets[k]))
 
 
-def _refuse_others(whole: Shape, parts: Parts, sets: Sequence[frozenset[int]], best: int, known: Sequence[int]) -> None:
-    """Refuse to choose between two people in one file (`InputError`)."""
+def _rivals(
+    parts: Parts, sets: Sequence[frozenset[int]], best: int, among: Sequence[int], beside: bool = False
+) -> list[int]:
+    """Which sets may be meant instead of the best one, the largest first: those that are large enough and ``beside`` it; by
+    default also those around it that are in no such set together with it, as clothes would be.
+    """
     least = _AS_LARGE * parts.share(sets[best])
-    rivals = [k for k in known if apart(parts, sets[k], sets[best]) and parts.share(sets[k]) >= least]
-    if not rivals:
-        return
-    firsts = sorted({min(sets[k]) for k in (best, *rivals)})
+
+    def another(one: frozenset[int]) -> bool:
+        if beside or one & sets[best]:
+            return apart(parts, one, sets[best])
+        return apart(parts, one, sets[best]) or not any(sets[k] >= one | sets[best] for k in among)
+
+    rivals = [k for k in among if k != best and parts.share(sets[k]) >= least and another(sets[k])]
+    return sorted(rivals, key=lambda k: -parts.share(sets[k]))
+
+
+def _refuse_to_choose(whole: Shape, parts: Parts, rivals: Sequence[frozenset[int]]) -> NoReturn:
+    """Two people in one file (`InputError`)."""
+    firsts = sorted({min(each) for each in rivals})
     shares = " and ".join(f"part {n} ({100 * parts.shares[n - 1]:.0f} % of the area)" for n in firsts[:3])
     problem = f"{whole.name or 'the shape'} holds several shapes of one kind: {shares} fit about equally well"
     raise InputError(problem, f"choose one with --only {firsts[0]} or --only {firsts[1]} (only= of load_shape)")

@@ -15,7 +15,9 @@ from meshmatch.api.inputs import as_model, usable
 from meshmatch.api.matcher import Matcher
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.parts import Parts
+from meshmatch.shapes.parts import apart as parts_apart
 from meshmatch.shapes.shape import Shape
 from tests.shapes.scenes import beside, chair, coat, eyes, floor, pack, pedestal, sample, second, together
 
@@ -78,6 +80,36 @@ def test_two_bodies_are_for_the_user_to_choose_from(reads: Reads) -> None:
     with pytest.raises(InputError, match=r"two\.ply holds several shapes of one kind: part 1 .* and part 2 ") as caught:
         find_alone(loaders(), scene, CONFIG)
     assert "--only 1 or --only 2" in caught.value.hint
+
+
+def test_two_bodies_that_run_into_each_other_are_not_one_in_clothes(reads: Reads) -> None:
+    reads({BODY.V: 3.7})
+    other = Shape(BODY.verts + 0.04 * np.sqrt(BODY.area), BODY.faces)
+    scene = together("two.ply", BODY, other)
+    parts = Parts.of(scene)
+    assert not parts_apart(parts, frozenset([1]), frozenset([2]))
+    with pytest.raises(InputError, match="several shapes of one kind"):
+        find_alone(loaders(), scene, CONFIG)
+    # a body and its clothes read as a body, both alone and together
+    on_floor = together("scan.ply", BODY, other, floor(BODY))
+    reads({BODY.V: 3.7, 2 * BODY.V: 3.9})
+    alone = find_alone(loaders(), on_floor, CONFIG)
+    assert alone is not None and alone.clean.shape.V == 2 * BODY.V
+
+
+def test_a_body_that_reads_strangely_may_be_meant_too(reads: Reads, monkeypatch: pytest.MonkeyPatch) -> None:
+    strange = decimate(second(BODY), 10_000)
+    scene = together("two.ply", BODY, strange)
+    reads({BODY.V: 3.7, usable(strange).shape.V: 5.0})
+    for trust in (0.6, 0.8):
+        made = SimpleNamespace(verdict="fair", trust=trust, partial=False)
+        monkeypatch.setattr(apart, "classify", lambda *_, made=made: (True, made))
+        if trust < 0.7:
+            alone = find_alone(loaders(), scene, CONFIG)
+            assert alone is not None and alone.fit is None and len(alone.clean.left_out) == 1
+        else:
+            with pytest.raises(InputError, match="several shapes of one kind"):
+                find_alone(loaders(), scene, CONFIG)
 
 
 def test_what_its_user_chose_and_what_has_no_parts_is_left_alone(reads: Reads) -> None:
