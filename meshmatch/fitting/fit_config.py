@@ -155,7 +155,7 @@ class FitConfig:
         Where a fit is poor, search for longer: for a part from more orientations, and for separate
         parts of the file that are the shape and that the network alone does not recognise.
     again
-        Where a fit is not good, make it again with all of the search.
+        Where something in particular speaks against a fit, make it again with all of the search.
     samples
         Points drawn on the surface.
     coarse_samples
@@ -243,7 +243,8 @@ class FitConfig:
         Returns
         -------
         FitConfig
-            With fewer orientations, interpretations, samples and steps; where a fit is then not good, it is made `again`.
+            With fewer orientations, interpretations, samples and steps; where anything speaks against a fit, it is made
+            `again`.
 
         Examples
         --------

@@ -66,7 +66,8 @@ class Fitter:
             check_landmarks(self.model)
         began = time.monotonic()
         found = self._fit(self.config, shape, landmarks, began)
-        if self.config.again and found.verdict != "good":
+        # Of 180 people, ten with something in particular against them gained 2.6 cm, six that were merely doubted nothing.
+        if self.config.again and any(reason.code != "doubt" for reason in found.reasons):
             found = self._fit(self.config.with_all_of_the_search(), shape, landmarks, began)
         return found
 
