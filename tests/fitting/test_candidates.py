@@ -216,7 +216,7 @@ def test_what_looked_worse_at_first_wins_at_the_end(system: NodeSystem, scan: Or
     comparison.score = lambda each, in_full: scorer.score(scan, each) if in_full else each.residual  # type: ignore[method-assign]
     shares: list[float] = []
     progress = Progress(lambda stage, name, share: shares.append(share))
-    best = choose([wrong, replace(wrong, residual=0.0301), right], 2, comparison, progress)
+    best = choose([wrong, replace(wrong, residual=0.0301), right], 2, comparison, progress)[1]
     assert np.array_equal(best.vectors, right.vectors)
     assert comparison.calls[True] == [0.03, 0.0305]  # of two alike only the better one is refined
     assert shares[-1] == 1.0 and shares == sorted(shares)
@@ -225,13 +225,13 @@ def test_what_looked_worse_at_first_wins_at_the_end(system: NodeSystem, scan: Or
 def test_interpretations_alike_cost_one_refinement(system: NodeSystem) -> None:
     candidates = [still(system, 0.03 + 0.001 * k) for k in range(9)]
     comparison = Scored(system)
-    assert choose(candidates, 4, comparison, Progress()).residual == 0.03
+    assert choose(candidates, 4, comparison, Progress())[1].residual == 0.03
     assert {in_full: len(calls) for in_full, calls in comparison.calls.items()} == {False: 0, True: 1}
 
 
 def test_an_interpretation_left_far_behind_is_not_refined_in_full(system: NodeSystem) -> None:
     comparison = Scored(system)
-    assert choose([still(system, 0.03), folded(system, 0.033)], 4, comparison, Progress()).residual == 0.03
+    assert choose([still(system, 0.03), folded(system, 0.033)], 4, comparison, Progress())[1].residual == 0.03
     assert comparison.calls == {False: [0.03, 0.033], True: [0.03]}
 
 

@@ -22,6 +22,7 @@ from meshmatch.fitting import fit_config
 from meshmatch.fitting.search.candidates import STAGE, candidates_of_part, candidates_of_whole, completed, of_file
 from meshmatch.fitting.search.discontinuities import Pairs, discontinuous_share, neighbours
 from meshmatch.fitting.search.frames import USUAL, stands_upright
+from meshmatch.fitting.search.limbs import bare_places, limbs_of
 from meshmatch.fitting.search.predictor import (
     USUAL_SPREAD,
     Candidate,
@@ -62,6 +63,7 @@ class RefinementSettings:
         ties
     part_finalists : interpretations of a part that get a few steps each
     screening_samples : samples that are enough to tell interpretations apart
+    bent_margin : a fit with a limb bent is taken if its score is less than this times the score of that without
     """
 
     discontinuity_cost: float = 0.1
@@ -76,6 +78,7 @@ class RefinementSettings:
     spread_cost: float = 0.3
     part_finalists: int = 4
     screening_samples: int = 4096
+    bent_margin: float = 0.98
 
 
 SETTINGS = RefinementSettings()
@@ -147,12 +150,14 @@ def _fit_nodes(task: FitTask, candidates: list[Candidate]) -> Candidate:
         pool.append(replace(each, residual=residual))
     found = best_first(pool)
     comparison = WholeComparison(task.on_visible_samples, found)
-    return choose([*of_file(task, found), *found], config.finalists, comparison, task.progress.stage("refinement"))
+    progress = task.progress.stage("refinement")
+    chosen, fit = choose([*of_file(task, found), *found], config.finalists, comparison, progress)
+    return with_limb_bent(comparison, chosen, fit)
 
 
 def _fit_nodes_to_part(task: FitTask, candidates: list[Candidate]) -> Candidate:
     """The best of several interpretations of a part, refined by least squares on the nodes."""
-    return choose(candidates, SETTINGS.part_finalists, PartComparison(task), task.progress.stage(STAGE, 0.6, 1.0))
+    return choose(candidates, SETTINGS.part_finalists, PartComparison(task), task.progress.stage(STAGE, 0.6, 1.0))[1]
 
 
 REFINEMENTS: dict[fit_config.Refine, Refinement] = {
@@ -162,8 +167,12 @@ REFINEMENTS: dict[fit_config.Refine, Refinement] = {
 }
 
 
-def choose(candidates: Sequence[Candidate], count: int, comparison: WholeComparison, progress: Progress) -> Candidate:
-    """The best of several interpretations (best first), refined; at most ``count`` that are unlike each other are tried."""
+def choose(
+    candidates: Sequence[Candidate], count: int, comparison: WholeComparison, progress: Progress
+) -> tuple[Candidate, Candidate]:
+    """The best of several interpretations (best first), as it came and refined; at most ``count`` that are unlike each
+    other are tried.
+    """
     finalists: list[Candidate] = []
     known: list[Floats] = []
     for candidate in candidates[: SETTINGS.pool]:
@@ -176,7 +185,31 @@ def choose(candidates: Sequence[Candidate], count: int, comparison: WholeCompari
     progress(0.6)
     refined = parallel_map(lambda candidate: comparison.refined(candidate, in_full=True), finalists)
     progress(1.0)
-    return min(refined, key=lambda each: comparison.score(each, True)) if len(refined) > 1 else refined[0]
+    best = int(np.argmin([comparison.score(each, True) for each in refined])) if len(refined) > 1 else 0
+    return finalists[best], refined[best]
+
+
+def with_limb_bent(comparison: WholeComparison, chosen: Candidate, fit: Candidate) -> Candidate:
+    """A fit with a limb bent to the one place that it leaves bare, if that is better and leaves nothing bare; ``chosen`` was
+    refined to it.
+
+    That is what is bent and refined anew, for a limb in a wrong place is deformed there by the fit. Where several places
+    are bare several limbs are wrong: of two people each limb that was moved let another one go astray. What is bare of a
+    cloud its noise hides.
+    """
+    task, limbs = comparison.task, limbs_of(comparison.task.model)
+    if not limbs.bends or not task.samples.signed:
+        return fit
+    local = task.coarse.to_local(fit.pose)
+    places = bare_places(local, task.system.surface(fit.vectors))
+    if len(places) != 1:
+        return fit
+    reaching = limbs.reaching(local, comparison.averaged(chosen).vectors, places[0])
+    if reaching is None:
+        return fit
+    bent = comparison.refined(replace(chosen, vectors=reaching), in_full=True)
+    better = comparison.score(bent, False) < SETTINGS.bent_margin * comparison.score(fit, False)
+    return bent if better and not bare_places(local, task.system.surface(bent.vectors)) else fit
 
 
 def _screened(candidates: list[Candidate], comparison: WholeComparison, progress: Progress) -> list[Candidate]:
@@ -215,7 +248,7 @@ class WholeComparison:
         """An interpretation after its refinement."""
         task = self.task
         if in_full:
-            candidate = averaged(task.system, candidate, self._candidates)
+            candidate = self.averaged(candidate)
         fixed = None
         if self._landmarks is not None:
             fixed = self._landmarks[0], candidate.pose.to_local(self._landmarks[1])
@@ -223,6 +256,10 @@ class WholeComparison:
         facing = local if local.signed else local.facing(task.system.surface(candidate.vectors))
         vectors = refine_nodes(task.system, facing, candidate.vectors, self.schedule(in_full), fixed)
         return replace(candidate, vectors=vectors, residual=two_way_residual(task.system, local, vectors))
+
+    def averaged(self, candidate: Candidate) -> Candidate:
+        """An interpretation with the mean node vectors of those that agree with it, see `averaged`."""
+        return averaged(self.task.system, candidate, self._candidates)
 
     def schedule(self, in_full: bool) -> fit_config.NodeRefineConfig:
         """All steps, or a few of the same schedule: they tell which interpretations the surface agrees with."""
