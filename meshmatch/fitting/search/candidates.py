@@ -123,10 +123,10 @@ def candidates_of_whole(task: FitTask) -> tuple[FitTask, list[Candidate]]:
     chosen += [each for each in of_file(task, candidates) if each not in chosen]
     best = best_first(task.predictor.fit_all([(task.samples, each.pose) for each in chosen]))
     orientation(0.8)
-    if not task.config.again:  # else what needs more is asked again
-        if best[0].residual > SETTINGS.unusual_residual and not task.shape.is_cloud and task.config.partial != "yes":
-            best = best_first([*best, *_turned_anywhere(task)])
-        best += _about_face(task, best[0])
+    unusual = best[0].residual > SETTINGS.unusual_residual and not task.shape.is_cloud
+    if unusual and task.config.partial != "yes" and not task.config.again:  # else it is asked again
+        best = best_first([*best, *_turned_anywhere(task)])
+    best += _about_face(task, best[0])
     orientation(1.0)
     return task, best_first(best)
 
