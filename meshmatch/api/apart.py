@@ -182,9 +182,8 @@ def _rivals(
     least = _AS_LARGE * parts.share(sets[best])
 
     def another(one: frozenset[int]) -> bool:
-        if beside or one & sets[best]:
-            return apart(parts, one, sets[best])
-        return apart(parts, one, sets[best]) or not any(sets[k] >= one | sets[best] for k in among)
+        as_clothes = beside or one & sets[best] or any(sets[k] >= one | sets[best] for k in among)
+        return apart(parts, one, sets[best]) or not as_clothes
 
     rivals = [k for k in among if k != best and parts.share(sets[k]) >= least and another(sets[k])]
     return sorted(rivals, key=lambda k: -parts.share(sets[k]))
