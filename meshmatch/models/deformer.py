@@ -19,7 +19,7 @@ from meshmatch.fields.field import TURN_ROWS, PointField, PointwiseField
 from meshmatch.fields.shape_functions import has_nodes, shape_functions
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models import layers
-from meshmatch.models.network import NetworkConfig
+from meshmatch.models.network import NetworkConfig, naming
 
 
 def rotation_from_six(six: Float[torch.Tensor, "B 6"]) -> Float[torch.Tensor, "B 3 3"]:
@@ -58,7 +58,8 @@ class Deformer(nn.Module):
         self.register_buffer("anchor_phi", anchor_phi)
         self.encoder: layers.Encoder
         if isinstance(config.encoder, type):
-            self.encoder = config.encoder(basis, config.code)
+            with naming(config.encoder):
+                self.encoder = config.encoder(basis, config.code)
         elif config.encoder == "basis":
             self.encoder = layers.BasisEncoder(basis, config.width, config.depth, config.code)
         else:
@@ -141,11 +142,19 @@ class Deformer(nn.Module):
             raise InputError(
                 f"points must be (B, P, 3), not {tuple(points.shape)}", "one cloud is a batch: points[None]"
             )
-        vectors = self.decoder(self.encoder(self.encoder.features(points)))
+        vectors = self.decoder(self.code_of(points))
         for _ in range(self.config.corrections):
             vectors = self.correct(vectors, points)
         result: torch.Tensor = vectors
         return result
+
+    def code_of(self, points: Float[torch.Tensor, "B P 3"]) -> Float[torch.Tensor, "B D"]:
+        """Codes of scans in the core frame; `ModelError` if an encoder of one's own fails, or gives something else."""
+        with naming(self.config.encoder):
+            code: torch.Tensor = self.encoder(self.encoder.features(points))
+            if tuple(code.shape) != (wanted := (len(points), self.config.code)):
+                raise ValueError(f"it gives {tuple(code.shape)} instead of {wanted}")
+        return code
 
     # The same questions in arrays, as `models.network.Network` has them: for fields that torch alone can evaluate.
 
@@ -165,7 +174,7 @@ class Deformer(nn.Module):
 
     @torch.inference_mode()
     def encode(self, cloud: Float[Floats, "P 3"]) -> Float[Floats, " D"]:
-        return np.asarray(_array(self.encoder(self.encoder.features(self._tensor(cloud))))[0])
+        return np.asarray(_array(self.code_of(self._tensor(cloud)))[0])
 
     @torch.inference_mode()
     def decode(self, code: Float[Floats, " D"]) -> Float[Floats, "R 3"]:

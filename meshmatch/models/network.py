@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any, Literal, Protocol
 
 from meshmatch.arrays import Float, Floats, Floats32
-from meshmatch.errors import ModelError
+from meshmatch.errors import MeshmatchError, ModelError
 from meshmatch.fields.shape_functions import FIELDS, FieldName, has_nodes
 
 POINT_SIZES = (128, 128, 256, 512, 1024)  # of the layers of `models.layers.PointEncoder`
@@ -91,6 +92,20 @@ def _check_class(encoder: object) -> None:
     ):
         what = f"an encoder of one's own is a class with features and forward, not {repr(encoder)[:80]}"
         raise ModelError(what, "derive one from meshmatch.models.layers.Encoder, and give the class itself")
+
+
+@contextmanager
+def naming(encoder: str | type) -> Iterator[None]:
+    """Around what an encoder does: an error in a class of one's own is said by a `ModelError` that names the class."""
+    try:
+        yield
+    except MeshmatchError:
+        raise
+    except Exception as error:
+        if not isinstance(encoder, type):
+            raise
+        what = f"the encoder {_name_of(encoder)} fails: {type(error).__name__}: {error}"
+        raise ModelError(what, "the error above says where") from error
 
 
 def _name_of(encoder: type) -> str:

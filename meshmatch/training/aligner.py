@@ -5,14 +5,21 @@ A step costs a tenth of one of the whole network, and what it takes to know ever
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
 from meshmatch.arrays import Float
+from meshmatch.errors import ModelError
 from meshmatch.models.deformer import Deformer
+from meshmatch.outputs import replace_on_success
 from meshmatch.progress import Progress
 from meshmatch.training import scans
 from meshmatch.training.batches import Draw, batches
@@ -30,12 +37,32 @@ class _Unread(torch.nn.Module):
         return points[:, :_POINTS]
 
 
+@dataclass(frozen=True)
+class Aligned:
+    """What became of the aligner: whether all its steps are done, seconds of this run and of all, and the mean distance of
+    its last rotations."""
+
+    done: bool = True
+    seconds: float = 0.0
+    of_all: float = 0.0
+    error: float = math.nan
+
+
 def train_aligner(
-    model: Deformer, data: BatchDataset, steps: int, progress: Progress | None = None, draw: Draw = "auto"
-) -> float:
-    """Train the aligner of a model in place, where the model is; the mean distance of its last rotations. A function of the
-    data's seed and the sort of device."""
-    aligner, device = model.aligner, model.nodes.device
+    model: Deformer,
+    data: BatchDataset,
+    steps: int,
+    progress: Progress | None = None,
+    draw: Draw = "auto",
+    minutes: float | None = None,
+    checkpoint: Path | None = None,
+) -> Aligned:
+    """Train the aligner of a model in place, where the model is: a function of the data's seed and the sort of device.
+
+    After so many ``minutes`` it stops, with a ``checkpoint`` that the next call goes on from (`ModelError` if that is of
+    another training).
+    """
+    aligner, device, began = model.aligner, model.nodes.device, time.monotonic()
     assert aligner is not None
     raw = replace(data, aligner=_Unread(), encoder=None, seed=data.seed + _SEED)  # type: ignore[arg-type]
     drawn = list(batches(raw, range(-(-_SHAPES // data.shapes)), device, 0, draw))
@@ -44,9 +71,12 @@ def train_aligner(
         for name in ("align_features", "align_rotation", "align_center")
     )
     optimiser = torch.optim.AdamW(aligner.parameters(), _RATE, betas=(0.9, 0.99), weight_decay=0.01)
+    first, before = 0, 0.0
+    if checkpoint is not None and checkpoint.is_file():
+        first, before = _load(checkpoint, aligner, optimiser, {"seed": str(data.seed), "steps": str(steps)})
     aligner.train()
     recent = torch.zeros((), device=device)
-    for step in range(steps):
+    for step in range(first, steps):
         generator = step_generator(data.seed + _SEED, step, device)
         torch.manual_seed(step)  # of dropout
         for group in optimiser.param_groups:
@@ -65,7 +95,45 @@ def train_aligner(
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
-        recent = recent + (off.detach() - recent) / min(step + 1, 50)
+        recent = recent + (off.detach() - recent) / min(step - first + 1, 50)
         if progress is not None:
             progress((step + 1) / steps)
-    return float(recent)
+        seconds = time.monotonic() - began
+        if minutes is not None and seconds > 60 * minutes and step + 1 < steps:
+            if checkpoint is not None:
+                words = {"step": str(step + 1), "seconds": f"{before + seconds:.1f}"}
+                _save(checkpoint, aligner, optimiser, words | {"seed": str(data.seed), "steps": str(steps)})
+            return Aligned(False, seconds, before + seconds, float(recent))
+    seconds = time.monotonic() - began
+    return Aligned(True, seconds, before + seconds, float(recent))
+
+
+def _save(path: Path, aligner: torch.nn.Module, optimiser: torch.optim.Optimizer, words: dict[str, str]) -> None:
+    arrays = {f"aligner.{name}": tensor for name, tensor in aligner.state_dict().items()}
+    for index, state in optimiser.state_dict()["state"].items():
+        arrays |= {f"optimiser.{index}.{name}": torch.as_tensor(tensor) for name, tensor in state.items()}
+    with replace_on_success(path) as temporary:
+        save_file({name: each.detach().cpu().contiguous().clone() for name, each in arrays.items()}, temporary, words)
+
+
+def _load(
+    path: Path, aligner: torch.nn.Module, optimiser: torch.optim.Optimizer, same: dict[str, str]
+) -> tuple[int, float]:
+    """Go on where `_save` was called: the next step, and seconds of all runs before."""
+    held: dict[str, dict[str, Tensor]] = {"aligner": {}}
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            words = file.metadata() or {}
+            step, seconds = int(words["step"]), float(words["seconds"])
+            for name in file.keys():  # noqa: SIM118 (it is no dictionary)
+                part, _, key = name.rpartition(".") if name.startswith("optimiser.") else name.partition(".")
+                held.setdefault(part, {})[key] = file.get_tensor(name)
+        if any(words[name] != value for name, value in same.items()) or not 0 < step < int(same["steps"]):
+            raise ValueError("of another training")
+        aligner.load_state_dict(held.pop("aligner"))
+        state = {int(part.removeprefix("optimiser.")): each for part, each in held.items()}
+        optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+    except (SafetensorError, OSError, LookupError, ValueError, RuntimeError) as error:
+        hint = "train into another folder, or start afresh"
+        raise ModelError(f"{path} is not a checkpoint of this training", hint) from error
+    return step, seconds

@@ -12,6 +12,7 @@ from meshmatch.locks import locked
 from meshmatch.outputs import as_path, make_folder
 
 CHECKPOINT = Path("checkpoint", "last.safetensors")  # in the model folder
+ALIGNER = Path("checkpoint", "aligner.safetensors")  # of one that was stopped before all else could be learned
 Train = TypeVar("Train", bound=Callable[..., Any])
 
 

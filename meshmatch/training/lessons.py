@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -41,6 +42,7 @@ class Lessons:
     frame: dict[str, str] | None = None  # how fits find it, where the shapes say so
     mirror: Mirroring = "no"  # "auto" where shapes come in two sides
     unseen: Source | None = None  # draws shapes to be measured on, where the source draws but few again and again
+    digest: str = ""  # the same for the same shapes, wherever they lie: a checkpoint goes on with no others
 
 
 def generated(kind: Kind | Bodies, recipe: Recipe, progress: Progress) -> Lessons:
@@ -48,7 +50,7 @@ def generated(kind: Kind | Bodies, recipe: Recipe, progress: Progress) -> Lesson
     seed = recipe.train.seed
     if isinstance(kind, Kind):
         made = kind.generator(seed, progress)
-        return Lessons(made.template, made.draw, made.kind, made.data, mirror=made.mirror)
+        return Lessons(made.template, made.draw, made.kind, made.data, mirror=made.mirror, digest=_digest(made.data))
     if kind.characters is None:
         kind = replace(kind, characters=recipe.characters)
     if kind.bodies is None:
@@ -56,7 +58,7 @@ def generated(kind: Kind | Bodies, recipe: Recipe, progress: Progress) -> Lesson
     template = read_template(kind.template or recipe.template)
     source = people_source(template, kind, seed, progress)
     few = drawn_once(source, kind.bodies, seed, progress) if kind.bodies else source
-    return Lessons(template, few, "human", kind.words, unseen=source)
+    return Lessons(template, few, "human", kind.words, unseen=source, digest=_digest(kind.words))
 
 
 def prepared(shapes: Path, recipe: Recipe) -> Lessons:
@@ -66,13 +68,22 @@ def prepared(shapes: Path, recipe: Recipe) -> Lessons:
     frame = frame_of(shapes) if recipe.deform else None
     mirror: Mirroring = "auto" if has_sides(shapes) else "no"
     if recipe.train.loss.needs_correspondence:
-        verts = torch.from_numpy(read_registered(shapes, template))
-        source = (deformed_source if recipe.deform else registered_source)(verts)
-        return Lessons(template, source, "", f"{len(verts)} registered shapes of {name}", frame, mirror)
+        verts = read_registered(shapes, template)
+        source = (deformed_source if recipe.deform else registered_source)(torch.from_numpy(verts))
+        data = f"{len(verts)} registered shapes of {name}"
+        return Lessons(template, source, "", data, frame, mirror, digest=_digest(verts))
     samples = read_samples(shapes, template)
     known = f" and {len(samples.template_landmarks)} known points" if len(samples.template_landmarks) else ""
     data = f"{len(samples.points)} shapes of {name}, without correspondence{known}"
-    return Lessons(template, samples, "", data, frame, mirror)
+    return Lessons(template, samples, "", data, frame, mirror, digest=_digest(samples.points, samples.landmarks))
+
+
+def _digest(*parts: np.ndarray | str) -> str:
+    """Of arrays, or of words where shapes are generated anew."""
+    found = hashlib.sha256()
+    for part in parts:
+        found.update(part.encode() if isinstance(part, str) else np.ascontiguousarray(part).tobytes())
+    return found.hexdigest()[:16]
 
 
 def template_of(
@@ -135,11 +146,12 @@ def lessons(
     if kind is not None:
         raise OptionError("generated shapes do not go with a folder of shapes", "leave out one of the two")
     if isinstance(shapes, RegisteredShapes):
-        source = deformed_source(torch.from_numpy(np.asarray(shapes.verts, np.float32)))
-        known = f"{len(shapes.verts)} fits of {shapes.name}"
+        verts = np.asarray(shapes.verts, np.float32)
+        source, digest = deformed_source(torch.from_numpy(verts)), _digest(verts)
+        known = f"{len(verts)} fits of {shapes.name}"
         if shapes.orientation is None:
-            return Lessons(shapes.template, source, shapes.name, known)
+            return Lessons(shapes.template, source, shapes.name, known, digest=digest)
         frame = {"orientation": shapes.orientation, "scale": "area"}
         sides: Mirroring = "auto" if shapes.mirror else "no"
-        return Lessons(shapes.template, source, "", f"{known}, without a model", frame, sides)
+        return Lessons(shapes.template, source, "", f"{known}, without a model", frame, sides, digest=digest)
     return prepared(Path(shapes), recipe)

@@ -108,8 +108,8 @@ def learning_rate(step: int, config: TrainConfig) -> float:
 class Trainer:
     """State of a run: weights, their average, the optimiser and the next step. All of it is in a checkpoint."""
 
-    def __init__(self, model: Any, points: Any, config: TrainConfig) -> None:
-        self.config = config
+    def __init__(self, model: Any, points: Any, config: TrainConfig, digest: str = "") -> None:
+        self.config, self.digest = config, digest  # of the shapes, see `Lessons`; empty where it is not known
         self.rank = int(os.environ.get("RANK", 0))
         self.world = int(os.environ.get("WORLD_SIZE", 1))
         self.device = training_device(int(os.environ.get("LOCAL_RANK", 0)), config.device)
@@ -136,10 +136,11 @@ class Trainer:
         arrays = {n: t.detach().cpu().contiguous().clone() for n, t in arrays.items()}
         with replace_on_success(path) as temporary:
             words = {"step": str(self.step), "seconds": f"{self.seconds:.1f}", "seed": str(self.config.seed)}
-            save_file(arrays, temporary, words)
+            save_file(arrays, temporary, words | {"digest": self.digest})
 
     def load(self, path: Path) -> None:
-        """Go on where `save` was called; `ModelError` if the file is none, or of another seed, network or template."""
+        """Go on where `save` was called; `ModelError` if the file is none, or of another seed, network or template, or of
+        other shapes."""
         hint = "train into another folder, or start afresh"
         here = self.model.state_dict()
         of_parameters = {name: tensor.shape for name, tensor in self.average.items()}
@@ -150,7 +151,7 @@ class Trainer:
             with safe_open(str(path), framework="pt") as file:
                 words = file.metadata() or {}
                 step, seconds = int(words["step"]), float(words.get("seconds", 0.0))
-                seed = int(words.get("seed", self.config.seed))
+                seed, digest = int(words.get("seed", self.config.seed)), words.get("digest", "")
                 for name in file.keys():  # noqa: SIM118 (it is no dictionary)
                     part, _, key = name.partition(".")
                     parts[part][key] = file.get_tensor(name)
@@ -171,6 +172,11 @@ class Trainer:
         weights = parts["model"]
         if not all(torch.equal(weights[n], here[n].cpu()) for n in here if n.endswith(_OF_TEMPLATE)):
             raise ModelError(f"{path} is a checkpoint for another template", hint)
+        if digest and self.digest and digest != self.digest:
+            raise ModelError(
+                f"{path} is a checkpoint of a training with other shapes",
+                "train into another folder (--start, with this one, begins with its weights), or start afresh",
+            )
         self.step, self.seconds = step, seconds
         self.model.load_state_dict(weights)
         for name, tensor in parts["average"].items():
@@ -185,14 +191,16 @@ class Trainer:
         report: Callable[[StepReport], None] | None = None,
         validate: Callable[[Deformer], float] | None = None,
         every: int = 50,
+        spent: float = 0.0,
     ) -> None:
-        """Train until ``steps`` or ``minutes`` are over; writes ``checkpoint`` now and then and at the end."""
+        """Train until ``steps`` or ``minutes`` are over, of which so many seconds are ``spent``; writes ``checkpoint`` now
+        and then and at the end."""
         config = self.config
         torch.set_num_threads(config.threads)
         _keep_memory()
         ours = range(self.rank, config.steps * self.world, self.world)[self.step : config.steps]
-        began = saved = time.monotonic()
-        before = self.seconds
+        saved = time.monotonic()
+        began, before = saved - spent, self.seconds - spent
         sums: dict[str, Tensor | float] = {}
         summed = 0
         self.model.train()
@@ -215,7 +223,7 @@ class Trainer:
             if checkpoint is not None and now - saved > 60 * config.checkpoint_minutes:
                 self.save(checkpoint)
                 saved = now
-            if config.minutes is not None and self._any(now - began > 60 * config.minutes):
+            if config.minutes is not None and self.any_says(now - began > 60 * config.minutes):
                 break
         if checkpoint is not None:
             self.save(checkpoint)
@@ -272,7 +280,7 @@ class Trainer:
         names, values = zip(*self.model.named_parameters(), strict=True)
         torch._foreach_lerp_([self.average[n] for n in names], [v.detach() for v in values], 1 - keep)
 
-    def _any(self, stop: bool) -> bool:
+    def any_says(self, stop: bool) -> bool:
         """Whether any process says so: one that stopped alone would leave the others waiting for its gradients."""
         if self.world == 1:
             return stop

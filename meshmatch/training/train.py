@@ -37,9 +37,9 @@ from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.prepared_folder import RegisteredShapes, ShapeSamples
 from meshmatch.templates.template import Template, save_template, template_radius
-from meshmatch.training.aligner import train_aligner
+from meshmatch.training.aligner import Aligned, train_aligner
+from meshmatch.training.alone import ALIGNER, alone
 from meshmatch.training.alone import CHECKPOINT as CHECKPOINT
-from meshmatch.training.alone import alone
 from meshmatch.training.datasets import BatchDataset, CloudDataset, build_lattice
 from meshmatch.training.facts import CardFacts as CardFacts
 from meshmatch.training.facts import inherited
@@ -170,8 +170,9 @@ def _learn(
     facts = replace(facts, category=facts.category or learned.category or facts.name, data=facts.data or learned.data)
     facts = replace(facts, frame=facts.frame or learned.frame, mirror=facts.mirror or learned.mirror)
     return train_model(
-        learned.template, learned.source, output, recipe, facts, resume, report, learned.unseen, tensorboard, aligning
-    )
+        learned.template, learned.source, output, recipe, facts, resume, report, learned.unseen, tensorboard, aligning,
+        learned.digest,
+    )  # fmt: skip
 
 
 def train_model(
@@ -185,9 +186,10 @@ def train_model(
     unseen: Source | None = None,
     tensorboard: bool = False,
     aligning: Progress | None = None,
+    digest: str = "",
 ) -> Path:
     """`train` on shapes with the template's vertices, validated on ``unseen`` ones or on more of the same, or on samples
-    without correspondence; returns the folder.
+    without correspondence; returns the folder. The shapes' ``digest`` is that of `Lessons`.
 
     `InputError` of a single shape; `OptionError` if the model to start from has another template, network or kernel.
     """
@@ -221,12 +223,9 @@ def train_model(
         data = build_dataset(template, source, model, recipe.scan, *size)
         few = {"shapes": 32, "scans_per_shape": 1, "source": unseen or source}
     resumed = resume and checkpoint.is_file()
-    if config.align_steps and not resumed and isinstance(data, BatchDataset) and model.aligner is not None:
-        torch.set_num_threads(config.threads)
-        model.to(training_device(int(os.environ.get("LOCAL_RANK", 0)), config.device))
-        train_aligner(model, data, config.align_steps, aligning, config.draw)
+    aligned = Aligned() if resumed else align(model, data, config, output / ALIGNER, resume, aligning)
     held_out = replace(data, seed=VALIDATION_SEED, **few)[0]
-    trainer = Trainer(model, points, config)
+    trainer = Trainer(model, points, config, digest)
     if resumed:
         trainer.load(checkpoint)
         for name in ("encoder", "aligner"):  # what reads the batches are copies (see `build_dataset`)
@@ -247,7 +246,10 @@ def train_model(
         metrics = Metrics(output / METRICS, trainer)
         drawn = curves(output / CURVES, trainer.step) if tensorboard else None
         report = in_turn(metrics, drawn, report, lambda now: keep(now.validation))
-    trainer.run(data, checkpoint, report, error)
+    trainer.seconds += aligned.of_all
+    if not trainer.any_says(not aligned.done):
+        trainer.run(data, checkpoint, report, error, spent=aligned.seconds)
+        (output / ALIGNER).unlink(missing_ok=True)
     trainer.close()
     if trainer.rank == 0:
         score = error(trainer.model)
@@ -255,6 +257,26 @@ def train_model(
             keep(score)
         export(trainer, template, output, recipe, facts, score)
     return output
+
+
+def align(
+    model: Deformer, data: Any, config: TrainConfig, checkpoint: Path, resume: bool, progress: Progress | None
+) -> Aligned:
+    """The aligner alone, if a training begins with it."""
+    if not resume:
+        checkpoint.unlink(missing_ok=True)
+    if not config.align_steps or not isinstance(data, BatchDataset) or model.aligner is None:
+        return Aligned()
+    torch.set_num_threads(config.threads)
+    model.to(training_device(int(os.environ.get("LOCAL_RANK", 0)), config.device))
+    return train_aligner(model, data, config.align_steps, progress, config.draw, config.minutes, checkpoint)
+
+
+def check_encoder(model: Deformer, P: int) -> None:
+    """`ModelError` if an encoder of one's own fails on two clouds of P points: told before anything is learned, and without
+    a trace in what is."""
+    with torch.random.fork_rng(devices=[]):
+        deepcopy(model).train().code_of(0.3 * torch.randn(2, P, 3))
 
 
 def export(trainer: Trainer, template: Template, output: Path, recipe: Recipe, facts: CardFacts, score: float) -> None:
@@ -325,7 +347,10 @@ def build_deformer(
         phi = field.for_training().phi
     nodes = torch.from_numpy(template.nodes).float()
     torch.manual_seed(seed)
-    return Deformer(network, nodes, torch.from_numpy(anchors).float(), phi, basis, align_basis)
+    model = Deformer(network, nodes, torch.from_numpy(anchors).float(), phi, basis, align_basis)
+    if isinstance(network.encoder, type):
+        check_encoder(model, scan.points)
+    return model
 
 
 def loss_vertices(template: Template, M: int = 1000) -> Int[Ints, " M"]:

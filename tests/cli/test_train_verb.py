@@ -41,7 +41,7 @@ class Recorder:
         return torch.rand(count, 4, 3, generator=generator)
 
     def train_model(self, *given: Any) -> Path:
-        template, source, output, recipe, facts, resume, report, unseen, self.tensorboard, _ = given
+        template, source, output, recipe, facts, resume, report, unseen, self.tensorboard, *_ = given
         told = {"template": template.name, "source": source, "output": output, "recipe": recipe, "resume": resume}
         self.called = told | vars(facts) | {"unseen": unseen}
         report(StepReport(1, 2, 1e-3, 4.0, {"total": 0.5}, 0.04))

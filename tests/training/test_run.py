@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import shutil
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,7 +42,17 @@ from meshmatch.training.records import curves
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.train import CardFacts, train, train_model
 from tests.generators.stick import stick_figure
-from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, egg_template, prepared_eggs, small_data, small_network
+from tests.training.small import (
+    NETWORK,
+    POINTS,
+    SCAN,
+    UPRIGHT,
+    egg_template,
+    prepared_eggs,
+    registered_eggs,
+    small_data,
+    small_network,
+)
 
 SMALL = Recipe(NETWORK, TrainConfig(steps=4, shapes=4, scans_per_shape=1, workers=0, warm_up=1), SCAN, "smooth")
 
@@ -295,6 +306,68 @@ def test_an_encoder_of_ones_own_is_trained_kept_and_asked_for(prepared: Path, tm
     ours = trained(prepared, tmp_path / "ours")
     with pytest.raises(ModelError, match="meshmatch's own encoder"):
         load_model(ours, encoder=Pooled)
+
+
+class Failing(Pooled):
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        return super().forward(features) @ torch.ones(3, 3)
+
+
+class Short(Pooled):
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        return super().forward(features)[:, 1:]
+
+
+class Unmade(Pooled):
+    def __init__(self, basis: torch.Tensor, outputs: int) -> None:
+        raise KeyError("layers")
+
+
+@pytest.mark.parametrize(
+    ("encoder", "words"),
+    [
+        (Failing, "Failing fails: RuntimeError: .*shapes cannot be multiplied"),
+        (Short, r"Short fails: ValueError: it gives \(2, 15\) instead of \(2, 16\)"),
+        (Unmade, "Unmade fails: KeyError: 'layers'"),
+    ],
+)
+def test_an_encoder_that_fails_is_named_before_anything_is_learned(
+    prepared: Path, tmp_path: Path, encoder: type[Encoder], words: str
+) -> None:
+    own = replace(SMALL, network=replace(NETWORK, encoder=encoder))
+    with pytest.raises(ModelError, match=f"the encoder {__name__}.{words}") as caught:
+        trained(prepared, tmp_path / "model", own)
+    assert caught.value.__cause__ is not None and caught.value.__cause__.__traceback__ is not None
+    assert not (tmp_path / "model" / "metrics.jsonl").exists()
+
+
+def test_trying_an_encoder_leaves_no_trace(prepared: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    own = replace(SMALL, network=replace(NETWORK, encoder=Pooled))
+    tried = load_model(trained(prepared, tmp_path / "tried", own), encoder=Pooled).card
+    monkeypatch.setattr("meshmatch.training.train.check_encoder", lambda *_: None)
+    assert (
+        load_model(trained(prepared, tmp_path / "not", own), encoder=Pooled).card.weights_sha256 == tried.weights_sha256
+    )
+
+
+@pytest.mark.parametrize("unsupervised", [False, True])
+def test_a_checkpoint_goes_on_with_no_other_shapes(prepared: Path, tmp_path: Path, unsupervised: bool) -> None:
+    chosen = replace(recipe_for(prepared, unsupervised=unsupervised), network=SMALL.network).changed(
+        steps=4, points=96, workers=0, minutes=1e-9
+    )
+    trained(prepared, tmp_path / "model", chosen)
+    moved, fewer = tmp_path / "moved", tmp_path / "fewer"
+    shutil.copytree(prepared, moved)
+    assert load_model(trained(moved, tmp_path / "model", chosen)).card.steps == 2
+    eggs = registered_eggs(tmp_path / "eggs", 5)
+    (eggs / "egg4.ply").unlink()
+    nodes = NodeConfig(strategy="uniform", K=36, radius=0.45, depth=0.05)
+    prepare(eggs, fewer, PrepareConfig(nodes))
+    assert read_template(fewer / "template.safetensors").hash == read_template(prepared / "template.safetensors").hash
+    with pytest.raises(ModelError, match="a training with other shapes") as caught:
+        trained(fewer, tmp_path / "model", chosen)
+    assert "--start" in caught.value.hint
+    assert load_model(trained(fewer, tmp_path / "model", chosen, resume=False)).card.steps == 1
 
 
 def test_a_training_may_begin_with_a_models_weights(prepared: Path, tmp_path: Path) -> None:
