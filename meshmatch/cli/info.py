@@ -14,6 +14,7 @@ from meshmatch.errors import InputError
 
 if TYPE_CHECKING:
     from meshmatch.shapes.parts import Parts
+    from meshmatch.shapes.shape import Shape
 
 _SHOWN_PARTS, _MOST_PARTS = 20, 1000  # of a mesh: in words, and with --json
 
@@ -42,7 +43,7 @@ def info(
     for key, value in record.items():
         if key == "unit_if_a_person" and value is None:
             continue
-        values = value if key in ("repair", "reasons", "meshes") else [value]  # a line each
+        values = value if key in ("repair", "reasons", "meshes", "materials") else [value]  # a line each
         if key == "largest_parts":
             values = _part_lines(value, record["parts"])
         shown = [_shown(item) for item in values] or ["nothing to do" if key == "repair" else "none"]
@@ -83,10 +84,27 @@ def _shape(file: Path) -> Json:
         for name, count in meshes:
             counts[name] += count
         about["meshes"] = [f"{name} ({count:,} vertices)" for name, count in counts.items()]
+    about |= _materials(file, shape)
     about |= {"size": size, "area": shape.area, "colors": shape.colors is not None}
     usual = {"longest_along": long_axis(clean.shape), "unit_if_a_person": guess_unit(clean.shape)}
     repaired = {"repaired_vertices": clean.shape.V, "repaired_faces": clean.shape.F}
     return about | edges | parts | usual | {"repair": list(clean.notes)} | repaired | {"hash": shape.hash}
+
+
+def _materials(file: Path, shape: "Shape") -> Json:
+    """The materials of a file that has some, with the size of their images; or why these cannot be read."""
+    from meshmatch.shapes.textured_files import find_appearance
+
+    try:
+        look = find_appearance(file, shape, plain=True)
+    except InputError as error:
+        return {"materials": [error.message]}
+    found = []
+    for material in () if look is None else look.materials:
+        size = None if material.image is None else f"a texture of {material.image.shape[1]} x {material.image.shape[0]}"
+        if material.name or size:
+            found.append(f"{material.name or 'without a name'} ({size or 'one color'})")
+    return {"materials": found} if found else {}
 
 
 def _parts(parts: "Parts", meshes: list[tuple[str, int]]) -> list[Json]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
@@ -115,3 +116,18 @@ def test_a_file_that_is_none_of_these_is_an_error(run: Run, tmp_path: Path, name
     assert answer.status == 1
     assert answer.out == ""
     assert name in answer.err
+
+
+def test_materials_and_their_textures(run: Run, tmp_path: Path, sphere: Shape) -> None:
+    save_shape(tmp_path / "plain.obj", sphere)
+    assert "materials" not in record(run, tmp_path / "plain.obj")
+    (tmp_path / "dressed.mtl").write_text("newmtl cloth\nmap_Kd cloth.png\nnewmtl skin\nKd 1 0 0\n")
+    corners = "mtllib dressed.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 0 1\n"
+    (tmp_path / "dressed.obj").write_text(corners + "usemtl cloth\nf 1/1 2/2 3/3\nusemtl skin\nf 1 2 4\n")
+    Image.new("RGB", (20, 10)).save(tmp_path / "cloth.png")
+    found = record(run, tmp_path / "dressed.obj")
+    assert found["materials"] == ["cloth (a texture of 20 x 10)", "skin (one color)"]
+    assert "skin (one color)" in run("info", tmp_path / "dressed.obj").out
+    (tmp_path / "cloth.png").write_bytes(b"no image")
+    (why,) = record(run, tmp_path / "dressed.obj")["materials"]  # type: ignore[misc, attr-defined]
+    assert "cloth.png cannot be read as an image" in why
