@@ -2,6 +2,7 @@
 
 import math
 import os
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -26,8 +27,11 @@ if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
     from meshmatch.templates.prepared_folder import RegisteredShapes
     from meshmatch.training.loop import StepReport
+    from meshmatch.training.recipes import Recipe
 
 _FALLS = 0.99  # of the validation before
+_LOOKED = 10.0  # seconds of training after which its length is told
+_CODE_STEP = 0.08  # of a training step: a step of the search for a code, of a pointwise model
 _ENERGIES = ("volume", "arap", "blend")
 _IMPLICIT = (
     *("implicit", "preset", "shapes", "field", "rate", *_ENERGIES, "name", "category", "licence", "steps"),
@@ -190,7 +194,7 @@ def train(
             check_writable(how.picture)
     first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs one speaks
     console = Console(quiet or not first)
-    steps, learn = (_implicit if how.implicit else _by_template)(output, how, console)
+    steps, learn, then = (_implicit if how.implicit else _by_template)(output, how, console)
     if not how.fresh and (output / CHECKPOINT).is_file():
         console.say(f"going on from the checkpoint in {output}; --fresh starts anew")
     reports: list[StepReport] = []
@@ -201,8 +205,8 @@ def train(
             console.say(f"{now.words} ({now.seconds:.0f} s{_left(reports)})")
 
     with console.progress() as progress:
-        learn(resume=not how.fresh, progress=progress, report=report)
-        if first and how.shapes is not None and not how.implicit:
+        learn(resume=not how.fresh, progress=_forecast(console, progress, steps, how.minutes, then), report=report)
+        if first and how.shapes is not None and then is not None:
             _calibrate(console, output, how.shapes, how.threads, progress)
     if first:
         if how.picture is not None:
@@ -210,13 +214,55 @@ def train(
         _summary(console, output, steps, reports, how.picture, json)
 
 
+def _forecast(
+    console: Console, progress: ProgressCallback, steps: int, most: float | None, then: "Recipe | None"
+) -> ProgressCallback:
+    """The same progress, which tells after the first steps about how long the training takes, and what comes then."""
+    from meshmatch.api.calibration import COUNT, SEARCHED
+    from meshmatch.fields.shape_functions import has_nodes
+
+    began: tuple[float, float] | None = None
+    told = False
+
+    def report(stage: str, name: str, share: float) -> None:
+        nonlocal began, told
+        progress(stage, name, share)
+        if told or name != "training" or not stage.startswith("step"):
+            return
+        now = time.monotonic()
+        if began is None:  # the first step waits for its batch
+            began = now, share
+        elif now - began[0] >= _LOOKED and share > began[1]:
+            each = (now - began[0]) / (share - began[1]) / steps
+            left = each * steps * (1 - share) / 60
+            words = [_about(left if most is None else min(left, most), "of training")]
+            if then is not None:
+                fits = f"to fit {COUNT} of the shapes, which tells how far fits are to be trusted"
+                pointwise = not has_nodes(then.network.field)
+                words.append(_about(each * COUNT * SEARCHED * _CODE_STEP / 60 if pointwise else 0, fits))
+            console.say(", then ".join(words))
+            told = True
+
+    return report
+
+
+def _about(minutes: float, what: str) -> str:
+    return f"{f'about {minutes:.0f} min' if minutes >= 1 else 'less than a minute'} {what}"
+
+
 def _calibrate(console: Console, output: Path, shapes: Path, threads: int, progress: ProgressCallback) -> None:
     """Find what is usual of fits by a model that learned no correspondence."""
-    card = read_any_card(output)
-    if not isinstance(card, ModelCard) or card.correspondence:
-        return
+    console.say("fitting some of the shapes, which tells how far fits by this model are to be trusted")
+    began = time.monotonic()
+
+    def counted(stage: str, name: str, share: float) -> None:
+        progress(stage, name, share)
+        left = (time.monotonic() - began) * (1 - share) / share / 60 if stage == "shapes" else 0
+        if left >= 1:
+            console.say(f"fitted {name}{_left_words(left)}")
+
     try:
-        usual = meshmatch.calibrate(output, shapes, threads=threads, progress=progress).metrics["usual"]
+        usual = meshmatch.calibrate(output, shapes, threads=threads, progress=counted).metrics["usual"]
     except InputError as error:
         console.say(f"note: what is usual of its fits is not known, and none will be good: {error.message}")
         return
@@ -231,12 +277,16 @@ def _left(reports: "list[StepReport]") -> str:
     first, now = reports[0], reports[-1]
     if now.step in (first.step, now.steps):
         return ""
-    minutes = (now.seconds - first.seconds) / (now.step - first.step) * (now.steps - now.step) / 60
+    return _left_words((now.seconds - first.seconds) / (now.step - first.step) * (now.steps - now.step) / 60)
+
+
+def _left_words(minutes: float) -> str:
     return f", about {minutes:.0f} min left" if minutes >= 1 else ", less than a minute left"
 
 
-def _by_template(output: Path, how: TrainOptions, console: Console) -> tuple[int, Callable[..., Any]]:
-    """The steps of a training that deforms a template of vertices, and what runs it."""
+def _by_template(output: Path, how: TrainOptions, console: Console) -> "tuple[int, Callable[..., Any], Recipe | None]":
+    """The steps of a training that deforms a template of vertices, what runs it, and its recipe where the model must be
+    calibrated."""
     from meshmatch.models.inference import training_device
     from meshmatch.training import train as training
     from meshmatch.training.recipes import going_on, recipe_for, small_data
@@ -262,10 +312,11 @@ def _by_template(output: Path, how: TrainOptions, console: Console) -> tuple[int
     facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, start or how.start)
     shapes, kind = fitted or how.shapes, _generated(how)
     learn = partial(training.train, output, shapes=shapes, kind=kind, recipe=recipe, facts=facts)
-    return recipe.train.steps, partial(learn, validation=how.validate, tensorboard=how.tensorboard)
+    then = None if recipe.train.loss.needs_correspondence else recipe
+    return recipe.train.steps, partial(learn, validation=how.validate, tensorboard=how.tensorboard), then
 
 
-def _implicit(output: Path, how: TrainOptions, console: Console) -> tuple[int, Callable[..., Any]]:
+def _implicit(output: Path, how: TrainOptions, console: Console) -> tuple[int, Callable[..., Any], None]:
     """The same of an implicit model."""
     how.refuse(sorted({each.name for each in fields(how)}.difference(_IMPLICIT)), "--implicit")
     if how.shapes is None or how.field == "rbf":
@@ -288,7 +339,8 @@ def _implicit(output: Path, how: TrainOptions, console: Console) -> tuple[int, C
     )
     config = replace(DIF_NET if published else ImplicitConfig(), field=field)
     facts = CardFacts(how.name or "", how.category or "", "", how.licence)
-    return training.steps, partial(train_implicit, output, how.shapes, config=config, training=training, facts=facts)
+    learn = partial(train_implicit, output, how.shapes, config=config, training=training, facts=facts)
+    return training.steps, learn, None
 
 
 def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None, TrainedModel | None]":

@@ -19,7 +19,7 @@ from meshmatch.implicit.space import CUBE_RADIUS, cube_nodes
 from meshmatch.models.card import IMPLICIT, ImplicitCard, check_name, write_card
 from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.registry import WEIGHTS
-from meshmatch.progress import ProgressCallback
+from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.training.alone import CHECKPOINT, alone
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
@@ -136,14 +136,8 @@ def train_implicit(
     trainer = Trainer(network, None, replace(training, shapes=min(training.shapes, len(shapes.names))))
     if resume and checkpoint.is_file():
         trainer.load(checkpoint)
-
-    def both(now: StepReport) -> None:
-        if report is not None:
-            report(now)
-        if progress is not None:
-            progress(now.words, "training", now.step / now.steps)
-
-    trainer.run(ImplicitDataset(shapes, trainer.config), checkpoint, both)
+    told = Progress(progress, "training")
+    trainer.run(ImplicitDataset(shapes, trainer.config), checkpoint, report, progress=told)
     trainer.close()
     if trainer.rank == 0:
         (output / IMPLICIT).unlink(missing_ok=True)

@@ -24,6 +24,7 @@ from meshmatch.errors import ModelError, OptionError
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.inference import training_device
 from meshmatch.outputs import replace_on_success
+from meshmatch.progress import Progress
 from meshmatch.training.batches import Draw, batches
 from meshmatch.training.losses import CorrespondenceLoss, Objective
 
@@ -92,9 +93,14 @@ class StepReport:
     @property
     def words(self) -> str:
         """One line for people."""
+        return f"step {self.step:,} of {self.steps:,}{self.losses}"
+
+    @property
+    def losses(self) -> str:
+        """What `words` say of them."""
         words = ", ".join(f"{name} {value:.4g}" for name, value in self.terms.items())
         known = "" if self.validation is None else f", validation {self.validation:.4f}"
-        return f"step {self.step:,} of {self.steps:,}: {words}{known}"
+        return f": {words}{known}"
 
 
 def learning_rate(step: int, config: TrainConfig) -> float:
@@ -192,6 +198,7 @@ class Trainer:
         validate: Callable[[Deformer], float] | None = None,
         every: int = 50,
         spent: float = 0.0,
+        progress: Progress | None = None,
     ) -> None:
         """Train until ``steps`` or ``minutes`` are over, of which so many seconds are ``spent``; writes ``checkpoint`` now
         and then and at the end."""
@@ -202,7 +209,7 @@ class Trainer:
         saved = time.monotonic()
         began, before = saved - spent, self.seconds - spent
         sums: dict[str, Tensor | float] = {}
-        summed = 0
+        summed, lately = 0, ""
         self.model.train()
         if self.world > 1:  # which begin with the same weights
             for held in (*self.model.state_dict().values(), *self.average.values()):
@@ -218,8 +225,11 @@ class Trainer:
                 score = validate(self.model) if validate and self.step % (10 * every) == 0 else None
                 means = {name: float(value) / summed for name, value in sums.items()}
                 rate = learning_rate(self.step, config)
-                report(StepReport(self.step, config.steps, rate, now - began, means, score))
-                sums, summed = {}, 0
+                reported = StepReport(self.step, config.steps, rate, now - began, means, score)
+                report(reported)
+                sums, summed, lately = {}, 0, reported.losses
+            if progress is not None:  # at every step, for one may take seconds
+                progress.named(f"step {self.step:,} of {config.steps:,}{lately}")(self.step / config.steps)
             if checkpoint is not None and now - saved > 60 * config.checkpoint_minutes:
                 self.save(checkpoint)
                 saved = now

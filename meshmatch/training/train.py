@@ -147,30 +147,25 @@ def train(
     if tensorboard:
         check_curves()
 
-    def told(now: StepReport) -> None:
-        if progress is not None:
-            progress(now.words, "training", now.step / now.steps)
-
     making = Progress(progress, "shapes").stage("making shapes (once)")
-    aligning = Progress(progress, "training").stage("orientations alone (once)")
 
     def make() -> Lessons:
         return measured_on(validation, lessons(shapes, kind, recipe, making))
 
-    return _learn(output, facts, recipe, resume, in_turn(told, report), tensorboard, make, aligning)
+    return _learn(output, facts, recipe, resume, report, tensorboard, make, Progress(progress, "training"))
 
 
 @alone
 def _learn(
-    output: str | Path, facts: CardFacts, recipe: Recipe, resume: bool, report: Report, tensorboard: bool,
-    make: Callable[[], Lessons], aligning: Progress,
+    output: str | Path, facts: CardFacts, recipe: Recipe, resume: bool, report: Report | None, tensorboard: bool,
+    make: Callable[[], Lessons], progress: Progress,
 ) -> Path:  # fmt: skip
     """What `train` does once its folder is its own."""
     learned = make()
     facts = replace(facts, category=facts.category or learned.category or facts.name, data=facts.data or learned.data)
     facts = replace(facts, frame=facts.frame or learned.frame, mirror=facts.mirror or learned.mirror)
     return train_model(
-        learned.template, learned.source, output, recipe, facts, resume, report, learned.unseen, tensorboard, aligning,
+        learned.template, learned.source, output, recipe, facts, resume, report, learned.unseen, tensorboard, progress,
         learned.digest,
     )  # fmt: skip
 
@@ -185,7 +180,7 @@ def train_model(
     report: Callable[[StepReport], None] | None = None,
     unseen: Source | None = None,
     tensorboard: bool = False,
-    aligning: Progress | None = None,
+    progress: Progress | None = None,
     digest: str = "",
 ) -> Path:
     """`train` on shapes with the template's vertices, validated on ``unseen`` ones or on more of the same, or on samples
@@ -223,6 +218,7 @@ def train_model(
         data = build_dataset(template, source, model, recipe.scan, *size)
         few = {"shapes": 32, "scans_per_shape": 1, "source": unseen or source}
     resumed = resume and checkpoint.is_file()
+    aligning = None if progress is None else progress.stage("orientations alone (once)")
     aligned = Aligned() if resumed else align(model, data, config, output / ALIGNER, resume, aligning)
     held_out = replace(data, seed=VALIDATION_SEED, **few)[0]
     trainer = Trainer(model, points, config, digest)
@@ -248,7 +244,7 @@ def train_model(
         report = in_turn(metrics, drawn, report, lambda now: keep(now.validation))
     trainer.seconds += aligned.of_all
     if not trainer.any_says(not aligned.done):
-        trainer.run(data, checkpoint, report, error, spent=aligned.seconds)
+        trainer.run(data, checkpoint, report, error, spent=aligned.seconds, progress=progress)
         (output / ALIGNER).unlink(missing_ok=True)
     trainer.close()
     if trainer.rank == 0:

@@ -11,6 +11,7 @@ import meshmatch
 from meshmatch.api import calibration
 from meshmatch.errors import InputError, MeshmatchError, ModelError, OptionError
 from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_config import LatentRefineConfig
 from meshmatch.fitting.judge.features import FitFeatures
 from meshmatch.fitting.judge.reasons import Reason
 from meshmatch.fitting.usual import FAIR, Usual
@@ -32,7 +33,8 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Shapes that were asked for; every third cannot be fitted."""
     asked: list[Any] = []
 
-    def fit_all(self: object, shapes: list[Any], errors: str) -> list[Fit | MeshmatchError]:
+    def fit_all(self: meshmatch.Matcher, shapes: list[Any], errors: str) -> list[Fit | MeshmatchError]:
+        assert self.config == meshmatch.FitConfig(latent=LatentRefineConfig(steps=400))  # all else as fits are judged
         asked.extend(shapes)
         fits = [fit_of(0.2 + 0.01 * k, 0.01 + 0.001 * k) for k in range(len(shapes))]
         return [fit if k % 3 else InputError("broken") for k, fit in enumerate(fits)]

@@ -1,6 +1,7 @@
 """`train` hands everything on to the training run; the run itself has tests of its own."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,16 +9,21 @@ from typing import Any
 import pytest
 import torch
 
+import meshmatch
+from meshmatch.cli.train import _calibrate, _forecast
+from meshmatch.cli.words import Console
 from meshmatch.generators.generator import Generator
 from meshmatch.generators.kinds import GENERATORS
-from meshmatch.models.card import read_card, write_card
+from meshmatch.models.card import ModelCard, read_card, write_card
+from meshmatch.progress import ProgressCallback
 from meshmatch.templates.location import bundled_folder
 from meshmatch.training import train as training
 from meshmatch.training.loop import StepReport
-from meshmatch.training.recipes import recipe_for
+from meshmatch.training.recipes import clouds, recipe_for
 from tests.cli.conftest import Run
 from tests.fitting.eggs import egg_template
 from tests.generators.momentum_files import write_rig
+from tests.models.small_model import small_card
 
 
 class Recorder:
@@ -306,3 +312,48 @@ def test_a_run_without_a_report_has_no_picture(
     answer = run("train", "-o", tmp_path / "mine", "--picture", tmp_path / "l.png")
     assert "was not drawn" in answer.err
     assert not (tmp_path / "l.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("field", "minutes", "words"),
+    [
+        ("mls", None, "about 10 min of training, then less than a minute to fit 12 of the shapes, which tells"),
+        ("pointwise", None, r"about 10 min of training, then about \d+ min to fit 12 of the shapes, which tells"),
+        ("pointwise", 3.0, r"about 3 min of training, then about \d+ min to fit 12"),
+        (None, None, "about 10 min of training$"),
+    ],
+)
+def test_how_long_it_takes_is_told_after_the_first_steps(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], field: Any, minutes: Any, words: str
+) -> None:
+    clock = iter([100.0, 103.0, 112.0, 200.0])
+    monkeypatch.setattr("meshmatch.cli.train.time.monotonic", lambda: next(clock))
+    recipe = None if field is None else clouds().changed(field=field)
+    told: list[Any] = []
+    report = _forecast(Console(), lambda *each: told.append(each), 500, minutes, recipe)
+    report("making shapes (once)", "shapes", 0.5)
+    report("orientations alone (once)", "training", 0.5)
+    for step in (10, 12, 20, 30):
+        report(f"step {step} of 500", "training", step / 500)
+    said = capsys.readouterr().err.splitlines()
+    assert len(told) == 6 and len(said) == 1 and re.search(words, said[0])
+
+
+def test_fits_that_calibrate_a_model_are_told_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = iter([0.0, 90.0, 360.0, 990.0])
+    monkeypatch.setattr("meshmatch.cli.train.time.monotonic", lambda: next(clock))
+
+    def calibrate(output: Path, shapes: Path, threads: int, progress: ProgressCallback) -> ModelCard:
+        progress("refinement", "a.ply", 0.5)
+        for done in (1, 4, 11):
+            progress("shapes", f"{done} of 12", done / 12)
+        return small_card(metrics={"usual": {"fits": 12, "stretch": 0.1, "residual": 0.01}})
+
+    monkeypatch.setattr(meshmatch, "calibrate", calibrate)
+    _calibrate(Console(), tmp_path / "model", tmp_path, 1, lambda *_: None)
+    begun, first, fourth, _, done = capsys.readouterr().err.splitlines()
+    assert begun.startswith("fitting some of the shapes")
+    assert first == "fitted 1 of 12, about 16 min left" and fourth == "fitted 4 of 12, about 12 min left"
+    assert done.startswith("fitted 12 of the shapes: the template is stretched 1.11-fold, 1 % of sqrt(area) apart")
