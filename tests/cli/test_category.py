@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import meshmatch
 from meshmatch.api import kinds
-from meshmatch.errors import ModelError
+from meshmatch.errors import InputError, ModelError
 from meshmatch.models.card import read_card, write_card
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
@@ -164,7 +165,12 @@ def test_known_points_and_preset_reach_the_training(
         write_card(replace(card, name=facts.name), Path(output) / "card.json")
         return output
 
+    def calibrate(output, shapes, **_):
+        called.update(calibrated=(output, shapes))
+        raise InputError("few shapes")
+
     monkeypatch.setattr("meshmatch.training.train.train_model", stub)
+    monkeypatch.setattr(meshmatch, "calibrate", calibrate)
     if registered:
         (eggs / "egg1.ply").unlink()
     prepared = ("--landmarks", ".tip.npy", "--template", "egg2", *AS_THEY_ARE)
@@ -175,6 +181,8 @@ def test_known_points_and_preset_reach_the_training(
         *("--stiffness", "0.2", "--category", "egg", "--licence", "CC0", "--seed", "4", "--fresh"),
     )
     assert answer.status == 0, answer.err
+    assert called["calibrated"] == (tmp_path / "mine", tmp_path / "out")
+    assert "none will be good: few shapes" in answer.err
     assert called["known"] == (2 if registered else 3, 1, 3)
     assert (called["category"], called["licence"], called["resume"]) == ("egg", "CC0", False)
     assert (called["recipe"].network.encoder, called["stiffness"]) == ("point", 0.2)

@@ -135,12 +135,12 @@ def every_step(stop):
 
     run = Trainer.run
 
-    def changed(self, data, checkpoint=None, report=None, validate=None, every=50):
+    def changed(self, data, checkpoint=None, report=None, validate=None, **more):
         def both(now):
             self.save(checkpoint)
             stop(now)
 
-        run(self, data, checkpoint, both, validate, 1)
+        run(self, data, checkpoint, both, validate, 1, **more)
 
     return changed
 

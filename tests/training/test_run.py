@@ -153,7 +153,7 @@ def test_the_best_model_so_far_is_kept_beside_the_last(prepared: Path, tmp_path:
     scores = iter([0.3, 0.2, 0.25, 0.5])  # of three validations on the way, and at the end
     monkeypatch.setattr("meshmatch.training.train.held_out_error", lambda *_: next(scores))
     run = Trainer.run
-    monkeypatch.setattr(Trainer, "run", lambda *args: run(*args, every=1))  # validated every ten steps
+    monkeypatch.setattr(Trainer, "run", lambda *args, **more: run(*args, **more, every=1))  # validated every ten steps
     folder = trained(prepared, tmp_path / "model", SMALL.changed(steps=30))
     best, last = load_model(folder / "best").card, load_model(folder).card
     assert (best.steps, last.steps) == (20, 30)
