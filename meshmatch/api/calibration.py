@@ -82,7 +82,7 @@ def calibrate(
         raise ModelError(f"{card.name} learned correspondence: its fits are judged without others", "leave it as it is")
     if count < FEWEST:
         raise OptionError(f"{count} shapes are too few to say what is usual", f"take {FEWEST} or more")
-    given = _files(as_path(shapes)) if isinstance(shapes, str | Path) else list(shapes)
+    given = shapes_in(as_path(shapes)) if isinstance(shapes, str | Path) else list(shapes)
     if len(given) < FEWEST:
         raise _too_few(len(given))
     some = [given[k] for k in np.unique(np.linspace(0, len(given) - 1, min(count, len(given))).round().astype(int))]
@@ -102,7 +102,7 @@ def _too_few(count: int) -> InputError:
     return InputError(f"{count} shapes that can be fitted are too few to say what is usual", f"give {FEWEST} or more")
 
 
-def _files(folder: Path) -> list[Path]:
+def shapes_in(folder: Path) -> list[Path]:
     """The shapes of a folder; of one that `prepare` made, as it left them."""
     inside = folder / _NORMALISED if (folder / _NORMALISED).is_dir() else folder
     files = [file for file in sorted(inside.glob("*")) if file.is_file() and suffix_of(file) in SUFFIXES]

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _FALLS = 0.99  # of the validation before
 _LOOKED = 10.0  # seconds of training after which its length is told
-_CODE_STEP = 0.08  # of a training step: a step of the search for a code, of a pointwise model
+_CODE_STEP = 0.06  # of a training step: a step of the search for a code, of a pointwise model
 _ENERGIES = ("volume", "arap", "blend")
 _IMPLICIT = (
     *("implicit", "preset", "shapes", "field", "rate", *_ENERGIES, "name", "category", "licence", "steps"),
@@ -205,7 +205,7 @@ def train(
             console.say(f"{now.words} ({now.seconds:.0f} s{_left(reports)})")
 
     with console.progress() as progress:
-        learn(resume=not how.fresh, progress=_forecast(console, progress, steps, how.minutes, then), report=report)
+        learn(resume=not how.fresh, progress=_forecast(console, progress, steps, how, then), report=report)
         if first and how.shapes is not None and then is not None:
             _calibrate(console, output, how.shapes, how.threads, progress)
     if first:
@@ -215,10 +215,10 @@ def train(
 
 
 def _forecast(
-    console: Console, progress: ProgressCallback, steps: int, most: float | None, then: "Recipe | None"
+    console: Console, progress: ProgressCallback, steps: int, how: TrainOptions, then: "Recipe | None"
 ) -> ProgressCallback:
     """The same progress, which tells after the first steps about how long the training takes, and what comes then."""
-    from meshmatch.api.calibration import COUNT, SEARCHED
+    from meshmatch.api.calibration import COUNT, SEARCHED, shapes_in
     from meshmatch.fields.shape_functions import has_nodes
 
     began: tuple[float, float] | None = None
@@ -235,11 +235,12 @@ def _forecast(
         elif now - began[0] >= _LOOKED and share > began[1]:
             each = (now - began[0]) / (share - began[1]) / steps
             left = each * steps * (1 - share) / 60
-            words = [_about(left if most is None else min(left, most), "of training")]
-            if then is not None:
-                fits = f"to fit {COUNT} of the shapes, which tells how far fits are to be trusted"
+            words = [_about(left if how.minutes is None else min(left, how.minutes), "of training")]
+            if then is not None and how.shapes is not None:
+                fits = min(COUNT, len(shapes_in(how.shapes)))
+                what = f"to fit {fits} of the shapes, which tells how far fits are to be trusted"
                 pointwise = not has_nodes(then.network.field)
-                words.append(_about(each * COUNT * SEARCHED * _CODE_STEP / 60 if pointwise else 0, fits))
+                words.append(_about(each * fits * SEARCHED * _CODE_STEP / 60 if pointwise else 0, what))
             console.say(", then ".join(words))
             told = True
 

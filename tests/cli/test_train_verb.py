@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import meshmatch
-from meshmatch.cli.train import _calibrate, _forecast
+from meshmatch.cli.train import TrainOptions, _calibrate, _forecast
 from meshmatch.cli.words import Console
 from meshmatch.generators.generator import Generator
 from meshmatch.generators.kinds import GENERATORS
@@ -317,20 +317,28 @@ def test_a_run_without_a_report_has_no_picture(
 @pytest.mark.parametrize(
     ("field", "minutes", "words"),
     [
-        ("mls", None, "about 10 min of training, then less than a minute to fit 12 of the shapes, which tells"),
-        ("pointwise", None, r"about 10 min of training, then about \d+ min to fit 12 of the shapes, which tells"),
-        ("pointwise", 3.0, r"about 3 min of training, then about \d+ min to fit 12"),
+        ("mls", None, "about 10 min of training, then less than a minute to fit 9 of the shapes, which tells"),
+        ("pointwise", None, r"about 10 min of training, then about \d+ min to fit 9 of the shapes, which tells"),
+        ("pointwise", 3.0, r"about 3 min of training, then about \d+ min to fit 9 "),
         (None, None, "about 10 min of training$"),
     ],
 )
 def test_how_long_it_takes_is_told_after_the_first_steps(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], field: Any, minutes: Any, words: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    field: Any,
+    minutes: Any,
+    words: str,
 ) -> None:
+    for number in range(9):
+        (tmp_path / f"{number}.ply").touch()
     clock = iter([100.0, 103.0, 112.0, 200.0])
     monkeypatch.setattr("meshmatch.cli.train.time.monotonic", lambda: next(clock))
     recipe = None if field is None else clouds().changed(field=field)
     told: list[Any] = []
-    report = _forecast(Console(), lambda *each: told.append(each), 500, minutes, recipe)
+    how = TrainOptions(shapes=tmp_path, minutes=minutes)
+    report = _forecast(Console(), lambda *each: told.append(each), 500, how, recipe)
     report("making shapes (once)", "shapes", 0.5)
     report("orientations alone (once)", "training", 0.5)
     for step in (10, 12, 20, 30):
