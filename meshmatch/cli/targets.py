@@ -106,6 +106,7 @@ def _transfer_all(
     rest |= {"maps": maps, "run": _changed(run, json=False, quiet=True)}
     how = {name: value for name, value in rest.items() if name not in ("run", "output", "picture")}
     records: dict[str, Json] = {}
+    warned: set[str] = set()
     headed = False
 
     def drawn(name: str) -> Path | None:
@@ -124,7 +125,8 @@ def _transfer_all(
         *_, confidence, seconds, _, _ = record.row()
         last = "kept" if record.kept else seconds
         console.say(_ROW.format(record.name, record.verdict, confidence, last).rstrip())
-        if record.error:
+        if record.error and record.error not in warned:  # what is wrong with the source is wrong for each target
+            warned.add(record.error)
             console.warn(f"{record.name}: {record.error}")
 
     rows = transfer_each(found.files, output, endings, (verb.__name__, how, run.strict), made, tell, drawn)
@@ -153,8 +155,10 @@ def _tell(console: Console, output: Path, rows: Sequence[TransferRecord], record
     if json:
         print_json({"output": output, "table": output / TABLE, "verdicts": counts, "targets": records})
     if counts[FAILED]:
-        failed = [row.name for row in rows if row.verdict == FAILED]
-        names = ", ".join(failed[:_NAMED]) + (", ..." if len(failed) > _NAMED else "")
+        failed = [row for row in rows if row.verdict == FAILED]
+        names = ", ".join([row.name for row in failed[:_NAMED]] + (["..."] if len(failed) > _NAMED else []))
+        reasons = {row.error for row in failed}
+        names += f", all for one reason: {reasons.pop()}" if len(reasons) < min(len(failed), 2) else ""
         hint = "warnings above say why; the same command goes on with what is missing"
         raise InputError(f"{len(failed)} of {len(rows)} targets failed: {names}", hint)
 

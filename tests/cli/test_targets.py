@@ -130,6 +130,15 @@ def test_one_that_fails_stops_no_other(run: Run, files: Path, stub: FakeMatching
     assert table()["a-bad"]["verdict"] == "good"
 
 
+def test_what_is_wrong_with_the_source_is_said_once(run: Run, files: Path, stub: FakeMatching) -> None:
+    Path("labels.txt").write_text("none\n")
+    answer = run(*LABELS)
+    assert answer.status == 1 and answer.err.count("warning: ") == 1
+    assert len([line for line in answer.err.splitlines() if " failed" in line and "targets" not in line]) == 2
+    reason = table()["b"]["error"]
+    assert answer.err.splitlines()[-2] == f"error: 2 of 2 targets failed: b, sub/c, all for one reason: {reason}"
+
+
 def test_a_poor_map_fails_where_that_is_asked(run: Run, files: Path, stub: FakeMatching) -> None:
     stub.verdict = "poor"
     assert well(run(*LABELS)).err.count("poor") >= 2
