@@ -73,7 +73,7 @@ def find_alone(
     """
     if whole.is_cloud or whole.weights is not None or config.partial == "yes":
         return None
-    parts = Parts.of(whole)
+    parts = Parts.of(whole, bases=True)
     sets, clean = [], []
     for numbers in tries(parts):
         with suppress(InputError):  # too few faces to be fitted
@@ -129,13 +129,16 @@ def may_be_parts(clean: Repaired, config: FitConfig) -> bool:
     """Whether a long search would try a mesh, or what it is made of, as parts of something."""
     if clean.shape.is_cloud:
         return False
-    return len(Parts.of(clean.original)) > 1 or may_show_part(clean.shape, config)
+    return len(Parts.of(clean.original, bases=True)) > 1 or may_show_part(clean.shape, config)
 
 
 def left_out_words(parts: Parts, numbers: Sequence[int]) -> str:
     """What is said of parts that were left out."""
-    those = f"{len(numbers)} of {len(parts)} parts, {100 * parts.share(numbers):.0f} % of the area"
-    return f"left out {those}: {_listed(numbers)} (--only and --without choose parts)"
+    those = f"{len(numbers)} of {len(parts)} parts"
+    if min(numbers) > len(parts) - parts.bases:
+        those = "the flat base that it is fused with" if parts.bases == 1 else f"{parts.bases} flat bases"
+    share = f"{100 * parts.share(numbers):.0f} % of the area"
+    return f"left out {those}, {share}: {_listed(numbers)} (--only and --without choose parts)"
 
 
 def _listed(numbers: Sequence[int]) -> str:

@@ -46,6 +46,8 @@ def info(
         values = value if key in ("repair", "reasons", "meshes", "materials") else [value]  # a line each
         if key == "largest_parts":
             values = _part_lines(value, record["parts"])
+        if key == "flat_bases":
+            values = [f"part {each['part']}: {100 * each['share_of_area']:.3g} % of the area" for each in value]
         shown = [_shown(item) for item in values] or ["nothing to do" if key == "repair" else "none"]
         rows += [(key.replace("_", " ") if n == 0 else "", text) for n, text in enumerate(shown)]
     print_rows(rows)
@@ -76,8 +78,12 @@ def _shape(file: Path) -> Json:
     if not shape.is_cloud:
         border, crowded = shape.edges.counts
         edges = {"watertight": border == crowded == 0, "open_edges": border, "non_manifold_edges": crowded}
-        found = Parts.of(shape)
+        found, fused = Parts.of(shape), Parts.of(shape, bases=True)
         parts = {"parts": len(found)} | ({"largest_parts": _parts(found, meshes)} if len(found) > 1 else {})
+        bases = [
+            {"part": n, "share_of_area": float(fused.shares[n - 1])} for n in range(len(found) + 1, len(fused) + 1)
+        ]
+        parts |= {"flat_bases": bases} if bases else {}
     about: Json = {"kind": "point cloud" if shape.is_cloud else "mesh", "vertices": shape.V, "faces": shape.F}
     if meshes:
         counts: Counter[str] = Counter()

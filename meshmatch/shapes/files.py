@@ -128,7 +128,12 @@ class _Named:
 
     @cached_property
     def parts(self) -> Parts:
-        return Parts.of(self.shape)
+        return Parts.of(self.shape, bases=True)
+
+    @cached_property
+    def _connected(self) -> Parts:
+        """The same with what they are fused with."""
+        return Parts.of(self.shape) if self.parts.bases else self.parts
 
     def of(self, pattern: str) -> Bool[Bools, " V"] | None:
         """The vertices of the meshes of a name, or of the part of a number; None if there is none. Numbers of a label map
@@ -140,7 +145,8 @@ class _Named:
         if _is_label_map(self.shape):
             return None
         if pattern.isdecimal() and len(pattern) < 10 and 0 < int(pattern) <= len(self.parts):
-            return np.asarray(self.parts.number == int(pattern))
+            parts = self._connected if int(pattern) <= len(self._connected) else self.parts
+            return np.asarray(parts.number == int(pattern))
         return None
 
     def weighted(self, only: Sequence[str], without: Sequence[str]) -> Shape:

@@ -1,7 +1,7 @@
 """The connected parts of a mesh by number, and which of them may be an object of their own.
 
 Files without names, such as ply and stl, hold a body together with a floor, a pedestal or a chair. Numbers name the parts:
-from 1, the largest area first.
+from 1, the largest area first. A flat base that something is fused with is a part too, after all others.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry import triangles
+from meshmatch.shapes.bases import base_plane
 from meshmatch.shapes.faces import flat_faces, seams
 from meshmatch.shapes.shape import Shape
 
@@ -26,6 +27,8 @@ _SAMPLES, _MOST_SAMPLES, _LEAST_SAMPLES = 12_000, 6_000, 2  # of all parts, and 
 _TOUCHING = 0.03  # parts so near to each other are one group
 _BELONGING, _SMALL = 0.1, 0.2  # parts so near, and no larger than this share of a part, belong to it: eyes, hair, shoes
 _MOST_TRIES = 6
+_MOST_BASES = 2  # parts of which a base is looked for, the largest ones
+_OF_STANDING = 0.4  # share of all that stands on a base that one piece has: not each of the legs of a table
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +36,8 @@ class Parts:
     """The connected parts of a mesh; part n, counted from 1, is the one of the n-th largest area.
 
     Vertices at one position are connected where they lie on open edges, as at the seams of textures and the corners of an
-    stl. Equal areas (to 6 digits) are in the order of their first vertices.
+    stl. Equal areas (to 6 digits) are in the order of their first vertices. Bases come last, see `of`; what stands on one
+    keeps the number that both have together.
 
     Attributes
     ----------
@@ -41,16 +45,20 @@ class Parts:
     number : (V,) which part each vertex is in; 0 for one that no face with any area uses
     faces : (F,) which part each face is in; 0 for a face without area, or at an invalid vertex
     areas : (P,) of each part, squared units of the file
+    bases : how many of the parts are bases: the last ones
     """
 
     shape: Shape
     number: Int[Ints, " V"]
     faces: Int[Ints, " F"]
     areas: Float[Floats, " P"]
+    bases: int = 0
 
     @classmethod
-    def of(cls, shape: Shape) -> Parts:
-        """The parts of a shape; a cloud has none."""
+    def of(cls, shape: Shape, bases: bool = False) -> Parts:
+        """The parts of a shape; a cloud has none. ``bases`` cuts off the flat ones that something is fused with, see
+        `meshmatch.shapes.bases`: parts of their own, to which the vertices along the cut belong.
+        """
         usable = np.flatnonzero(shape.valid_faces)
         corners = shape.faces[usable]
         twin = seams(shape.verts, corners)
@@ -61,15 +69,21 @@ class Parts:
         if not len(usable):
             return cls(shape, number, of_face, np.empty(0))
         label = triangles.face_parts(twin[corners], shape.V)
-        areas = np.bincount(label, shape.face_areas[usable]).astype(np.float64)
+        area = shape.face_areas[usable]
+        areas = np.bincount(label, area).astype(np.float64)
         first = np.full(len(areas), shape.V)
         np.minimum.at(first, label, corners.min(axis=1))
         order = np.lexsort((first, -np.log(np.maximum(areas, 1e-300)).round(6)))
         rank = np.empty(len(order), np.int64)
         rank[order] = np.arange(1, len(order) + 1)
-        of_face[usable] = rank[label]
-        number[corners] = rank[label][:, None]
-        return cls(shape, number, of_face, areas[order])
+        part = rank[label]
+        found = _bases(shape, twin[corners], vectors[solid], area, part) if bases else []
+        number[corners] = part[:, None]
+        for own in found:
+            part[own] = part.max() + 1
+            number[corners[own]] = part[own, None]
+        of_face[usable] = part
+        return cls(shape, number, of_face, np.bincount(part, area)[1:].astype(np.float64), len(found))
 
     def __len__(self) -> int:
         return len(self.areas)
@@ -118,7 +132,7 @@ def without_parts(shape: Shape, parts: Parts, numbers: Sequence[int]) -> Shape:
 
 def leave_out(shape: Shape, numbers: Sequence[int]) -> Shape:
     """As `without_parts`; the shape itself where there are none to be left out."""
-    return without_parts(shape, Parts.of(shape), numbers) if numbers else shape
+    return without_parts(shape, Parts.of(shape, bases=True), numbers) if numbers else shape
 
 
 def tries(parts: Parts) -> list[frozenset[int]]:
@@ -166,23 +180,49 @@ def _reference(parts: Parts) -> int:
     return next((n for n in range(1, min(len(parts), _MOST_LARGE) + 1) if not _is_plain(parts, n)), 2)
 
 
+def _bases(
+    shape: Shape,
+    corners: Int[Ints, "F 3"],
+    vectors: Float[Floats, "F 3"],
+    area: Float[Floats, " F"],
+    part: Int[Ints, " F"],
+) -> list[Int[Ints, " N"]]:
+    """Which of some faces, that are in parts, are of each flat base."""
+    found = []
+    for number in range(1, min(_MOST_BASES, int(part.max())) + 1):
+        own = np.flatnonzero(part == number)
+        plane = base_plane(shape.verts, corners[own], vectors[own])
+        if plane is None:
+            continue
+        low = plane.below(shape.verts[corners[own]].mean(axis=1))
+        base, rest = own[low], own[~low]
+        if len(rest) and _plain(shape.verts, corners[base], area[base]):
+            pieces = np.bincount(triangles.face_parts(corners[rest], shape.V), area[rest])
+            if pieces.max() >= _OF_STANDING * pieces.sum():
+                found.append(base)
+    return found
+
+
 def _is_plain(parts: Parts, number: int) -> bool:
-    """Whether a part is as flat or convex as floors, pedestals and boxes are."""
+    chosen = np.flatnonzero(parts.faces == number)
+    return _plain(parts.shape.verts, parts.shape.faces[chosen], parts.shape.face_areas[chosen])
+
+
+def _plain(verts: Float[Floats, "V 3"], corners: Int[Ints, "F 3"], area: Float[Floats, " F"]) -> bool:
+    """Whether faces are as flat or convex as floors, pedestals and boxes are."""
     from scipy.spatial import ConvexHull, QhullError
 
-    shape, chosen = parts.shape, np.flatnonzero(parts.faces == number)
-    corners = shape.faces[chosen]
     used = np.unique(corners)
-    some = shape.verts[used[np.linspace(0, len(used) - 1, min(len(used), _HULL_POINTS)).astype(np.int64)]]
+    some = verts[used[np.linspace(0, len(used) - 1, min(len(used), _HULL_POINTS)).astype(np.int64)]]
     try:
         planes = ConvexHull(some - some.mean(axis=0)).equations
     except QhullError:  # flat
         return True
-    picked = np.linspace(0, len(chosen) - 1, min(len(chosen), _HULL_POINTS)).astype(np.int64)
-    centers = shape.verts[corners[picked]].mean(axis=1) - some.mean(axis=0)
-    weights = np.maximum(shape.face_areas[chosen[picked]], 1e-300)
+    picked = np.linspace(0, len(corners) - 1, min(len(corners), _HULL_POINTS)).astype(np.int64)
+    centers = verts[corners[picked]].mean(axis=1) - some.mean(axis=0)
+    weights = np.maximum(area[picked], 1e-300)
     depth = np.maximum(-(centers @ planes[:, :3].T + planes[:, 3]).max(axis=1), 0.0)
-    return bool((depth * weights).sum() / weights.sum() <= _PLAIN * np.sqrt(parts.areas[number - 1]))
+    return bool((depth * weights).sum() / weights.sum() <= _PLAIN * np.sqrt(area.sum()))
 
 
 def _samples(parts: Parts, unit: float) -> tuple[Float[Floats, "S 3"], Int[Ints, " S"]]:

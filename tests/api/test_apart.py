@@ -16,10 +16,22 @@ from meshmatch.api.matcher import Matcher
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.shapes.decimate import decimate
-from meshmatch.shapes.parts import Parts
+from meshmatch.shapes.parts import Parts, leave_out
 from meshmatch.shapes.parts import apart as parts_apart
 from meshmatch.shapes.shape import Shape
-from tests.shapes.scenes import beside, chair, coat, eyes, floor, pack, pedestal, sample, second, together
+from tests.shapes.scenes import (
+    beside,
+    chair,
+    coat,
+    eyes,
+    floor,
+    fused_with_floor,
+    pack,
+    pedestal,
+    sample,
+    second,
+    together,
+)
 
 CONFIG = FitConfig()
 BODY = sample("climber")
@@ -61,6 +73,16 @@ def test_the_parts_that_are_known_are_kept_and_the_others_said(reads: Reads) -> 
     assert alone.clean.notes[0].startswith(f"left out 2 of 3 parts, {share:.0f} % of the area: parts ")
     assert not any("weight 0" in note for note in alone.clean.notes)
     assert len(asked) <= 6
+
+
+def test_a_base_that_a_body_is_fused_with_is_left_out(reads: Reads) -> None:
+    scene = fused_with_floor(BODY)
+    rest = usable(leave_out(scene, [2])).shape.V
+    reads({rest: 3.7})
+    alone = find_alone(loaders(), scene, CONFIG)
+    assert alone is not None and alone.clean.left_out == (2,)
+    words = "left out the flat base that it is fused with, 8"
+    assert alone.clean.notes[0].startswith(words) and "part 2 (--only" in alone.clean.notes[0]
 
 
 def test_clothes_stay_where_they_read_as_well(reads: Reads) -> None:

@@ -50,6 +50,18 @@ def floor(body: Shape, width: float = 3.0) -> Shape:
     return sheet(below(body), width)
 
 
+def fused_with_floor(body: Shape, width: float = 3.0) -> Shape:
+    """A body and a floor that triangles between a foot and the floor make one part."""
+    ground = floor(body, width)
+    lowest, middle = int(np.asarray(body.verts)[:, 2].argmin()), body.V + np.array([84, 85, 97])
+    bridge = np.array([[lowest, middle[0], middle[1]], [lowest, middle[2], middle[0]]])
+    verts, faces = (
+        np.concatenate([body.verts, ground.verts]),
+        np.concatenate([body.faces, ground.faces + body.V, bridge]),
+    )
+    return Shape(verts, faces, "scan.ply")
+
+
 def pedestal(body: Shape, height: float = 0.5) -> Shape:
     x, y, z = below(body)
     return box([x - 0.4, y - 0.4, z - height], [x + 0.4, y + 0.4, z])
