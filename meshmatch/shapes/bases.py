@@ -1,7 +1,7 @@
 """The flat base that a body stands on and is fused with: a piece of the floor in a scan, the plate or plinth of a figurine.
 
-It has a plane in which much of the surface lies. Something stands on that, and nothing lies behind, or a block no higher than
-what stands on it.
+It has a plane in which much of the surface lies. Something stands on that, and behind it is nothing, or a block no higher
+than what stands on it.
 """
 
 from __future__ import annotations
