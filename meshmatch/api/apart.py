@@ -71,7 +71,7 @@ def find_alone(
 
     `InputError` where different parts are such shapes, and nothing tells which one is meant.
     """
-    if whole.is_cloud or whole.weights is not None or config.partial == "yes":
+    if whole.weights is not None or config.partial == "yes":
         return None
     parts = Parts.of(whole, bases=True)
     sets, clean = [], []

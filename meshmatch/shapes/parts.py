@@ -57,8 +57,11 @@ class Parts:
     @classmethod
     def of(cls, shape: Shape, bases: bool = False) -> Parts:
         """The parts of a shape; a cloud has none. ``bases`` cuts off the flat ones that something is fused with, see
-        `meshmatch.shapes.bases`: parts of their own, to which the vertices along the cut belong.
+        `meshmatch.shapes.bases`: parts of their own, to which the vertices along the cut belong. A cloud with a base has two
+        parts.
         """
+        if bases and shape.is_cloud:
+            return _of_cloud(cls, shape)
         usable = np.flatnonzero(shape.valid_faces)
         corners = shape.faces[usable]
         twin = seams(shape.verts, corners)
@@ -77,7 +80,7 @@ class Parts:
         rank = np.empty(len(order), np.int64)
         rank[order] = np.arange(1, len(order) + 1)
         part = rank[label]
-        found = _bases(shape, twin[corners], vectors[solid], area, part) if bases else []
+        found = _bases(shape, twin[corners], area, part) if bases else []
         number[corners] = part[:, None]
         for own in found:
             part[own] = part.max() + 1
@@ -143,6 +146,8 @@ def tries(parts: Parts) -> list[frozenset[int]]:
     """
     if len(parts) < 2:
         return []
+    if parts.shape.is_cloud:
+        return [frozenset({1})]
     reference = _reference(parts)
     unit = float(np.sqrt(parts.areas[reference - 1]))
     large = [n for n in range(1, min(len(parts), 10 * _MOST_LARGE) + 1) if parts.areas[n - 1] >= _LARGE * unit**2]
@@ -180,48 +185,54 @@ def _reference(parts: Parts) -> int:
     return next((n for n in range(1, min(len(parts), _MOST_LARGE) + 1) if not _is_plain(parts, n)), 2)
 
 
-def _bases(
-    shape: Shape,
-    corners: Int[Ints, "F 3"],
-    vectors: Float[Floats, "F 3"],
-    area: Float[Floats, " F"],
-    part: Int[Ints, " F"],
-) -> list[Int[Ints, " N"]]:
+def _bases(shape: Shape, corners: Int[Ints, "F 3"], area: Float[Floats, " F"], part: Int[Ints, " F"]) -> list[Ints]:
     """Which of some faces, that are in parts, are of each flat base."""
     found = []
     for number in range(1, min(_MOST_BASES, int(part.max())) + 1):
         own = np.flatnonzero(part == number)
-        plane = base_plane(shape.verts, corners[own], vectors[own])
+        plane = base_plane(Shape(shape.verts, corners[own]))
         if plane is None:
             continue
-        low = plane.below(shape.verts[corners[own]].mean(axis=1))
+        centers = shape.verts[corners[own]].mean(axis=1)
+        low = plane.below(centers)
         base, rest = own[low], own[~low]
-        if len(rest) and _plain(shape.verts, corners[base], area[base]):
+        if len(rest) and _plain(shape.verts[np.unique(corners[base])], centers[low], area[base]):
             pieces = np.bincount(triangles.face_parts(corners[rest], shape.V), area[rest])
             if pieces.max() >= _OF_STANDING * pieces.sum():
                 found.append(base)
     return found
 
 
+def _of_cloud(cls: type[Parts], shape: Shape) -> Parts:
+    """What stands on the base of a cloud, and the base; no parts if it has none."""
+    number, faces = np.zeros(shape.V, np.int64), np.empty(0, np.int64)
+    plane = base_plane(Shape(shape.verts[shape.valid], shape.faces))
+    low = shape.valid & plane.below(shape.verts) if plane is not None else number > 0
+    if not low.any() or not _plain(shape.verts[low], shape.verts[low], shape.vertex_areas[low]):
+        return cls(shape, number, faces, np.empty(0))
+    number = np.where(shape.valid, 1 + low, 0)
+    return cls(shape, number, faces, np.bincount(number, shape.vertex_areas)[1:].astype(np.float64), 1)
+
+
 def _is_plain(parts: Parts, number: int) -> bool:
-    chosen = np.flatnonzero(parts.faces == number)
-    return _plain(parts.shape.verts, parts.shape.faces[chosen], parts.shape.face_areas[chosen])
+    shape, chosen = parts.shape, np.flatnonzero(parts.faces == number)
+    corners = shape.faces[chosen]
+    return _plain(shape.verts[np.unique(corners)], shape.verts[corners].mean(axis=1), shape.face_areas[chosen])
 
 
-def _plain(verts: Float[Floats, "V 3"], corners: Int[Ints, "F 3"], area: Float[Floats, " F"]) -> bool:
-    """Whether faces are as flat or convex as floors, pedestals and boxes are."""
+def _plain(verts: Float[Floats, "V 3"], centers: Float[Floats, "F 3"], area: Float[Floats, " F"]) -> bool:
+    """Whether faces between vertices are as flat or convex as floors, pedestals and boxes are."""
     from scipy.spatial import ConvexHull, QhullError
 
-    used = np.unique(corners)
-    some = verts[used[np.linspace(0, len(used) - 1, min(len(used), _HULL_POINTS)).astype(np.int64)]]
+    some = verts[np.linspace(0, len(verts) - 1, min(len(verts), _HULL_POINTS)).astype(np.int64)]
+    middle = some.mean(axis=0)
     try:
-        planes = ConvexHull(some - some.mean(axis=0)).equations
+        planes = ConvexHull(some - middle).equations
     except QhullError:  # flat
         return True
-    picked = np.linspace(0, len(corners) - 1, min(len(corners), _HULL_POINTS)).astype(np.int64)
-    centers = verts[corners[picked]].mean(axis=1) - some.mean(axis=0)
+    picked = np.linspace(0, len(centers) - 1, min(len(centers), _HULL_POINTS)).astype(np.int64)
     weights = np.maximum(area[picked], 1e-300)
-    depth = np.maximum(-(centers @ planes[:, :3].T + planes[:, 3]).max(axis=1), 0.0)
+    depth = np.maximum(-((centers[picked] - middle) @ planes[:, :3].T + planes[:, 3]).max(axis=1), 0.0)
     return bool((depth * weights).sum() / weights.sum() <= _PLAIN * np.sqrt(area.sum()))
 
 

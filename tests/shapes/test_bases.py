@@ -10,6 +10,7 @@ from meshmatch.errors import InputError
 from meshmatch.shapes.bases import base_plane
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.parts import Parts, leave_out
+from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from tests.shapes.scenes import fused_with_floor, moved, sample, together
 
@@ -29,17 +30,13 @@ def hills(*centers: tuple[float, float], height: float = 2.0, N: int = 81) -> np
     return height * sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / 0.08) for a, b in centers)
 
 
-def plane_of(shape: Shape) -> object:
-    return base_plane(shape.verts, shape.faces, shape.face_vectors)
-
-
 @pytest.mark.parametrize("noise", [0.0, 0.005])
 def test_the_plane_that_a_hill_stands_on_is_found_however_it_lies(noise: float) -> None:
     shape = landscape(hills((0.3, 0.2)))
     rng = np.random.default_rng(0)
     turn = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
     verts = 100 * (shape.verts + noise * rng.standard_normal(shape.verts.shape)) @ turn.T + [7.0, 8.0, 9.0]
-    found = base_plane(verts, shape.faces, Shape(verts, shape.faces).face_vectors)
+    found = base_plane(Shape(verts, shape.faces))
     assert found is not None and found.normal @ turn[:, 2] > 0.999
     below = found.below(verts)
     assert below[shape.verts[:, 2] < 1e-3].mean() > 0.95 and not below[shape.verts[:, 2] > 0.1].any()
@@ -53,7 +50,7 @@ def test_what_stands_on_nothing_has_no_base(name: str) -> None:
 
 def test_legs_on_a_plate_are_a_table_and_not_on_a_base() -> None:
     table = landscape(hills((-1.2, -1.2), (1.2, -1.2), (-1.2, 1.2), (1.2, 1.2)))
-    assert plane_of(table) is not None
+    assert base_plane(table) is not None
     assert Parts.of(table, bases=True).bases == 0
 
 
@@ -79,3 +76,16 @@ def test_a_user_may_leave_out_a_base_and_a_part_is_chosen_with_it(tmp_path: Path
     assert np.asarray(load_shape(tmp_path / "scan.ply", only=1).weights).all()
     with pytest.raises(InputError, match="no part 3"):
         load_shape(tmp_path / "scan.ply", without=3)
+
+
+def cloud_of(shape: Shape) -> Shape:
+    return Shape(sample_surface(shape, 4000, np.random.default_rng(5)).points, np.empty((0, 3), np.int64))
+
+
+def test_the_floor_of_a_cloud_is_a_part_and_a_body_alone_has_none() -> None:
+    body = sample("climber")
+    for shape, bases in ((fused_with_floor(body), 1), (body, 0)):
+        parts = Parts.of(cloud_of(shape), bases=True)
+        assert parts.bases == bases and len(parts) == 2 * bases
+    found = Parts.of(cloud_of(fused_with_floor(body)), bases=True)
+    assert np.allclose(found.bounds[1][:, 2], body.bounds[0, 2], atol=0.05)

@@ -173,7 +173,7 @@ def test_names_and_numbers_mix_and_a_name_goes_first(tmp_path: Path) -> None:
 def test_wrong_numbers_are_told(three: Shape, tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
     save_shape(tmp_path / "three.ply", three)
     save_shape(tmp_path / "ball.ply", make_sphere(2))
-    save_shape(tmp_path / "cloud.xyz", Shape(three.verts, np.empty((0, 3), np.int64)))
+    save_shape(tmp_path / "cloud.xyz", Shape(make_sphere(2).verts, np.empty((0, 3), np.int64)))
     for wrong in ("4", "0", "99999999999999999999999"):
         with pytest.raises(InputError, match=r"three\.ply has no part") as caught:
             load_shape(tmp_path / "three.ply", only=wrong)

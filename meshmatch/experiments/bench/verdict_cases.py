@@ -20,7 +20,7 @@ from skimage.measure import marching_cubes
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.experiments.bench.partial import seen_faces
 from meshmatch.experiments.makers.character_designs import people
-from meshmatch.experiments.makers.fused_surface import fused_surface
+from meshmatch.experiments.makers.fused_surface import fused_with_base
 from meshmatch.experiments.makers.human_bodies import unseen_bodies
 from meshmatch.generators.generator import Generator
 from meshmatch.generators.kinds import GENERATORS, Kind
@@ -442,32 +442,10 @@ class Cases:
         return fine, truth[cKDTree(shape.verts).query(fine.verts)[1]]
 
     def _fused(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        """One skin around a body and what it stands in a little: a floor, a plate or a plinth; of every other floor the top
-        alone, with bumps.
-        """
+        """One skin around a body and the plinth, plate or floor that it stands in; of every other floor the top alone."""
         shape, truth = self.body(number, rng)
-        height, low = np.ptp(shape.verts[:, 1]), shape.verts[:, 1].min()
-        feet = shape.verts[shape.verts[:, 1] < low + 0.06 * height]
-        kind, middle, reach = number % 4, 0.5 * (feet.min(0) + feet.max(0)), np.ptp(feet[:, ::2], axis=0)
-        wide = reach + rng.uniform(0.1, 0.3) * height if kind < 2 else rng.uniform(0.8, 1.6, 2) * height
-        thick = rng.uniform(0.2, 0.5) * height if kind == 0 else 0.05 * height
-        top = low + rng.uniform(0.005, 0.02) * height
-        corner = 0.5 * np.array([wide[0], thick, wide[1]])
-        block = boxes([np.array([middle - corner, middle + corner])], 0.1 * height)
-        verts = block.verts.copy()
-        verts[:, 1] += top - verts[:, 1].max()
-        whole = fused_surface(joined(shape, block, verts), step := 0.008 * height)
-        distance, nearest = cKDTree(shape.verts).query(whole.verts)
-        of_body = (distance < 2 * step) & (whole.verts[:, 1] > top + 1.5 * step)
-        found = np.where(of_body, truth[nearest], -1)
-        if kind != 3:
-            return whole, found
-        waves, phase = 3 / height * rng.standard_normal((6, 2)), rng.uniform(0, 2 * np.pi, 6)
-        bumps = 0.0015 * np.sin(whole.verts[:, ::2] @ waves.T + phase).sum(1) + 0.001 * rng.standard_normal(whole.V)
-        moved = whole.verts.copy()
-        moved[:, 1] += height * bumps * np.clip((top - moved[:, 1]) / (3 * step) + 1, 0, 1)
-        above = whole.verts[whole.faces, 1].mean(1) > top - 0.6 * step
-        return faces_kept(Shape(moved, whole.faces), found, np.asarray(above))
+        whole, near = fused_with_base(shape, ("plinth", "plate", "floor", "scanned floor")[number % 4], rng)
+        return whole, np.where(near < 0, -1, truth[near])
 
     def _not_manifold(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         """With triangles twice, turned round, and across the body."""
