@@ -9,6 +9,7 @@ Limbs and joints are the template's: a limb is a label with all that hangs on it
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,6 +41,7 @@ class LimbSettings:
     joints : so many joints of a limb are turned at most, from its end or from the piece before it
     turns : how often each of them is turned
     missed : so far from the middle of a bare place that of a limb may stay
+    tangled : a limb of fewer labels is not tangled with others
     alike : ways to bend that leave nodes so near are the same, but for a share ``differing`` of the nodes
     """
 
@@ -49,6 +51,7 @@ class LimbSettings:
     joints: int = 3
     turns: int = 4
     missed: float = 0.08
+    tangled: int = 3
     alike: float = 0.05
     differing: float = 0.02
 
@@ -89,12 +92,29 @@ class Bend:
     joints: tuple[Limb, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class Branch:
+    """A limb that hangs on the core, with all that hangs on it."""
+
+    limbs: tuple[Limb, ...]  # itself first
+    pieces: tuple[Int[Ints, " N"], ...]  # the vertices of each of these labels
+    holder: Int[Ints, " H"]  # of the label that it hangs on
+
+    @staticmethod
+    def together(branches: Sequence[Branch]) -> Limb:
+        """Some of them as if they were one limb, without a joint."""
+        roots = [each.limbs[0] for each in branches]
+        verts = np.concatenate([each.verts for each in roots])
+        return Limb(verts, np.array([], np.int64), np.sum([each.share for each in roots], axis=0))
+
+
 class Limbs:
-    """What of a template can be bent, and how; ``bends`` are all ways."""
+    """What of a template can be bent, and how: ``bends`` are all ways, ``branches`` are limbs that can be tangled."""
 
     def __init__(self, template: Template, system: NodeSystem) -> None:
         self._system, self._nodes = system, np.asarray(template.nodes)
         self.bends: list[Bend] = []  # those that turn fewer joints first
+        self.branches: list[Branch] = []
         if not system.linear:
             return
         limbs = _limbs(template, system.phi)
@@ -107,6 +127,13 @@ class Limbs:
                 for last in range(first + 1, min(first + SETTINGS.joints, len(pieces)) + 1):
                     self.bends.append(Bend(pieces[0], tuple(pieces[first:last][::-1])))
         self.bends.sort(key=lambda bend: len(bend.joints))
+        own = {name: np.flatnonzero(template.labels == name) for name in range(len(template.label_names))}
+        for root, (limb, onto) in limbs.items():
+            names = [name for name in limbs if np.isin(own[name], limb.verts).all()]
+            if onto not in limbs and len(names) >= SETTINGS.tangled:
+                names.sort(key=lambda name: name != root)
+                together = tuple(limbs[name][0] for name in names)
+                self.branches.append(Branch(together, tuple(own[name] for name in names), own[onto]))
 
     def bent(
         self, vectors: Float[Floats, "K 3"], bend: Bend, place: Float[Floats, " 3"]

@@ -187,7 +187,7 @@ class Predictor:
         It is predicted from the samples ``local``, and ``coarse`` ones give the residual; both are in the core frame,
         which is ``pose``. There are ``count`` tilts with a standard deviation of ``degrees`` about each axis.
         """
-        found = self._readings(local, count, degrees)
+        found = self.readings(local, count, degrees)
         return parallel_map(
             lambda vectors: Candidate(pose, vectors, two_way_residual(self.system, coarse, vectors)), found
         )
@@ -200,12 +200,12 @@ class Predictor:
         """
         asked = replace(self, rng=np.random.default_rng(_SPREAD_SEED))
         here = self.system.moved(vectors)[at]
-        readings = asked._readings(local, _SPREAD_READINGS, _SPREAD_TILT)
+        readings = asked.readings(local, _SPREAD_READINGS, _SPREAD_TILT)
         return float(
             np.median([np.linalg.norm(self.system.moved(each)[at] - here, axis=1).mean() for each in readings])
         )
 
-    def _readings(self, local: OrientedPoints, count: int, degrees: float) -> list[Floats]:
+    def readings(self, local: OrientedPoints, count: int, degrees: float) -> list[Floats]:
         """Node vectors (K, 3) read in tilted copies of samples, and as many in those of their mirror image."""
         tilts = Rotation.from_rotvec(np.radians(degrees) * self.rng.standard_normal((count, 3))).as_matrix()
         sides = [local]
