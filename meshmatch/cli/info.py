@@ -93,7 +93,9 @@ def _shape(file: Path) -> Json:
     about |= _materials(file, shape)
     about |= {"size": size, "area": shape.area, "colors": shape.colors is not None}
     usual = {"longest_along": long_axis(clean.shape), "unit_if_a_person": guess_unit(clean.shape)}
-    repaired = {"repaired_vertices": clean.shape.V, "repaired_faces": clean.shape.F}
+    repaired: Json = {"repaired_vertices": clean.shape.V, "repaired_faces": clean.shape.F}
+    if not shape.is_cloud:  # seams of texture coordinates are open edges before their vertices are merged
+        repaired["repaired_watertight"] = not any(clean.shape.edges.counts)
     return about | edges | parts | usual | {"repair": list(clean.notes)} | repaired | {"hash": shape.hash}
 
 

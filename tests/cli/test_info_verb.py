@@ -27,7 +27,7 @@ def test_a_mesh(run: Run, two: tuple[Path, Path]) -> None:
     found = record(run, two[0])
     assert (found["kind"], found["vertices"], found["faces"]) == ("mesh", 642, 1280)
     assert found["size"] == pytest.approx([2.0, 2.0, 2.0], abs=0.1)
-    assert found["watertight"] is True
+    assert found["watertight"] is found["repaired_watertight"] is True
     assert found["repair"] == []
     assert found["hash"] == load_shape(two[0]).hash
 
@@ -44,6 +44,16 @@ def test_a_mesh_that_needs_repair(run: Run, tmp_path: Path, sphere: Shape) -> No
     assert (tmp_path / "bad.ply").read_bytes() == before
     shown = run("info", tmp_path / "bad.ply").out
     assert all(note in shown for note in found["repair"])  # type: ignore[attr-defined]
+
+
+def test_a_seam_is_no_hole(run: Run, tmp_path: Path, sphere: Shape) -> None:
+    verts = sphere.verts[sphere.faces[:100]].reshape(-1, 3)  # a hundred triangles with corners of their own
+    apart = np.concatenate([sphere.faces[100:], 642 + np.arange(300).reshape(-1, 3)])
+    save_shape(tmp_path / "seam.ply", Shape(np.concatenate([sphere.verts, verts]), apart))
+    found = record(run, tmp_path / "seam.ply")
+    assert (found["watertight"], found["repaired_watertight"]) == (False, True)
+    save_shape(tmp_path / "hole.ply", Shape(sphere.verts, sphere.faces[1:]))
+    assert record(run, tmp_path / "hole.ply")["repaired_watertight"] is False
 
 
 def test_parts_holes_axis_and_unit(run: Run, tmp_path: Path, sphere: Shape) -> None:
