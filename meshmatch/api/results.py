@@ -21,7 +21,7 @@ from meshmatch.maps.evaluate import CM, Evaluation, SurfaceDistance, evaluate_ma
 from meshmatch.maps.files import load_map
 from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.places import PlacedFit, Places, surface_distance
-from meshmatch.maps.unfold import unfolded_pair
+from meshmatch.maps.unfold_pair import unfolded_pair
 from meshmatch.maps.vertex_map import VertexMap, check_map
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.progress import ProgressCallback

@@ -32,7 +32,8 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.build import build_map
 from meshmatch.maps.files import check_suffix
 from meshmatch.maps.places import Places
-from meshmatch.maps.unfold import unfolded, unfolded_pair
+from meshmatch.maps.unfold import unfolded
+from meshmatch.maps.unfold_pair import unfolded_pair
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.progress import ProgressCallback

@@ -55,7 +55,6 @@ _THINNEST = 1e-3  # height over length: what is thinner has no area that its ima
 _STIFFEST = 50.0  # a sliver's sides count no more
 _MOST = 0.2  # a map that folds more of the surface is wrong as a whole
 _LARGEST = 200_000  # vertices; triangles of larger meshes are smaller than the fits are exact
-_LARGEST_BOTH_WAYS = 60_000  # vertices for which both maps are made at once: of more that takes longer than matching
 _NOTHING = 1e-6  # share of its area that an image without any may have
 _HOLD = 1e-3  # how much each image stays, so that every part has a solution
 
@@ -75,18 +74,6 @@ def unfolded(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -
         return found
     moved = (images.map.face != start.face) | (images.map.barycentric != start.barycentric).any(axis=1)
     return _between_files(images.map, found, own, target, np.flatnonzero(moved[own.number]))
-
-
-def unfolded_pair(
-    found: VertexMap, opposite: Callable[[], VertexMap], source: Shape, target: Shape, partial: bool, workers: int = 1
-) -> tuple[VertexMap, VertexMap | None]:
-    """A map between two shapes with fewer folds; of two whole meshes that match well, and are not too large, with its
-    inverse, which takes the place of the map that ``opposite`` makes.
-    """
-    clouds = source.is_cloud or target.is_cloud
-    if partial or clouds or found.verdict != "good" or max(source.V, target.V) > _LARGEST_BOTH_WAYS:
-        return unfolded(found, source, target, workers), None
-    return unfolded_both_ways(found, opposite(), source, target, workers)
 
 
 def unfolded_both_ways(
