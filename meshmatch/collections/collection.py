@@ -32,8 +32,7 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.build import build_map
 from meshmatch.maps.files import check_suffix
 from meshmatch.maps.places import Places
-from meshmatch.maps.unfold import unfolded
-from meshmatch.maps.unfold_pair import unfolded_pair
+from meshmatch.maps.unfold_pair import both_unfolded
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.progress import ProgressCallback
@@ -265,8 +264,8 @@ class Collection(FitsFolder):
         a, b = (names[shape.hash] for shape in shapes)
         there, back = self.map(a, b).for_shapes(*shapes), self.map(b, a).for_shapes(*shapes[::-1])
         part = self._words(a)["partial"] or self._words(b)["partial"]
-        there, opposite = unfolded_pair(there, lambda: back, *shapes, part)
-        return MapPair(*shapes, there, opposite=opposite or unfolded(back, *shapes[::-1]))
+        there, back = both_unfolded(there, back, *shapes, part)
+        return MapPair(*shapes, there, opposite=back)
 
     def holds(self, shape: ShapeLike) -> bool:
         """Whether a shape is among the fits, or among those of another kind, by its vertices and faces.

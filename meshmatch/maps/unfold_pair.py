@@ -41,6 +41,14 @@ def unfolded_pair(
     return here.in_file(forward, found, there), there.in_file(backward, back, here)
 
 
+def both_unfolded(
+    found: VertexMap, opposite: VertexMap, source: Shape, target: Shape, partial: bool
+) -> tuple[VertexMap, VertexMap]:
+    """A map between two shapes and its opposite with fewer folds: as `unfolded_pair` makes them, or each by itself."""
+    forward, backward = unfolded_pair(found, lambda: opposite, source, target, partial)
+    return forward, backward or unfolded_pair(opposite, lambda: found, target, source, partial=True)[0]
+
+
 @dataclass(frozen=True, eq=False)
 class _Kept:
     """What is left of a mesh of which vertices have weight 0: ``shape``, of which vertices and faces of the file."""
