@@ -33,6 +33,10 @@ class GarmentResult(MovedMesh):
         (N,) vertices that would have sunk deeper below the target's skin than below the source's, and were pushed out.
     sunk
         (M,) vertices that are below the target's skin all the same, and are above the source's.
+    below, far
+        Share (0..1) of its vertices below the source's skin, and further than 5 % of sqrt(area) from it.
+    sits
+        Whether these say that it sits on the source; another person's clothes, or another pose's, do not.
     maps
         The maps that were followed.
     seconds
@@ -54,6 +58,9 @@ class GarmentResult(MovedMesh):
 
     pushed: Int[Ints, " N"]
     sunk: Int[Ints, " M"]
+    below: float
+    far: float
+    sits: bool
     maps: MapPair
     seconds: float
     body: Path | None = None
@@ -139,5 +146,17 @@ def transfer_garment(garment: ShapeLike, source: ShapeLike, target: ShapeLike, m
         turn = None if target.upright else turn_upright(maps, source.upright)
     seconds = time.monotonic() - began
     return GarmentResult(
-        shape, found.turns, found.pushed, found.sunk, maps, seconds, body, original=original, binding=binding, turn=turn
+        shape,
+        found.turns,
+        found.pushed,
+        found.sunk,
+        found.below,
+        found.far,
+        found.sits,
+        maps,
+        seconds,
+        body,
+        original=original,
+        binding=binding,
+        turn=turn,
     )

@@ -240,7 +240,7 @@ def _tell(console: Console, about: dict[str, Any]) -> None:
     few = ", ".join(f"{100 * share:.1f} %" for share in shares[:3])
     console.say(f"{about['shapes']} shapes, {about['modes']} modes; the first explain {few} of the variance")
     name, apart = next(iter(about["furthest"].items()))
-    console.say(f"furthest from the mean: {name}, by {apart:.4g}")
+    console.say(f"furthest from the mean: {name}, by {apart:.4g} (root mean square over its surface)")
     if "measures" in about:
         found = about["measures"]
         told = (

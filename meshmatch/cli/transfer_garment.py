@@ -48,6 +48,9 @@ def transfer_garment(
         result = meshmatch.transfer_garment(garment, source, target, transfer)
         plan.write(temporary, result.shape, result.turns, result.binding, result.turn, into)
     a, b = result.maps.source, result.maps.target
+    if not result.sits:
+        where = f"{100 * result.below:.0f} % of it lies below the skin and {100 * result.far:.0f} % far from it"
+        console.warn(f"{garment.name} seems not to sit on {transfer.names[0]}, in this pose: {where}")
     if b.is_cloud:
         console.say(f"note: {transfer.names[1]} is a point cloud: nothing was pushed out of it")
     elif len(result.pushed):
@@ -66,5 +69,6 @@ def transfer_garment(
 
         transfer.draw(result.maps, compose_worn((a, b), (worn, result.shape)))
     record = {"picture": picture, "files": [str(file) for file in plan.files], "vertices": worn.V}
-    record |= {"joined": join, "pushed_out": len(result.pushed), "below_skin": len(result.sunk)}
-    return transfer.record(record, result.maps, float(result.maps.forward.confidence.mean()))
+    numbers = {"joined": join, "pushed_out": len(result.pushed), "below_skin": len(result.sunk), "sits": result.sits}
+    shares = {"below_source_skin": round(result.below, 4), "far_from_source": round(result.far, 4)}
+    return transfer.record(record | numbers | shares, result.maps, float(result.maps.forward.confidence.mean()))

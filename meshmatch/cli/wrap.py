@@ -78,7 +78,9 @@ def wrap(
         console.say(f"the {len(binding.rig.joints)} joints of {names[0]} have moved along")
     if plan.is_turned(binding, result.turn):
         console.say(f"note: a node turns {names[0]} upright, along y")
-    console.say(f"wrote {' '.join(map(str, plan.files))}: {names[0]} on {names[1]} ({result.seconds:.1f} s)")
+    console.say(
+        f"wrote {' '.join(map(str, plan.files))}: {names[0]} on {names[1]} ({result.match.seconds + result.seconds:.1f} s)"
+    )
     if picture is not None:
         from meshmatch.render.compose import compose_fit
 
@@ -88,7 +90,9 @@ def wrap(
         record = {"output": output, "files": [str(file) for file in plan.files], "picture": picture, "vertices": a.V}
         record |= {"free": int(result.free.sum()), "distance": {key: float(each) for key, each in numbers.items()}}
         record |= words.map_record(found, names) | how.record(result.match.source_fit)
-        print_json(record | {"notes": list(result.match.notes), "seconds": round(result.seconds, 3)})
+        print_json(
+            record | {"notes": list(result.match.notes), "seconds": round(result.match.seconds + result.seconds, 3)}
+        )
 
 
 def _members(file: Path | None, base: "meshmatch.Shape") -> "Ints":

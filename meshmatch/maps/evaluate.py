@@ -99,7 +99,7 @@ class SurfaceDistance:
     def __str__(self) -> str:
         """In words."""
         name, length = self.unit.name, "" if self.unit.name == "file" else f" {self.unit.symbol}"
-        place = {"file": ", in the unit of the file", "cm": ", at 1.9 square metres of skin"}.get(name, "")
+        place = {"file": ", in the unit of the file", "cm": ", on a body of 1.9 square metres of skin"}.get(name, "")
         return f"surfaces lie {self.mean:.2g}{length} apart on average, {self.most:.2g} at most{place}"
 
     def as_dict(self) -> dict[str, float | str]:

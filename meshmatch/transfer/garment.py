@@ -36,6 +36,9 @@ _BOUND, _PUSHED = 3.0, 30.0
 _CLEAR, _LEAST, _SLACK, _ROUNDS = 0.0015, 2e-5, 1e-5, 4
 # A garment whose middle vertex is further from the body does not sit on it.
 _FURTHEST = 0.5
+# Nor does one of which more is below the skin, or so far off: at most 0.16 and 0.02 are of 80 garments of generated people,
+# and mostly more than 0.3 of the garments of others.
+_FAR, _MOST_BELOW, _MOST_FAR = 0.05, 0.25, 0.25
 _CHUNK = 16_384
 
 
@@ -44,13 +47,21 @@ class Carried:
     """A garment on another body.
 
     ``verts`` (V, 3) in the frame and unit of that body; ``turns`` (V, 3, 3) how each vertex was turned; ``pushed`` (V,)
-    which were pushed out, and ``sunk`` (V,) which are under the skin and were not before.
+    which were pushed out, and ``sunk`` (V,) which are under the skin and were not before. ``below`` and ``far`` are shares
+    (0..1) of its vertices below the source's skin, and far from it.
     """
 
     verts: Float[Floats, "V 3"]
     turns: Float[Floats, "V 3 3"]
     pushed: Int[Ints, " N"]
     sunk: Int[Ints, " M"]
+    below: float
+    far: float
+
+    @property
+    def sits(self) -> bool:
+        """Whether it seems to sit on the source, in the source's pose."""
+        return self.below <= _MOST_BELOW and self.far <= _MOST_FAR
 
 
 def carry_garment(garment: Shape, forward: VertexMap, source: Shape, target: Shape, workers: int = 1) -> Carried:
@@ -66,16 +77,19 @@ def carry_garment(garment: Shape, forward: VertexMap, source: Shape, target: Sha
     own, back = np.unique(same_rows(garment.verts), return_inverse=True)  # seams are closed
     cloth = _Cloth(garment.verts[own], back[garment.faces], jacobians[own])
     places = bound[own]
+    before = _Skin(turned_outwards(source)).heights(cloth.at(cloth.rest), workers)[0]
+    at = before[: len(own)][back]
+    sits = float((at < 0).mean()), float((at > _FAR * length_of(source)).mean())
     if target.is_cloud:
         verts, none = cloth.solve(places, np.full(len(own), _BOUND)), np.empty(0, np.int64)
-        return Carried(verts[back], turns, none, none)
+        return Carried(verts[back], turns, none, none, *sits)
     scale = np.cbrt(np.abs(np.linalg.det(jacobians[own])))
-    before = _Skin(turned_outwards(source)).heights(cloth.at(cloth.rest), workers)[0] * cloth.at(scale[:, None])[:, 0]
+    before = before * cloth.at(scale[:, None])[:, 0]
     least = np.minimum(before, _CLEAR * length_of(target))
     least[before > 0] = np.maximum(least[before > 0], _LEAST * length_of(target))
     verts, pushed, heights = _pushed_out(cloth, places, least, _Skin(turned_outwards(target)), workers)
     sunk = (heights < 0) & (before[: len(own)] > 0)
-    return Carried(verts[back], turns, np.flatnonzero(pushed[back]), np.flatnonzero(sunk[back]))
+    return Carried(verts[back], turns, np.flatnonzero(pushed[back]), np.flatnonzero(sunk[back]), *sits)
 
 
 class _Body:

@@ -299,7 +299,7 @@ def test_distances_of_surfaces_are_in_the_unit_of_the_file(sphere: Shape) -> Non
     assert str(found) == "surfaces lie 5 apart on average, 5 at most, in the unit of the file"
     as_person = meshmatch.measure_distance(one, other, unit="cm")
     assert as_person.mean == pytest.approx(5.0 * 100 * np.sqrt(1.9 / other.area), rel=0.01)
-    assert str(as_person).endswith("at most, at 1.9 square metres of skin")
+    assert str(as_person).endswith("at most, on a body of 1.9 square metres of skin")
     assert meshmatch.measure_distance(one, other, unit="x100").as_dict()["unit"] == "x100"
     half = Shape(one.verts, one.faces[one.verts[one.faces].mean(1)[:, 0] > 0])
     assert meshmatch.measure_distance(half, other).most > 50

@@ -115,7 +115,9 @@ def test_where_nearness_says_nothing_a_fit_is_as_likely_wrong_as_right() -> None
 def test_reasons_are_sentences_with_codes() -> None:
     (reason,) = judge(replace(SOUND, residual=0.1)).reasons
     assert reason.code == "residual"
-    assert str(reason) == "template and shape are 10.0 % of sqrt(area) apart on average (13.8 cm on a person)"
+    assert (
+        str(reason) == "template and shape are 10.0 % of sqrt(area) apart on average, as 13.8 cm would be on a person"
+    )
     judged = (
         judge(replace(SOUND, residual=0.028, stretch=0.98, spread=value)) for value in np.linspace(0.02, 0.06, 400)
     )

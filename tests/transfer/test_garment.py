@@ -26,6 +26,16 @@ def test_it_bends_with_the_body() -> None:
     assert np.degrees(Rotation.from_matrix(top).magnitude()) == pytest.approx(np.degrees(0.5 * 0.6), abs=4)
 
 
+def test_one_that_does_not_sit_on_the_body_is_known() -> None:
+    body, cloth = rod(), sleeve()
+    same = same_numbers(body, body)
+    assert carry_garment(cloth, same, body, body).sits
+    narrow = carry_garment(replace(cloth, verts=cloth.verts * [0.5, 1, 0.5]), same, body, body)
+    assert not narrow.sits and narrow.below == 1 and narrow.far == 0
+    wide = carry_garment(replace(cloth, verts=cloth.verts * [4, 1, 4]), same, body, body)
+    assert not wide.sits and wide.below == 0 and wide.far > 0.9
+
+
 def test_it_turns_and_grows_with_the_body_exactly() -> None:
     body, cloth = rod(), sleeve()
     turn = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix()

@@ -188,7 +188,8 @@ def _reasons(features: FitFeatures) -> list[Reason]:
 
 def _gap(residual: float) -> str:
     on_a_person = 100 * np.sqrt(_SKIN) * residual
-    return f"template and shape are {100 * residual:.1f} % of sqrt(area) apart on average ({on_a_person:.1f} cm on a person)"
+    as_much = f"as {on_a_person:.1f} cm would be on a person"
+    return f"template and shape are {100 * residual:.1f} % of sqrt(area) apart on average, {as_much}"
 
 
 def _folds(inverted: float) -> str:
