@@ -24,7 +24,7 @@ from meshmatch.maps.evaluate import CM, X100, ErrorUnit
 from meshmatch.models.card import ModelCard
 from meshmatch.models.registry import list_models
 from meshmatch.models.trained import TrainedModel
-from meshmatch.progress import ProgressCallback
+from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
@@ -170,6 +170,7 @@ def choose_model(
     if settled is not None and settled.card not in [model.card for model in models]:
         models.append(Installed.loaded(settled))
     shapes = [each.shape for each in clean]
+    Progress(progress, shapes[0].name).stage("looking for its kind")(0.0)
     readings = category_residuals(models, shapes, configs)
     if np.isinf(readings).all():
         raise _no_model()
@@ -178,6 +179,7 @@ def choose_model(
     tried = [known.kind is None or each.far_parts > 0 for known, each in zip(found, clean, strict=True)]
     for number in np.flatnonzero(tried).tolist():
         config = configs[number]
+        Progress(progress, shapes[number].name).stage("looking at its parts")(0.0)
         loaders, whole = [model.load for model in models], clean[number].original
         if (alone := find_alone(loaders, whole, config, _order(models), progress)) is not None:
             card = models[alone.row].card
