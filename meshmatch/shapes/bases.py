@@ -43,6 +43,8 @@ class Plane:
 
 def base_plane(shape: Shape) -> Plane | None:
     """The plane on which something stands that is fused with a base; of a mesh of one part, or of a cloud."""
+    if not shape.area > 0:
+        return None
     samples = sample_surface(shape, _POINTS, np.random.default_rng(0))
     seen = _Samples(samples.points - samples.points.mean(axis=0), samples.normals, samples.signed)
     found = seen.best()

@@ -78,6 +78,20 @@ def test_a_user_may_leave_out_a_base_and_a_part_is_chosen_with_it(tmp_path: Path
         load_shape(tmp_path / "scan.ply", without=3)
 
 
+@pytest.mark.parametrize("points", [np.zeros((50, 3)), np.eye(3), np.arange(60.0).reshape(20, 3)])
+def test_a_cloud_that_is_no_surface_has_no_base(points: np.ndarray) -> None:
+    assert Parts.of(Shape(points, np.empty((0, 3), np.int64)), bases=True).bases == 0
+
+
+def test_vertices_without_a_position_do_no_harm() -> None:
+    scene = fused_with_floor(sample("climber"))
+    verts = np.array(scene.verts)
+    verts[[5, -3]] = np.nan
+    for faces in (scene.faces, np.empty((0, 3), np.int64)):
+        broken = Shape.with_invalid(verts, faces, "broken")
+        assert (Parts.of(broken, bases=True).number[[5, -3]] == 0).all()
+
+
 def cloud_of(shape: Shape) -> Shape:
     return Shape(sample_surface(shape, 4000, np.random.default_rng(5)).points, np.empty((0, 3), np.int64))
 
