@@ -32,6 +32,8 @@ from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
 from meshmatch.templates.template import Template, template_radius
+from meshmatch.training.datasets import Batch
+from meshmatch.training.loop import Trainer
 from meshmatch.training.train import build_loss_points
 from tests.conftest import icosphere
 from tests.experiments.small_bench import BODY, build, order
@@ -142,6 +144,32 @@ def test_a_cell_is_trained_into_a_model(
     model = load_model(tmp_path / "model")
     assert model.network.config.field == run.field
     assert model.card.steps == found["steps"]
+
+
+def test_a_cell_that_was_stopped_goes_on_exactly(
+    setting: Setting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = pool_of(setting, "T", 3)
+    monkeypatch.setattr(ablation_training, "pool_of", lambda *_: small)
+    recipe = setting.recipe(BASE)
+    often = replace(recipe, train=replace(recipe.train, checkpoint_minutes=0.0))
+    monkeypatch.setattr(Setting, "recipe", lambda *_: often)
+    whole = train_run(BASE, setting, tmp_path / "whole" / "model", 4)
+    iterate, done = Trainer.iterate, []
+
+    def stopped(trainer: Trainer, batch: Batch) -> dict[str, torch.Tensor]:
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.append(trainer.step)
+        return iterate(trainer, batch)
+
+    monkeypatch.setattr(Trainer, "iterate", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        train_run(BASE, setting, tmp_path / "halves" / "model", 4)
+    monkeypatch.setattr(Trainer, "iterate", iterate)
+    again = train_run(BASE, setting, tmp_path / "halves" / "model", 4)
+    assert done == [0, 1] and again["model"] == whole["model"]
+    assert not list((tmp_path / "halves").glob("checkpoint*"))
 
 
 def test_fewer_supervised_points_are_regularised_everywhere(setting: Setting) -> None:

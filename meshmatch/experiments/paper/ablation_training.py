@@ -209,7 +209,9 @@ def pool_of(setting: Setting, pose: str, shapes: int = BASE.shapes) -> Pool:
 
 
 def train_run(run: Run, setting: Setting, folder: Path, steps: int) -> dict[str, Any]:
-    """Train from the beginning, write a model folder, and say how it went. The rate falls to 0 at the last step.
+    """Train, write a model folder, and say how it went. The rate falls to 0 at the last step.
+
+    On the way a checkpoint lies beside the folder; a training that was stopped goes on from it, exactly.
 
     Returns
     -------
@@ -223,12 +225,20 @@ def train_run(run: Run, setting: Setting, folder: Path, steps: int) -> dict[str,
     model = new_network(run, setting, pool)
     points = build_loss_points(template, recipe.kernel, model, gradients=STRAINED)
     trainer = Trainer(model, fewer(points, run.supervised), replace(recipe.train, steps=steps))
+    make_folder(folder.parent)
+    checkpoint = folder.parent / f"checkpoint-{steps}.safetensors"
+    if checkpoint.is_file():
+        trainer.load(checkpoint)
     model.train()
-    began = time.monotonic()
+    spent, began = trainer.seconds, time.monotonic()
+    saved = began
     while trainer.step < steps:
         batch = pool.batch(trainer.step, recipe.train.shapes, run.shapes, run.seed)
         trainer.iterate(replace(batch, targets=batch.targets[:, : run.supervised]))
-    trainer.seconds = time.monotonic() - began
+        trainer.seconds = spent + time.monotonic() - began
+        if time.monotonic() - saved > 60 * recipe.train.checkpoint_minutes:
+            trainer.save(checkpoint)
+            saved = time.monotonic()
     trainer.config = recipe.train
     model.load_state_dict(trainer.averaged_state())
     loss_points = points.to(trainer.device)
@@ -237,6 +247,7 @@ def train_run(run: Run, setting: Setting, folder: Path, steps: int) -> dict[str,
     make_folder(folder)
     facts = CardFacts("run", "human", f"{run.shapes} shapes, scanned beforehand", licence="")
     export(trainer, template, folder, replace(recipe, storage="float16"), facts, held_out)
+    checkpoint.unlink(missing_ok=True)
     return {
         "steps": trainer.step,
         "seconds": round(trainer.seconds, 2),
