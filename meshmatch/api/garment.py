@@ -33,8 +33,10 @@ class GarmentResult(MovedMesh):
         (N,) vertices that would have sunk deeper below the target's skin than below the source's, and were pushed out.
     sunk
         (M,) vertices that are below the target's skin all the same, and are above the source's.
-    below, far
-        Share (0..1) of its vertices below the source's skin, and further than 5 % of sqrt(area) from it.
+    below
+        Share (0..1) of its vertices below the source's skin.
+    far
+        Share (0..1) of its vertices further from the source's skin than 5 % of sqrt(area).
     sits
         Whether these say that it sits on the source; another person's clothes, or another pose's, do not.
     maps

@@ -14,7 +14,6 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry import triangles
-from meshmatch.shapes.bases import base_plane
 from meshmatch.shapes.faces import flat_faces, seams
 from meshmatch.shapes.shape import Shape
 
@@ -187,6 +186,8 @@ def _reference(parts: Parts) -> int:
 
 def _bases(shape: Shape, corners: Int[Ints, "F 3"], area: Float[Floats, " F"], part: Int[Ints, " F"]) -> list[Ints]:
     """Which of some faces, that are in parts, are of each flat base."""
+    from meshmatch.shapes.bases import base_plane
+
     found = []
     for number in range(1, min(_MOST_BASES, int(part.max())) + 1):
         own = np.flatnonzero(part == number)
@@ -205,6 +206,8 @@ def _bases(shape: Shape, corners: Int[Ints, "F 3"], area: Float[Floats, " F"], p
 
 def _of_cloud(cls: type[Parts], shape: Shape) -> Parts:
     """What stands on the base of a cloud, and the base; no parts if it has none."""
+    from meshmatch.shapes.bases import base_plane
+
     number, faces = np.zeros(shape.V, np.int64), np.empty(0, np.int64)
     plane = base_plane(Shape(shape.verts[shape.valid], shape.faces))
     low = shape.valid & plane.below(shape.verts) if plane is not None else number > 0
