@@ -131,6 +131,13 @@ class TrainOptions(Options):
         help="Share of bodies that wear clothes, are children, stylised or built of parts; most others are naked "
         "adults. Default: 0.5; with the preset paper 0.",
     )
+    stylised: float | None = Option(
+        None,
+        min=0.0,
+        max=1.0,
+        metavar="SHARE",
+        help="Share of these that have the proportions of cartoons. Default: 0.15.",
+    )
     poses: Path | None = optional("FILE", "Poses to mix with the sampled ones: .npz, .json or .csv (docs/formats.md).")
     pose_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies that stand in a pose of --poses.")
     mhr: Path | None = optional(
@@ -358,7 +365,10 @@ def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None
     if how.preset != "default" or how.unsupervised:
         name = "--unsupervised" if how.unsupervised else f"--preset {how.preset}"
         raise OptionError(f"{name} does not go with fits", "fits have correspondence; leave it out")
-    how.refuse(("template", "poses", "characters", "identities", "bodies", "mhr"), "fits, but with generated shapes")
+    how.refuse(
+        ("template", "poses", "characters", "stylised", "identities", "bodies", "mhr"),
+        "fits, but with generated shapes",
+    )
     collection = Collection(how.shapes)
     found = collection.to_learn()
     if collection.model == NO_MODEL:
@@ -387,11 +397,13 @@ def _generated(how: TrainOptions) -> "Kind | Bodies | None":
 
         scanned = scanned_bodies(how.mhr, how.mhr_share, how.template)
     if how.kind in (None, "human"):
-        choices = how.kind, known, how.characters, how.bodies, scanned
+        choices = how.kind, known, how.characters, how.bodies, scanned, how.stylised
         if how.shapes is not None and all(each is None for each in choices):
             return None
-        return Bodies(how.template, how.identities or Bodies.identities, known, how.characters, how.bodies, scanned)
-    how.refuse(("template", "poses", "characters", "bodies", "mhr"), f"--kind {how.kind}, but with human bodies")
+        return Bodies(how.template, how.identities or Bodies.identities, *choices[1:])
+    how.refuse(
+        ("template", "poses", "characters", "stylised", "bodies", "mhr"), f"--kind {how.kind}, but with human bodies"
+    )
     return Kind(str(how.kind), how.identities or Kind.identities)
 
 

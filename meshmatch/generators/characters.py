@@ -23,7 +23,7 @@ from meshmatch.generators.figure import Figure
 from meshmatch.generators.generator import Source, mixed
 from meshmatch.generators.limbs import Draw, Limbs
 from meshmatch.generators.pose_files import GivenPoses
-from meshmatch.generators.proportions import PLAIN, SHARES, TOON, draw_style, rounded, stretched
+from meshmatch.generators.proportions import PLAIN, SHARES, STYLISED, TOON, draw_style, rounded, shares_with, stretched
 from meshmatch.generators.rig import Rig, forward_kinematics, skin
 from meshmatch.generators.scanned_bodies import scanned_source
 from meshmatch.progress import Progress
@@ -52,7 +52,8 @@ def people_source(template: Template, bodies: Bodies, seed: int = 0, progress: P
     if not bodies.characters:
         return human_source(template, bodies.identities, seed, progress, bodies.poses)
     rig = posable_rig(template, bodies.identities, seed, progress, bodies.poses)
-    return partial(sample_characters, Cast(Figure.of(rig), bodies.characters, bodies.poses))
+    kinds = shares_with(STYLISED if bodies.stylised is None else bodies.stylised)
+    return partial(sample_characters, Cast(Figure.of(rig), bodies.characters, bodies.poses, kinds))
 
 
 def sample_characters(cast: Cast, B: int, generator: torch.Generator) -> Float[Tensor, "B V 3"]:

@@ -19,6 +19,7 @@ from meshmatch.generators.rig import skin
 PLAIN, CHILD, FREE, TOON, BUILT = range(5)
 SHARES = (0.56, 0.1, 0.05, 0.15, 0.14)
 """Of the characters: as they are, children, freely stretched, stylised, built of parts."""
+STYLISED = SHARES[TOON]
 # Typical sizes of parts: along and across, and how much they vary (deviation of the logarithm).
 _CHILD = {"head": (1.5, 1.45, 0.14), "neck": (0.75, 1.0, 0.12), "thigh": (0.72, 1.0, 0.12), "shin": (0.72, 1.0, 0.12),
           "upper arm": (0.78, 1.0, 0.1), "forearm": (0.78, 1.0, 0.1), "hand": (0.95, 1.0, 0.08), "foot": (0.95, 1.0, 0.08),
@@ -28,6 +29,14 @@ _TOON = {"head": (2.6, 2.9, 0.3), "neck": (0.3, 1.1, 0.35), "thigh": (0.3, 1.25,
          "foot": (1.2, 1.6, 0.25), "belly": (0.8, 1.25, 0.22), "chest": (0.8, 1.15, 0.22),
          "hips": (0.9, 1.25, 0.22)}  # fmt: skip
 _SPREAD = 0.22  # of free and built bodies
+
+
+def shares_with(stylised: float) -> tuple[float, ...]:
+    """`SHARES` with another one of stylised characters; the others stand to each other as they did."""
+    if stylised == STYLISED:
+        return SHARES
+    left = (1 - stylised) / (1 - STYLISED)
+    return tuple(stylised if kind == TOON else left * share for kind, share in enumerate(SHARES))
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from meshmatch.generators.bodies import Bodies
 from meshmatch.generators.characters import people_source
 from meshmatch.generators.generator import Source, shipped_template
 from meshmatch.generators.kinds import Kind
+from meshmatch.generators.proportions import STYLISED
 from meshmatch.models.registry import TEMPLATE
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress
@@ -53,6 +54,8 @@ def generated(kind: Kind | Bodies, recipe: Recipe, progress: Progress) -> Lesson
         return Lessons(made.template, made.draw, made.kind, made.data, mirror=made.mirror, digest=_digest(made.data))
     if kind.characters is None:
         kind = replace(kind, characters=recipe.characters)
+    if kind.stylised is None and recipe.stylised != STYLISED:
+        kind = replace(kind, stylised=recipe.stylised)
     if kind.bodies is None:
         kind = replace(kind, bodies=recipe.bodies)
     template = read_template(kind.template or recipe.template)

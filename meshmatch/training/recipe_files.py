@@ -26,7 +26,7 @@ _LOSSES: dict[str, type[Objective]] = {
 }
 _OF_THE_MACHINE = ("minutes", "checkpoint_minutes", "threads", "device", "draw", "compile")
 _PARTS = {"network", "field", "recipe"}
-_OWN = ("deform", "storage", "template", "characters", "bodies")
+_OWN = ("deform", "storage", "template", "characters", "bodies", "stylised")
 _MOST: dict[str, float] = {
     "shapes": 4096,
     "scans_per_shape": 256,
@@ -35,7 +35,7 @@ _MOST: dict[str, float] = {
     "bodies": 20_000,
     "correct_points": 100_000,
 }
-_MOST |= dict.fromkeys(("holes", "outliers", "partial", "outside", "strays", "characters", "average"), 1)
+_MOST |= dict.fromkeys(("holes", "outliers", "partial", "outside", "strays", "characters", "stylised", "average"), 1)
 _MOST |= {"momentum": 0.9999999}
 _LEAST = {"points": 64}
 _HINT = "give the card.json of a model, or a part of one: network, field.kernel, recipe.train, recipe.scan"

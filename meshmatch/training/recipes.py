@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from meshmatch.errors import OptionError
+from meshmatch.generators.proportions import STYLISED
 from meshmatch.geometry.kernels import KERNELS, Kernel
 from meshmatch.models.checkpoint import Storage
 from meshmatch.models.network import PAPER, NetworkConfig
@@ -46,6 +47,8 @@ class Recipe:
         The bundled one that generated bodies have, unless they name another.
     characters
         The share (0..1) of generated bodies in clothes or of other proportions, unless they say otherwise.
+    stylised
+        The share of these that have the proportions of cartoons, unless they say otherwise.
     bodies
         How many generated bodies are drawn, once; 0 for ever new ones. Unless they say otherwise.
 
@@ -64,6 +67,7 @@ class Recipe:
     template: str = "human-T"
     characters: float = 0.0
     bodies: int = 0
+    stylised: float = STYLISED
 
     def changed(self, **settings: Any) -> Recipe:
         """Another recipe.

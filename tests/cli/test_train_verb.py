@@ -34,11 +34,12 @@ class Recorder:
         self.called: dict[str, Any] = {}
         self.poses: Any = None
         self.characters: Any = None
+        self.stylised: Any = None
         self.drawn = 0
 
     def people_source(self, template: Any, bodies: Any, seed: int, progress: Any) -> Any:
         self.bodies = (template.name, bodies.identities, seed)
-        self.poses, self.characters = bodies.poses, bodies.characters
+        self.poses, self.characters, self.stylised = bodies.poses, bodies.characters, bodies.stylised
         progress(0.5)
         return self.draw if bodies.bodies else "bodies"
 
@@ -104,6 +105,17 @@ def test_half_of_the_people_are_characters_unless_another_share_is_asked_for(
     assert "characters" not in stub.called["data"]
     assert run("train", "-o", tmp_path / "paper", "--preset", "paper").status == 0
     assert stub.characters == 0
+
+
+def test_how_many_are_stylised_is_the_users_and_the_recipes(run: Run, stub: Recorder, tmp_path: Path) -> None:
+    assert run("train", "-o", tmp_path / "usual").status == 0
+    assert stub.stylised is None and "stylised or" in stub.called["data"]
+    assert run("train", "-o", tmp_path / "more", "--stylised", 0.4).status == 0
+    assert stub.stylised == 0.4 and "stylised (40% of these) or" in stub.called["data"]
+    card = tmp_path / "card.json"
+    card.write_text('{"recipe": {"stylised": 0.3, "characters": 0.8}}')
+    assert run("train", "-o", tmp_path / "read", "--recipe", card).status == 0
+    assert (stub.stylised, stub.characters) == (0.3, 0.8)
 
 
 def test_scanned_bodies_are_mixed_in(run: Run, stub: Recorder, tmp_path: Path) -> None:
@@ -265,6 +277,7 @@ def test_of_several_processes_one_speaks(
         ("--kind cat", 2, "cat"),
         ("--kind hand --template human-A", 1, "--template does not go"),
         ("--kind hand --characters 0.5", 1, "--characters does not go"),
+        ("--kind hand --stylised 0.5", 1, "--stylised does not go"),
         ("--kind hand --bodies 5", 1, "--bodies does not go"),
         ("--picture l.jpg", 1, "l.jpg"),
         ("--picture nowhere/l.png", 1, "there is no folder"),

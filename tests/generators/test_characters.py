@@ -10,7 +10,19 @@ from meshmatch.generators.bodies import Bodies, sample_bodies
 from meshmatch.generators.characters import Cast, sample_characters, sample_layers, standing
 from meshmatch.generators.clothes import dressed, skirted
 from meshmatch.generators.figure import PARTS, Figure, joints_of, part
-from meshmatch.generators.proportions import BUILT, CHILD, PLAIN, SHARES, TOON, Style, draw_style, rounded, stretched
+from meshmatch.generators.proportions import (
+    BUILT,
+    CHILD,
+    PLAIN,
+    SHARES,
+    STYLISED,
+    TOON,
+    Style,
+    draw_style,
+    rounded,
+    shares_with,
+    stretched,
+)
 from meshmatch.generators.rig import Rig, forward_kinematics
 from tests.generators.stick import seeded, stick_figure
 
@@ -196,6 +208,17 @@ def test_people_are_a_function_of_the_seed_and_of_the_share(figure: Figure) -> N
     assert torch.equal(clothed, naked)
 
 
+def test_more_are_stylised_and_the_others_as_they_were_to_each_other() -> None:
+    assert shares_with(STYLISED) == SHARES
+    shares = shares_with(0.4)
+    assert shares[TOON] == 0.4 and sum(shares) == pytest.approx(1)
+    assert [each / shares[PLAIN] for each in shares[1:TOON]] == pytest.approx(
+        [each / SHARES[PLAIN] for each in SHARES[1:TOON]]
+    )
+    kind = draw_style(4000, seeded(), shares).kind
+    assert float((kind == TOON).float().mean()) == pytest.approx(0.4, abs=0.03)
+
+
 def test_modellers_poses_have_legs_down_and_arms_between_hanging_and_level(figure: Figure) -> None:
     _, heads = resting(figure, 100)
     world, offset = forward_kinematics(figure.rig, heads, standing(figure.rig, heads, seeded()))
@@ -214,3 +237,5 @@ def test_modellers_poses_have_legs_down_and_arms_between_hanging_and_level(figur
 def test_a_share_is_a_share(share: float) -> None:
     with pytest.raises(OptionError, match="share"):
         Bodies(characters=share)
+    with pytest.raises(OptionError, match="share"):
+        Bodies(stylised=share)
