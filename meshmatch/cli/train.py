@@ -136,7 +136,7 @@ class TrainOptions(Options):
         min=0.0,
         max=1.0,
         metavar="SHARE",
-        help="Share of these that have the proportions of cartoons. Default: 0.15.",
+        help="Share of the --characters that have the proportions of cartoons. Default: 0.15.",
     )
     poses: Path | None = optional("FILE", "Poses to mix with the sampled ones: .npz, .json or .csv (docs/formats.md).")
     pose_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies that stand in a pose of --poses.")
