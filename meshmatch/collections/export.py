@@ -25,7 +25,7 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.inscribed import inscribed_diameters
 from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.maps.places import Places
-from meshmatch.outputs import folder_on_success, make_folder
+from meshmatch.outputs import as_path, folder_on_success, make_folder
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import load_shape, save_upright
 from meshmatch.shapes.formats import gltf
@@ -112,6 +112,13 @@ class Export:
             raise OptionError(what, "leave out the originals and the place")
         if self.values is not None and not self.original:
             raise OptionError("values go with the original meshes", "ask for these: original, --original")
+
+    def check_output(self, output: str | Path) -> None:
+        """`OptionError` for a folder that is named as one of the files would be."""
+        path = as_path(output)
+        if (ending := path.suffix.lower()) in (*MESHES, *TABLES):
+            what = f"{path.name} is to be a folder, and is named as a file"
+            raise OptionError(what, f"name the folder {path.stem}, and the files --format {ending}")
 
 
 @dataclass(frozen=True, eq=False)

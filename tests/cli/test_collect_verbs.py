@@ -227,6 +227,9 @@ def test_what_cannot_be_exported(fits: Path, run: Run, tmp_path: Path, monkeypat
     out = tmp_path / "out"
     assert "wrl" in run("export", fits, "-o", out, "--format", "wrl").err
     assert run("export", tmp_path, "-o", out).status == 1 and not out.exists()
+    named = run("export", fits, "-o", tmp_path / "points.npz")
+    assert named.status == 1 and "name the folder points, and the files --format .npz" in named.err
+    assert not (tmp_path / "points.npz").exists()
     out.mkdir()
     (out / "mine.txt").write_text("kept")
     answer = run("export", fits, "-o", out)
