@@ -24,6 +24,7 @@ from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.fitting.agree import member_of, with_vectors
 from meshmatch.fitting.alike import is_finer
+from meshmatch.fitting.judge.calibration import calibration_of
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree_step, log_stretch
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.system import node_system
@@ -72,7 +73,9 @@ def fit_alone(task: FitTask) -> Record:
         if setting.agrees:
             how = AgreeConfig.for_collection(setting.trained)
             samples = member_of(node_system(setting.trained), fit.repaired.shape, fit, setting.config, how).samples
-        doubted = setting.model == NO_MODEL or (fit.verdict == "poor" and not setting.learned)
+        likely, doubted = fit.trust, setting.model == NO_MODEL or (fit.verdict == "poor" and not setting.learned)
+        if fit.signs is not None and not doubted:
+            likely = fit.signs.p_correct(calibration_of(setting.trained.card.category))
         distance, furthest = surface_distance(fit.repaired.shape, fit.shape, fit.partial)
         record = Record(
             name=source.name,
@@ -85,7 +88,7 @@ def fit_alone(task: FitTask) -> Record:
             furthest=furthest,
             **regularity_words(fit.regularity),
             stretch=math.nan if fit.signs is None else fit.signs.stretch,
-            likely=fit.trust if fit.signs is None or doubted else fit.signs.p_correct,
+            likely=likely,
             mirrored=int(fit.frame.mirrored),
             side=fit.side,
             scale=fit.frame.scale,

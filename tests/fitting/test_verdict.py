@@ -11,6 +11,7 @@ from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Floats, Ints
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter, cap_verdict
+from meshmatch.fitting.judge.calibration import Calibration
 from meshmatch.fitting.judge.features import (
     FitFeatures,
     astray_share,
@@ -69,7 +70,7 @@ def test_all_features_are_tried() -> None:
 @pytest.mark.parametrize("sign", RISING)
 def test_trust_falls_as_a_sign_rises_and_verdicts_never_improve(sign: str) -> None:
     found = [replace(SOUND, **{sign: value}) for value in RISING[sign]]
-    trust = [each.p_correct for each in found]
+    trust = [each.p_correct() for each in found]
     assert trust == sorted(trust, reverse=True) and (trust[-1] < trust[0] or sign in APART)
     judged = [judge(each) for each in found]
     ranks = [RANK[each.verdict] for each in judged]
@@ -77,18 +78,18 @@ def test_trust_falls_as_a_sign_rises_and_verdicts_never_improve(sign: str) -> No
     assert ranks[-1] > 0 or sign == "flipped"
     for each in judged:
         assert bool(each.reasons) == (each.verdict != "good")
-        assert each.trust == each.features.p_correct
+        assert each.trust == each.features.p_correct()
 
 
 @pytest.mark.parametrize(("sign", "code"), [("astray", "pieces"), ("uncut", "uncut"), ("forward", "bent")])
 def test_some_signs_tell_by_themselves(sign: str, code: str) -> None:
     """A fit that is fair otherwise is poor, and says by which sign; below its limit a sign does not count."""
     fair = replace(SOUND, residual=0.03, partial=True)
-    assert fair.p_correct > 0.9 and judge(fair).verdict == "fair"
+    assert fair.p_correct() > 0.9 and judge(fair).verdict == "fair"
     limits = {"astray": 0.03, "uncut": 0.3, "forward": 27.0}
     below, above = (replace(fair, **{sign: factor * limits[sign]}) for factor in (0.99, 1.01))
-    assert below.p_correct == fair.p_correct and judge(below).verdict == "fair"
-    assert above.p_correct < 0.3 and judge(above).verdict == "poor"
+    assert below.p_correct() == fair.p_correct() and judge(below).verdict == "fair"
+    assert above.p_correct() < 0.3 and judge(above).verdict == "poor"
     told = {reason.code for reason in judge(above).reasons}
     assert code in told and code not in {reason.code for reason in judge(below).reasons}
 
@@ -198,8 +199,8 @@ def test_parts_of_other_proportions_are_even() -> None:
         for parts in (0 * labels(), upper.astype(int))
     )
     assert 0.2 < one and two < 0.5 * one
-    even, level = (replace(SOUND, stretch_spread=value).p_correct for value in (0.05, 0.2))
-    assert even == level > replace(SOUND, stretch_spread=0.3).p_correct
+    even, level = (replace(SOUND, stretch_spread=value).p_correct() for value in (0.05, 0.2))
+    assert even == level > replace(SOUND, stretch_spread=0.3).p_correct()
 
 
 def test_a_shortened_template_is_not_torn() -> None:
@@ -313,9 +314,9 @@ def test_a_registration_is_judged_by_the_parts_of_its_shape(monkeypatch: pytest.
         asked.append((*args[:3], kwargs["connected"]))
         return compute_features(*args, **kwargs)
 
-    def excused(features: FitFeatures, residual: float) -> Judgement:
+    def excused(features: FitFeatures, residual: float, calibration: Calibration) -> Judgement:
         asked.append(residual)
-        return judge_with_allowance(features, residual)
+        return judge_with_allowance(features, residual, calibration)
 
     monkeypatch.setattr("meshmatch.fitting.judge.verdict.compute_features", watched)
     monkeypatch.setattr("meshmatch.fitting.judge.verdict.judge_with_allowance", excused)

@@ -30,6 +30,13 @@ CALIBRATION = Calibration(
     date="2026-11-25",
 )
 
+_OF_CATEGORY: dict[str, Calibration] = {}
+
+
+def calibration_of(category: str) -> Calibration:
+    """The calibration of the fits by models of a category: that of people, where it has none of its own."""
+    return _OF_CATEGORY.get(category, CALIBRATION)
+
 
 @dataclass(frozen=True, kw_only=True)
 class DirectCalibration:

@@ -16,7 +16,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
-from meshmatch.fitting.judge.calibration import CALIBRATION
+from meshmatch.fitting.judge.calibration import CALIBRATION, Calibration
 from meshmatch.fitting.search.discontinuities import discontinuous_share, neighbours
 from meshmatch.fitting.search.predictor import USUAL_SPREAD, two_way_residual, weighted_mean
 from meshmatch.fitting.search.visibility import area_share, visible_vertices
@@ -110,10 +110,9 @@ class FitFeatures:
         """Whether each feature speaks that decides alone: ``astray``, ``uncut``, ``forward``."""
         return self.astray > _ASTRAY, self.uncut > _UNCUT, self.forward > _FORWARD
 
-    @property
-    def p_correct(self) -> float:
+    def p_correct(self, calibration: Calibration = CALIBRATION) -> float:
         """Probability (0..1) that the fit is right."""
-        logit = CALIBRATION.offset + np.dot(CALIBRATION.weights, self.values()) + _ALONE * sum(self.alone)
+        logit = calibration.offset + np.dot(calibration.weights, self.values()) + _ALONE * sum(self.alone)
         return float(1 / (1 + np.exp(logit)))
 
 

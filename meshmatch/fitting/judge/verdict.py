@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshmatch.arrays import Bool, Bools
+from meshmatch.fitting.judge.calibration import CALIBRATION, Calibration, calibration_of
 from meshmatch.fitting.judge.features import (
     FitFeatures,
     cloud_allowance,
@@ -72,11 +73,12 @@ class Judgement:
     verdict: Verdict
     reasons: tuple[Reason, ...]
     features: FitFeatures
+    calibration: Calibration = CALIBRATION
 
     @property
     def trust(self) -> float:
         """How far (0..1) the fit can be trusted."""
-        return self.features.p_correct
+        return self.features.p_correct(self.calibration)
 
 
 def judge_registration(found: Registration, partial: bool) -> Judgement:
@@ -107,23 +109,26 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
     if partial and not task.shape.is_cloud:
         edges = found.core_frame.apply(task.shape.verts[task.shape.edges.open].mean(1))
         features = replace(features, uncut=uncut_share(task.system, found.local, vectors, edges))
-    return judge(features) if task.shape.is_cloud else judge_with_allowance(features, found.candidate.residual)
+    calibration = calibration_of(task.model.card.category)
+    if task.shape.is_cloud:
+        return judge(features, calibration)
+    return judge_with_allowance(features, found.candidate.residual, calibration)
 
 
-def judge_with_allowance(features: FitFeatures, residual: float) -> Judgement:
+def judge_with_allowance(features: FitFeatures, residual: float, calibration: Calibration = CALIBRATION) -> Judgement:
     """Verdict, reasons and trust of a fit of a mesh that has that ``residual``, some of it excused in ``features``.
 
     What is excused makes no fit good: front and back of a figure of solids differ by no more than that.
     """
-    judged = judge(features)
-    if judged.verdict != "good" or judge(replace(features, residual=residual)).verdict == "good":
+    judged = judge(features, calibration)
+    if judged.verdict != "good" or judge(replace(features, residual=residual), calibration).verdict == "good":
         return judged
     return replace(judged, verdict="fair", reasons=(Reason("residual", _gap(residual)),))
 
 
-def judge(features: FitFeatures) -> Judgement:
+def judge(features: FitFeatures, calibration: Calibration = CALIBRATION) -> Judgement:
     """Verdict, reasons and trust."""
-    trust, reasons = features.p_correct, _reasons(features)
+    trust, reasons = features.p_correct(calibration), _reasons(features)
     lacking = max(features.uncovered_shape, features.uncovered_template)
     if features.partial:
         lost = f"{100 * features.hidden:.0f} % of the template has no counterpart"
@@ -144,11 +149,11 @@ def judge(features: FitFeatures) -> Judgement:
     ):
         verdict = "fair"
     else:
-        return Judgement("good", (), features)
+        return Judgement("good", (), features, calibration)
     if trust < LIMITS.good_trust and not reasons:
         likely = f"{int(100 * trust)} % likely to be right, where a good fit needs {100 * LIMITS.good_trust:.0f} %"
         reasons.append(Reason("doubt", likely))
-    return Judgement(verdict, tuple(reasons), features)
+    return Judgement(verdict, tuple(reasons), features, calibration)
 
 
 def _reasons(features: FitFeatures) -> list[Reason]:
