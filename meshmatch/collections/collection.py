@@ -394,8 +394,7 @@ class Collection(FitsFolder):
             The format or place is unknown, no fit is left, an original is not as it was, or the folder is named as a file,
             is not empty or cannot be written.
         """
-        how = Export(suffix, place, original, values, metadata, smooth, cycle)
-        how.check_output(output)
+        how = Export(suffix, place, original, values, metadata, smooth, cycle).into(output)
         verdicts = {name: str(self._words(name)["verdict"]) for name in self._names_of_one_kind()}
         left_out = tuple(name for name, verdict in verdicts.items() if verdict == "poor" and not poor)
         names = [name for name in verdicts if name not in left_out]

@@ -113,12 +113,13 @@ class Export:
         if self.values is not None and not self.original:
             raise OptionError("values go with the original meshes", "ask for these: original, --original")
 
-    def check_output(self, output: str | Path) -> None:
-        """`OptionError` for a folder that is named as one of the files would be."""
+    def into(self, output: str | Path) -> Export:
+        """The same; `OptionError` for a folder that is named as one of the files would be."""
         path = as_path(output)
         if (ending := path.suffix.lower()) in (*MESHES, *TABLES):
             what = f"{path.name} is to be a folder, and is named as a file"
             raise OptionError(what, f"name the folder {path.stem}, and the files --format {ending}")
+        return self
 
 
 @dataclass(frozen=True, eq=False)

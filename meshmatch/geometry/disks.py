@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array
-from scipy.sparse.linalg import splu
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+from meshmatch.geometry.smoothing import factors
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import (
     dot,
@@ -139,7 +139,7 @@ class _Springs:
             result[self.free] = np.linalg.solve(matrix, right)
         else:
             sparse = csc_array((entries, (rows, columns)), shape=(N, N))
-            result[self.free] = splu(sparse, permc_spec="MMD_AT_PLUS_A").solve(right)
+            result[self.free] = factors(sparse).solve(right)
         return result
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import cg
+from scipy.sparse import csc_array, csr_array, diags_array
+from scipy.sparse.linalg import SuperLU, cg, splu
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 
@@ -15,6 +15,14 @@ def laplacian(edges: Int[Ints, "E 2"], weight: Float[Floats, " E"], V: int) -> c
     places = np.concatenate([start, end]), np.concatenate([end, start])
     neighbours = csr_array((np.concatenate([weight, weight]), places), shape=(V, V))
     return csr_array(diags_array(np.asarray(neighbours.sum(axis=1)).ravel()) - neighbours)
+
+
+def factors(matrix: csc_array) -> SuperLU:
+    """Of a matrix without negative eigenvalues, or whose diagonal outweighs the rest of every row: it needs no other pivots,
+    and the search for these would take most of the time.
+    """
+    options = {"SymmetricMode": True}
+    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
 
 
 def solved(matrix: csr_array, right: Float[Floats, "V D"], start: Float[Floats, "V D"]) -> Float[Floats, "V D"]:

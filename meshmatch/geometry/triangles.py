@@ -142,6 +142,39 @@ def closest_on_triangles(
     return result
 
 
+def covering_balls(
+    triangles: Float[Floats, "N 3 3"],
+) -> tuple[Int[Ints, " M"], Float[Floats, "M 3"], Float[Floats, " M"]]:
+    """Balls that cover triangles, the larger of them with several along their longest side, so that they are thin where
+    these are: at most three times as many as there are triangles.
+
+    Returns
+    -------
+    item
+        Which triangle each covers a part of.
+    center, radius
+        Of each ball.
+    """
+    rows, sides = np.arange(len(triangles)), triangles[:, [1, 2, 0]] - triangles
+    squared = np.square(sides).sum(axis=2)
+    longest = squared.argmax(axis=1)
+    start, side = triangles[rows, longest], sides[rows, longest]
+    across = triangles[rows, (longest + 2) % 3] - start
+    across -= (dot(across, side) / np.maximum(squared[rows, longest], 1e-300))[:, None] * side
+    length, height = np.sqrt(squared[rows, longest]), np.sqrt(squared_lengths(across))
+    least = np.maximum(0.5 * length.mean(), 2 * height) + 1e-300
+    count = np.maximum(np.ceil(length / least), 1).astype(np.int64)
+    item = np.repeat(rows, count)
+    share = (np.arange(len(item)) - (np.cumsum(count) - count)[item] + 0.5) / count[item]
+    center = start[item] + share[:, None] * side[item] + 0.5 * across[item]
+    radius = np.sqrt(np.square(0.5 * length / count) + np.square(0.5 * height))
+    whole = count == 1
+    center[whole[item]] = triangles[whole].mean(axis=1)
+    reach = np.square(triangles[whole] - triangles[whole].mean(axis=1)[:, None]).sum(axis=2)
+    radius[whole] = np.sqrt(reach.max(axis=1, initial=0.0))
+    return item, center, radius[item] * (1 + 1e-12)
+
+
 def together(count: int, one: Int[Ints, " N"], two: Int[Ints, " N"]) -> Int[Ints, " count"]:
     """The least of all that hang together, for each; of so few at a time sparse graphs cost more."""
     least = np.arange(count)
@@ -228,6 +261,27 @@ def edges_of(faces: Int[Ints, "F 3"]) -> Edges:
         keys = ordered[begins[low : low + _CHUNK]] >> 1
         vertices[low : low + _CHUNK, 0], vertices[low : low + _CHUNK, 1] = np.divmod(keys, _stride(faces))
     return Edges(vertices, begins, sizes, disagreeing)
+
+
+@dataclass(frozen=True, eq=False)
+class FacesAround:
+    """Which faces touch each vertex: those of vertex v from ``start[v]`` to ``start[v + 1]``."""
+
+    start: Int[Ints, " V_plus_1"]
+    face: Int[Ints, " N"]
+
+    @classmethod
+    def of(cls, faces: Int[Ints, "F 3"], V: int) -> FacesAround:
+        """Of V vertices."""
+        corners = faces.ravel()
+        start = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=V))])
+        return cls(start, np.argsort(corners, kind="stable") // 3)
+
+    def at(self, vertices: Int[Ints, " N"]) -> Int[Ints, " M"]:
+        """The faces that touch any of these vertices, each once and in order."""
+        first, count = self.start[vertices], self.start[vertices + 1] - self.start[vertices]
+        within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        return np.unique(self.face[np.repeat(first, count) + within])
 
 
 def directed_edges(faces: Int[Ints, "F 3"]) -> Int[Ints, " F_times_3"]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.geometry.triangles import closest_on_triangles, interpolate, squared_lengths
+from meshmatch.geometry.triangles import closest_on_triangles, covering_balls, interpolate, squared_lengths
 from meshmatch.maps.folds import known_normals, normals_at
 from meshmatch.maps.footpoints import Footpoints, reassign_islands
 from meshmatch.maps.vertex_map import VertexMap
@@ -37,9 +37,9 @@ _NEAR = 0.2
 _TRUSTED, _UNCERTAIN = 0.5, 0.003
 # An edge of the image may be this many times as long as the source's, and a little more.
 _STRETCH, _SLACK = 3.0, 0.02
-# Triangles are searched by size, each class up to twice as large as the one before, and at most so many classes.
+# Balls are searched by size, each class up to twice as large as the one before, and at most so many classes.
 _CLASSES = 12
-# Queries at a time; how many triangles are tried first, and at most.
+# Queries at a time; how many balls are tried first, and at most.
 _CHUNK, _FIRST, _MAX_TRIED = 8192, 12, 512
 _LEAST = 256  # queries of one of several threads
 # Rounds in which islands of an inverse are searched again.
@@ -79,12 +79,12 @@ class MappedMesh:
         self.face = np.concatenate([kept, np.full(len(single), -1)])
         held = self.points[self.corners]
         self._center = held.mean(axis=1)
-        self._radius = np.sqrt(((held - self._center[:, None]) ** 2).sum(axis=2).max(axis=1))
-        # For triangles of each size: a tree of their centers, their numbers, and the largest radius.
-        largest = float(self._radius.max()) or 1.0
-        size = np.floor(np.log2(np.maximum(self._radius / largest, 0.5**_CLASSES)))
+        # For balls of each size: a tree of their centers, which triangles they cover, their radii, and the largest.
+        item, center, radius = covering_balls(held)
+        largest = float(radius.max()) or 1.0
+        size = np.floor(np.log2(np.maximum(radius / largest, 0.5**_CLASSES)))
         groups = [np.flatnonzero(size == k) for k in np.unique(size)]
-        self._trees = [(cKDTree(self._center[own]), own, float(self._radius[own].max())) for own in groups]
+        self._trees = [(cKDTree(center[own]), item[own], radius[own], float(radius[own].max())) for own in groups]
         # A cloud has gaps between its points, which are no reason for low confidence.
         self._gap = self.unit / np.sqrt(len(np.unique(self.points, axis=0))) if source.is_cloud else 0.0
 
@@ -137,17 +137,17 @@ class MappedMesh:
             attempt(some, nearest[some])
 
         def search(rows: Ints) -> None:
-            for tree, which, largest in self._trees:
+            for tree, which, radius, largest in self._trees:
                 asking, done, ask = rows, 0, min(_FIRST, len(which))
                 while len(asking):
                     reach = (np.sqrt(best[asking].max()) + largest) * (1 + 1e-9)
                     found = tree.query(points[asking], ask, distance_upper_bound=reach)
                     distance, close = (each.reshape(len(asking), -1) for each in found)
                     row, column = np.nonzero(np.isfinite(distance[:, done:]))
-                    items = which[close[row, column + done]]
-                    lower = np.maximum(distance[row, column + done] - self._radius[items], 0.0)
+                    ball = close[row, column + done]
+                    lower = np.maximum(distance[row, column + done] - radius[ball], 0.0)
                     worth = lower**2 <= best[asking[row]]
-                    attempt(asking[row[worth]], items[worth])
+                    attempt(asking[row[worth]], which[ball[worth]])
                     if ask >= min(len(which), _MAX_TRIED):
                         break
                     asking = asking[np.maximum(distance[:, -1] - largest, 0.0) ** 2 <= best[asking]]

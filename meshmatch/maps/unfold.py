@@ -23,10 +23,11 @@ from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.sparse.linalg import splu
 
-from meshmatch.arrays import Bools, Floats, Int, Ints
+from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.derived import derived
 from meshmatch.geometry.disks import Disk, found_in, mean_values, patches
 from meshmatch.geometry.triangles import (
+    FacesAround,
     dot,
     edge_lengths,
     interpolate,
@@ -70,9 +71,9 @@ def unfolded(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -
     images.repeat(images.smoothed, _SMOOTHED)
     images.repeat(images.flattened, _FLAT)
     images.repeat(images.flattened, _LAST, 0.0)
-    if images.map is start:
+    moved = (images.face != start.face) | (images.weights != start.barycentric).any(axis=1)
+    if not moved.any():
         return found
-    moved = (images.map.face != start.face) | (images.map.barycentric != start.barycentric).any(axis=1)
     return _between_files(images.map, found, own, target, np.flatnonzero(moved[own.number]))
 
 
@@ -162,10 +163,11 @@ def _between_files(
 
 
 class _Images:
-    """The source's vertices on the target, both scaled to area 1."""
+    """The source's vertices on the target, both scaled to area 1: on which of its faces, or vertices, and where."""
 
     def __init__(self, found: VertexMap, source: Shape, target: Shape, workers: int) -> None:
-        self.map, self.source, self._target_in_file, self.workers = found, source, target, workers
+        self._found, self.source, self._target_in_file, self.workers = found, source, target, workers
+        self.index, self.face, self.weights = found.index.copy(), found.face.copy(), found.barycentric.copy()
         self.opposite: _Images | None = None  # of the way back, which follows what is laid flat
         faces = wound_alike(source)[source.valid_faces]
         self.verts, self.points = source.verts / length_of(source), found.points(target) / length_of(target)
@@ -180,8 +182,16 @@ class _Images:
         self.upwards = known_normals(target)
         self.areas = triangle_areas(self.verts, self.faces)
         self.ratio = _ratios(self.points, self.normals, self.verts, self.faces)
-        self.torn = self._torn(self.points, self.faces)
+        self.torn = _torn(self.points, self.verts, self.faces)
+        self.around, self.around_target = (
+            FacesAround.of(each, V) for each, V in ((self.faces, source.V), (target.faces, target.V))
+        )
         self.surface: MappedMesh | None = None
+
+    @property
+    def map(self) -> VertexMap:
+        """As it is now."""
+        return replace(self._found, index=self.index.copy(), face=self.face.copy(), barycentric=self.weights.copy())
 
     def inverse(self) -> _Images:
         """Of the inverse of the map as it is now."""
@@ -194,21 +204,13 @@ class _Images:
             if not move(rings, least):
                 break
 
-    def _torn(self, points: Floats, faces: Ints) -> Bools:
-        """(F,) which faces images (V, 3) pull apart. Where the map does, their corners never move."""
-        found = np.zeros(len(faces), bool)
-        for start, end in zip(faces.T, faces[:, [1, 2, 0]].T, strict=True):
-            own, image = (np.sqrt(squared_lengths(each[start] - each[end])) for each in (self.verts, points))
-            found |= image > _STRETCH * own + _SLACK
-        return found
-
     def relaid(self, rings: int, least: float) -> bool:
         """Lay out the surroundings of all folds anew, so many triangles wide; False where there is nothing to do."""
         rows, near = self._around_folds(rings, least)
         laid = near[~self.torn[near] & np.isfinite(self.ratio[near])]
         if not len(rows) or not len(laid):
             return False
-        self._take_better(rows, near, *self._on_surface(rows, self._solved(rows, laid), self.normals[rows]))
+        self._take_better(rows, near, self._on_surface(rows, self._solved(rows, laid), self.normals[rows]))
         return True
 
     def smoothed(self, rings: int, least: float) -> bool:
@@ -218,10 +220,11 @@ class _Images:
             return False
         weights = mean_values(self.verts, self.faces[near])[rows]
         means = diags_array(1 / weights.sum(axis=1)) @ weights
-        points, normals = self.points, self.normals
+        points, normals = self.points.copy(), self.normals.copy()
         for _ in range(_SWEEPS):
-            points, normals, found = self._on_surface(rows, means @ points, unit(means @ normals))
-        self._take_better(rows, near, points, normals, found)
+            found = self._on_surface(rows, means @ points, unit(means @ normals))
+            points[rows], normals[rows] = found.points, found.normals
+        self._take_better(rows, near, found)
         return True
 
     def flattened(self, rings: int, least: float) -> bool:
@@ -244,61 +247,46 @@ class _Images:
         beneath = self._beneath(disk, reach)
         if not len(rows) or beneath is None:
             return False
-        number = np.full(self.target.V, -1)
-        number[beneath.vertices] = np.arange(len(beneath.vertices))
-        corners = number[self._corners(rim)]
-        plane = beneath.laid_flat(self.target.verts)
-        if plane is None or (corners < 0).any():
+        between = self._corners(rim)
+        corners = np.minimum(np.searchsorted(beneath.vertices, between), len(beneath.vertices) - 1)
+        if (beneath.vertices[corners] != between).any():
             return False
-        places = disk.laid_flat(self.verts, interpolate(plane, corners, self.map.barycentric[rim]), self.side)
+        plane = beneath.laid_flat(self.target.verts)
+        if plane is None:
+            return False
+        places = disk.laid_flat(self.verts, interpolate(plane, corners, self.weights[rim]), self.side)
         if places is None:
             return False
         face, weights, _ = found_in(plane, beneath.corners, np.delete(places, disk.rim, axis=0))
         corners = self.target.faces[beneath.faces[face]]
-        points, normals = self.points.copy(), self.normals.copy()
-        points[rows] = interpolate(self.target.verts, corners, weights)
-        normals[rows] = self.side * unit(interpolate(self.upwards, corners, weights))
-        moved = np.zeros(len(self.verts), bool)
-        moved[rows] = True
-        near = np.flatnonzero(self._touches(moved))
-        found = _heaviest(corners, weights), beneath.faces[face], weights
+        found = self._placed(corners, beneath.faces[face], weights)
+        near = self.around.at(rows)
         if self.opposite is None:
-            return self._take_better(rows, near, points, normals, found)
-        both = self, self.opposite
-        kept, folded = [each._state for each in both], sum(each._folded for each in both)
-        if not self._take_better(rows, near, points, normals, found):
+            return self._take_better(rows, near, found)
+        before, folded = self._at(rows), self._folded(near)
+        if not self._take_better(rows, near, found):
             return False
         face, weights, inside = found_in(places, disk.corners, plane)
-        self.opposite._follow(beneath.vertices[inside], self, disk.faces[face[inside]], weights[inside])
-        if sum(each._folded for each in both) < folded:
+        others = beneath.vertices[inside]
+        changed = self.opposite.around.at(others)
+        others_before, folded = self.opposite._at(others), folded + self.opposite._folded(changed)
+        self.opposite._follow(others, changed, self, disk.faces[face[inside]], weights[inside])
+        if self._folded(near) + self.opposite._folded(changed) < folded:
             return True
-        for each, state in zip(both, kept, strict=True):
-            each.map, each.points, each.normals, each.ratio = state
+        self._take(rows, near, before)
+        self.opposite._take(others, changed, others_before)
         return False
 
-    @property
-    def _state(self) -> tuple[VertexMap, Floats, Floats, Floats]:
-        return self.map, self.points.copy(), self.normals.copy(), self.ratio.copy()
-
-    @property
-    def _folded(self) -> float:
+    def _folded(self, faces: Ints) -> float:
         """How much of the surface is folded, and how badly."""
-        return float((self.areas * _badness(self.ratio)).sum())
+        return float((self.areas[faces] * _badness(self.ratio[faces])).sum())
 
-    def _follow(self, rows: Ints, back: _Images, faces: Ints, weights: Floats) -> None:
-        """Put vertices where those faces of the other way lie that now cover them."""
+    def _follow(self, rows: Ints, near: Ints, back: _Images, faces: Ints, weights: Floats) -> None:
+        """Put vertices where those faces of the other way lie that now cover them; ``near`` are the faces around."""
         corners, in_file = back.faces[faces], back.face_in_file[faces]
-        points, normals = self.points.copy(), self.normals.copy()
-        points[rows] = interpolate(back.verts, corners, weights)
-        normals[rows] = self.side * unit(interpolate(self.upwards, corners, weights))
         order = (back.source.faces[in_file][:, :, None] == corners[:, None, :]).argmax(axis=2)
-        weights = np.take_along_axis(weights, order, axis=1)
-        vertex = _heaviest(back.source.faces[in_file], weights)
-        self._take(rows, points, normals, (vertex, in_file, weights))
-        moved = np.zeros(len(self.verts), bool)
-        moved[rows] = True
-        changed = np.flatnonzero(self._touches(moved))
-        self.ratio[changed] = _ratios(self.points, self.normals, self.verts, self.faces[changed])
+        own = back.source.faces[in_file]
+        self._take(rows, near, self._placed(own, in_file, np.take_along_axis(weights, order, axis=1)))
 
     def _beneath(self, disk: Disk, reach: float) -> Disk | None:
         """The part of the target that the images of a disk lie on, and so far around, if it is a disk."""
@@ -306,16 +294,17 @@ class _Images:
         sides = images[disk.corners] - images[disk.corners[:, [1, 2, 0]]]
         far = reach * np.sqrt(squared_lengths(sides.reshape(-1, 3)).max()) + 2 * self._edge
         away = dijkstra(self._along, indices=np.unique(self._corners(disk.vertices)), min_only=True, limit=2 * far)
-        away = np.maximum(np.maximum(away[faces[:, 0]], away[faces[:, 1]]), away[faces[:, 2]])
-        found = patches(faces, away <= far, away <= 2 * far)
-        return Disk.of(faces, found[0]) if len(found) == 1 else None
+        some = self.around_target.at(np.flatnonzero(np.isfinite(away)))
+        away = away[faces[some]].max(axis=1)
+        found = patches(faces[some], away <= far, away <= 2 * far)
+        return Disk.of(faces, some[found[0]]) if len(found) == 1 else None
 
     def _corners(self, rows: Ints) -> Ints:
         """(N, 3) the target's vertices that images lie between; of an image on an edge those of the edge alone, whichever of
         its two faces it is told to be on.
         """
-        weights = self.map.barycentric[rows]
-        corners = corners_of(self.target.faces, self.map.face[rows], self.map.index[rows])
+        weights = self.weights[rows]
+        corners = corners_of(self.target.faces, self.face[rows], self.index[rows])
         return np.where(weights < _NOTHING, _heaviest(corners, weights)[:, None], corners)
 
     @property
@@ -340,28 +329,27 @@ class _Images:
         inside[self.faces[self.torn].ravel()] = False
         return np.flatnonzero(inside), np.flatnonzero(self._touches(inside))
 
-    def _take_better(
-        self, rows: Ints, near: Ints, points: Floats, normals: Floats, found: tuple[Ints, Ints, Floats]
-    ) -> bool:
+    def _take_better(self, rows: Ints, near: Ints, found: _Places) -> bool:
         """Keep new images of these vertices where less of the faces around is folded; False if there are none."""
-        ratio = _ratios(points, normals, self.verts, self.faces[near])
+        vertices, corners = np.unique(self.faces[near], return_inverse=True)
+        corners, moved = corners.reshape(-1, 3), np.searchsorted(vertices, rows)
+        points, normals, verts = self.points[vertices], self.normals[vertices], self.verts[vertices]
+        points[moved], normals[moved] = found.points, found.normals
+        ratio = _ratios(points, normals, verts, corners)
         # each part that moved counts by itself
-        number = np.full(len(self.verts), -1)
-        number[rows] = np.arange(len(rows))
-        corners = number[self.faces[near]]
-        part = _parts(corners, len(rows))
-        of_face = np.where(corners >= 0, part[corners], -1).max(axis=1)
+        number = np.full(len(vertices), -1)
+        number[moved] = np.arange(len(rows))
+        part = _parts(number[corners], len(rows))
+        of_face = np.where(number[corners] >= 0, part[number[corners]], -1).max(axis=1)
         own = self.areas[near]
         before, after = (
             np.bincount(of_face, own * _badness(each), part.max() + 1) for each in (self.ratio[near], ratio)
         )
         # Where little is sound around, and much moves, a solution may lie anywhere; the rim, which is held, then tears.
-        tears = np.bincount(of_face, self._torn(points, self.faces[near]) & ~self.torn[near], part.max() + 1) > 0
+        tears = np.bincount(of_face, _torn(points, verts, corners) & ~self.torn[near], part.max() + 1) > 0
         improved = (after < before) & ~tears
-        better = improved[part]
-        self._take(rows[better], points, normals, (found[0][better], found[1][better], found[2][better]))
-        changed = near[improved[of_face]]
-        self.ratio[changed] = _ratios(self.points, self.normals, self.verts, self.faces[changed])
+        better, changed = improved[part], improved[of_face]
+        self._take(rows[better], near[changed], found.some(better), ratio[changed])
         return bool(improved.any())
 
     def _touches(self, marked: Bools) -> Bools:
@@ -433,26 +421,57 @@ class _Images:
         held = csr_array((value[~free], (first[~free], second[~free])), shape=(N, V)) @ self.points
         return np.asarray(splu(matrix.tocsc()).solve(right[rows] - held + _HOLD * self.points[rows]))
 
-    def _on_surface(
-        self, rows: Ints, wanted: Floats, facing: Floats
-    ) -> tuple[Floats, Floats, tuple[Ints, Ints, Floats]]:
-        """All points and normals, these rows put on the target's surface where it faces so; and where on it they are."""
+    def _on_surface(self, rows: Ints, wanted: Floats, facing: Floats) -> _Places:
+        """Where points of these rows lie on the target's surface, where it faces so."""
         if self.surface is None:
             self.surface = MappedMesh.of(self.target)
         foot = self.surface.query(wanted, self.side * facing, self.workers)
-        points, normals = self.points.copy(), self.normals.copy()
-        points[rows] = foot.values(self.target.faces, self.target.verts)
-        normals[rows] = self.side * unit(foot.values(self.target.faces, self.upwards))
-        return points, normals, (foot.vertex, foot.face, foot.barycentric)
+        points = foot.values(self.target.faces, self.target.verts)
+        normals = self.side * unit(foot.values(self.target.faces, self.upwards))
+        return _Places(foot.vertex, foot.face, foot.barycentric, points, normals)
 
-    def _take(self, rows: Ints, points: Floats, normals: Floats, found: tuple[Ints, Ints, Floats]) -> None:
-        """Move these vertices."""
-        if not len(rows):
-            return
-        self.points[rows], self.normals[rows] = points[rows], normals[rows]
-        index, face, weights = self.map.index.copy(), self.map.face.copy(), self.map.barycentric.copy()
-        index[rows], face[rows], weights[rows] = found
-        self.map = replace(self.map, index=index, face=face, barycentric=weights)
+    def _placed(self, corners: Ints, face: Ints, weights: Floats) -> _Places:
+        """Places between corners (N, 3) of the target's faces."""
+        points = interpolate(self.target.verts, corners, weights)
+        normals = self.side * unit(interpolate(self.upwards, corners, weights))
+        return _Places(_heaviest(corners, weights), face, weights, points, normals)
+
+    def _at(self, rows: Ints) -> _Places:
+        """Where these vertices are."""
+        return _Places(self.index, self.face, self.weights, self.points, self.normals).some(rows)
+
+    def _take(self, rows: Ints, near: Ints, places: _Places, ratio: Floats | None = None) -> None:
+        """Move these vertices; the faces around have these ratios of areas then."""
+        self.points[rows], self.normals[rows] = places.points, places.normals
+        self.index[rows], self.face[rows], self.weights[rows] = places.index, places.face, places.weights
+        if ratio is None:
+            ratio = _ratios(self.points, self.normals, self.verts, self.faces[near])
+        self.ratio[near] = ratio
+
+
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """Images of N vertices: on which faces of the target, at which of their vertices, -1 and one vertex alone, and where."""
+
+    index: Int[Ints, " N"]
+    face: Int[Ints, " N"]
+    weights: Float[Floats, "N 3"]
+    points: Float[Floats, "N 3"]
+    normals: Float[Floats, "N 3"]
+
+    def some(self, rows: Ints | Bools) -> _Places:
+        """Of some of the vertices; a copy."""
+        places = self.points[rows], self.normals[rows]
+        return _Places(self.index[rows], self.face[rows], self.weights[rows], *places)
+
+
+def _torn(points: Floats, verts: Floats, faces: Ints) -> Bools:
+    """(F,) which faces images (V, 3) pull apart. Where the map does, their corners never move."""
+    found = np.zeros(len(faces), bool)
+    for start, end in zip(faces.T, faces[:, [1, 2, 0]].T, strict=True):
+        own, image = (np.sqrt(squared_lengths(each[start] - each[end])) for each in (verts, points))
+        found |= image > _STRETCH * own + _SLACK
+    return found
 
 
 def _ratios(points: Floats, normals: Floats, verts: Floats, faces: Ints) -> Floats:

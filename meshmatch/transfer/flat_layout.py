@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import SuperLU
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+from meshmatch.geometry.smoothing import factors
 from meshmatch.geometry.triangles import same_rows, together, triangle_areas, unit
 from meshmatch.transfer.texels import faces_on
 
@@ -249,8 +250,7 @@ def _factors(values: NDArray[Any], rows: Ints, columns: Ints, kept: Bools) -> Su
     place = np.cumsum(kept) - 1
     both, count = kept[rows] & kept[columns], int(kept.sum())
     matrix = coo_array((values[both], (place[rows[both]], place[columns[both]])), shape=(count, count)).tocsc()
-    options = {"SymmetricMode": True}
-    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    return factors(matrix)
 
 
 def _untangled(uv: Floats, corners: Ints) -> Floats:

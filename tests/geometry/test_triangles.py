@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from meshmatch.geometry.triangles import (
+    FacesAround,
     blend,
     closest_on_triangles,
+    covering_balls,
     cross_product,
     dot,
     interpolate,
@@ -82,3 +84,29 @@ def test_one_or_two_edges_are_enough() -> None:
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     height = np.abs(dot(points - corners[:, 0], normal)) / np.linalg.norm(normal, axis=1)
     assert np.allclose(distance[~on_edges], height[~on_edges], atol=1e-8)
+
+
+def test_balls_cover_triangles_of_any_form() -> None:
+    """Every point of a triangle lies in one of its balls; long ones have several, thin as they are."""
+    rng = np.random.default_rng(0)
+    triangles = rng.normal(size=(300, 3, 3))
+    triangles[:100, 2] = 0.5 * (triangles[:100, 0] + triangles[:100, 1]) + 0.01 * rng.normal(size=(100, 3))  # slivers
+    triangles[100:110, 1:] = triangles[100:110, :1]  # points
+    triangles[110:120, 2] = triangles[110:120, 1]  # lines
+    item, center, radius = covering_balls(triangles)
+    assert set(item) == set(range(300)) and 300 < len(item) <= 3 * 300
+    weights = rng.dirichlet([0.5, 0.5, 0.5], 200)
+    for k, triangle in enumerate(triangles):
+        points = np.concatenate([weights @ triangle, triangle])
+        own = item == k
+        away = np.linalg.norm(points[:, None] - center[own], axis=2)
+        assert (away <= radius[own] + 1e-12).any(axis=1).all()
+    assert np.bincount(item)[:100].mean() > 2
+    assert radius[np.isin(item, np.arange(100, 110))].max() < 1e-12
+
+
+def test_faces_around_vertices() -> None:
+    faces = np.array([[0, 1, 2], [2, 1, 3], [4, 3, 1]])
+    around = FacesAround.of(faces, 6)
+    found = [around.at(np.array(each, np.int64)).tolist() for each in ([0], [1], [0, 4], [5], [])]
+    assert found == [[0], [0, 1, 2], [0, 2], [], []]

@@ -79,10 +79,17 @@ def test_what_folds_the_way_back_more_is_undone(monkeypatch: pytest.MonkeyPatch)
     images = _Images(found, source, target, 1)
     back = images.opposite = _Images(invert_map(found, source, target), target, source, 1)
     before = back.ratio.copy()
-    monkeypatch.setattr(back, "_follow", lambda *_: back.ratio.fill(-1.0))
+    followed = []
+
+    def folds(rows, near, *_):
+        followed.append(len(near))
+        back.ratio[near] = -1.0
+
+    monkeypatch.setattr(back, "_follow", folds)
     images.repeat(images.flattened, (1, 2))
     np.testing.assert_array_equal(images.map.points(target), found.points(target))
     np.testing.assert_array_equal(back.ratio, before)
+    assert followed and min(followed) > 0
 
 
 def test_both_ways_are_the_same_in_either_order_however_a_file_stands_and_is_cut() -> None:
