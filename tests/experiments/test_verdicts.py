@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from meshmatch.errors import InputError
 from meshmatch.experiments.bench import verdicts
 from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, TUNED, Cases, furniture, melded
+from meshmatch.fitting.judge.calibration import Calibration
 from meshmatch.geometry.triangles import face_parts, is_watertight
 from meshmatch.shapes.shape import Shape
 
@@ -123,11 +124,23 @@ def test_weights_are_found() -> None:
     signs = rng.normal(size=(400, 2))
     wrong = signs[:, 0] > 0.3
     found = [
-        {"verdict": "good", "signs": list(sign), "error": 20.0 if bad else 1.0}
+        {"verdict": "good", "fit": "good", "signs": list(sign), "error": 20.0 if bad else 1.0}
         for sign, bad in zip(signs, wrong, strict=True)
     ]
     weights, offset = verdicts.fitted_weights(found)
     assert weights[0] > 10 * abs(weights[1]) and -offset / weights[0] == pytest.approx(0.3, abs=0.1)
+    astray = {"verdict": "poor", "fit": "good", "signs": [-3.0, 0.0], "error": 30.0}  # by the target's fit
+    again, same = verdicts.fitted_weights([*found, *[astray] * 50])
+    assert (again.tolist(), same) == (weights.tolist(), offset)
+
+
+def test_weights_of_few_cases_stay_near_those_given() -> None:
+    given = Calibration(weights=(2.0, 3.0), offset=-1.0, data="", seeds=(), date="")
+    few = [{"verdict": "good", "fit": "good", "signs": [0.1 * k, 0.0], "error": 1.0} for k in range(5)]
+    weights, offset = verdicts.fitted_weights(few, given)
+    assert weights == pytest.approx(given.weights, abs=0.5) and offset < given.offset
+    alone, _ = verdicts.fitted_weights(few)
+    assert abs(alone).max() < 1.0
 
 
 @pytest.mark.slow

@@ -11,7 +11,8 @@ from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Floats, Ints
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter, cap_verdict
-from meshmatch.fitting.judge.calibration import Calibration
+from meshmatch.fitting.judge import calibration
+from meshmatch.fitting.judge.calibration import CALIBRATION, Calibration, calibration_of
 from meshmatch.fitting.judge.features import (
     FitFeatures,
     astray_share,
@@ -201,6 +202,17 @@ def test_parts_of_other_proportions_are_even() -> None:
     assert 0.2 < one and two < 0.5 * one
     even, level = (replace(SOUND, stretch_spread=value).p_correct() for value in (0.05, 0.2))
     assert even == level > replace(SOUND, stretch_spread=0.3).p_correct()
+
+
+def test_a_category_is_judged_by_its_own_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert calibration_of("head") != calibration_of("human") == calibration_of("egg") == CALIBRATION
+    own = replace(CALIBRATION, offset=CALIBRATION.offset + 50)
+    fitter = Fitter(egg_model(), FitConfig(samples=900, variants=0, finalists=1, careful=1, partial="no"))
+    usual = fitter.fit(egg_model().template.shape)
+    monkeypatch.setitem(calibration._OF_CATEGORY, egg_model().card.category, own)
+    doubted = fitter.fit(egg_model().template.shape)
+    assert usual.trust > 0.9 and doubted.verdict == "poor"
+    assert usual.signs == doubted.signs and doubted.trust == pytest.approx(doubted.signs.p_correct(own))
 
 
 def test_a_shortened_template_is_not_torn() -> None:

@@ -8,7 +8,8 @@ above 8. Confidence is compared, at every vertex, with how often the error is wi
 never is. All maps weigh the same, however many vertices they have. The longest fit is in CPU seconds.
 
 ``--fit`` prints the weights that tell right from wrong best, of the cases of this run, in the form in which
-`meshmatch.fitting.judge.calibration` keeps them. Measure with other seeds than those that it names.
+`meshmatch.fitting.judge.calibration` keeps them; those of other kinds lean on people's. Measure with other seeds than those
+that it names.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from meshmatch.experiments import runner
 from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, Case, Cases, between, direction
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.judge.calibration import Calibration
+from meshmatch.fitting.judge.calibration import CALIBRATION, Calibration
 from meshmatch.generators.kinds import GENERATORS
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.outputs import make_folder
@@ -175,24 +176,29 @@ def bars_of(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def fitted_weights(found: Sequence[Mapping[str, Any]]) -> tuple[Float[Floats, " N"], float]:
-    """Weights of the signs and an offset: the logistic regression of being wrong, with a little ridge; no sign speaks for
-    a fit.
+def fitted_weights(
+    found: Sequence[Mapping[str, Any]], near: Calibration | None = None
+) -> tuple[Float[Floats, " N"], float]:
+    """Weights of the signs and an offset: the logistic regression of being wrong, with a little ridge about 0, or about
+    those ``near``; no sign speaks for a fit. Maps onto a target whose own fit is poor say nothing of a case.
     """
-    known = [each for each in found if each["verdict"] != REFUSED]
+    known = [
+        each for each in found if each["verdict"] != REFUSED and (each["verdict"] != "poor" or each["fit"] == "poor")
+    ]
     X, error = np.array([each["signs"] for each in known]), np.array([each["error"] for each in known])
+    weights, offset = (np.zeros(X.shape[1]), 0.0) if near is None else (np.array(near.weights), near.offset)
     sign = np.where(error > WRONG_CM, 1.0, -1.0)
     weight = np.where((error > RIGHT_CM) & (error < 1.5 * WRONG_CM), 0.5, 1.0)  # neither quite right nor quite wrong
-    deviation = X.std(0) + 1e-9
+    deviation = np.where(X.std(0) > 0, X.std(0), 1.0)
     Z = X / deviation
 
     def loss(p: Floats) -> float:
-        costs = np.logaddexp(0.0, -sign * (Z @ p[1:] + p[0]))
+        costs = np.logaddexp(0.0, -sign * (X @ weights + offset + Z @ p[1:] + p[0]))
         return float((weight * costs).sum() / weight.sum() + _RIDGE * np.square(p[1:]).sum())
 
-    bounds = [(None, None), *[(0.0, None)] * X.shape[1]]
+    bounds = [(None, None), *[(-each, None) for each in weights * deviation]]
     p = minimize(loss, np.zeros(X.shape[1] + 1), method="L-BFGS-B", bounds=bounds).x
-    return p[1:] / deviation, float(p[0])
+    return weights + p[1:] / deviation, offset + float(p[0])
 
 
 def of_seed(
@@ -257,7 +263,8 @@ def main(
     notes = [f"confidence: AUC {auc:.3f}, furthest from the truth {furthest:.3f}"]
     record: dict[str, Any] = {"families": by_family, "verdicts": by_verdict, "confidence": steps, "auc": auc, **bars}
     if fit:
-        weights, offset = fitted_weights([each for each in found if each["family"] not in KEPT])
+        near = None if kind == "human" else CALIBRATION
+        weights, offset = fitted_weights([each for each in found if each["family"] not in KEPT], near)
         record["weights"] = [round(float(value), 3) for value in weights] + [round(offset, 3)]
         fitted = Calibration(
             weights=tuple(record["weights"][:-1]),
