@@ -108,30 +108,29 @@ def _part(points: Floats) -> Floats:
 
 
 def _neighbourhoods(points: Floats) -> tuple[Floats, Floats, Ints, int, float]:
-    """The points to judge by; distance and index (P, most + 1) of their neighbours, themselves first; how many of these
-    to look at; and how thick noise makes the cloud beside its spacing, in 0..1."""
+    """The points to judge by; distance and index (P, k + 1) of their neighbours, themselves first; k; and how thick noise
+    makes the cloud beside its spacing, in 0..1."""
     part = np.ascontiguousarray(_part(points), float)
-    distance, index = _neighbours(part.tobytes())
-    most = index.shape[1] - 1
-    few = min(int(np.clip(len(part) // 100, 12, 18)), most)
-    some = slice(None, None, max(len(part) // 3000, 1))
-    values = np.linalg.eigvalsh(_spread(part, index[some, : min(12, most) + 1]))
-    thick = np.median(values[:, 0] / np.maximum(values[:, 1], np.maximum(1e-15 * values[:, 2], 1e-300)))
-    # measured on bodies: below 0.15 without noise, 0.2 at noise of 0.3 % of the diagonal, 0.5 at 1 %
-    blend = float(np.clip((thick - 0.15) / 0.35, 0.0, 1.0))
-    k = round(few ** (1.0 - blend) * most**blend)
-    return part, distance, index, max(k, min(3, most)), blend
+    return part, *_neighbours(part.tobytes())
 
 
-@lru_cache(maxsize=4)
-def _neighbours(data: bytes) -> tuple[Floats, Ints]:
-    """Of points as bytes, so that areas, normals and roughness of a cloud ask once."""
+@lru_cache(maxsize=8)
+def _neighbours(data: bytes) -> tuple[Floats, Ints, int, float]:
+    """Of points as bytes, so that areas, normals and roughness of a cloud ask once: few, or many where there is noise."""
     from meshmatch.geometry.trees import cKDTree
 
     part = np.frombuffer(data).reshape(-1, 3)
-    distance, index = cKDTree(part).query(part, min(max(len(part) // 200, 18), len(part) - 1) + 1)
+    tree, most = cKDTree(part), min(max(len(part) // 200, 18), len(part) - 1)
+    few = min(int(np.clip(len(part) // 100, 12, 18)), most)
+    some = part[:: max(len(part) // 3000, 1)]
+    values = np.linalg.eigvalsh(_spread(part, tree.query(some, min(12, most) + 1)[1]))
+    thick = np.median(values[:, 0] / np.maximum(values[:, 1], np.maximum(1e-15 * values[:, 2], 1e-300)))
+    # measured on bodies: below 0.15 without noise, 0.2 at noise of 0.3 % of the diagonal, 0.5 at 1 %
+    blend = float(np.clip((thick - 0.15) / 0.35, 0.0, 1.0))
+    k = max(round(few ** (1.0 - blend) * most**blend), min(3, most))
+    distance, index = tree.query(part, k + 1)
     distance.flags.writeable = index.flags.writeable = False
-    return distance, index
+    return distance, index, k, blend
 
 
 def _spread(points: Floats, index: Ints) -> Floats:
