@@ -21,6 +21,7 @@ from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.faces import turn_faces
 from meshmatch.shapes.shape import Shape
 
+_ROUNDING = 1e-6  # of a ratio of areas: what has none is not turned over
 CRUSHED = 0.25
 """An image of less than this share of a triangle's area, both shapes scaled to the same area, is crushed."""
 
@@ -34,7 +35,7 @@ class Folds:
     flipped
         Share (0..1) of the source's area on triangles whose images are turned over.
     crushed
-        Share on triangles whose images have less than a quarter of their area, both shapes scaled to the same area.
+        Share on triangles whose images have less than a quarter of their area, or none, both shapes scaled to the same area.
     stretch
         Half of the source's area is stretched, or shrunk, by more than this factor in some direction; 1 for an isometry.
     """
@@ -58,8 +59,9 @@ class Folds:
         ratio, factor = ratio[known], _factors(points, normals, verts, faces[known])
         order = np.argsort(factor)
         middle = order[np.searchsorted(np.cumsum(share[order]), 0.5)]
-        crushed = (ratio > 0) & (ratio < CRUSHED)
-        return cls(float(share[ratio <= 0].sum()), float(share[crushed].sum()), float(factor[middle]))
+        flipped = ratio < -_ROUNDING
+        crushed = ~flipped & (ratio < CRUSHED)
+        return cls(float(share[flipped].sum()), float(share[crushed].sum()), float(factor[middle]))
 
 
 def known_normals(shape: Shape) -> Float[Floats, "V 3"]:
@@ -122,7 +124,8 @@ def _factors(points: Floats, normals: Floats, verts: Floats, faces: Ints) -> Flo
     product = np.sqrt(squared_lengths(image) / np.maximum(square, 1e-300))
     difference = np.sqrt(np.maximum(total**2 - 4 * product**2, 0.0))
     large = np.sqrt(np.maximum(total + difference, 0.0) / 2)
-    return np.asarray(np.maximum(large, large / np.maximum(product, 1e-12)))
+    small = product / np.maximum(large, 1e-300)
+    return np.asarray(np.maximum(large, 1 / np.maximum(small, 1e-12)))
 
 
 def _facing(normals: Floats, faces: Ints) -> Floats:

@@ -238,6 +238,13 @@ def test_folds_of_known_maps() -> None:
     long = Shape(flat.verts * [2, 0.5, 1], flat.faces)
     found = VertexMap.between(flat, long, np.arange(4))
     assert Folds.of(found, flat, long) == Folds(0.0, 0.0, pytest.approx(2.0))
+    collapsed = Folds.of(VertexMap.between(flat, flat, np.array([0, 1, 2, 2])), flat, flat)
+    assert (collapsed.flipped, collapsed.crushed) == (
+        0.0,
+        0.5,
+    )  # one triangle has become a line, and is not turned over
+    point = Folds.of(VertexMap.between(flat, flat, np.zeros(4, int)), flat, flat)
+    assert (point.flipped, point.crushed) == (0.0, 1.0) and point.stretch > 1e6
     wide = Shape(flat.verts * [10, 10, 1], flat.faces)
     assert Folds.of(VertexMap.between(flat, wide, np.arange(4)), flat, wide).stretch == pytest.approx(1.0)
     small = Shape(np.concatenate([flat.verts, flat.verts[:3] * 0.1 + 5]), np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6]]))
