@@ -4,6 +4,8 @@ materials, images and vertex colors.
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
@@ -26,6 +28,7 @@ _BENT = 0.25
 _FEW = 200_000  # faces; on larger meshes edges are short enough to be straight
 # A place this far off, in sizes of its triangle's image, is searched again from the other corners. Set by hand.
 _FAR = 0.1
+_BESIDE = 0.499  # of a texel: what a color between texels is mixed of, but for what hardly counts
 
 
 class MaterialSampler:
@@ -121,8 +124,23 @@ def known_texels(material: Material, uv: Floats) -> Bools | None:
     # Triangles that hold no center of a texel still name some; they count where nothing near is known.
     at = _texels_at(corners[small].mean(axis=1), material, known.shape)
     alone = ~maximum_filter(known, 3)[at]
-    known[_texels_at(corners[small][alone].reshape(-1, 2), material, known.shape)] = True
+    points = _along(corners[small][alone])
+    if len(points) > 4.0 * known.size + 64.0 * len(uv):
+        return None
+    for offset in itertools.product((-_BESIDE, _BESIDE), repeat=2):
+        known[_texels_at(points + offset, material, known.shape)] = True
     return known
+
+
+def _along(corners: Floats) -> Floats:
+    """(M, 2) points along the longest sides of triangles (N, 3, 2) that are points or lines, half a texel apart."""
+    sides = corners[:, [1, 2, 0]] - corners
+    rows, longest = np.arange(len(corners)), np.square(sides).sum(axis=2).argmax(axis=1)
+    start, side = corners[rows, longest], sides[rows, longest]
+    count = np.ceil(2.0 * np.abs(side).max(axis=1)).astype(np.int64) + 1
+    row = np.repeat(rows, count)
+    share = (np.arange(len(row)) - (np.cumsum(count) - count)[row]) / np.maximum(count - 1, 1)[row]
+    return np.asarray(start[row] + share[:, None] * side[row])
 
 
 def _texels_at(points: Floats, material: Material, shape: tuple[int, ...]) -> tuple[Ints, Ints]:

@@ -465,6 +465,20 @@ def test_points_get_colors(sphere: Shape) -> None:
     np.testing.assert_allclose(found, colors_of_vertices(sphere, look, fine, back), atol=0.03)
 
 
+@pytest.mark.parametrize("slant", [0.0, 0.3])
+def test_a_ramp_along_a_line_of_the_image_is_not_mixed_with_the_rest(slant: float) -> None:
+    """Coordinates on one line, as of an image of heights, between two columns of texels: triangles hold none of them."""
+    height = np.linspace(0.1, 0.9, 9)
+    verts = np.column_stack([np.tile([0.0, 0.1], 9), np.repeat(height, 2), np.zeros(18)])
+    faces = np.array([[k, k + 1, k + 2] if k % 2 == 0 else [k + 1, k, k + 2] for k in range(16)])
+    uv = np.column_stack([0.5 + slant * (verts[:, 1] - 0.5), verts[:, 1]])[faces]
+    image = np.full((64, 64, 4), 255, np.uint8)
+    image[..., :3] = np.linspace(0, 255, 64).astype(np.uint8)[:, None, None]
+    look, strip = wearing(image, uv), Shape(verts, faces)
+    found = to_srgb(colors_of_vertices(strip, look, strip, VertexMap.identity(strip))[:, 0])
+    assert found == pytest.approx(verts[:, 1], abs=0.02)
+
+
 def test_fine_detail_becomes_a_mean_at_a_sparse_point() -> None:
     image = np.zeros((64, 64, 4), np.uint8)
     image[..., 3] = 255
