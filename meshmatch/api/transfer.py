@@ -38,9 +38,10 @@ from meshmatch.transfer.landmarks import (
     Landmarks,
     at_points,
     at_vertices,
-    load_landmarks,
+    landmarks_with_warnings,
     push_landmarks,
     save_landmarks,
+    warn_of_far_ones,
 )
 from meshmatch.transfer.low_confidence import LowConfidence, replace_low_labels, replace_low_values, replace_low_weights
 from meshmatch.transfer.value_files import Values, checked_colors, light_of, save_colors, save_values
@@ -457,7 +458,7 @@ def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape, spa
     if isinstance(landmarks, Landmarks):
         return landmarks
     if isinstance(landmarks, str | Path):
-        return load_landmarks(landmarks, source, space)[0]
+        return landmarks_with_warnings(landmarks, source, space)
     try:
         places = np.asarray(off_torch(landmarks))
     except (TypeError, ValueError) as error:
@@ -467,6 +468,8 @@ def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape, spa
     if places.ndim == 1 and places.dtype.kind in "iu":
         return at_vertices(source, places)
     if places.ndim == 2 and places.shape[1] == 3 and places.dtype.kind in "iuf":
-        return at_points(source, places.astype(np.float64))[0]
+        found, distance = at_points(source, places.astype(np.float64))
+        warn_of_far_ones(source, float(distance.max(initial=0.0)))
+        return found
     hint = "give vertices (N,) as integers, or positions (N, 3)"
     raise InputError(f"landmarks cannot be an array of {places.shape} {places.dtype}", hint)

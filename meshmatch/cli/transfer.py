@@ -14,7 +14,6 @@ from meshmatch.cli.words import Json
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import replace_on_success
 
-_FAR = 0.02  # of the size of a shape: a landmark this far from its surface is worth a warning
 On = Literal["vertices", "faces"]
 
 
@@ -239,21 +238,14 @@ def transfer_landmarks(
     import numpy as np
 
     from meshmatch.shapes.landmark_files import mesh_space
-    from meshmatch.transfer.landmarks import check_landmarks_suffix, load_landmarks
+    from meshmatch.transfer.landmarks import check_landmarks_suffix, landmarks_with_warnings
 
     transfer = Transfer(source, target, output, maps, run, picture)
     console = transfer.console
     check_landmarks_suffix(output)
     with transfer.outputs(landmarks) as (temporary,):
         a = meshmatch.load_shape(source)
-        given, furthest = load_landmarks(landmarks, a, mesh_space(source))
-        for note in given.notes:
-            console.warn(note)
-        if furthest > _FAR * a.diagonal:
-            console.warn(
-                f"a landmark lies {furthest:.4g} from {a.name}, {100 * furthest / a.diagonal:.0f} % of its size: the "
-                "nearest point of the surface was taken"
-            )
+        given = landmarks_with_warnings(landmarks, a, mesh_space(source))
         result = meshmatch.transfer_landmarks(a, target, given, transfer, rule=meshmatch.ConfidenceRule(min_confidence))
         found, b = result.data, result.maps.target
         result.writer(temporary, output)

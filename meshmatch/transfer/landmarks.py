@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from meshmatch.arrays import Brief, Float, Floats, Int, Ints
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, warn
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.folds import known_normals
 from meshmatch.maps.mapped_mesh import MappedMesh, discontinuous_faces
@@ -37,6 +37,7 @@ from meshmatch.shapes.shape import Shape
 
 # A landmark this far from the surface, in diagonals of the shape, belongs to another shape.
 _ELSEWHERE = 0.25
+_FAR = 0.02  # one this far from it, in the same unit, is worth a warning
 _OTHER_FRAME = np.array([-1.0, -1.0, 1.0])  # of 3D Slicer: LPS or RAS
 # Landmarks are in the other frame if they lie this far from the surface, in diagonals of it, and then so many times nearer.
 _ASTRAY, _MUCH_NEARER = 0.01, 4.0
@@ -82,7 +83,7 @@ def at_points(
     _refuse(~usable, names, lambda k: f" has no position: {points[k].tolist()}")
     places = MappedMesh.of(shape).query(points)
     elsewhere = places.distance > _ELSEWHERE * max(shape.diagonal, 1e-30)
-    there = f"{shape.name or 'the source'}, whose size is {shape.diagonal:.4g}"
+    there = f"{shape.name or 'the source'}, whose diagonal is {shape.diagonal:.4g}"
     hint = "landmarks must be in the frame and unit of the source's file"
     _refuse(elsewhere, names, lambda k: f" lies {places.distance[k]:.4g} away from {there}", hint)
     return _on_surface(shape, names, places.vertex, places.face, places.barycentric), places.distance
@@ -182,6 +183,23 @@ def load_landmarks(path: str | Path, shape: Shape, space: Space = "") -> tuple[L
         return _on_shape(found if space else _in_frame_of(shape, found, path.name), shape)
 
     return tables.read_by_suffix(path, dict.fromkeys(LANDMARK_READERS, read), "landmarks", _HINT)
+
+
+def landmarks_with_warnings(path: str | Path, shape: Shape, space: Space = "") -> Landmarks:
+    """As `load_landmarks`, which warns of landmarks that are missing, of turned ones, and of such as lie off the surface."""
+    found, furthest = load_landmarks(path, shape, space)
+    for note in found.notes:
+        warn(note)
+    warn_of_far_ones(shape, furthest)
+    return found
+
+
+def warn_of_far_ones(shape: Shape, furthest: float) -> None:
+    """Warn where the landmark that lies furthest from a shape is clearly not on it."""
+    if furthest > _FAR * shape.diagonal:
+        share = f"{100 * furthest / shape.diagonal:.0f} % of its diagonal"
+        name = shape.name or "the source"
+        warn(f"a landmark lies {furthest:.4g} from {name}, {share}: the nearest point of the surface was taken")
 
 
 def _in_frame_of(shape: Shape, found: LandmarkFile, name: str) -> LandmarkFile:

@@ -12,7 +12,7 @@ from meshmatch import ConfidenceRule
 from meshmatch.api import matching
 from meshmatch.api.results import MapPair
 from meshmatch.api.transfer import have_same_faces
-from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.errors import InputError, MeshmatchError, MeshmatchWarning, OptionError
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.picture import Look
@@ -320,3 +320,16 @@ def test_distances_of_surfaces_are_in_the_unit_of_the_file(sphere: Shape) -> Non
         meshmatch.measure_distance(one, other.verts)
     with pytest.raises(OptionError, match="invalid unit"):
         meshmatch.measure_distance(one, other, unit="mm")  # type: ignore[arg-type]
+
+
+def test_landmarks_that_are_missing_or_off_the_surface_are_told(
+    pair: tuple[Shape, Shape, VertexMap], tmp_path: Path
+) -> None:
+    sphere, other, true = pair
+    file = tmp_path / "marks.json"
+    file.write_text('{"first": 3, "gone": -1, "second": 5}')
+    with pytest.warns(MeshmatchWarning, match="landmark gone is vertex -1: left out"):
+        found = meshmatch.transfer_landmarks(sphere, other, file, true).data
+    assert found.names == ("first", "second")
+    with pytest.warns(MeshmatchWarning, match="the nearest point of the surface was taken"):
+        meshmatch.transfer_landmarks(sphere, other, 1.2 * sphere.verts[:2], true)
