@@ -8,12 +8,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import meshmatch
 from meshmatch.errors import MeshmatchWarning
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.gltf import INSTANCES, Document
+from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_morphs import read_morphs
 from meshmatch.shapes.moved_files import save_moved
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.textured_files import load_appearance
+from meshmatch.templates.location import bundled_folder
+from meshmatch.transfer.bake import colors_of_vertices
 from tests.shapes.morphs import SCALE, TURN, UP, write_morphs
 from tests.shapes.painted import CORNERS, FACES
 from tests.transfer.rigs import BEND, played, write_tube
@@ -135,3 +141,33 @@ def test_copies_of_a_mesh_become_one_mesh_each(tmp_path: Path) -> None:
             tmp_path / "moved.glb", path, Shape(SCALE * shape.verts, shape.faces), np.tile(np.eye(3), (16, 1, 1))
         )
     assert np.allclose(load_shape(tmp_path / "moved.glb").verts, SCALE * shape.verts)
+
+
+def mirrored(path: Path, scale: list[float]) -> Path:
+    """The textured sample with a scale of its node."""
+    editor = Editor(Document(path, (bundled_folder() / "samples" / "dancer-textured.glb").read_bytes()))
+    next(node for node in editor.json["nodes"] if "mesh" in node)["scale"] = scale
+    path.write_bytes(editor.to_bytes())
+    return path
+
+
+def test_a_mirrored_node_is_not_inside_out(tmp_path: Path) -> None:
+    """Its triangles run the other way around (glTF 2.0, 3.7.4), and each corner keeps its texture coordinates."""
+    plain, mirror = mirrored(tmp_path / "plain.glb", [1, 1, 1]), mirrored(tmp_path / "mirror.glb", [-1, 1, 1])
+    one, other = load_shape(plain), load_shape(mirror)
+    assert np.array_equal(other.faces, one.faces[:, ::-1])
+    np.testing.assert_allclose(other.verts, one.verts * [-1, 1, 1])
+    assert np.einsum("nd,nd->", other.verts[other.faces].mean(1) - other.verts.mean(0), other.face_vectors) > 0
+    coordinates = [load_appearance(path, shape).uv for path, shape in ((plain, one), (mirror, other))]
+    assert np.array_equal(coordinates[1], coordinates[0][:, ::-1])
+
+
+def test_a_mirrored_node_wears_its_texture(tmp_path: Path) -> None:
+    mirror = mirrored(tmp_path / "mirror.glb", [-1, 1, 1])
+    meshmatch.transfer_texture(mirror, mirror, options=meshmatch.BakeOptions(size=256)).save(tmp_path / "worn.glb")
+    assert np.array_equal(load_shape(tmp_path / "worn.glb").faces, load_shape(mirror).faces)
+    colors = []
+    for path in (mirror, tmp_path / "worn.glb"):
+        shape = load_shape(path)
+        colors.append(colors_of_vertices(shape, load_appearance(path, shape), shape, VertexMap.identity(shape))[:, :3])
+    assert np.abs(colors[0] - colors[1]).mean() < 0.02 < 0.2 < colors[0].std()

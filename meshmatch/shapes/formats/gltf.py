@@ -134,7 +134,7 @@ class Document:
             places += vertices + (corners // thirds if primitive.get("mode", _TRIANGLES) != _POINTS else 0)
             check_places(self.name, self.size, places)
             own = self.placed(node, primitive, place)
-            triangles = self.triangles(primitive)
+            triangles = self.drawn_triangles(node, primitive, place)
             if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(own)):
                 raise damaged(self.name, f"a face refers to vertex {int(triangles.max())} of {len(own)}")
             faces.append(triangles + seen)
@@ -157,8 +157,8 @@ class Document:
     def faces(self) -> Int[Ints, "F 3"]:
         """The triangles of `scene`, and nothing else of it."""
         found, seen = [NO_FACES], 0
-        for _, primitive, _ in self.primitives():
-            found.append(self.triangles(primitive) + seen)
+        for node, primitive, place in self.primitives():
+            found.append(self.drawn_triangles(node, primitive, place) + seen)
             seen += self.count(primitive["attributes"]["POSITION"])
         return np.vstack(found)
 
@@ -304,7 +304,18 @@ class Document:
             numbers = self.accessor(attributes[f"JOINTS_{k}"], whole=True)
             yield numbers, self.accessor(attributes[f"WEIGHTS_{k}"])
 
+    def mirrors(self, number: int, primitive: dict[str, Any], place: Floats) -> bool:
+        """Whether a node draws a primitive as in a mirror, which turns its triangles over (section 3.7.4); skins do not."""
+        skinned = "skin" in self.nodes[number] and "JOINTS_0" in primitive["attributes"]
+        return not skinned and bool(np.linalg.det(place[:3, :3]) < 0)
+
+    def drawn_triangles(self, number: int, primitive: dict[str, Any], place: Floats) -> Int[Ints, "F 3"]:
+        """The triangles of a primitive, counterclockwise from outside in the scene."""
+        found = self.triangles(primitive)
+        return found[:, ::-1] if self.mirrors(number, primitive, place) else found
+
     def triangles(self, primitive: dict[str, Any]) -> Int[Ints, "F 3"]:
+        """Those of a primitive as the file has them."""
         mode = primitive.get("mode", _TRIANGLES)
         if mode == _POINTS:
             return NO_FACES

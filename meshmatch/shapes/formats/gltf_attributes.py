@@ -51,9 +51,9 @@ def read_skin(path: Path, data: bytes) -> tuple[csr_array, tuple[str, ...]]:
 
 def _coordinates(document: Document) -> Floats | None:
     parts = [np.empty((0, 3, 2))]
-    for _, primitive, _ in document.primitives():
+    for node, primitive, place in document.primitives():
         attributes = primitive["attributes"]
-        faces = document.triangles(primitive)
+        faces = document.drawn_triangles(node, primitive, place)
         if len(faces) and "TEXCOORD_0" not in attributes:
             return None
         if len(faces):
@@ -109,10 +109,10 @@ class Look:
         colors: list[Floats | None] = []
         counts: list[int] = []
         numbers: dict[tuple[int, bool], int] = {}
-        for _, primitive, _ in self.document.primitives():
+        for node, primitive, place in self.document.primitives():
             counts.append(self.document.count(primitive["attributes"]["POSITION"]))
             colors.append(self.document.colors(primitive))
-            faces = self.document.triangles(primitive)
+            faces = self.document.drawn_triangles(node, primitive, place)
             uv = self._coordinates(primitive) if len(faces) else None
             key = primitive.get("material", -1), uv is not None
             if key not in self.materials:

@@ -61,6 +61,8 @@ def dressed(
         for k, part in parts.items():
             faces = document.triangles(part)
             corners = uv[seen : seen + len(faces)]
+            if document.mirrors(number, part, document.world[number]):  # they are in the order of the scene's triangles
+                corners = corners[:, ::-1]
             seen += len(faces)
             if not len(faces):
                 continue
