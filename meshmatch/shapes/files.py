@@ -314,6 +314,8 @@ def as_shape(source: ShapeLike, name: str = "") -> Shape:
         return source
     if isinstance(source, str | os.PathLike):
         return load_shape(os.fspath(source))
+    if isinstance(held := getattr(source, "shape", None), Shape):  # a fit has points, but in a frame of its own
+        raise InputError(f"cannot make a shape of {type(source).__name__}", f"pass its .shape, {held.V} vertices")
     found = None if isinstance(source, np.ndarray | tuple | list) else arrays_of(source, name)
     if found is not None:
         return _from_arrays(found.verts, found.faces, name, found.colors)

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints, off_torch
-from meshmatch.errors import InputError
-from meshmatch.shapes.formats import fan, joined_colors, painted, runs
+from meshmatch.errors import InputError, warn
+from meshmatch.shapes.formats import colors_of_faces, fan, joined_colors, painted, runs
 from meshmatch.shapes.formats.polygons import triangles_of
 
 HINT = "pass a path, a Shape, (vertices, faces), an (N, 3) array, or an object with .vertices and .faces"
@@ -76,7 +76,7 @@ def arrays_of(source: Any, name: str) -> Arrays | None:
     points = _value(source, "vertices", "points")
     if points is None:
         return None
-    return Arrays(points, _triangles(points, _faces(source, label), label), _colors(source))
+    return Arrays(points, _triangles(points, _faces(source, label), label), _colors(source, label))
 
 
 def as_faces(values: Any, points: Any, label: str) -> Any:
@@ -291,9 +291,13 @@ def _batch(source: Any, label: str) -> Arrays:
     return Arrays(source.points_packed())
 
 
-def _colors(source: Any) -> Float[Floats, "V 4"] | None:
-    """Colors of the vertices, as trimesh and Open3D have them."""
+def _colors(source: Any, label: str) -> Float[Floats, "V 4"] | None:
+    """Colors of the vertices, as trimesh and Open3D have them; the mean of those around where trimesh has them of faces."""
     visual: Any = getattr(source, "visual", None)
+    if getattr(visual, "kind", None) == "face":
+        warn(f"{label} has colors of faces: each vertex gets the mean of those around it")
+        own = np.repeat(np.asarray(visual.face_colors, np.float64) / 255.0, 3, axis=0)
+        return colors_of_faces(len(source.vertices), np.asarray(source.faces).ravel(), own)
     if getattr(visual, "kind", None) == "vertex" and len(visual.vertex_colors):  # a cloud of trimesh has none
         return np.asarray(visual.vertex_colors, np.float64) / 255.0
     for has, name in (("has_vertex_colors", "vertex_colors"), ("has_colors", "colors")):

@@ -12,7 +12,7 @@ import torch
 import trimesh
 
 from meshmatch.arrays import as_numbers
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, MeshmatchWarning
 from meshmatch.shapes.files import as_shape, save_shape
 from meshmatch.shapes.shape import Shape
 
@@ -255,3 +255,18 @@ def test_reading_a_mesh_loads_no_trimesh(tmp_path: Path, cube: Shape) -> None:
     )
     words = [sys.executable, "-c", code, str(tmp_path / "a.ply"), str(tmp_path / "a.stl")]
     assert "[]" in subprocess.run(words, capture_output=True, text=True, check=True).stdout
+
+
+def test_colors_of_a_trimeshs_faces_are_those_of_vertices(cube: Shape) -> None:
+    mesh = trimesh.Trimesh(cube.verts, cube.faces, process=False)
+    mesh.visual.face_colors = np.tile([255, 0, 0, 255], (cube.F, 1))
+    with pytest.warns(MeshmatchWarning, match="the mean of those around"):
+        found = as_shape(mesh)
+    assert found.colors == pytest.approx(np.tile([1.0, 0.0, 0.0, 1.0], (cube.V, 1)))
+
+
+def test_what_has_a_shape_is_none(cube: Shape) -> None:
+    """A fit has points and faces, but in the frame of its template."""
+    with pytest.raises(InputError, match="cannot make a shape") as told:
+        as_shape(thing(shape=cube, points=cube.verts, faces=cube.faces))
+    assert told.value.hint.startswith("pass its .shape")
