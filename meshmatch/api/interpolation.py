@@ -319,6 +319,8 @@ def _steps(
         frame = blend.frame(moment) if place == "files" else fits[0].frame
         name = f"{number:03d}"
         placed = frame.undo(verts)
+        if binding is not None and moment == blend.times[0]:  # rounding aside it is where it was
+            placed = shape_of(fits[0]).original.verts
         shape = Shape(placed, fits[0].shape.faces, name) if binding is None else binding.shape(placed, name)
         if matcher.progress is not None:
             matcher.progress("frames", "sequence", (number + 1) / len(moments))

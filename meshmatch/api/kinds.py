@@ -201,7 +201,9 @@ def choose_model(
     chosen = settled or models[min(rows, key=lambda row: readings[row].sum())].load()
     by = "" if chosen.card.name == common else f" (model {chosen.card.name})"
     words = [
-        f"{shape.name}: {each.kind}{by}" if each.kind else f"{shape.name} {_unsure(shape, each, common + by)}"
+        f"{shape.name or 'the shape'}: {each.kind}{by}"
+        if each.kind
+        else f"{shape.name} {_unsure(shape, each, common + by)}"
         for shape, each in zip(shapes, found, strict=True)
     ]
     usable = [

@@ -454,11 +454,12 @@ class Matcher:
         """The fit with its shape, and with what its user should know."""
         from meshmatch.api.apart import may_be_parts
 
-        notes = [f"{clean.shape.name}: {note}" for note in clean.notes]
+        whose = f"{clean.shape.name}: " if clean.shape.name else ""
+        notes = [f"{whose}{note}" for note in clean.notes]
         if config.for_model(self.model).refine != config.refine:
             notes.append(f"model {self.model.card.name} is pointwise and has no nodes: its code was refined instead")
         if fit.verdict == "poor" and not config.try_harder and may_be_parts(clean, config):
-            notes.append(f"{clean.shape.name}: --try-harder (in Python FitConfig(try_harder=True)) searches for longer")
+            notes.append(f"{whose}--try-harder (in Python FitConfig(try_harder=True)) searches for longer")
         return replace(fit, repaired=clean, left_out=clean.left_out, notes=(*notes, *fit.notes))
 
     def _agreed(

@@ -129,20 +129,20 @@ def load_truth(
     """True points on source and target, where they are known."""
     import numpy as np
 
-    from meshmatch.shapes.tables import load_pairs, load_points
+    from meshmatch.shapes import tables
 
     if points is not None:
-        return load_points(points[0]), load_points(points[1])
+        return tables.load_points(points[0]), tables.load_points(points[1])
     if truth is None:
         return None
-    try:
-        return load_pairs(truth)
-    except InputError:
-        column = load_points(truth)  # its error is the one to tell: a column is the simpler form
+    columns = tables.load_truth(truth).T
+    if len(columns) == 2:
+        return columns[0].copy(), columns[1].copy()
+    (column,) = columns
     if len(column) != source.V:
         hint = "ground truth in one column needs an entry for every vertex of the source"
         raise InputError(f"{truth.name} has {len(column)} entries, but {source.name} has {source.V} vertices", hint)
-    return np.arange(source.V), column
+    return np.arange(source.V), column.copy()
 
 
 class Options:

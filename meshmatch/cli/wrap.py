@@ -73,7 +73,7 @@ def wrap(
     numbers = {"mean": apart.mean(), "95 %": np.quantile(apart, 0.95), "worst": apart.max()} if len(apart) else {}
     told = ", ".join(f"{what} {value:.4g}" for what, value in numbers.items())
     kept = f"; {len(np.unique(rows))} vertices kept their shape" if len(rows) else ""
-    console.say(f"distance to {names[1]} (its size is {np.sqrt(b.area):.4g}): {told}{kept}")
+    console.say(f"distance to {names[1]} (whose sqrt(area) is {np.sqrt(b.area):.4g}): {told}{kept}")
     if binding is not None and output.suffix.lower() == ".glb":
         console.say(f"the {len(binding.rig.joints)} joints of {names[0]} have moved along")
     if plan.is_turned(binding, result.turn):

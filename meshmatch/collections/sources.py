@@ -57,8 +57,11 @@ def find_sources(
     counts = Counter(source.name for source in found)
     for source in found:
         if counts[source.name] > 1:
-            both = " and ".join(each.file for each in found if each.name == source.name)
-            raise InputError(f"two shapes are called {source.name}: {both}", "rename one, or put them into two folders")
+            alike = [each for each in found if each.name == source.name]
+            apart = len({each.folder.location for each in alike}) > 1
+            hint = "give the folder that both folders are in, or rename one" if apart else "rename one"
+            both = " and ".join(each.path for each in alike)
+            raise InputError(f"two shapes are called {source.name}: {both}", hint)
     return found, left_out
 
 

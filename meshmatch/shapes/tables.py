@@ -36,6 +36,7 @@ from meshmatch.shapes.input_files import check_memory, existing, read_npy, read_
 T = TypeVar("T")
 _PAIRS = "one pair a line: a vertex of the source, then a vertex of the target, counted from 0"
 _POINTS = "one vertex a line, counted from 0"
+_TRUTH = f"{_PAIRS}; or for each vertex of the source the target's alone"
 # What a damaged file raises in the readers of the standard library and NumPy.
 _DAMAGE = (ValueError, TypeError, LookupError, ArithmeticError, RecursionError, EOFError, StopIteration, csv.Error)
 DECIMAL_COMMA = "for a decimal comma: put semicolons or tabs between the cells (0,5;1,25), or write points (0.5)"
@@ -392,7 +393,7 @@ def check_suffix(path: str | Path, suffixes: Iterable[str], what: str) -> str:
         return ".glb"
     if suffix not in suffixes:
         given = f"'{suffix}'" if suffix else "a name without a suffix"
-        unknown = f"{path.name}: {given} is not a format for {what}"
+        unknown = f"{path.name or path}: {given} is not a format for {what}"
         raise OptionError(unknown, f"end the name in one of {' '.join(suffixes)}")
     return suffix
 
@@ -470,28 +471,34 @@ def short_floats(values: np.ndarray) -> list[Any]:
 
 def load_pairs(path: str | Path) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
     """Read pairs: vertices of the source, and the same N points on the target; `InputError` as `load_points`."""
-    first, second = _vertices(Path(path), 2, _PAIRS).T.copy()
+    first, second = _vertices(Path(path), (2,), _PAIRS).T.copy()
     return first, second
 
 
 def load_points(path: str | Path) -> Int[Ints, " N"]:
     """Read a list of vertices of one shape; `InputError` if the file is missing or empty, or is none."""
-    return _vertices(Path(path), 1, _POINTS)[:, 0].copy()
+    return _vertices(Path(path), (1,), _POINTS)[:, 0].copy()
 
 
-def _vertices(path: Path, columns: int, hint: str) -> Ints:
+def load_truth(path: str | Path) -> Int[Ints, "N columns"]:
+    """Read pairs as `load_pairs`, in two columns, or for each vertex of the source its partner, in one."""
+    return _vertices(Path(path), (1, 2), _TRUTH)
+
+
+def _vertices(path: Path, columns: tuple[int, ...], hint: str) -> Ints:
     """(N, columns) numbers of vertices."""
     suffix = path.suffix.lower()
     read = read_npy if suffix == ".npy" else lambda path: read_table(path, comments="ends", whole=True).numbers()[1]
     rows = read_by_suffix(path, {suffix: lambda path: whole(read(path))}, "vertices", hint)
-    if rows.ndim == 1 and columns == 1:
+    if rows.ndim == 1 and 1 in columns:
         rows = rows[:, None]
     if rows.size == 0:
         raise InputError(f"{path.name} holds no vertex", hint)
-    if rows.ndim != 2 or rows.shape[1] != columns:
+    if rows.ndim != 2 or rows.shape[1] not in columns:
         shape = " x ".join(str(n) for n in rows.shape)
-        comma = f"; {DECIMAL_COMMA}" if columns == 1 and rows.shape[1:] == (2,) else ""
-        raise InputError(f"{path.name} has {shape} numbers, not {columns} a line", hint + comma)
+        comma = f"; {DECIMAL_COMMA}" if columns == (1,) and rows.shape[1:] == (2,) else ""
+        asked = " or ".join(str(n) for n in columns)
+        raise InputError(f"{path.name} has {shape} numbers, not {asked} a line", hint + comma)
     if rows.min() < 0:
         raise InputError(f"{path.name} names vertex {int(rows.min())}", hint)
     return rows

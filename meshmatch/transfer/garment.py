@@ -112,7 +112,9 @@ class _Body:
         away = float(np.median(self.tree.query(garment.verts[garment.valid], workers=workers)[0]))
         if away > _FURTHEST * self.size:
             far = f"{garment.name or 'the garment'} is not on {self.name}: it is {away:.4g} away from it"
-            raise InputError(far, f"both need the same place and unit; {self.name} is {2 * self.size:.4g} in size")
+            raise InputError(
+                far, f"both need the same place and unit; the sqrt(area) of {self.name} is {self.size:.4g}"
+            )
         places, jacobians = np.empty((garment.V, 3)), np.empty((garment.V, 3, 3))
         for low in range(0, garment.V, _CHUNK):
             asked = garment.verts[low : low + _CHUNK]

@@ -208,6 +208,7 @@ def test_matchers_refuse_other_types_with_a_hint(matcher: Matcher, sphere: Shape
     ("landmarks", "told"),
     [
         (([0], [1], [2]), "two lists of vertices, not 3"),
+        ([(0, 1), (2, 3)], "not a list of pairs"),
         (([0, 1], [0]), "in pairs"),
         (([0.5], [1]), "lists of vertex numbers"),
         (([9999], [1]), "vertex 9999 is not on"),

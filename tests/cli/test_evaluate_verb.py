@@ -139,7 +139,7 @@ def test_units_draw_different_curves(evaluate: Callable[[str], Answer]) -> None:
     [
         ("--truth short.txt", "3 entries"),
         ("--truth none.txt", "none.txt"),
-        ("--truth wide.txt", "not 1 a line"),
+        ("--truth wide.txt", "not 1 or 2 a line"),
         ("--truth outside.txt", "not among the 642 vertices"),
         ("--truth short.txt --points short.txt short.txt", "choose one"),
         ("--curve c.png", "needs ground truth"),
