@@ -32,6 +32,8 @@ from meshmatch.fields.shape_functions import ShapeFunctions
 # (points (B, P, 3), code (B, D)) -> displacements (B, P, 3); what happens to a point depends on no other point.
 Motion = Callable[[Float[torch.Tensor, "B P 3"], Float[torch.Tensor, "B D"]], Float[torch.Tensor, "B P 3"]]
 TURN_ROWS = 3
+# So many codes at a time: what a network makes of more points does not stay in the processor's cache.
+CODES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,12 +235,14 @@ class PointwiseField(Brief):
 
     def displacement(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B P 3"]:
         code, turn = unpack(rows, self.D)
-        u = self.motion(self.points.expand(len(code), -1, -1), code)
+        u = torch.cat([self.motion(self.points.expand(len(part), -1, -1), part) for part in code.split(CODES)])
         return u + (self.points + u) @ turn
 
     def deformation_gradient(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B G 3 3"]:
         code, turn = unpack(rows, self.D)
-        F = value_and_jacobian(self.motion, self.gradient_points.expand(len(code), -1, -1), code)[1]
+        at = self.gradient_points
+        parts = (value_and_jacobian(self.motion, at.expand(len(part), -1, -1), part)[1] for part in code.split(CODES))
+        F = torch.cat(list(parts))
         F = F + torch.eye(3, dtype=F.dtype, device=F.device)
         return F + turn.transpose(1, 2)[:, None] @ F
 
