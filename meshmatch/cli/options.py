@@ -135,14 +135,14 @@ def load_truth(
         return tables.load_points(points[0]), tables.load_points(points[1])
     if truth is None:
         return None
-    columns = tables.load_truth(truth).T
-    if len(columns) == 2:
-        return columns[0].copy(), columns[1].copy()
-    (column,) = columns
+    rows = tables.load_truth(truth)
+    if rows.shape[1] == 2:
+        return rows[:, 0], rows[:, 1]
+    column = rows[:, 0]
     if len(column) != source.V:
         hint = "ground truth in one column needs an entry for every vertex of the source"
         raise InputError(f"{truth.name} has {len(column)} entries, but {source.name} has {source.V} vertices", hint)
-    return np.arange(source.V), column.copy()
+    return np.arange(source.V), column
 
 
 class Options:

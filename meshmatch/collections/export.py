@@ -116,7 +116,7 @@ class Export:
     def into(self, output: str | Path) -> Export:
         """The same; `OptionError` for a folder that is named as one of the files would be."""
         path = as_path(output)
-        if (ending := path.suffix.lower()) in (*MESHES, *TABLES):
+        if (ending := path.suffix.lower()) in (*MESHES, *TABLES) and not path.is_dir():
             what = f"{path.name} is to be a folder, and is named as a file"
             raise OptionError(what, f"name the folder {path.stem}, and the files --format {ending}")
         return self

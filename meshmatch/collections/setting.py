@@ -18,6 +18,7 @@ from meshmatch.fitting.alike import as_part
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import may_show_part
+from meshmatch.fitting.judge.calibration import CALIBRATION, calibration_of
 from meshmatch.fitting.without_model import fit_without_model
 from meshmatch.maps.fit_files import StoredFit, read_fit
 from meshmatch.maps.places import PlacedFit
@@ -203,9 +204,11 @@ class Setting:
         return dict(json.loads(json.dumps(chosen)))
 
     def digest(self) -> str:
-        """Of all that decides how a shape is fitted."""
-        compared = "" if self.learned else "compared"
-        return digest_of(self.template_hash, json.dumps(self.choices(), sort_keys=True) + compared)
+        """Of all that decides how a shape is fitted, and by what weights the fit is judged, where these are no people's."""
+        how = "" if self.learned else "compared"
+        if self.learned and (judged := calibration_of(self.trained.card.category)) != CALIBRATION:
+            how = judged.date
+        return digest_of(self.template_hash, json.dumps(self.choices(), sort_keys=True) + how)
 
 
 def template_at(store: Store, file: str = TEMPLATE) -> Template:

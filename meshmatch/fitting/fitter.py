@@ -279,8 +279,8 @@ def landmark_places(clean: Sequence[Repaired], landmarks: Sequence[ArrayLike]) -
 
     `OptionError` if these are not pairs of vertices, or a shape does not have one.
     """
-    if isinstance(landmarks, list) and landmarks and all(isinstance(each, tuple) for each in landmarks):
-        raise OptionError("landmarks must be two lists of vertices, not a list of pairs", "write list(zip(*pairs))")
+    if isinstance(landmarks, list) and all(isinstance(each, tuple) and len(each) == 2 for each in landmarks):
+        raise OptionError("landmarks must be two lists of vertices, not a list of pairs", "write tuple(zip(*pairs))")
     if len(landmarks) != 2:
         raise OptionError(f"landmarks must be two lists of vertices, not {len(landmarks)}", _HINT)
     places = []

@@ -163,7 +163,7 @@ def covering_balls(
     across -= (dot(across, side) / np.maximum(squared[rows, longest], 1e-300))[:, None] * side
     length, height = np.sqrt(squared[rows, longest]), np.sqrt(squared_lengths(across))
     least = np.maximum(0.5 * length.mean(), 2 * height) + 1e-300
-    count = np.maximum(np.ceil(length / least), 1).astype(np.int64)
+    count = np.maximum(np.ceil(length / least - 1e-9), 1).astype(np.int64)  # of even triangles one
     item = np.repeat(rows, count)
     share = (np.arange(len(item)) - (np.cumsum(count) - count)[item] + 0.5) / count[item]
     center = start[item] + share[:, None] * side[item] + 0.5 * across[item]

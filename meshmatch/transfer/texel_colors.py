@@ -29,6 +29,7 @@ _FEW = 200_000  # faces; on larger meshes edges are short enough to be straight
 # A place this far off, in sizes of its triangle's image, is searched again from the other corners. Set by hand.
 _FAR = 0.1
 _BESIDE = 0.499  # of a texel: what a color between texels is mixed of, but for what hardly counts
+_POINTS = 2**18  # at a time, along triangles that are lines
 
 
 class MaterialSampler:
@@ -124,23 +125,22 @@ def known_texels(material: Material, uv: Floats) -> Bools | None:
     # Triangles that hold no center of a texel still name some; they count where nothing near is known.
     at = _texels_at(corners[small].mean(axis=1), material, known.shape)
     alone = ~maximum_filter(known, 3)[at]
-    points = _along(corners[small][alone])
-    if len(points) > 4.0 * known.size + 64.0 * len(uv):
+    thin = corners[small][alone]
+    sides = thin[:, [1, 2, 0]] - thin
+    rows, longest = np.arange(len(thin)), np.square(sides).sum(axis=2).argmax(axis=1)
+    start, side = thin[rows, longest], sides[rows, longest]
+    ends = np.cumsum(np.ceil(2.0 * np.abs(side).max(axis=1)).astype(np.int64) + 1)  # points half a texel apart
+    if len(ends) and ends[-1] > known.size + 64 * len(uv):
         return None
-    for offset in itertools.product((-_BESIDE, _BESIDE), repeat=2):
-        known[_texels_at(points + offset, material, known.shape)] = True
+    for low in range(0, int(ends[-1]) if len(ends) else 0, _POINTS):
+        point = np.arange(low, min(low + _POINTS, int(ends[-1])))
+        row = np.searchsorted(ends, point, side="right")
+        first, count = np.where(row > 0, ends[row - 1], 0), np.diff(ends, prepend=0)[row]
+        share = (point - first) / np.maximum(count - 1, 1)
+        points = start[row] + share[:, None] * side[row]
+        for offset in itertools.product((-_BESIDE, _BESIDE), repeat=2):
+            known[_texels_at(points + offset, material, known.shape)] = True
     return known
-
-
-def _along(corners: Floats) -> Floats:
-    """(M, 2) points along the longest sides of triangles (N, 3, 2) that are points or lines, half a texel apart."""
-    sides = corners[:, [1, 2, 0]] - corners
-    rows, longest = np.arange(len(corners)), np.square(sides).sum(axis=2).argmax(axis=1)
-    start, side = corners[rows, longest], sides[rows, longest]
-    count = np.ceil(2.0 * np.abs(side).max(axis=1)).astype(np.int64) + 1
-    row = np.repeat(rows, count)
-    share = (np.arange(len(row)) - (np.cumsum(count) - count)[row]) / np.maximum(count - 1, 1)[row]
-    return np.asarray(start[row] + share[:, None] * side[row])
 
 
 def _texels_at(points: Floats, material: Material, shape: tuple[int, ...]) -> tuple[Ints, Ints]:

@@ -305,9 +305,11 @@ class Document:
             yield numbers, self.accessor(attributes[f"WEIGHTS_{k}"])
 
     def mirrors(self, number: int, primitive: dict[str, Any], place: Floats) -> bool:
-        """Whether a node draws a primitive as in a mirror, which turns its triangles over (section 3.7.4); skins do not."""
-        skinned = "skin" in self.nodes[number] and "JOINTS_0" in primitive["attributes"]
-        return not skinned and bool(np.linalg.det(place[:3, :3]) < 0)
+        """Whether a node, or most joints of its skin, draws a primitive as in a mirror, which turns its triangles over (3.7.4)."""
+        node = self.nodes[number]
+        skinned = "skin" in node and "JOINTS_0" in primitive["attributes"]
+        moves = self.bones(node["skin"]) if skinned else place[None]
+        return bool((np.linalg.det(moves[:, :3, :3]) < 0).mean() > 0.5)
 
     def drawn_triangles(self, number: int, primitive: dict[str, Any], place: Floats) -> Int[Ints, "F 3"]:
         """The triangles of a primitive, counterclockwise from outside in the scene."""
