@@ -305,7 +305,7 @@ class Document:
             yield numbers, self.accessor(attributes[f"WEIGHTS_{k}"])
 
     def mirrors(self, number: int, primitive: dict[str, Any], place: Floats) -> bool:
-        """Whether a node, or most joints of its skin, draws a primitive as in a mirror, which turns its triangles over (3.7.4)."""
+        """Whether a node, or most joints of its skin, draws a primitive as in a mirror: its triangles turn over (3.7.4)."""
         node = self.nodes[number]
         skinned = "skin" in node and "JOINTS_0" in primitive["attributes"]
         moves = self.bones(node["skin"]) if skinned else place[None]
