@@ -129,13 +129,13 @@ def load_truth(
     """True points on source and target, where they are known."""
     import numpy as np
 
-    from meshmatch.shapes import tables
+    from meshmatch.shapes import vertex_lists
 
     if points is not None:
-        return tables.load_points(points[0]), tables.load_points(points[1])
+        return vertex_lists.load_points(points[0]), vertex_lists.load_points(points[1])
     if truth is None:
         return None
-    rows = tables.load_truth(truth)
+    rows = vertex_lists.load_truth(truth)
     if rows.shape[1] == 2:
         return rows[:, 0], rows[:, 1]
     column = rows[:, 0]
@@ -282,7 +282,7 @@ class PairOptions(FitOptions):
 
     def pairs(self) -> tuple[Ints, Ints] | None:
         """Vertices that are known to correspond."""
-        from meshmatch.shapes.tables import load_pairs
+        from meshmatch.shapes.vertex_lists import load_pairs
 
         return None if self.known_pairs is None else load_pairs(self.known_pairs)
 

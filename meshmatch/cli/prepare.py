@@ -85,7 +85,7 @@ def prepare(
     from meshmatch.api.prepare import PrepareConfig
     from meshmatch.api.prepare import prepare as prepare_shapes
     from meshmatch.render.compose import compose_shapes
-    from meshmatch.shapes.tables import load_points
+    from meshmatch.shapes.vertex_lists import load_points
     from meshmatch.templates.make import NodeConfig
 
     console = Console(quiet)

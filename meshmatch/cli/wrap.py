@@ -99,7 +99,7 @@ def _members(file: Path | None, base: "meshmatch.Shape") -> "Ints":
     """The vertices that a file names, alone or in parts."""
     import numpy as np
 
-    from meshmatch.shapes.tables import load_points
+    from meshmatch.shapes.vertex_lists import load_points
     from meshmatch.transfer.label_files import load_labels
 
     if file is None:

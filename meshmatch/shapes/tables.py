@@ -1,14 +1,9 @@
 """Files of tables: what separates the cells of a text, as spreadsheets, NumPy, pandas, R and people write it, whether the
-decimal mark is a point or a comma, which cells are missing; the choice of a reader by suffix, and errors in one line; lists
-of known vertices: pairs of two shapes (landmarks, a partial truth), or points of one.
+decimal mark is a point or a comma, which cells are missing; the choice of a reader by suffix, and errors in one line.
 
 A decimal comma is read where something else separates the cells (``0,5;1,25``, also a tab or spaces), where it is in
 quotes, and in a single column whose digits are no second column of whole numbers. Where both could be meant, readers
 refuse the table and say so.
-
-The text of a list of vertices has one pair, or one vertex, a line: numbers separated by spaces, tabs, commas or semicolons;
-``#`` begins a comment; a first line of words is taken for a header. ``.npy`` files hold the same as an array of whole
-numbers. Vertices are counted from 0, in the order of the shape's file.
 """
 
 from __future__ import annotations
@@ -28,15 +23,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from meshmatch import blender
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.outputs import as_path, plain_text
-from meshmatch.shapes.input_files import check_memory, existing, read_npy, read_text
+from meshmatch.shapes.input_files import check_memory, existing, read_text
 
 T = TypeVar("T")
-_PAIRS = "one pair a line: a vertex of the source, then a vertex of the target, counted from 0"
-_POINTS = "one vertex a line, counted from 0"
-_TRUTH = f"{_PAIRS}; or for each vertex of the source the target's alone"
 # What a damaged file raises in the readers of the standard library and NumPy.
 _DAMAGE = (ValueError, TypeError, LookupError, ArithmeticError, RecursionError, EOFError, StopIteration, csv.Error)
 DECIMAL_COMMA = "for a decimal comma: put semicolons or tabs between the cells (0,5;1,25), or write points (0.5)"
@@ -467,38 +459,3 @@ def short_floats(values: np.ndarray) -> list[Any]:
     found = floats.astype(object)
     found[np.isnan(floats)] = None
     return list(found.tolist())
-
-
-def load_pairs(path: str | Path) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
-    """Read pairs: vertices of the source, and the same N points on the target; `InputError` as `load_points`."""
-    first, second = _vertices(Path(path), (2,), _PAIRS).T.copy()
-    return first, second
-
-
-def load_points(path: str | Path) -> Int[Ints, " N"]:
-    """Read a list of vertices of one shape; `InputError` if the file is missing or empty, or is none."""
-    return _vertices(Path(path), (1,), _POINTS)[:, 0].copy()
-
-
-def load_truth(path: str | Path) -> Int[Ints, "N columns"]:
-    """Read pairs as `load_pairs`, in two columns, or for each vertex of the source its partner, in one."""
-    return _vertices(Path(path), (1, 2), _TRUTH)
-
-
-def _vertices(path: Path, columns: tuple[int, ...], hint: str) -> Ints:
-    """(N, columns) numbers of vertices."""
-    suffix = path.suffix.lower()
-    read = read_npy if suffix == ".npy" else lambda path: read_table(path, comments="ends", whole=True).numbers()[1]
-    rows = read_by_suffix(path, {suffix: lambda path: whole(read(path))}, "vertices", hint)
-    if rows.ndim == 1 and 1 in columns:
-        rows = rows[:, None]
-    if rows.size == 0:
-        raise InputError(f"{path.name} holds no vertex", hint)
-    if rows.ndim != 2 or rows.shape[1] not in columns:
-        shape = " x ".join(str(n) for n in rows.shape)
-        comma = f"; {DECIMAL_COMMA}" if columns == (1,) and rows.shape[1:] == (2,) else ""
-        asked = " or ".join(str(n) for n in columns)
-        raise InputError(f"{path.name} has {shape} numbers, not {asked} a line", hint + comma)
-    if rows.min() < 0:
-        raise InputError(f"{path.name} names vertex {int(rows.min())}", hint)
-    return rows

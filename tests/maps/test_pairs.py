@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
-from meshmatch.shapes.tables import load_pairs, load_points
+from meshmatch.shapes.vertex_lists import load_pairs, load_points
 
 
 @pytest.mark.parametrize(

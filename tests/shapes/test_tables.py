@@ -9,7 +9,8 @@ import pytest
 
 from meshmatch.errors import InputError, MeshmatchWarning
 from meshmatch.maps.files import load_map
-from meshmatch.shapes.tables import is_missing, load_pairs, load_points, number, read_table, whole
+from meshmatch.shapes.tables import is_missing, number, read_table, whole
+from meshmatch.shapes.vertex_lists import load_pairs, load_points
 from meshmatch.transfer.label_files import load_labels
 from meshmatch.transfer.landmarks import load_landmarks
 from meshmatch.transfer.value_files import load_values

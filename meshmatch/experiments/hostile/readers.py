@@ -31,8 +31,8 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.parts import Parts
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.tables import load_pairs, load_points
 from meshmatch.shapes.textured_files import find_appearance, load_coordinates
+from meshmatch.shapes.vertex_lists import load_pairs, load_points
 from meshmatch.templates.prepared_folder import (
     frame_of,
     has_sides,

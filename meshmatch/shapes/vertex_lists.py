@@ -1,0 +1,54 @@
+"""Lists of known vertices: pairs of two shapes (landmarks, a truth), or points of one.
+
+The text has one pair, or one vertex, a line: numbers separated by spaces, tabs, commas or semicolons; ``#`` begins a
+comment; a first line of words is taken for a header. ``.npy`` files hold the same as an array of whole numbers. Vertices are
+counted from 0, in the order of the shape's file.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from meshmatch.arrays import Int, Ints
+from meshmatch.errors import InputError
+from meshmatch.shapes.input_files import read_npy
+from meshmatch.shapes.tables import DECIMAL_COMMA, read_by_suffix, read_table, whole
+
+_PAIRS = "one pair a line: a vertex of the source, then a vertex of the target, counted from 0"
+_POINTS = "one vertex a line, counted from 0"
+_TRUTH = f"{_PAIRS}; or for each vertex of the source the target's alone"
+
+
+def load_pairs(path: str | Path) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
+    """Read pairs: vertices of the source, and the same N points on the target; `InputError` as `load_points`."""
+    first, second = _vertices(Path(path), (2,), _PAIRS).T.copy()
+    return first, second
+
+
+def load_points(path: str | Path) -> Int[Ints, " N"]:
+    """Read a list of vertices of one shape; `InputError` if the file is missing or empty, or is none."""
+    return _vertices(Path(path), (1,), _POINTS)[:, 0].copy()
+
+
+def load_truth(path: str | Path) -> Int[Ints, "N columns"]:
+    """Read pairs as `load_pairs`, in two columns, or for each vertex of the source its partner, in one."""
+    return _vertices(Path(path), (1, 2), _TRUTH)
+
+
+def _vertices(path: Path, columns: tuple[int, ...], hint: str) -> Ints:
+    """(N, columns) numbers of vertices."""
+    suffix = path.suffix.lower()
+    read = read_npy if suffix == ".npy" else lambda path: read_table(path, comments="ends", whole=True).numbers()[1]
+    rows = read_by_suffix(path, {suffix: lambda path: whole(read(path))}, "vertices", hint)
+    if rows.ndim == 1 and 1 in columns:
+        rows = rows[:, None]
+    if rows.size == 0:
+        raise InputError(f"{path.name} holds no vertex", hint)
+    if rows.ndim != 2 or rows.shape[1] not in columns:
+        shape = " x ".join(str(n) for n in rows.shape)
+        comma = f"; {DECIMAL_COMMA}" if columns == (1,) and rows.shape[1:] == (2,) else ""
+        asked = " or ".join(str(n) for n in columns)
+        raise InputError(f"{path.name} has {shape} numbers, not {asked} a line", hint + comma)
+    if rows.min() < 0:
+        raise InputError(f"{path.name} names vertex {int(rows.min())}", hint)
+    return rows
