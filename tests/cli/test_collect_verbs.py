@@ -230,6 +230,8 @@ def test_what_cannot_be_exported(fits: Path, run: Run, tmp_path: Path, monkeypat
     named = run("export", fits, "-o", tmp_path / "points.npz")
     assert named.status == 1 and "name the folder points, and the files --format .npz" in named.err
     assert not (tmp_path / "points.npz").exists()
+    (tmp_path / "made.obj").mkdir()
+    assert run("export", fits, "-o", tmp_path / "made.obj").status == 0  # a folder already
     out.mkdir()
     (out / "mine.txt").write_text("kept")
     answer = run("export", fits, "-o", out)

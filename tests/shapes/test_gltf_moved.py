@@ -171,3 +171,21 @@ def test_a_mirrored_node_wears_its_texture(tmp_path: Path) -> None:
         shape = load_shape(path)
         colors.append(colors_of_vertices(shape, load_appearance(path, shape), shape, VertexMap.identity(shape))[:, :3])
     assert np.abs(colors[0] - colors[1]).mean() < 0.02 < 0.2 < colors[0].std()
+
+
+def test_a_skin_below_a_mirrored_node_is_not_inside_out(tmp_path: Path) -> None:
+    """Its joints say where its vertices are, not its node."""
+    path = tmp_path / "tube.glb"
+    write_tube(path)
+    plain = load_shape(path)
+    editor = Editor(Document(path, path.read_bytes()))
+    next(node for node in editor.json["nodes"] if "skin" in node)["scale"] = [-1, 1, 1]
+    path.write_bytes(editor.to_bytes())
+    assert np.array_equal(load_shape(path).faces, plain.faces)
+    scene = editor.json["scenes"][0]
+    editor.json["nodes"].append({"children": scene["nodes"], "scale": [-1, 1, 1]})
+    scene["nodes"] = [len(editor.json["nodes"]) - 1]
+    path.write_bytes(editor.to_bytes())
+    mirror = load_shape(path)
+    np.testing.assert_allclose(mirror.verts, plain.verts * [-1, 1, 1], atol=1e-6)
+    assert np.array_equal(mirror.faces, plain.faces[:, ::-1])
