@@ -67,10 +67,21 @@ def write_document(
     if path.suffix == ".gltf":
         path.write_text(json.dumps(made))
         return
-    text = json.dumps(made).encode()
+    path.write_bytes(glb(made, body))
+
+
+def glb(document: dict[str, Any], body: bytes) -> bytes:
+    """The glb of a document and its buffer, as a stranger's program may have made it, warnings and all."""
+    text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     head = b"glTF" + np.array([2, 28 + len(text) + len(body), len(text)], "<u4").tobytes() + b"JSON"
-    path.write_bytes(head + text + np.array([len(body)], "<u4").tobytes() + b"BIN\0" + body)
+    return head + text + np.array([len(body)], "<u4").tobytes() + b"BIN\0" + body
+
+
+def parts(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The document and the buffer of a glb."""
+    end = 20 + int.from_bytes(data[12:16], "little")
+    return json.loads(data[20:end]), data[end + 8 :]
 
 
 def write_gltf(

@@ -21,7 +21,7 @@ from meshmatch.shapes.textured_files import load_appearance
 from meshmatch.templates.location import bundled_folder
 from meshmatch.transfer.bake import colors_of_vertices
 from tests.shapes.morphs import SCALE, TURN, UP, write_morphs
-from tests.shapes.painted import CORNERS, FACES
+from tests.shapes.painted import CORNERS, FACES, glb, parts
 from tests.transfer.rigs import BEND, played, write_tube
 
 SPIN = Rotation.from_rotvec([0.4, -1.2, 0.8])
@@ -178,14 +178,14 @@ def test_a_skin_below_a_mirrored_node_is_not_inside_out(tmp_path: Path) -> None:
     path = tmp_path / "tube.glb"
     write_tube(path)
     plain = load_shape(path)
-    editor = Editor(Document(path, path.read_bytes()))
-    next(node for node in editor.json["nodes"] if "skin" in node)["scale"] = [-1, 1, 1]
-    path.write_bytes(editor.to_bytes())
+    document, buffer = parts(path.read_bytes())
+    next(node for node in document["nodes"] if "skin" in node)["scale"] = [-1, 1, 1]
+    path.write_bytes(glb(document, buffer))
     assert np.array_equal(load_shape(path).faces, plain.faces)
-    scene = editor.json["scenes"][0]
-    editor.json["nodes"].append({"children": scene["nodes"], "scale": [-1, 1, 1]})
-    scene["nodes"] = [len(editor.json["nodes"]) - 1]
-    path.write_bytes(editor.to_bytes())
+    scene = document["scenes"][0]
+    document["nodes"].append({"children": scene["nodes"], "scale": [-1, 1, 1]})
+    scene["nodes"] = [len(document["nodes"]) - 1]
+    path.write_bytes(glb(document, buffer))
     mirror = load_shape(path)
     np.testing.assert_allclose(mirror.verts, plain.verts * [-1, 1, 1], atol=1e-6)
     assert np.array_equal(mirror.faces, plain.faces[:, ::-1])
