@@ -12,6 +12,7 @@ from meshmatch.collections.setting import Record
 from meshmatch.collections.stores import Store
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.judge import calibration
 from meshmatch.fitting.judge.reasons import Reason
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.models.registry import NO_MODEL
@@ -119,3 +120,15 @@ def test_a_record_of_other_types_is_not_read() -> None:
     for words in ({**kept, "stretch": "much"}, {**kept, "name": 3}, {**kept, "mirrored": None}, {**kept, "other": 1}):
         with pytest.raises(TypeError):
             Record.of(words)
+
+
+def test_fits_are_judged_anew_where_the_weights_of_their_category_change(tmp_path: Path) -> None:
+    def digests() -> list[str]:
+        return [setting.Setting(Store.of(tmp_path), model, FitConfig()).digest() for model in ("head", "human")]
+
+    before = digests()
+    with pytest.MonkeyPatch.context() as patch:
+        later = replace(calibration.calibration_of("head"), date="2030-01-01")
+        patch.setitem(calibration._OF_CATEGORY, "head", later)
+        after = digests()
+    assert [one == other for one, other in zip(before, after, strict=True)] == [False, True]
