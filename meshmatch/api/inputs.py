@@ -78,7 +78,8 @@ def usable(shape: Shape) -> Repaired:
         places = "position" if fixed.V == 1 else "positions"
         raise InputError(f"{name} has only {fixed.V} distinct point {places}", f"at least {MINIMUM_POINTS} are needed")
     if not fixed.is_cloud and fixed.F < MINIMUM_FACES:
-        raise InputError(f"{name} has only {fixed.F} usable triangles", f"at least {MINIMUM_FACES} are needed")
+        triangles = "triangle" if fixed.F == 1 else "triangles"
+        raise InputError(f"{name} has only {fixed.F} usable {triangles}", f"at least {MINIMUM_FACES} are needed")
     if fixed.is_cloud and on_a_line(fixed.verts):
         raise InputError(f"{name} has no surface: all its points lie on a line", "is it a point cloud?")
     if not fixed.area > 0:

@@ -410,6 +410,7 @@ def _check_size(clean: Repaired) -> Repaired:
         places = "place" if shape.V == 1 else "places"
         raise InputError(f"it has points in only {shape.V} {places}", f"at least {MIN_POINTS} are needed")
     if not shape.is_cloud and shape.F < MIN_FACES:
-        raise InputError(f"it has only {shape.F} usable triangles", f"at least {MIN_FACES} are needed")
+        triangles = "triangle" if shape.F == 1 else "triangles"
+        raise InputError(f"it has only {shape.F} usable {triangles}", f"at least {MIN_FACES} are needed")
     sqrt_area_frame(shape)  # refuses a shape without area
     return clean

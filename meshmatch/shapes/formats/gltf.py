@@ -65,7 +65,20 @@ def understood(path: Path, data: bytes, what: str, reader: Callable[[Document], 
         with np.errstate(all="ignore"):
             return reader(Document(path, data))
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
-        raise damaged(path.name, f"its {what} no sense ({type(error).__name__}: {error})") from error
+        raise damaged(path.name, f"its {what} no sense: {_in_words(error)}") from error
+
+
+def _in_words(error: Exception) -> str:
+    """What is wrong with a description, of the error that reading it raised."""
+    if isinstance(error, KeyError):
+        return f"{error} is missing"
+    if isinstance(error, IndexError):
+        return "a number in it refers to nothing that the file has"
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    if isinstance(error, ValueError) and str(error):
+        return str(error)
+    return "a value in it is of the wrong kind"
 
 
 class Document:
