@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.errors import InputError
 from meshmatch.experiments.bench import verdicts
-from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, TUNED, Cases, furniture, melded
+from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, OF_PEOPLE, TUNED, Cases, furniture, melded
 from meshmatch.fitting.judge.calibration import Calibration
 from meshmatch.geometry.triangles import face_parts, is_watertight
 from meshmatch.shapes.shape import Shape
@@ -48,6 +48,11 @@ def test_furniture_is_watertight_and_of_one_piece() -> None:
 
 def test_families_that_tune_measure_nothing() -> None:
     assert not set(TUNED) & set(KEPT) and set(FAMILIES) == {*TUNED, *KEPT}
+
+
+def test_a_group_has_only_the_families_of_its_kind() -> None:
+    assert set(verdicts.families_of("human", "tuned")) - set(verdicts.families_of("hand", "tuned")) == set(OF_PEOPLE)
+    assert verdicts.families_of("hand", "cut, sound") == ["cut", "sound"]
 
 
 def test_a_truth_is_where_the_body_has_it(cases: Cases) -> None:

@@ -493,3 +493,4 @@ KEPT: dict[str, Family] = {
     "fused base": Cases._fused,
 }
 FAMILIES = TUNED | KEPT
+OF_PEOPLE = ("dressed", "stylised")

@@ -32,7 +32,7 @@ from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, Case, Cases, between, direction
+from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, OF_PEOPLE, Case, Cases, between, direction
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.calibration import CALIBRATION, Calibration
@@ -224,6 +224,13 @@ def of_seed(
         yield from found
 
 
+def families_of(kind: str, chosen: str) -> list[str]:
+    """Families by their names, or those of a group that the kind has."""
+    if chosen not in GROUPS:
+        return runner.names_of(chosen, FAMILIES, "family")
+    return [name for name in GROUPS[chosen] if kind == "human" or name not in OF_PEOPLE]
+
+
 @runner.command
 def main(
     kind: Annotated[str, Option(help=f"human, {', '.join(GENERATORS)}")] = "human",
@@ -235,7 +242,7 @@ def main(
     seed: runner.Seed = 1,
     seeds: Annotated[int, Option(min=1, help="so many seeds from that one on, all of which count together")] = 1,
 ) -> runner.Report:
-    names = GROUPS.get(families) or runner.names_of(families, FAMILIES, "family")
+    names = families_of(kind, families)
     found: list[dict[str, Any]] = []
     for number in range(seed, seed + seeds):
         found += of_seed(kind, names, count, number, threads, output)
