@@ -196,7 +196,7 @@ def names_of(words: str, known: Iterable[str], what: str) -> list[str]:
         A name that is not known.
     """
     allowed = list(known)
-    names = list(dict.fromkeys(name for name in words.split(",") if name))
+    names = list(dict.fromkeys(word.strip() for word in words.split(",") if word.strip()))
     for name in names:
         if name not in allowed:
             raise OptionError(f"unknown {what} '{name}'", f"choose from {', '.join(allowed)}")
