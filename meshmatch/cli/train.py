@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from meshmatch.training.recipes import Recipe
 
 _FALLS = 0.99  # of the validation before
+_APART = 0.9  # of the steps: no later error is compared with the last
 _LOOKED = 10.0  # seconds of training after which its length is told
 _CODE_STEP = 0.06  # of a training step: a step of the search for a code, of a pointwise model
 _ENERGIES = ("volume", "arap", "blend")
@@ -212,7 +213,12 @@ def train(
             console.say(f"{now.words} ({now.seconds:.0f} s{_left(reports)})")
 
     with console.progress() as progress:
-        learn(resume=not how.fresh, progress=_forecast(console, progress, steps, how, then), report=report)
+        try:
+            learn(resume=not how.fresh, progress=_forecast(console, progress, steps, how, then), report=report)
+        except KeyboardInterrupt:
+            if (output / CHECKPOINT).is_file():
+                console.say("stopped; the same command goes on from the checkpoint")
+            raise
         if first and how.shapes is not None and then is not None:
             _calibrate(console, output, how.shapes, how.threads, progress)
     if first:
@@ -313,7 +319,7 @@ def _by_template(output: Path, how: TrainOptions, console: Console) -> "tuple[in
         from meshmatch.training.recipe_files import read_recipe
 
         how.refuse(("preset",), "--recipe")
-        recipe = read_recipe(how.recipe, recipe)
+        recipe = read_recipe(how.recipe, recipe, started=(start or how.start) is not None)
         changes = {name: value for name, value in changes.items() if name in (*how.given, "threads", "device", "draw")}
     recipe = recipe.changed(**changes)
     training_device(wanted=recipe.train.device)  # before shapes are made
@@ -426,7 +432,7 @@ def _summary(
 ) -> None:
     card = read_any_card(output)
     if isinstance(card, ModelCard) and (distance := card.metrics.get("validation", {}).get("distance")):
-        before = [now.validation for now in reports if now.validation is not None and now.step < card.steps]
+        before = [now.validation for now in reports if now.validation is not None and now.step <= _APART * card.steps]
         falls = f", {'still falling' if distance < _FALLS * before[-1] else 'no longer falling'}" if before else ""
         console.say(f"off by {100 * distance:.2g} % of sqrt(area) on shapes that were not learned{falls}")
     console.say(

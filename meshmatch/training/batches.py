@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import repeat
@@ -70,9 +71,11 @@ class _Shapes(torch.utils.data.Dataset[Tensor]):
 def _loaded(data: torch.utils.data.Dataset[Any], steps: Sequence[int], workers: int) -> Iterable[Any]:
     return torch.utils.data.DataLoader(
         data, batch_size=None, sampler=steps, num_workers=workers, prefetch_factor=_AHEAD if workers else None,
-        worker_init_fn=_one_thread,
+        worker_init_fn=_begin,
     )  # fmt: skip
 
 
-def _one_thread(_: int) -> None:
+def _begin(_: int) -> None:
+    """A process that draws batches: of one thread, and ended by the training, which has yet to save itself on Ctrl-C."""
     torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

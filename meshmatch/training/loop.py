@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import ctypes
+import json
 import math
 import os
+import signal
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from numbers import Integral
 from pathlib import Path
 from typing import Any, get_args
@@ -20,7 +23,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from meshmatch.errors import ModelError, OptionError
+from meshmatch.errors import ModelError, OptionError, warn
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.inference import training_device
 from meshmatch.outputs import replace_on_success
@@ -28,6 +31,8 @@ from meshmatch.progress import Progress
 from meshmatch.training.batches import Draw, batches
 from meshmatch.training.losses import CorrespondenceLoss, Objective
 
+OF_THE_MACHINE = ("minutes", "checkpoint_minutes", "threads", "device", "draw", "compile")
+"""Settings of a training that a recipe does not pass on."""
 _OF_TEMPLATE = ("nodes", "anchors")  # what a checkpoint must share with the training that goes on from it
 _MOMENTS, _COUNT = ("exp_avg", "exp_avg_sq"), {"step": torch.Size()}  # of Adam: what it knows of each parameter
 
@@ -103,6 +108,17 @@ class StepReport:
         return f": {words}{known}"
 
 
+def settings_of(record: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Numbers and words of a recipe, by dotted names, without what belongs to the machine."""
+    found: dict[str, Any] = {}
+    for name, value in record.items():
+        if isinstance(value, Mapping):
+            found |= settings_of(value, f"{prefix}{name}.")
+        elif name not in (*OF_THE_MACHINE, "workers"):
+            found[prefix + name] = value
+    return found
+
+
 def learning_rate(step: int, config: TrainConfig) -> float:
     """Rate of a step: linear warm-up, constant, cosine to zero."""
     start = (1 - config.decay) * config.steps
@@ -114,8 +130,12 @@ def learning_rate(step: int, config: TrainConfig) -> float:
 class Trainer:
     """State of a run: weights, their average, the optimiser and the next step. All of it is in a checkpoint."""
 
-    def __init__(self, model: Any, points: Any, config: TrainConfig, digest: str = "") -> None:
+    def __init__(
+        self, model: Any, points: Any, config: TrainConfig, digest: str = "", recipe: Mapping[str, Any] | None = None
+    ) -> None:
         self.config, self.digest = config, digest  # of the shapes, see `Lessons`; empty where it is not known
+        self.settings: dict[str, Any] = settings_of(recipe or asdict(config))
+        self.earlier: list[dict[str, Any]] = []  # until which step other settings held, and which
         self.rank = int(os.environ.get("RANK", 0))
         self.world = int(os.environ.get("WORLD_SIZE", 1))
         self.device = training_device(int(os.environ.get("LOCAL_RANK", 0)), config.device)
@@ -142,11 +162,12 @@ class Trainer:
         arrays = {n: t.detach().cpu().contiguous().clone() for n, t in arrays.items()}
         with replace_on_success(path) as temporary:
             words = {"step": str(self.step), "seconds": f"{self.seconds:.1f}", "seed": str(self.config.seed)}
+            words |= {"settings": json.dumps(self.settings, default=str), "earlier": json.dumps(self.earlier)}
             save_file(arrays, temporary, words | {"digest": self.digest})
 
     def load(self, path: Path) -> None:
         """Go on where `save` was called; `ModelError` if the file is none, or of another seed, network or template, or of
-        other shapes."""
+        other shapes. Other settings than before are told, and kept for the card."""
         hint = "train into another folder, or start afresh"
         here = self.model.state_dict()
         of_parameters = {name: tensor.shape for name, tensor in self.average.items()}
@@ -158,6 +179,9 @@ class Trainer:
                 words = file.metadata() or {}
                 step, seconds = int(words["step"]), float(words.get("seconds", 0.0))
                 seed, digest = int(words.get("seed", self.config.seed)), words.get("digest", "")
+                known, earlier = json.loads(words.get("settings", "{}")), json.loads(words.get("earlier", "[]"))
+                if not isinstance(known, dict) or not isinstance(earlier, list):
+                    raise ValueError("no such settings")
                 for name in file.keys():  # noqa: SIM118 (it is no dictionary)
                     part, _, key = name.partition(".")
                     parts[part][key] = file.get_tensor(name)
@@ -172,8 +196,8 @@ class Trainer:
             raise ModelError(f"{path} is a checkpoint of a training with seed {seed}", hint)
         if any({name: t.shape for name, t in parts[part].items()} != expected[part] for part in expected):
             raise ModelError(f"{path} is a checkpoint of another network", hint)
-        known = {n: dict.fromkeys(_MOMENTS, p.shape) | _COUNT for n, p in enumerate(self.model.parameters())}
-        if any({key: t.shape for key, t in state[n].items()} != known.get(n) for n in state):
+        moments = {n: dict.fromkeys(_MOMENTS, p.shape) | _COUNT for n, p in enumerate(self.model.parameters())}
+        if any({key: t.shape for key, t in state[n].items()} != moments.get(n) for n in state):
             raise ModelError(f"{path} is not a checkpoint of a training", hint)
         weights = parts["model"]
         if not all(torch.equal(weights[n], here[n].cpu()) for n in here if n.endswith(_OF_TEMPLATE)):
@@ -189,6 +213,19 @@ class Trainer:
             self.average[name].copy_(tensor)
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
+        self.earlier = earlier
+        self._note_changes(known)
+
+    def _note_changes(self, before: dict[str, Any]) -> None:
+        """Tell which settings of the training up to here were others."""
+        now = json.loads(json.dumps(self.settings, default=str))
+        changed = {name: value for name, value in before.items() if name in now and now[name] != value}
+        if changed and self.step:
+            self.earlier = [*self.earlier, {"until_step": self.step} | changed]
+            words = ", ".join(
+                f"{name.rpartition('.')[2]} {value} is {now[name]} now" for name, value in changed.items()
+            )
+            warn(f"the {self.step:,} steps of the checkpoint had other settings: {words}")
 
     def run(
         self,
@@ -201,7 +238,7 @@ class Trainer:
         progress: Progress | None = None,
     ) -> None:
         """Train until ``steps`` or ``minutes`` are over, of which so many seconds are ``spent``; writes ``checkpoint`` now
-        and then and at the end."""
+        and then, at the end, and where Ctrl-C ends it."""
         config = self.config
         torch.set_num_threads(config.threads)
         _keep_memory()
@@ -209,32 +246,42 @@ class Trainer:
         saved = time.monotonic()
         began, before = saved - spent, self.seconds - spent
         sums: dict[str, Tensor | float] = {}
-        summed, lately = 0, ""
+        first, between, summed, lately = self.step, True, 0, ""
         self.model.train()
         if self.world > 1:  # which begin with the same weights
             for held in (*self.model.state_dict().values(), *self.average.values()):
                 dist.broadcast(held.detach(), 0)
-        for batch in batches(data, ours, self.device, config.workers, config.draw):
-            terms = self.iterate(batch)
-            for name, value in terms.items():
-                sums[name] = sums.get(name, 0.0) + value.detach().float()  # there: no step waits for a GPU's numbers
-            summed += 1
-            now = time.monotonic()
-            self.seconds = before + now - began
-            if report is not None and (self.step % every == 0 or self.step == config.steps):
-                score = validate(self.model) if validate and self.step % (10 * every) == 0 else None
-                means = {name: float(value) / summed for name, value in sums.items()}
-                rate = learning_rate(self.step, config)
-                reported = StepReport(self.step, config.steps, rate, now - began, means, score)
-                report(reported)
-                sums, summed, lately = {}, 0, reported.losses
-            if progress is not None:  # at every step, for one may take seconds
-                progress.named(f"step {self.step:,} of {config.steps:,}{lately}")(self.step / config.steps)
-            if checkpoint is not None and now - saved > 60 * config.checkpoint_minutes:
+        try:
+            for batch in batches(data, ours, self.device, config.workers, config.draw):
+                with _whole():
+                    between = False
+                    terms = self.iterate(batch)
+                    between = True
+                for name, value in terms.items():
+                    sums[name] = (
+                        sums.get(name, 0.0) + value.detach().float()
+                    )  # there: no step waits for a GPU's numbers
+                summed += 1
+                now = time.monotonic()
+                self.seconds = before + now - began
+                if report is not None and (self.step % every == 0 or self.step == config.steps):
+                    score = validate(self.model) if validate and self.step % (10 * every) == 0 else None
+                    means = {name: float(value) / summed for name, value in sums.items()}
+                    rate = learning_rate(self.step, config)
+                    reported = StepReport(self.step, config.steps, rate, now - began, means, score)
+                    report(reported)
+                    sums, summed, lately = {}, 0, reported.losses
+                if progress is not None:  # at every step, for one may take seconds
+                    progress.named(f"step {self.step:,} of {config.steps:,}{lately}")(self.step / config.steps)
+                if checkpoint is not None and now - saved > 60 * config.checkpoint_minutes:
+                    self.save(checkpoint)
+                    saved = now
+                if config.minutes is not None and self.any_says(now - began > 60 * config.minutes):
+                    break
+        except KeyboardInterrupt:
+            if checkpoint is not None and self.world == 1 and between and self.step > first:
                 self.save(checkpoint)
-                saved = now
-            if config.minutes is not None and self.any_says(now - began > 60 * config.minutes):
-                break
+            raise
         if checkpoint is not None:
             self.save(checkpoint)
         self.model.eval()
@@ -328,6 +375,33 @@ def _products(precision: str) -> Iterator[None]:
         yield
     finally:
         torch.set_float32_matmul_precision(before)
+
+
+@contextmanager
+def _whole() -> Iterator[None]:
+    """Signals that end the program wait until the block is done; where one comes again, a second later, they do not."""
+    came: list[int] = []
+    began = 0.0
+    named = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    ours = threading.current_thread() is threading.main_thread()
+    handlers: dict[int, Any] = {each: found for each in named if ours and callable(found := signal.getsignal(each))}
+
+    def wait(number: int, frame: Any) -> None:
+        nonlocal began
+        if came and time.monotonic() - began > 1:
+            handlers[number](number, frame)
+        began = time.monotonic()
+        came.append(number)
+
+    for number in handlers:
+        signal.signal(number, wait)
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    if came:
+        handlers[came[0]](came[0], None)
 
 
 def _check_terms(terms: Any) -> None:

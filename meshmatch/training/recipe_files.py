@@ -12,20 +12,21 @@ from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.errors import InputError, MeshmatchError, OptionError, warn
 from meshmatch.geometry.kernels import KERNELS
 from meshmatch.models.card import ModelCard
 from meshmatch.models.checkpoint import Storage
 from meshmatch.models.network import NetworkConfig
 from meshmatch.shapes.input_files import read_json
+from meshmatch.training.loop import OF_THE_MACHINE
 from meshmatch.training.losses import ChamferLoss, CorrespondenceLoss, Objective
 from meshmatch.training.recipes import Recipe
 
 _LOSSES: dict[str, type[Objective]] = {
     f"{each.__module__}.{each.__qualname__}": each for each in (CorrespondenceLoss, ChamferLoss)
 }
-_OF_THE_MACHINE = ("minutes", "checkpoint_minutes", "threads", "device", "draw", "compile")
 _PARTS = {"network", "field", "recipe"}
+_HISTORY = ("start", "earlier")
 _OWN = ("deform", "storage", "template", "characters", "bodies", "stylised")
 _MOST: dict[str, float] = {
     "shapes": 4096,
@@ -58,10 +59,12 @@ def recipe_record(recipe: Recipe) -> dict[str, Any]:
     return record
 
 
-def read_recipe(path: str | Path, usual: Recipe) -> Recipe:
+def read_recipe(path: str | Path, usual: Recipe, started: bool = False) -> Recipe:
     """The recipe of a card, or of a file that has parts of one; what it does not say is as in the usual one.
 
     What belongs to the machine (minutes, threads, device, where batches are drawn, compiling) is not taken from a file.
+    Warns where a training by it is another: one that is not ``started`` from the model that it names, or one of several
+    stages.
     `InputError` if it is none, names something unknown, or was learned by a loss that is not meshmatch's own.
     """
     path = Path(path)
@@ -77,9 +80,9 @@ def read_recipe(path: str | Path, usual: Recipe) -> Recipe:
         train = _object(own.get("train", {}), "recipe.train")
         loss = _loss(record, own, usual)
         loss = _filled(loss, _object(train.get("loss", {}), "recipe.train.loss"), "recipe.train.loss")
-        steps = {name: value for name, value in train.items() if name not in ("loss", *_OF_THE_MACHINE)}
+        steps = {name: value for name, value in train.items() if name not in ("loss", *OF_THE_MACHINE)}
         more = {name: own[name] for name in _OWN if name in own}
-        if unknown := sorted(own.keys() - {"train", "scan", "loss", "start", *_OWN}):
+        if unknown := sorted(own.keys() - {"train", "scan", "loss", *_HISTORY, *_OWN}):
             raise InputError(f"recipe.{unknown[0]} is unknown")
         network = _object(record.get("network", {}), "network")
         kernel = _object(record.get("field", {}), "field").get("kernel", usual.kernel)
@@ -88,6 +91,7 @@ def read_recipe(path: str | Path, usual: Recipe) -> Recipe:
             raise InputError("its kernel or storage is unknown")
         if Path(found.template).name != found.template:
             raise InputError("recipe.template must be the name of a bundled template")
+        _tell_history(path.name, own, started)
         return replace(
             found,
             network=NetworkConfig.from_dict(usual.network.to_dict() | network),
@@ -99,6 +103,15 @@ def read_recipe(path: str | Path, usual: Recipe) -> Recipe:
         raise InputError(f"{path.name} is no recipe: {error.message}", error.hint or _HINT) from error
     except (OSError, ValueError) as error:
         raise InputError(f"{path.name} is no recipe: {str(error).splitlines()[0]}", _HINT) from error
+
+
+def _tell_history(name: str, own: Mapping[str, Any], started: bool) -> None:
+    """Warn of what a recipe has behind it."""
+    if own.get("start") and not started:
+        known = own["start"].get("model", "another") if isinstance(own["start"], dict) else "another"
+        warn(f"{name} is of a training that started from the model {str(known)[:64]}; this one starts anew (--start)")
+    if own.get("earlier"):
+        warn(f"{name} is of a training whose settings changed on the way; this one has the last of them throughout")
 
 
 def _loss(record: Mapping[str, Any], own: Mapping[str, Any], usual: Recipe) -> Objective:

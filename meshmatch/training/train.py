@@ -189,7 +189,7 @@ def train_model(
     `InputError` of a single shape; `OptionError` if the model to start from has another template, network or kernel.
     """
     checkpoint = (output := Path(output)) / CHECKPOINT
-    recipe_record(recipe)  # what the card could not hold is refused now, not at the end
+    record = recipe_record(recipe)  # what the card could not hold is refused now, not at the end
     make_folder(checkpoint.parent)
     config, kernel = recipe.train, recipe.kernel
     if recipe.scan.sphere and getattr(source, "scale", "sphere") == "sphere":  # the paper's lengths are in it
@@ -221,7 +221,7 @@ def train_model(
     aligning = None if progress is None else progress.stage("orientations alone (once)")
     aligned = Aligned() if resumed else align(model, data, config, output / ALIGNER, resume, aligning)
     held_out = replace(data, seed=VALIDATION_SEED, **few)[0]
-    trainer = Trainer(model, points, config, digest)
+    trainer = Trainer(model, points, config, digest, record | {"kernel": recipe.kernel})
     if resumed:
         trainer.load(checkpoint)
         for name in ("encoder", "aligner"):  # what reads the batches are copies (see `build_dataset`)
@@ -280,7 +280,7 @@ def export(trainer: Trainer, template: Template, output: Path, recipe: Recipe, f
     (output / CARD).unlink(missing_ok=True)
     save_template(template, output / TEMPLATE)
     digest = save_weights(trainer.averaged_state(), output / WEIGHTS, storage=recipe.storage)
-    settings = recipe_record(recipe)
+    settings = recipe_record(recipe) | ({"earlier": trainer.earlier} if trainer.earlier else {})
     if isinstance(facts.start, TrainedModel):
         begun = facts.start.card
         settings["start"] = {"model": begun.name, "weights_sha256": begun.weights_sha256, "steps": begun.steps}

@@ -2,6 +2,7 @@
 
 import math
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from meshmatch.errors import ModelError, OptionError, OutputError
+from meshmatch.errors import MeshmatchWarning, ModelError, OptionError, OutputError
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.layers import BatchNorm
 from meshmatch.models.network import NetworkConfig
@@ -80,6 +81,53 @@ def test_a_stopped_run_ends_where_an_unbroken_one_does(
     assert second.step == whole.step == 10
     assert same(state(second), state(whole))
     assert same(second.averaged_state(), whole.averaged_state())
+
+
+@dataclass(frozen=True)
+class Interrupting(CorrespondenceLoss):
+    """Ctrl-C in the middle of the third step."""
+
+    def __call__(self, *inputs: Any) -> dict[str, torch.Tensor]:
+        if (step := CALLS.pop() + 1) == 3:
+            signal.raise_signal(signal.SIGINT)
+        CALLS.append(step)
+        return super().__call__(*inputs)
+
+
+CALLS: list[int] = []
+
+
+def test_ctrl_c_ends_a_training_after_its_step_with_a_checkpoint(egg: Template, tmp_path: Path) -> None:
+    config = replace(CONFIG, steps=5)
+    whole = trainer(egg, config)
+    whole.run(small_data(egg, whole.model, length=5))
+    path, stopped = tmp_path / "last.safetensors", trainer(egg, replace(config, loss=Interrupting(robust=True)))
+    CALLS[:] = [0]
+    with pytest.raises(KeyboardInterrupt):
+        stopped.run(small_data(egg, stopped.model, length=5), path)
+    assert CALLS == [3] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    second = trainer(egg, config)
+    second.load(path)
+    assert second.step == 3
+    second.run(small_data(egg, second.model, length=5))
+    assert same(state(second), state(whole))
+
+
+def test_other_settings_of_a_checkpoint_are_told_and_kept(egg: Template, tmp_path: Path) -> None:
+    path, first = tmp_path / "last.safetensors", trainer(egg, CONFIG)
+    first.run(small_data(egg, first.model, length=10))
+    first.save(path)
+    again = trainer(egg, replace(CONFIG, minutes=3, workers=2))
+    again.load(path)
+    assert again.earlier == []
+    other = trainer(egg, replace(CONFIG, steps=20, loss=replace(CONFIG.loss, volume=5.0)))
+    with pytest.warns(MeshmatchWarning, match="steps 10 is 20 now, volume 0.* is 5.0 now"):
+        other.load(path)
+    assert other.earlier == [{"until_step": 10, "steps": 10, "loss.volume": CONFIG.loss.volume}]
+    other.save(path)
+    last = trainer(egg, replace(CONFIG, steps=20, loss=replace(CONFIG.loss, volume=5.0)))
+    last.load(path)
+    assert last.earlier == other.earlier
 
 
 def test_a_seed_fixes_the_training(egg: Template) -> None:
@@ -243,6 +291,8 @@ def test_a_checkpoint_that_does_not_fit_is_refused(egg: Template, tmp_path: Path
         (lambda held, about: held.update({"optimiser.9999.step": torch.zeros(())}), "not a checkpoint"),
         (lambda held, about: about.update({"step": "-1"}), "not a checkpoint"),
         (lambda held, about: about.update({"seconds": "inf"}), "not a checkpoint"),
+        (lambda held, about: about.update({"settings": "[1]"}), "not a checkpoint"),
+        (lambda held, about: about.update({"earlier": "{"}), "not a checkpoint"),
     ],
 )
 def test_a_damaged_checkpoint_changes_nothing(
@@ -252,7 +302,7 @@ def test_a_damaged_checkpoint_changes_nothing(
     run = trainer(egg, replace(CONFIG, steps=1))
     run.run(small_data(egg, run.model, length=1), path)
     held, about = load_file(path), {"step": "1", "seconds": "2.0", "seed": str(CONFIG.seed)}
-    trainer(egg, CONFIG).load(path)
+    trainer(egg, run.config).load(path)
     change(held, about)
     save_file(held, path, about)
     before = state(run)

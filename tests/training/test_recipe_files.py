@@ -1,13 +1,14 @@
 """Recipes on cards, read back: the same, or refused in a line."""
 
 import json
+import warnings
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError, MeshmatchWarning, OptionError
 from meshmatch.models.inference import training_device
 from meshmatch.templates.location import bundled_folder
 from meshmatch.training.loop import TrainConfig
@@ -44,7 +45,7 @@ def test_a_recipe_comes_back_from_its_record(made: Any, tmp_path: Path) -> None:
 def test_the_cards_that_ship_can_be_read(name: str) -> None:
     path = bundled_folder() / "models" / name / "card.json"
     card = json.loads(path.read_text())
-    found = read_recipe(path, people())
+    found = read_recipe(path, people(), started=True)
     assert asdict(found.train)["loss"] == card["recipe"]["train"]["loss"]
     assert (found.train.steps, found.train.seed) == (card["recipe"]["train"]["steps"], card["recipe"]["train"]["seed"])
     assert found.network.to_dict() == card["network"]
@@ -57,7 +58,18 @@ def test_the_cards_that_ship_can_be_read(name: str) -> None:
 def test_hands_and_heads_learn_again_as_their_cards_say(name: str, options: dict[str, int]) -> None:
     """The commands of docs/models.md."""
     usual, path = recipe_for(kind=name), bundled_folder() / "models" / name / "card.json"
-    assert read_recipe(path, usual) == usual.changed(workers=0, **options)
+    assert read_recipe(path, usual, started=True) == usual.changed(workers=0, **options)
+
+
+def test_what_a_recipe_has_behind_it_is_told(tmp_path: Path) -> None:
+    begun = written(tmp_path, {"recipe": {"start": {"model": "human", "steps": 5}}})
+    with pytest.warns(MeshmatchWarning, match="started from the model human"):
+        read_recipe(begun, people())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_recipe(begun, people(), started=True)
+    with pytest.warns(MeshmatchWarning, match="settings changed on the way"):
+        read_recipe(written(tmp_path, {"recipe": {"earlier": [{"until_step": 3, "train.steps": 3}]}}), people())
 
 
 def test_a_part_changes_a_part(tmp_path: Path) -> None:
