@@ -19,7 +19,14 @@ from meshmatch.experiments.paper.ablation_errors import (
     refinement_of,
     subject,
 )
-from meshmatch.experiments.paper.ablation_results import Sample, claims_table, difference, rising
+from meshmatch.experiments.paper.ablation_results import (
+    Sample,
+    claims_table,
+    difference,
+    over_bodies,
+    over_shapes,
+    rising,
+)
 from meshmatch.experiments.paper.ablation_training import SCANS, Setting, fewer, new_network, pool_of, timed, train_run
 from meshmatch.experiments.paper.ablation_views import BASE, CODED, CONSTRAINTS, TABLE3, VIEWS, Run, all_runs
 from meshmatch.experiments.runner import words_of
@@ -214,7 +221,10 @@ def test_a_claim_needs_an_interval_beside_zero(errors: tuple[list[float], ...], 
 def test_a_claim_that_nobody_measured_has_no_row() -> None:
     there = Sample([1.0, 1.1]), Sample([2.0, 2.1])
     found = [rising("held out", "a < b", there), rising("scape", "b < c", [Sample([]), Sample([])])]
-    assert words_of(claims_table(found)) == (["claim", "held out", "scape"], [["a < b", "supported", ""]])
+    assert words_of(claims_table(found)) == (
+        ["claim", "held out", "scape"],
+        [["a < b", "supported (0.70 to 1.30)", ""]],
+    )
 
 
 def test_an_interval_of_seeds_is_the_textbooks() -> None:
@@ -225,11 +235,21 @@ def test_an_interval_of_seeds_is_the_textbooks() -> None:
 
 
 def test_pairs_must_carry_an_order_too() -> None:
-    """Half of the pairs are better and half worse: the mean of one pair more or less decides."""
+    """Half of the bodies are better and half worse: the mean of one body more or less decides."""
     clear, even = [1.0] * 4, [0.0, 0.0, 2.2, 2.2]
-    for pairs, verdict in (([1.1] * 4, "supported"), (even, "not testable here")):
-        samples = Sample([1.0, 1.01], [clear, clear]), Sample([1.1, 1.11], [pairs, pairs])
+    for bodies, verdict in (([1.1] * 4, "supported"), (even, "not testable here")):
+        samples = Sample([1.0, 1.01], [clear, clear]), Sample([1.1, 1.11], [bodies, bodies])
         assert rising("scape", "rising", samples).verdict == verdict
+
+
+def test_pairs_of_a_shape_are_no_independent_witnesses() -> None:
+    """All pairs of one of twelve shapes are worse, all others a little better or the same."""
+    off = np.full((12, 12), -0.02)
+    off[3], off[:, 3] = 2.0, 2.0
+    off = off[~np.eye(12, dtype=bool)]
+    low, high = over_shapes(off, 12)
+    assert low < 0 < over_bodies(off)[0] and high > over_bodies(off)[1]
+    assert over_shapes(np.arange(6.0), 3)[0] >= 0 and over_shapes(np.full(6, 0.5), 3) == [0.5, 0.5]
 
 
 def subjects_of(small: Path, name: str, cache: Path, measure: Measure = QUICK):

@@ -1,13 +1,15 @@
 """The paper's tables and claims, read off what is known of the ablation runs.
 
-Training again from another seed moves errors by as much as many choices do, and six shapes are a small sample. So an order
-of two errors is there only where 95 % intervals of their difference leave out 0: over seeds (Welch's, of at least two
-trainings each), and over what was measured on, the pairs of a set or held-out bodies (a paired bootstrap). A claim is
-*supported* if every next error is larger, *not supported* if one is smaller, and else *not testable here*.
+Training again from another seed moves errors by as much as many choices do, and a set has few shapes. So an order of two
+errors is there only where 95 % intervals of their difference leave out 0: over seeds (Welch's, of at least two trainings
+each), and over what was measured on, held-out bodies or the shapes of a set (a paired bootstrap; of shapes, not of pairs, for
+a hard shape is hard in all of its pairs). A claim is *supported* if every next error is larger, *not supported* if one is
+smaller, and else *not testable here*.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -18,6 +20,7 @@ import numpy as np
 from rich.table import Table
 from scipy.stats import bootstrap, ttest_ind, ttest_rel
 
+from meshmatch.arrays import Floats
 from meshmatch.experiments.paper.ablation_views import (
     BASE,
     CODED,
@@ -34,6 +37,7 @@ from meshmatch.experiments.paper.ablation_views import (
 from meshmatch.experiments.runner import table
 
 SUPPORTED, NOT_SUPPORTED, UNTESTED = "supported", "not supported", "not testable here"
+_DRAWS = 4000
 _UNMEASURED = "not measured"
 CLAIMS: tuple[tuple[str, tuple[Run, ...]], ...] = (
     (
@@ -82,14 +86,16 @@ class Claim:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Mean errors of the trainings of one choice, and the errors of every pair, or body, by each of them."""
+    """Mean errors of the trainings of one choice, and by each of them the errors of every body, or of all ordered pairs of
+    so many ``shapes``."""
 
     seeds: Sequence[float]
-    pairs: Sequence[Sequence[float]] = ()
+    each: Sequence[Sequence[float]] = ()
+    shapes: int = 0
 
 
 def difference(a: Sample, b: Sample, paired: bool = False) -> tuple[float, float] | None:
-    """The hull of the 95 % intervals of b's error less a's, over seeds and over pairs; None where there are too few seeds.
+    """The hull of the 95 % intervals of b's error less a's, over seeds and over shapes; None where there are too few seeds.
 
     ``paired``: both are of the same networks.
     """
@@ -102,13 +108,31 @@ def difference(a: Sample, b: Sample, paired: bool = False) -> tuple[float, float
         test = ttest_rel(b.seeds, a.seeds) if paired else ttest_ind(b.seeds, a.seeds, equal_var=False)
         over_seeds = test.confidence_interval(0.95)
         ends = [float(over_seeds.low), float(over_seeds.high)]
-    if a.pairs and b.pairs:
-        off = np.mean(b.pairs, axis=0) - np.mean(a.pairs, axis=0)
+    if a.each and b.each:
+        off = np.mean(b.each, axis=0) - np.mean(a.each, axis=0)
         if np.ptp(off) > 0:
-            rng = np.random.default_rng(0)
-            drawn = bootstrap((off,), np.mean, n_resamples=4000, method="percentile", rng=rng).confidence_interval
-            ends += [float(drawn.low), float(drawn.high)]
+            ends += over_shapes(off, a.shapes) if a.shapes else over_bodies(off)
     return min(ends), max(ends)
+
+
+def over_bodies(off: Floats) -> list[float]:
+    """The ends of the 95 % interval of a mean of independent numbers."""
+    rng = np.random.default_rng(0)
+    drawn = bootstrap((off,), np.mean, n_resamples=_DRAWS, method="percentile", rng=rng).confidence_interval
+    return [float(drawn.low), float(drawn.high)]
+
+
+def over_shapes(off: Floats, shapes: int) -> list[float]:
+    """The ends of the 95 % interval of a mean over all ordered pairs of so many shapes, which are drawn with all their
+    pairs; none of a shape with itself.
+    """
+    between = np.zeros((shapes, shapes))
+    between[~np.eye(shapes, dtype=bool)] = off
+    often = np.random.default_rng(0).multinomial(shapes, [1 / shapes] * shapes, _DRAWS).astype(float)
+    pairs = shapes**2 - np.square(often).sum(1)
+    some = pairs > 0
+    means = ((often @ between) * often).sum(1)[some] / pairs[some]
+    return [float(each) for each in np.percentile(means, [2.5, 97.5])]
 
 
 def rising(where: str, words: str, samples: Sequence[Sample], paired: bool = False) -> Claim:
@@ -126,7 +150,9 @@ def rising(where: str, words: str, samples: Sequence[Sample], paired: bool = Fal
 def sample(known: Known, run: Run, where: str, method: str | None = None) -> Sample:
     """What is known of a run on the held-out shapes or a set."""
     records = known.records(run, where, method)
-    return Sample([each["mean_cm"] for each in records], [each["pair_cm"] for each in records if each.get("pair_cm")])
+    each = [found["pair_cm"] for found in records if found.get("pair_cm")]
+    shapes = 0 if where == HELD_OUT or not each else (1 + math.isqrt(1 + 4 * len(each[0]))) // 2
+    return Sample([found["mean_cm"] for found in records], each, shapes)
 
 
 def claims(known: Known, sets: Sequence[str]) -> list[Claim]:
@@ -145,10 +171,11 @@ def claims(known: Known, sets: Sequence[str]) -> list[Claim]:
 
 
 def claims_table(found: Sequence[Claim]) -> Table:
-    """Each claim that was measured in a row, its verdicts on the held-out shapes and each set."""
+    """Each claim that was measured in a row, its verdicts on the held-out shapes and each set, with the intervals."""
     rows: dict[str, dict[str, str]] = {}
     for claim in (each for each in found if each.verdict != _UNMEASURED):
-        rows.setdefault(claim.words, {"claim": claim.words})[claim.where] = claim.verdict
+        known = "; ".join("one seed" if each is None else f"{each[0]:.2f} to {each[1]:.2f}" for each in claim.intervals)
+        rows.setdefault(claim.words, {"claim": claim.words})[claim.where] = f"{claim.verdict} ({known})"
     columns = {"claim": "claim", **{claim.where: claim.where for claim in found}}
     return table("What the paper claims", list(rows.values()), columns)
 
