@@ -82,6 +82,14 @@ def test_a_page_that_differs_from_its_files_is_told_and_then_made(tmp_path: Path
         pages.results_file("few", tmp_path)
 
 
+def test_the_card_of_people_has_the_errors_of_the_results() -> None:
+    card = json.loads((ROOT / "templates" / "models" / "human" / "card.json").read_text(encoding="utf-8"))
+    sets = json.loads((DOCS / "results" / "accuracy.json").read_text(encoding="utf-8"))["values"]["sets"]
+    assert card["metrics"].keys() == sets.keys()
+    for name, found in card["metrics"].items():
+        assert found["nodes"] == {key: sets[name][key] for key in found["nodes"]}
+
+
 def test_results_are_one_short_page() -> None:
     assert len((DOCS / "results.md").read_text(encoding="utf-8").split()) <= 1500
 
