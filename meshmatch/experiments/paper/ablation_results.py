@@ -2,9 +2,9 @@
 
 Training again from another seed moves errors by as much as many choices do, and a set has few shapes. So an order of two
 errors is there only where 95 % intervals of their difference leave out 0: over seeds (Welch's, of at least two trainings
-each), and over what was measured on, held-out bodies or the shapes of a set (a paired bootstrap; of shapes, not of pairs, for
-a hard shape is hard in all of its pairs). A claim is *supported* if every next error is larger, *not supported* if one is
-smaller, and else *not testable here*.
+each), and over what was measured on, held-out bodies or the shapes of a set (a paired bootstrap; of shapes, not of pairs,
+for a hard shape is hard in all of its pairs). A claim is *supported* if every next error is larger, *not supported* if one
+is smaller, and else *not testable here*.
 """
 
 from __future__ import annotations
