@@ -265,7 +265,8 @@ class Trainer:
                 now = time.monotonic()
                 self.seconds = before + now - began
                 if report is not None and (self.step % every == 0 or self.step == config.steps):
-                    score = validate(self.model) if validate and self.step % (10 * every) == 0 else None
+                    asked = self.step % (10 * every) == 0 or self.step == config.steps
+                    score = validate(self.model) if validate and asked else None
                     means = {name: float(value) / summed for name, value in sums.items()}
                     rate = learning_rate(self.step, config)
                     reported = StepReport(self.step, config.steps, rate, now - began, means, score)

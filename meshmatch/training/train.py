@@ -74,7 +74,7 @@ def train(
 
     The folder receives ``checkpoint/last.safetensors`` and ``metrics.jsonl`` on the way and, at every stop,
     ``template.safetensors``, ``weights.safetensors`` and last ``card.json``; and in ``best`` the same of the model with the
-    lowest validation error, which is measured every 500 steps.
+    lowest validation error, which is measured every 500 steps and at the end.
 
     Parameters
     ----------

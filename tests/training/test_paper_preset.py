@@ -133,7 +133,7 @@ def test_lengths_of_the_loss_are_those_of_the_unit_sphere(tmp_path: Path, monkey
     class Seen(Exception):
         pass
 
-    def trainer(_model: object, _points: object, config: TrainConfig, _digest: str) -> None:
+    def trainer(_model: object, _points: object, config: TrainConfig, *_: object) -> None:
         raise Seen(config.loss.reconstruction)
 
     monkeypatch.setattr("meshmatch.training.train.Trainer", trainer)

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from meshmatch.api.prepare import PrepareConfig, prepare
-from meshmatch.errors import InputError, ModelError, OptionError, OutputError, TemplateError
+from meshmatch.errors import InputError, MeshmatchWarning, ModelError, OptionError, OutputError, TemplateError
 from meshmatch.experiments.makers import human_bodies
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.fitting.fit_config import FitConfig
@@ -116,6 +116,7 @@ def test_a_folder_becomes_a_model(prepared: Path, tmp_path: Path, chosen: Recipe
         "rate": seen[-1].rate,
         "seconds": json.loads(line)["seconds"],
         **seen[-1].terms,
+        "validation": seen[-1].validation,
     }
     model = load_model(folder)
     assert model.card == card
@@ -251,7 +252,9 @@ def test_training_goes_on_from_the_checkpoint_unless_told_not_to(prepared: Path,
     again = verify_model(trained(prepared, stopped))  # nothing left to do: the same model
     assert (again.weights_sha256, again.steps) == (whole.weights_sha256, 4)
     longer = replace(SMALL, train=replace(SMALL.train, steps=6))
-    assert verify_model(trained(prepared, stopped, longer)).steps == 6
+    with pytest.warns(MeshmatchWarning, match="steps 4 is 6 now"):
+        found = verify_model(trained(prepared, stopped, longer))
+    assert (found.steps, found.recipe["earlier"]) == (6, [{"until_step": 4, "train.steps": 4}])
     other = replace(SMALL, train=replace(SMALL.train, seed=1))
     fresh = verify_model(trained(prepared, stopped, other, resume=False))
     assert (fresh.steps, fresh.seed) == (4, 1)
@@ -304,7 +307,8 @@ def test_an_encoder_of_ones_own_is_trained_kept_and_asked_for(prepared: Path, tm
     fit = Fitter(model, FitConfig(samples=300, coarse_samples=60, careful=1, partial="no")).fit(egg_template().shape)
     assert np.isfinite(fit.points).all()
     longer = replace(own, train=replace(own.train, steps=6))
-    assert load_model(trained(prepared, folder, longer), encoder=Pooled).card.steps == 6
+    with pytest.warns(MeshmatchWarning, match="other settings"):
+        assert load_model(trained(prepared, folder, longer), encoder=Pooled).card.steps == 6
     ours = trained(prepared, tmp_path / "ours")
     with pytest.raises(ModelError, match="meshmatch's own encoder"):
         load_model(ours, encoder=Pooled)
