@@ -126,6 +126,34 @@ def call_clips_by_name():
         action.name = name
 
 
+def bind_clips():
+    """Let clips fit only the objects that play them: an fbx gets each for all objects whose properties have the names of
+    its own, and "location" is a property of all. Each gets a curve without keys, for a property of these objects alone.
+    """
+    marks = {}
+    for each in bpy.data.objects:
+        data = each.animation_data
+        if data is None:
+            continue
+        for user in (data, *(strip for track in data.nla_tracks for strip in track.strips)):
+            if user.action is None:
+                continue
+            slot = getattr(user, "action_slot", None)  # since Blender 4.4
+            mark = marks.setdefault((user.action.name, slot and slot.identifier), f"clip {len(marks)}")
+            each[mark] = 0.0
+            for curves in curves_of(user.action, slot):
+                if curves.find(f'["{mark}"]') is None:
+                    curves.new(f'["{mark}"]')
+
+
+def curves_of(action, slot):
+    """The lists of an action's curves."""
+    if slot is None:
+        return [action.fcurves]
+    bags = [strip.channelbag(slot) for layer in action.layers for strip in layer.strips]
+    return [bag.fcurves for bag in bags if bag is not None]
+
+
 def tell_clips(suffix):
     """Tell which clips a format leaves out: of shapes, or all but one."""
     names = {}
@@ -266,6 +294,7 @@ def main(source, output):
         tell_clips(suffix)
         tell_layers(suffix)
     if suffix == ".fbx":
+        bind_clips()
         split_channels()
         name_images()
     write(output, prepare())

@@ -312,6 +312,32 @@ def test_clips_of_an_fbx_keep_their_names(tmp_path: Path) -> None:
 
 
 @needs_blender
+def test_a_clip_of_one_object_moves_no_other_in_an_fbx(tmp_path: Path) -> None:
+    """A step of something that stands beside a skeleton led all that the skeleton moves away."""
+    write_tube(tmp_path / "tube.glb")
+    editor = Editor(Document(tmp_path / "tube.glb", (tmp_path / "tube.glb").read_bytes()))
+    steps = editor.add_node("steps", np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
+    editor.json["scenes"][0]["nodes"].append(steps)
+    times, places = np.array([0.0, 1.0], np.float32), np.array([[0, 90, 0], [0, 95, 0]], np.float32)
+    sampler = {"input": editor.add_array(times, bounds=True), "output": editor.add_array(places)}
+    channel = {"sampler": 0, "target": {"node": steps, "path": "translation"}}
+    editor.json["animations"].append({"name": "walk", "samplers": [sampler], "channels": [channel]})
+    (tmp_path / "both.glb").write_bytes(editor.to_bytes())
+    path = tmp_path / "both.fbx"
+    blender.from_glb(tmp_path / "both.glb", path, path)
+    old, new = meshmatch.load_shape(tmp_path / "both.glb"), meshmatch.load_shape(path)
+    np.testing.assert_allclose(new.verts.min(0), old.verts.min(0), atol=3e-3)
+    np.testing.assert_allclose(new.verts.max(0), old.verts.max(0), atol=3e-3)
+    document = Document(path, read_bytes(path))
+    moved = {
+        clip["name"]: {document.nodes[channel["target"]["node"]]["name"] for channel in clip["channels"]}
+        for clip in document.json["animations"]
+    }
+    assert set(moved) == {"bend", "walk"} and moved["walk"] == {"steps"}
+    assert {"hip", "knee", "foot"} <= moved["bend"] and "steps" not in moved["bend"]
+
+
+@needs_blender
 def test_scripts_and_drivers_of_a_blend_file_do_not_run(tmp_path: Path) -> None:
     for name, text in (("hostile.py", HOSTILE), ("trusting.py", TRUSTING)):
         (tmp_path / name).write_text(text)
