@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from meshmatch import blender
 from meshmatch.arrays import Brief, Float, Floats
 from meshmatch.errors import OptionError, warn
 from meshmatch.outputs import replace_all_on_success
@@ -172,6 +173,7 @@ def glb_base(file: Path | None, shape: Shape) -> tuple[Path, bytes, bool]:
 def tell_lost(file: Path | None, path: Path) -> None:
     """Say what an output in this format does not have of the file that it was made of."""
     before, after = ("" if each is None else each.suffix.lower() for each in (file, path))
+    after = ".glb" if blender.is_converted(path) else after  # by way of which it is written
     if file is None or before == after or after not in (".glb", ".obj", ".ply", ".off"):
         return
     lost: list[str] = []

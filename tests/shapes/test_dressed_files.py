@@ -14,6 +14,7 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance, load_coordinates
+from tests.blender_at_hand import stand_in
 from tests.shapes.painted import CORNERS, FACES, UV, encoded, quarters, write_document, write_gltf
 from tests.transfer.rigs import played, write_tube
 
@@ -309,12 +310,17 @@ def test_faces_without_a_material_get_one(tmp_path: Path) -> None:
     [
         ("tube.glb", "out.obj", "out.obj does not have the nodes, skins and clips of tube.glb"),
         ("leaf.obj", "out.glb", "out.glb does not have the polygons, groups, materials and normals of leaf.obj"),
+        ("leaf.obj", "out.fbx", "out.fbx does not have the polygons, groups, materials and normals of leaf.obj"),
         ("tube.glb", "out.glb", ""),
+        ("tube.glb", "out.usdz", ""),
         ("leaf.obj", "out.obj", ""),
         ("plain.ply", "out.glb", ""),
     ],
 )
-def test_what_a_format_does_not_hold_is_one_line(tmp_path: Path, name: str, out: str, said: str) -> None:
+def test_what_a_format_does_not_hold_is_one_line(
+    tmp_path: Path, name: str, out: str, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stand_in(tmp_path, monkeypatch)
     write_tube(tmp_path / "tube.glb")
     (tmp_path / "leaf.obj").write_bytes(LEAF)
     save_shape(tmp_path / "plain.ply", Shape(CORNERS, FACES, "plain"))
