@@ -27,7 +27,7 @@ from meshmatch.shapes.formats import gltf
 from meshmatch.shapes.formats.gltf_edit import remembering
 from meshmatch.shapes.formats.gltf_morphs import with_morphs
 from meshmatch.shapes.formats.gltf_vrm import check_character
-from meshmatch.shapes.moved_files import MovedFile
+from meshmatch.shapes.moved_files import MovedFile, tell_left, with_look
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.blend_shapes import carry_moves
@@ -87,7 +87,8 @@ class BlendShapesResult(Brief):
         Parameters
         ----------
         path
-            A .glb: the target as it came, with morph targets and the clips that animate them. An .npz: ``names`` (K,) and
+            A .glb: the target as it came, with morph targets and the clips that animate them; of another file than glTF
+            with its texture or its one color. An .npz: ``names`` (K,) and
             ``moves`` (K, V, 3). Or a new folder, which gets an .obj for each shape: the target's own text with other
             positions, if it came as .obj.
 
@@ -103,20 +104,27 @@ class BlendShapesResult(Brief):
         check_character(self.original, path)
         if suffix:
             with replace_on_success(path) as temporary:
-                if suffix == ".npz":
-                    save_blend_shapes(temporary, self.shapes)
-                else:
-                    temporary.write_bytes(self._to_glb())
+                self.write(path, temporary)
             return
         with folder_on_success(path) as folder:
             self._write_meshes(self._plans(folder))
 
-    def _to_glb(self) -> bytes:
-        """The target as it came, with morph targets."""
+    def write(self, output: Path, place: Path) -> None:
+        """Write an output that is one file where it waits to get its name. What it does not hold is told."""
+        if check_shapes_output(output) == ".npz":
+            save_blend_shapes(place, self.shapes)
+            return
+        glb, lost = self._to_glb()
+        place.write_bytes(glb)
+        tell_left(output, self.original, lost)
+
+    def _to_glb(self) -> tuple[bytes, str]:
+        """The target as it came, with morph targets; and what it has not of the target's file."""
         path, data, in_gltf = as_scene(self.original or self.target, self.target)
         turn = np.eye(3) if in_gltf else turn_upright(self.maps, self.stands_along_y)
         adding = partial(with_morphs, shape=self.target, added=self.shapes, turn=turn)
-        return remembering(gltf.understood(path, data, "scene makes", adding), self.target)
+        glb, lost = with_look(gltf.understood(path, data, "scene makes", adding), self.original, self.target)
+        return remembering(glb, self.target), lost
 
     def _plans(self, folder: Path) -> list[MovedFile]:
         """The files of a folder of meshes: an .obj for each shape, and what an .obj takes along, once."""

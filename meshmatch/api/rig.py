@@ -24,6 +24,7 @@ from meshmatch.shapes.formats.gltf_humanoid import Person, person_of, with_bones
 from meshmatch.shapes.formats.gltf_rig import Rig, read_rig
 from meshmatch.shapes.formats.gltf_rigged import Binding, hanging_groups, rigged
 from meshmatch.shapes.input_files import read_bytes
+from meshmatch.shapes.moved_files import tell_left, with_look
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.attributes import joint_table, most_votes, pull_weights
 from meshmatch.transfer.carry_rig import UP, carry, upright
@@ -61,6 +62,8 @@ class RiggedResult(Brief):
         The source's file.
     original
         The target's file, if it came from one.
+    lost
+        What of that file the glb does not hold, in words.
 
     Examples
     --------
@@ -78,6 +81,7 @@ class RiggedResult(Brief):
     glb: bytes
     source: Path
     original: Path | None = None
+    lost: str = ""
 
     def _repr_html_(self) -> str:
         from meshmatch.api.notebook import carried_html
@@ -107,9 +111,15 @@ class RiggedResult(Brief):
             The file cannot be written.
         """
         path = as_path(path)
-        person = check_rig_output(path, self.source, self.original)
+        check_rig_output(path, self.source, self.original)
         with replace_on_success(path) as temporary:
-            temporary.write_bytes(self.glb if person is None else self._character(path, person))
+            self.write(path, temporary)
+
+    def write(self, output: Path, place: Path) -> None:
+        """Write an output where it waits to get its name. What it does not hold is told."""
+        person = check_rig_output(output, self.source, self.original)
+        place.write_bytes(self.glb if person is None else self._character(output, person))
+        tell_left(output, self.original, self.lost)
 
     def _character(self, path: Path, person: Person) -> bytes:
         name = path if self.original is None else self.original
@@ -150,7 +160,7 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
         A rigged .glb, .gltf or .vrm, or a file that Blender reads.
     target
         The shape that receives the rig. Of a .glb, .gltf or .vrm everything is kept but a skeleton of its own; another
-        shape is turned upright by the skeleton.
+        shape is turned upright by the skeleton, and keeps its texture or its one color.
     match
         As in `find_maps`.
     pose
@@ -197,6 +207,7 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     before, after = (np.asarray(each.sum(axis=0)).ravel() > 0 for each in (weights.matrix, found))
     unused = tuple(weights.names[joint] for joint in np.flatnonzero(before & ~after))
     moving = SkinWeights(found, weights.names)
-    made = remembering(glb, b)
     original = as_path(target) if isinstance(target, str | Path) else None
-    return RiggedResult(standing, moving, unused, replaced.joints, replaced.clips, maps, made, source, original)
+    glb, lost = with_look(glb, original, b)
+    made = remembering(glb, b)
+    return RiggedResult(standing, moving, unused, replaced.joints, replaced.clips, maps, made, source, original, lost)

@@ -44,7 +44,7 @@ def transfer_rig(
     check_rig_output(output, source, target)
     with transfer.outputs() as (temporary,):
         result = meshmatch.transfer_rig(source, target, transfer, pose=pose)
-        result.save(temporary)
+        result.write(output, temporary)
     joints, clips = len(result.rig.joints), [clip.name for clip in result.rig.clips]
     if result.unused:
         many, names = len(result.unused), _listed(result.unused)

@@ -51,7 +51,10 @@ def transfer_shapes(
     with transfer.outputs(*(shapes or ()), files=[output] if suffix else ()) as temporary:
         given = None if shapes is None else shapes[0] if len(shapes) == 1 else shapes
         result = meshmatch.transfer_shapes(source, target, transfer, shapes=given)
-        result.save(*temporary or [output])
+        if temporary:
+            result.write(output, *temporary)
+        else:
+            result.save(output)
     names, clips = result.shapes.names, [clip.name for clip in result.shapes.clips]
     if result.still:
         listed = ", ".join(result.still[:_NAMED]) + (", ..." if len(result.still) > _NAMED else "")

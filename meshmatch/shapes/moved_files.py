@@ -22,6 +22,7 @@ from meshmatch.shapes.colors import bytes_of
 from meshmatch.shapes.dressed_files import Dressed
 from meshmatch.shapes.files import check_suffix, save_shape
 from meshmatch.shapes.formats import gltf, obj_look, obj_text
+from meshmatch.shapes.formats.gltf_dressed import dressed
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_join import joined
 from meshmatch.shapes.formats.gltf_moved import moved
@@ -138,16 +139,13 @@ class MovedFile:
         if as_it_came is not None:
             places[0].write_bytes(as_it_came)
             return
-        look = None
-        with suppress(InputError):  # an image that is not there is no reason to lose the mesh
-            look = None if original is None or shape.is_cloud else find_appearance(original, shape, plain=True)
+        look = _look_of(original, shape)
         worn = _one_image(shape, look) if suffix == ".glb" and look is not None else None
         if worn is not None:
             worn.write(self.output, places[:1])
         else:
             save_shape(places[0], shape)
-        if lost := _lost(original, look, worn is not None):
-            warn(f"{self.output.name} does not have {lost} of {getattr(original, 'name', '')}")
+        tell_left(self.output, original, _lost(original, look, worn is not None))
 
 
 def save_moved(
@@ -176,6 +174,33 @@ def check_into(file: Path | None, output: Path) -> None:
     if output.suffix.lower() not in (".glb", SUFFIX):
         raise OptionError(f"{output.name} cannot hold the target and what is put into it", "end the output in .glb")
     check_character(file, output)
+
+
+def with_look(glb: bytes, original: Path | None, shape: Shape) -> tuple[bytes, str]:
+    """A glb that was made of a shape, with the texture or the one color that the shape's file gives it; and what else of a
+    file that is no glTF a glb does not have, for `tell_left`.
+    """
+    if original is None or original.suffix.lower() in gltf.SUFFIXES:
+        return glb, ""
+    look = _look_of(original, shape)
+    worn = None if look is None else _one_image(shape, look)
+    if worn is not None:
+        adding = partial(dressed, uv=worn.uv, own=False, material=worn.material, turn=worn.turn)
+        glb = gltf.understood(original, glb, "scene makes", adding)
+    return glb, _lost(original, look, worn is not None)
+
+
+def tell_left(output: Path, original: Path | None, lost: str) -> None:
+    """Say what an output does not have of the file that it was made of, if there is anything."""
+    if original is not None and lost:
+        warn(f"{output.name} does not have {lost} of {original.name}")
+
+
+def _look_of(original: Path | None, shape: Shape) -> Appearance | None:
+    """The look of a mesh in its file; an image that is not there is no reason to lose the mesh."""
+    with suppress(InputError):
+        return None if original is None or shape.is_cloud else find_appearance(original, shape, plain=True)
+    return None
 
 
 def _turned(document: gltf.Document, turn: Float[Floats, "3 3"]) -> bytes:
@@ -235,7 +260,8 @@ def _lost(original: Path | None, look: Appearance | None, textured: bool) -> str
     if look is not None and not textured and (look.textured or len(look.materials) > 1):
         lost += ["the texture coordinates", "the materials"]
     if suffix == ".obj":
-        lost += ["the polygons", "the groups"]
+        lost += [f"the {word}" for word in obj_text.beyond_triangles(original.name, read_bytes(original))]
     elif suffix in gltf.SUFFIXES:
         lost += ["other maps than the base color", "skins", "morph targets", "the nodes"]
+    lost = list(dict.fromkeys(lost))
     return " and ".join([", ".join(lost[:-1]), lost[-1]]) if len(lost) > 1 else "".join(lost)

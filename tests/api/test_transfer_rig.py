@@ -11,11 +11,14 @@ from scipy.spatial.transform import Rotation
 import meshmatch
 from meshmatch.errors import InputError, MeshmatchWarning, OptionError
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.formats.gltf import Document, digest
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_rig import read_rig
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.textured_files import load_appearance
 from tests.shapes.painted import encoded, quarters, write_document
 from tests.transfer.rigs import AROUND, BEND, KNEE, NODES, played, tube, volume, write_tube
 
@@ -359,6 +362,27 @@ def test_what_is_made_of_a_mesh_takes_its_maps(source: Path) -> None:
     assert load_shape(out).made_of == ()
     with pytest.raises(InputError, match="was made for another target"):
         made.for_shapes(None, load_shape(out))
+
+
+def test_a_mesh_of_an_obj_keeps_its_texture(source: Path) -> None:
+    """Its seams split vertices, which move as before; what a glb does not hold is told."""
+    plain, target, shape = source.with_name("plain.ply"), source.with_name("target.obj"), tube()
+    save_shape(plain, Shape(2 * shape.verts, shape.faces))
+    bare = rigged(source, plain)[0]
+    expected = played(bare, "bend", 1.0)
+    uv = np.random.default_rng(0).random((shape.F, 3, 2))
+    save_textured(target, Textured(2 * shape.verts, shape.faces, uv), quarters())
+    with target.open("a") as text:
+        text.write("f 1/1 2/2 3/3 4/4\n")
+    with pytest.warns(MeshmatchWarning, match=r"^rigged\.glb does not have the polygons of target\.obj$"):
+        out, _ = rigged(source, target)
+    before, after = load_shape(target), load_shape(out)
+    assert after.V > before.V and digest(before.faces) != digest(after.faces)
+    assert np.allclose(played(out, "bend", 1.0)[after.faces], expected[before.faces], atol=1e-5)
+    given, kept = load_appearance(target, before), load_appearance(out, after)
+    assert np.allclose(kept.uv, given.uv, atol=1e-6)
+    assert np.array_equal(kept.materials[0].image, given.materials[0].image)
+    assert before.hash in after.made_of  # and so takes its maps
 
 
 def test_a_cloud_is_rigged_too(source: Path) -> None:

@@ -12,11 +12,15 @@ from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.blend_shape_files import load_blend_shapes
 from meshmatch.shapes.blend_shapes import BlendShapes, WeightClip
+from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_morphs import read_morphs, with_morphs
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.textured_files import load_appearance
 from tests.cli.conftest import Run, refused, well
+from tests.shapes.painted import quarters
 from tests.transfer.rigs import tube, write_tube
 
 CALL = ("transfer-shapes", "a.glb", "b.ply", "--map", "ab.npz")
@@ -66,6 +70,23 @@ def test_shapes_into_a_glb(run: Run, pair: Path) -> None:
     # the ply lies, the glb stands as a.glb does
     assert np.allclose(found.moves[:2], 2 * moves_of(tube())[:2], atol=0.02)
     assert np.allclose(load_shape("out.glb").verts, 2 * tube().verts, atol=1e-5)
+
+
+def test_an_obj_keeps_its_texture_in_a_glb(run: Run, pair: Path) -> None:
+    b = load_shape("b.ply")
+    save_textured("b.obj", Textured(b.verts, b.faces, np.random.default_rng(0).random((b.F, 3, 2))), quarters())
+    with Path("b.obj").open("a") as text:
+        text.write("f 1/1 2/2 3/3 4/4\n")
+    save_map("ab.npz", VertexMap.between(load_shape("a.glb"), load_shape("b.obj"), np.arange(b.V), verdict="good"))
+    answer = well(run("transfer-shapes", "a.glb", "b.obj", "--map", "ab.npz", "-o", "out.glb", "--quiet"))
+    assert answer.err == "warning: out.glb does not have the polygons of b.obj\n"
+    out, before = load_shape("out.glb"), load_shape("b.obj")
+    look, given = load_appearance("out.glb", out), load_appearance("b.obj", before)
+    np.testing.assert_allclose(look.uv, given.uv, atol=1e-6)
+    np.testing.assert_array_equal(look.materials[0].image, given.materials[0].image)
+    found = read_morphs(Path("out.glb"), Path("out.glb").read_bytes())
+    np.testing.assert_allclose(found.moves[:2, out.faces], 2 * moves_of(tube())[:2, before.faces], atol=0.02)
+    assert (found.moves[2, out.faces].any(axis=2) == (before.faces == 100)).all()
 
 
 def test_shapes_into_arrays(run: Run, pair: Path) -> None:

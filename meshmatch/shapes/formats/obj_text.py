@@ -153,7 +153,7 @@ def beyond_triangles(name: str, data: bytes) -> list[str]:
     there = {
         "polygons": bool(len(sizes)) and int(sizes.max()) > 3,
         "groups": len(groups[1]) + len(objects[1]) > 1,
-        "materials": len(set(materials[0].split(b"\n"))) > 1,
+        "materials": len({name.strip() for name in materials[0].split(b"\n")} - {b""}) > 1,
         "normals": len(normals) > 0,
     }
     return [word for word, known in there.items() if known]
