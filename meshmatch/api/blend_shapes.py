@@ -129,14 +129,13 @@ class BlendShapesResult(Brief):
     def _plans(self, folder: Path) -> list[MovedFile]:
         """The files of a folder of meshes: an .obj for each shape, and what an .obj takes along, once."""
         taken: set[str] = set()
-        plans: list[MovedFile] = []
+        files: list[Path] = []
         for name in self.shapes.names:
             plain = _PLAIN.sub("_", name)[:_LONGEST].strip(". ") or "shape"
             stem = next(word for word in _numbered(plain) if word.lower() not in taken)
             taken.add(stem.lower())
-            planned = MovedFile.planned(folder / f"{stem}.obj", self.original if not plans else None)
-            plans.append(replace(planned, original=self.original))
-        return plans
+            files.append(folder / f"{stem}.obj")
+        return MovedFile.planned_all(files, self.original)
 
     def _write_meshes(self, plans: Sequence[MovedFile]) -> None:
         normals = shape_normals(self.target, self.shapes.moves)

@@ -17,6 +17,7 @@ from meshmatch.api.inputs import UnknownKindsError, configs_for, usable
 from meshmatch.api.matcher import Matcher
 from meshmatch.api.matching import matcher_for
 from meshmatch.api.results import shape_of
+from meshmatch.api.upright import turn_of_fit
 from meshmatch.arrays import Brief, Floats
 from meshmatch.errors import OptionError
 from meshmatch.fitting.agree import agreed_fits
@@ -24,12 +25,14 @@ from meshmatch.fitting.blend import WAYS, Blend, Deviation, Way
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.solve.system import NodeSystem
+from meshmatch.maps.deformed import surface_rotations
 from meshmatch.maps.footpoints import Surface, SurfaceBinding, in_core_frame
 from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import folder_on_success
 from meshmatch.progress import ProgressCallback
-from meshmatch.shapes.files import ShapeLike, as_shapes, save_shape
+from meshmatch.shapes.files import ShapeLike, as_shapes
+from meshmatch.shapes.moved_files import MovedFile
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 
@@ -335,17 +338,26 @@ def _steps(
     return steps, place, float(found.distance.mean())
 
 
-def save_folder(path: str | Path, result: Interpolation, kind: str = "ply") -> list[str]:
+def save_folder(path: str | Path, result: Interpolation, kind: str = "ply", original: Path | None = None) -> list[str]:
     """Write each shape of a sequence into a new folder, ``frame-000.ply`` ..., and a list of them, ``frames.json``; the
-    names of the files in order. `OptionError` for another format; `OutputError` where the folder is not empty, or cannot be
-    written.
+    names of the files in order. ``original`` is the file whose mesh moves, which they are like but for positions. A glb
+    stands along y as the first shape does. `OptionError` for another format; `OutputError` where the folder is not empty,
+    or cannot be written.
     """
     if kind not in FORMATS:
         raise OptionError(f"shapes of a sequence are not written as {kind}", f"choose {', '.join(FORMATS)}")
     names = [f"frame-{number:03d}.{kind}" for number in range(len(result.steps))]
+    fit = result.fits[0]
+    began = shape_of(fit).original if isinstance(fit, Fit) else None
+    turn = None if began is None or began.upright else turn_of_fit(fit)
     with folder_on_success(path) as folder:
-        for name, step in zip(names, result.steps, strict=True):
-            save_shape(folder / name, step.shape)
+        plans = MovedFile.planned_all([folder / name for name in names], original)
+        for plan, step in zip(plans, result.steps, strict=True):
+            turns = np.broadcast_to(np.eye(3), (step.shape.V, 3, 3))
+            if plan.turns_normals and began is not None:
+                turns = surface_rotations(began.verts, step.shape.verts, began.faces)
+            plan.make_folders()
+            plan.write(plan.files, step.shape, turns, turn=turn)
         frames = [{"file": name} | step.record for name, step in zip(names, result.steps, strict=True)]
         words = {"times_of_the_shapes": list(result.times), "place": result.place, "frames": frames}
         (folder / "frames.json").write_text(json.dumps(words, indent=1) + "\n", encoding="utf-8")

@@ -98,7 +98,8 @@ def interpolate(
         if suffix:
             _WRITERS[suffix](temporary, result, met)
         else:
-            interpolation.save_folder(temporary, result, sequence.format)
+            moves = not how.implicit and sequence.mesh == "source"
+            interpolation.save_folder(temporary, result, sequence.format, source if moves else None)
     _tell(console, result, files, sequence.place)
     what = "surfaces" if how.implicit else f"shapes of {result.steps[0].shape.V} vertices"
     console.say(

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -40,11 +40,19 @@ class MovedFile:
     """An output that is like an original file, but for where its vertices are: what is written, and copied beside it.
 
     ``original`` is None where the mesh came from no file; ``copies`` are pairs of a new file and what it is a copy of.
+    What the output does not hold is told, unless it is one of several (``told``) for the first of which it was.
     """
 
     output: Path
     original: Path | None
     copies: tuple[tuple[Path, Path], ...] = ()
+    told: bool = False
+
+    @classmethod
+    def planned_all(cls, outputs: Sequence[Path], original: Path | None) -> list[MovedFile]:
+        """Several outputs of one folder, which need the materials of an .obj beside them once; errors as `planned`."""
+        plans = [cls.planned(output, None if number else original) for number, output in enumerate(outputs)]
+        return [replace(plan, original=original, told=number > 0) for number, plan in enumerate(plans)]
 
     @classmethod
     def planned(cls, output: Path, original: Path | None, into: Path | None = None) -> MovedFile:
@@ -74,6 +82,12 @@ class MovedFile:
                 hint = "choose another folder for the output, or remove the file"
                 raise OptionError(f"cannot copy {file.name} beside {output.name}: another {copy} is there", hint)
         return cls(output, original, tuple(copies))
+
+    @property
+    def turns_normals(self) -> bool:
+        """Whether directions at vertices of the original are turned, rather than made anew."""
+        before, after = "" if self.original is None else self.original.suffix.lower(), self.output.suffix.lower()
+        return before == after == ".obj" or (before in gltf.SUFFIXES and after == ".glb")
 
     @property
     def files(self) -> list[Path]:
@@ -135,7 +149,7 @@ class MovedFile:
             return
         as_it_came = None
         if original is not None and suffix == ".glb" and original.suffix.lower() in gltf.SUFFIXES:
-            as_it_came = _scene(self.output, original, shape, turns, still)
+            as_it_came = _scene(self.output, original, shape, turns, still and not self.told)
         if as_it_came is not None:
             places[0].write_bytes(as_it_came)
             return
@@ -145,7 +159,8 @@ class MovedFile:
             worn.write(self.output, places[:1])
         else:
             save_shape(places[0], shape)
-        tell_left(self.output, original, _lost(original, look, worn is not None))
+        if not self.told:
+            tell_left(self.output, original, _lost(original, look, worn is not None))
 
 
 def save_moved(

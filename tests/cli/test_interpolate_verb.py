@@ -1,6 +1,7 @@
 """`interpolate` through the front door, on eggs, and once on the samples."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,11 +9,16 @@ import pytest
 from PIL import Image
 
 from meshmatch.api import interpolation
+from meshmatch.fitting.fit import Fit
+from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.textured_files import load_appearance
 from meshmatch.templates.location import bundled_folder
 from tests.cli.conftest import Run
 from tests.fitting.eggs import bent_egg, egg_model, write_model
+from tests.shapes.painted import quarters
 
 pytestmark = pytest.mark.usefixtures("remembered_fits")
 
@@ -55,6 +61,40 @@ def test_a_folder_of_shapes(run: Run, eggs: Path, tmp_path: Path) -> None:
     again = run(*call)
     assert again.status == 1
     assert "is not empty" in again.err
+
+
+def test_the_mesh_of_a_file_keeps_its_look(run: Run, eggs: Path, tmp_path: Path) -> None:
+    """An obj its text and materials, in a glb its image; what another format loses is said once."""
+    a = load_shape(eggs / "a.ply")
+    uv = np.random.default_rng(0).random((a.F, 3, 2))
+    worn = tmp_path / "worn.obj"
+    save_textured(worn, Textured(a.verts, a.faces, uv), quarters())
+    call = ("interpolate", worn, eggs / "b.ply", "-n", 2, "--model", eggs / "model", "--quiet", "--threads", 1)
+    frames = {kind: tmp_path / kind / f"frame-001.{kind}" for kind in ("obj", "glb", "ply")}
+    for kind, frame in frames.items():
+        done = run(*call, "-o", frame.parent, "--format", kind)
+        lost = "frame-000.ply does not have the texture coordinates and the materials of worn.obj"
+        assert (done.status, done.err) == (0, f"warning: {lost}\n" if kind == "ply" else "")
+        if kind != "ply":
+            given, kept = (load_appearance(file, load_shape(file)) for file in (worn, frame))
+            np.testing.assert_allclose(kept.uv, given.uv, atol=1e-6)
+            np.testing.assert_array_equal(kept.materials[0].image, given.materials[0].image)
+    text, before = (file.read_text().splitlines() for file in (frames["obj"], worn))
+    assert [line for line in text if line[:2] != "v "] == [line for line in before if line[:2] != "v "]
+    np.testing.assert_allclose(load_shape(frames["obj"]).verts, load_shape(frames["ply"]).verts, atol=1e-9)
+
+
+def test_a_glb_stands_as_the_first_shape_does(eggs: Path, tmp_path: Path) -> None:
+    shapes = [load_shape(eggs / f"{name}.ply") for name in "ab"]
+    result = interpolation.interpolate(shapes, 2, model=eggs / "model", threads=1)
+    fit = result.fits[0]
+    assert isinstance(fit, Fit)
+    lying = replace(result, fits=(replace(fit, up="+z"), result.fits[1]))
+    for each, folder in ((replace(result, fits=(replace(fit, up="+y"), fit)), "stands"), (lying, "lies")):
+        interpolation.save_folder(tmp_path / folder, each, "glb")
+    for name in ("frame-000.glb", "frame-001.glb"):
+        before, after = (load_shape(tmp_path / folder / name).verts for folder in ("stands", "lies"))
+        np.testing.assert_allclose(after, before @ [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-5)
 
 
 def test_there_and_back_through_a_third(run: Run, eggs: Path, tmp_path: Path) -> None:
