@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Real
 from pathlib import Path
@@ -256,11 +256,12 @@ def maps_of_fits(
         return Places.of(part, fit, own, threads), part.original
 
     (here, source), (there, target) = placed(first, before[0]), placed(second, before[1])
-    found = build_map(here, there, threads)
-    if source is None or target is None:
-        return found, None
-    partial = _partial(first) or _partial(second)
-    return unfolded_pair(found, lambda: build_map(there, here, threads), source, target, partial, threads)
+    found, back = build_map(here, there, threads), None
+    if source is not None and target is not None:
+        partial = _partial(first) or _partial(second)
+        found, back = unfolded_pair(found, lambda: build_map(there, here, threads), source, target, partial, threads)
+    ups = [fit.up if isinstance(fit, Fit) else "" for fit in fits]
+    return replace(found, source_up=ups[0], target_up=ups[1]), back
 
 
 def _partial(fit: Fit | ImplicitFit) -> bool:

@@ -252,7 +252,7 @@ def transfer_colors(
 def _write_colors(colors: Floats, maps: MapPair, file: Path | None, path: Path, final: Path) -> None:
     check_character(file, final)
     along_y = Path(maps.source.name).suffix.lower() in gltf.SUFFIXES
-    turn = turn_upright(maps, along_y) if final.suffix.lower() == ".glb" else None
+    turn = turn_upright(maps, along_y) if path.suffix.lower() == ".glb" else None  # of an fbx a glb waits to become it
     save_colors(path, maps.target, colors, file, turn)
     tell_lost(file, final)
 

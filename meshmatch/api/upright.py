@@ -20,18 +20,24 @@ def trust(source: Shape, maps: MapPair) -> Float[Floats, " V"]:
 
 def turn_of_fit(fit: object) -> Float[Floats, "3 3"] | None:
     """The turn after which a shape stands along y, by its fit; None if that does not know how it stands."""
-    if not isinstance(fit, Fit) or not fit.up:
+    return _turn_of_axis(fit.up) if isinstance(fit, Fit) else None
+
+
+def _turn_of_axis(name: str) -> Float[Floats, "3 3"] | None:
+    """The turn that takes an axis such as "+z" to y; None for an empty name."""
+    if not name:
         return None
     up = np.zeros(3)
-    up["xyz".index(fit.up[1])] = -1.0 if fit.up[0] == "-" else 1.0
+    up["xyz".index(name[1])] = -1.0 if name[0] == "-" else 1.0
     return turn_of(up)
 
 
 def turn_upright(maps: MapPair, along_y: bool) -> Float[Floats, "3 3"]:
-    """The turn about one axis, by right angles, after which the target stands along y: by its fit, or else as the source
-    does, if that stands ``along_y``; where neither is known, none.
+    """The turn about one axis, by right angles, after which the target stands along y: by its fit, or what the map says of
+    that, or else as the source does, if that stands ``along_y``; where neither is known, none.
     """
     known = None if maps.match is None else turn_of_fit(maps.match.target_fit)
+    known = _turn_of_axis(maps.forward.target_up) if known is None else known
     if known is not None:
         return known
     if not along_y:

@@ -62,8 +62,8 @@ def transfer_texture(
     """
     from meshmatch.api.texture import tiles_of_file
     from meshmatch.shapes import textured_files
-    from meshmatch.shapes.dressed_files import check_tiles, tell_lost
-    from meshmatch.transfer.value_files import parse_color, save_colors
+    from meshmatch.shapes.dressed_files import check_tiles
+    from meshmatch.transfer.value_files import parse_color
 
     transfer = Transfer(source, target, output, maps, run, picture)
     size, uv, image = texture.size, texture.uv, texture.image
@@ -92,9 +92,8 @@ def transfer_texture(
     turn = None
     with transfer.outputs(image, files=files) as temporary:
         if painted:
-            done = meshmatch.transfer_colors(a, b, transfer, colors=look, rule=rule)
-            save_colors(temporary[0], b, done.data, target)
-            tell_lost(target, output)
+            done = meshmatch.transfer_colors(a, target, transfer, colors=look, rule=rule)
+            done.writer(temporary[0], output)
             record, pair = transfer.tell_low(done.low, rule.minimum), done.maps
         else:
             with transfer.console.progress() as report:
@@ -113,7 +112,9 @@ def transfer_texture(
         from meshmatch.render.compose import compose_shapes
 
         result = meshmatch.load_shape(output)
-        if turn is not None:  # the picture shows it as the target's file has it
+        if painted:  # the picture shows it as the target's file has it
+            result = replace(result, verts=b.verts)
+        elif turn is not None:
             result = replace(result, verts=result.verts @ turn)
         transfer.draw(pair, compose_shapes([(a, look), (result, textured_files.find_appearance(output, result))]))
     record = {"picture": picture, "files": [str(file) for file in files], "tiles": tiles} | record

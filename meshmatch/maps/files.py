@@ -32,7 +32,7 @@ from meshmatch.shapes.tables import read_table, whole
 
 CSV_COLUMNS = ("source_vertex", "target_vertex", "face", "w0", "w1", "w2", "confidence")
 _ARRAYS = ("index", "face", "barycentric", "confidence")
-_WORDS = ("source", "target", "verdict", "source_hash", "target_hash")
+_WORDS = ("source", "target", "verdict", "source_hash", "target_hash", "source_up", "target_up")
 _COUNTS = ("source_vertices", "target_vertices")
 _KNOWN = (*_ARRAYS, *_WORDS, *_COUNTS, "reasons")
 _FORMAT = "meshmatch map 1"

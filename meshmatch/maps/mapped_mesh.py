@@ -243,6 +243,7 @@ def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, worker
         )
     sure = np.where(target.valid, np.clip(found.confidence, 0.0, 1.0), 0.0)
     rest: dict[str, Any] = {"face": found.face, "barycentric": found.barycentric, "confidence": sure}
+    rest |= {"source_up": checked.target_up, "target_up": checked.source_up}
     return VertexMap.between(target, source, found.vertex, verdict=checked.verdict, reasons=checked.reasons, **rest)
 
 

@@ -18,6 +18,7 @@ UNKNOWN = -1
 """A number of vertices that is not known."""
 DIRECTION = "index[i] is the vertex of the target matched to vertex i of the source"
 VERDICTS = ("good", "fair", "poor", "unknown")
+_UPS = ("", "+x", "-x", "+y", "-y", "+z", "-z")
 _OTHER_MESH = (
     "match these two again; a map needs one entry for each vertex of the source, in the order of its file, and one "
     "kept as .npy or .csv goes by the count of vertices alone"
@@ -60,6 +61,10 @@ class VertexMap(Pickled):
         `Shape.hash` of the source; empty where not known.
     target_hash
         `Shape.hash` of the target; empty where not known.
+    source_up
+        The axis of the source that the match took for up, such as "+z"; empty where not known.
+    target_up
+        The same of the target.
     target_faces
         (F_target, 3) triangles whose corners ``barycentric`` weights; not written to files.
 
@@ -67,7 +72,7 @@ class VertexMap(Pickled):
     ------
     InputError
         Arrays of the wrong shape or kind, an index outside the target, weights that do not sum to 1, or an unknown
-        verdict.
+        verdict or axis.
 
     Examples
     --------
@@ -89,6 +94,8 @@ class VertexMap(Pickled):
     target_vertices: int = UNKNOWN
     source_hash: str = ""
     target_hash: str = ""
+    source_up: str = ""
+    target_up: str = ""
     target_faces: Int[Ints, "F_target 3"] | None = None
 
     def __post_init__(self) -> None:
@@ -99,6 +106,9 @@ class VertexMap(Pickled):
             raise InputError(f"{label} has {size} entries for {self.source_vertices} vertices of the source")
         if self.verdict not in VERDICTS:
             raise InputError(f"{label}: a verdict is one of {', '.join(VERDICTS)}, not '{self.verdict}'")
+        for axis in (self.source_up, self.target_up):
+            if axis not in _UPS:
+                raise InputError(f"{label}: up is one of {', '.join(_UPS[1:])}, not '{axis[:20]}'")
         for name, array in arrays.items():
             object.__setattr__(self, name, frozen(array))
         if self.target_faces is not None:
@@ -419,6 +429,7 @@ class VertexMap(Pickled):
             reasons=tuple(dict.fromkeys(self.reasons + other.reasons)),
             source_vertices=self.source_vertices,
             source_hash=self.source_hash,
+            source_up=self.source_up,
         )
 
     def __repr__(self) -> str:

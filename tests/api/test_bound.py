@@ -61,10 +61,11 @@ def test_a_garment_bends_with_the_body_that_it_sits_on(body: Path, skinned: bool
 def test_both_are_written_into_one_file(body: Path) -> None:
     garment, out = body.with_name("stocking.obj"), body.with_name("out.glb")
     save_shape(garment, stocking())
-    garment.write_text("mtllib wool.mtl\nusemtl wool\n" + garment.read_text().replace("# meshmatch\n", ""))
+    text = garment.read_text().replace("# meshmatch\n", "")
+    garment.write_text(f"mtllib wool.mtl\nusemtl wool\ng leg\n{text}g cuff\n")
     garment.with_name("wool.mtl").write_text("newmtl wool\nKd 1 0 0\n")
     result = worn(body, garment)
-    with pytest.warns(MeshmatchWarning, match="polygons"):
+    with pytest.warns(MeshmatchWarning, match="groups"):
         result.save(out, join=True)
     before, after = (Document(path, path.read_bytes()).json for path in (body, out))
     assert after["nodes"][: len(before["nodes"])] == before["nodes"]
@@ -119,18 +120,20 @@ def test_its_own_joints_go_where_the_skin_goes(body: Path) -> None:
         assert away.mean() < 0.05 * longer
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_a_garment_on_a_body_that_lies_stands_upright_in_a_glb(tmp_path: Path, known: bool) -> None:
-    """As the source does, if that stands; else it stays as it lies."""
+@pytest.mark.parametrize(("stands", "up"), [(True, ""), (False, "+z"), (False, "")])
+def test_a_garment_on_a_body_that_lies_stands_upright_in_a_glb(tmp_path: Path, stands: bool, up: str) -> None:
+    """As the source does, if that stands, or as the map's file says; else it stays as it lies."""
     lie = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    source, target, garment = tmp_path / ("a.glb" if known else "a.ply"), tmp_path / "b.ply", tmp_path / "stocking.ply"
+    source, target, garment = tmp_path / ("a.glb" if stands else "a.ply"), tmp_path / "b.ply", tmp_path / "stocking.ply"
     save_shape(source, tube())
     save_shape(target, Shape(tube().verts @ lie.T, tube().faces))
     save_shape(garment, tube())
-    result = meshmatch.transfer_garment(garment, source, target, same_numbers(load_shape(source), load_shape(target)))
+    found = replace(same_numbers(load_shape(source), load_shape(target)), target_up=up)
+    meshmatch.save_map(tmp_path / "map.npz", found)
+    result = meshmatch.transfer_garment(garment, source, target, tmp_path / "map.npz")
     out = tmp_path / "out.glb"
     result.save(out)
-    expected = result.shape.verts @ lie if known else result.shape.verts
+    expected = result.shape.verts @ lie if stands or up else result.shape.verts
     np.testing.assert_allclose(load_shape(out).verts, expected, atol=1e-5)
 
 

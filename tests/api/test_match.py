@@ -49,7 +49,7 @@ def test_the_samples_match_well(both) -> None:
     assert both.map.verdict != "poor"
     assert both.map.source_vertices == len(both.map.index)
     assert len(np.unique(both.map.index)) > 0.4 * both.map.target_vertices
-    assert (both.source_fit.up, both.target_fit.up) == ("+y", "+z")
+    assert (both.source_fit.up, both.target_fit.up) == (both.map.source_up, both.map.target_up) == ("+y", "+z")
 
 
 @pytest.mark.slow

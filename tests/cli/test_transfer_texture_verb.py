@@ -301,6 +301,19 @@ def test_clouds_and_ply_get_vertex_colors(run: Run, pair: Path, target: str, out
     assert (found.V, found.is_cloud) == (b.V, target == "b.npy")
 
 
+@pytest.mark.parametrize("target", ["b.npy", "b.ply"])
+def test_a_map_tells_how_the_target_stands(run: Run, pair: Path, target: str) -> None:
+    """It remembers what its match found; a node turns a mesh, or a cloud, upright."""
+    b = load_shape("b.ply")
+    np.save("b.npy", b.verts)
+    save_shape("a.ply", replace(load_shape("a.glb"), colors=np.ones((load_shape("a.glb").V, 4))))
+    a, index = load_shape("a.ply"), load_map("ab.npz").index
+    save_map("up.npz", VertexMap.between(a, load_shape(target), index, target_up="+z"))
+    told(run("transfer-texture", "a.ply", target, "-o", "out.glb", "--map", "up.npz", *SMALL, "--json"))
+    upright = load_shape("out.glb").verts[: b.V]
+    np.testing.assert_allclose(upright, b.verts @ [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-5)
+
+
 def test_a_painted_mesh_is_a_source_like_any_other(run: Run, pair: Path) -> None:
     well(run(*call(out="mesh.ply")))
     b = load_shape("b.ply")

@@ -20,7 +20,7 @@ from tests.maps.test_vertex_map import A, B, C, random_map
 CARRIES = {".npy": ("index",), ".txt": ("index",), ".csv": ("index", "face", "barycentric", "confidence")}
 EVERYTHING = (
     *("index", "face", "barycentric", "confidence", "source", "target", "verdict", "reasons"),
-    *("source_vertices", "target_vertices", "source_hash", "target_hash"),
+    *("source_vertices", "target_vertices", "source_hash", "target_hash", "source_up", "target_up"),
 )
 
 
@@ -48,6 +48,23 @@ def test_write_then_read(tmp_path: Path, suffix: str, kind: str) -> None:
     save_map(path, m)
     same(load_map(path), m, CARRIES.get(suffix, EVERYTHING))
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_axes_may_be_missing_and_are_checked(tmp_path: Path) -> None:
+    """Files of older versions have none."""
+    m, path = random_map(A, B, 5), tmp_path / "map.npz"
+    save_map(path, m)
+    with np.load(path) as file:
+        known = dict(file)
+    np.savez(path, **{name: array for name, array in known.items() if not name.endswith("_up")})
+    found = load_map(path)
+    assert (found.source_up, found.target_up) == ("", "")
+    same(found, m, EVERYTHING[:-2])
+    for odd in ("up", "+w", "z", "+y" * 100_000):
+        np.savez(path, **known | {"target_up": np.array(odd)})
+        with pytest.raises(InputError, match=r"up is one of \+x, -x") as caught:
+            load_map(path)
+        assert len(str(caught.value)) < 200
 
 
 @pytest.mark.parametrize("suffix", MAP_SUFFIXES)

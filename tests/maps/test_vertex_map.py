@@ -25,6 +25,8 @@ def random_map(source: Shape, target: Shape, seed: int) -> VertexMap:
         confidence=rng.random(source.V).astype(np.float32),
         verdict="fair",
         reasons=(f"made up with seed {seed}", "µ and é survive"),
+        source_up=("+x", "-y", "+z")[seed % 3],
+        target_up=("-z", "+y")[seed % 2],
     )
 
 
@@ -123,6 +125,7 @@ def test_composition_follows_both_maps_and_is_associative() -> None:
     ab, bc, cd = random_map(A, B, 1), random_map(B, C, 2), random_map(C, D, 3)
     ac = ab.compose(bc)
     assert (ac.source, ac.target, ac.source_hash, ac.target_hash) == ("a", "c", A.hash, C.hash)
+    assert (ac.source_up, ac.target_up) == (ab.source_up, bc.target_up)
     for i in range(A.V):
         assert ac.index[i] == bc.index[ab.index[i]]
         assert ac.points(C)[i] == pytest.approx(bc.points(C)[ab.index[i]])
