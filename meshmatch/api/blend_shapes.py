@@ -104,27 +104,10 @@ class BlendShapesResult(Brief):
         check_character(self.original, path)
         if suffix:
             with replace_on_success(path) as temporary:
-                self.write(path, temporary)
+                write_shapes(self, path, temporary)
             return
         with folder_on_success(path) as folder:
             self._write_meshes(self._plans(folder))
-
-    def write(self, output: Path, place: Path) -> None:
-        """Write an output that is one file where it waits to get its name. What it does not hold is told."""
-        if check_shapes_output(output) == ".npz":
-            save_blend_shapes(place, self.shapes)
-            return
-        glb, lost = self._to_glb()
-        place.write_bytes(glb)
-        tell_left(output, self.original, lost)
-
-    def _to_glb(self) -> tuple[bytes, str]:
-        """The target as it came, with morph targets; and what it has not of the target's file."""
-        path, data, in_gltf = as_scene(self.original or self.target, self.target)
-        turn = np.eye(3) if in_gltf else turn_upright(self.maps, self.stands_along_y)
-        adding = partial(with_morphs, shape=self.target, added=self.shapes, turn=turn)
-        glb, lost = with_look(gltf.understood(path, data, "scene makes", adding), self.original, self.target)
-        return remembering(glb, self.target), lost
 
     def _plans(self, folder: Path) -> list[MovedFile]:
         """The files of a folder of meshes: an .obj for each shape, and what an .obj takes along, once."""
@@ -143,6 +126,20 @@ class BlendShapesResult(Brief):
             shape = replace(self.target, verts=self.target.verts + move)
             plan.make_folders()
             plan.write(plan.files, shape, shortest_turns(normals[0], now))
+
+
+def write_shapes(result: BlendShapesResult, output: Path, place: Path) -> None:
+    """Write an output that is one file where it waits to get its name. What it does not hold is told."""
+    if check_shapes_output(output) == ".npz":
+        save_blend_shapes(place, result.shapes)
+        return
+    target, original = result.target, result.original
+    path, data, in_gltf = as_scene(original or target, target)  # as it came
+    turn = np.eye(3) if in_gltf else turn_upright(result.maps, result.stands_along_y)
+    adding = partial(with_morphs, shape=target, added=result.shapes, turn=turn)
+    glb, lost = with_look(gltf.understood(path, data, "scene makes", adding), original, target)
+    place.write_bytes(remembering(glb, target))
+    tell_left(output, original, lost)
 
 
 def check_shapes_output(path: Path) -> str:

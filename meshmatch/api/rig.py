@@ -113,17 +113,17 @@ class RiggedResult(Brief):
         path = as_path(path)
         check_rig_output(path, self.source, self.original)
         with replace_on_success(path) as temporary:
-            self.write(path, temporary)
+            write_rig(self, path, temporary)
 
-    def write(self, output: Path, place: Path) -> None:
-        """Write an output where it waits to get its name. What it does not hold is told."""
-        person = check_rig_output(output, self.source, self.original)
-        place.write_bytes(self.glb if person is None else self._character(output, person))
-        tell_left(output, self.original, self.lost)
 
-    def _character(self, path: Path, person: Person) -> bytes:
-        name = path if self.original is None else self.original
-        return gltf.understood(name, self.glb, "scene makes", lambda document: with_bones(document, person))
+def write_rig(result: RiggedResult, output: Path, place: Path) -> None:
+    """Write an output where it waits to get its name. What it does not hold is told. Errors as `RiggedResult.save`."""
+    person, glb = check_rig_output(output, result.source, result.original), result.glb
+    if person is not None:
+        name = output if result.original is None else result.original
+        glb = gltf.understood(name, glb, "scene makes", lambda document: with_bones(document, person))
+    place.write_bytes(glb)
+    tell_left(output, result.original, result.lost)
 
 
 def check_rig_output(path: Path, source: Path, target: Path | None) -> Person | None:

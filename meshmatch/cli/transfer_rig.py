@@ -37,14 +37,14 @@ def transfer_rig(
     skeleton of its own; another TGT is turned upright. The skeleton has the bones and names of SRC; its clips play on TGT
     in whatever pose it came.
     """
-    from meshmatch.api.rig import check_rig_output
+    from meshmatch.api.rig import check_rig_output, write_rig
 
     transfer = Transfer(source, target, output, maps, run, picture)
     console = transfer.console
     check_rig_output(output, source, target)
     with transfer.outputs() as (temporary,):
         result = meshmatch.transfer_rig(source, target, transfer, pose=pose)
-        result.write(output, temporary)
+        write_rig(result, output, temporary)
     joints, clips = len(result.rig.joints), [clip.name for clip in result.rig.clips]
     if result.unused:
         many, names = len(result.unused), _listed(result.unused)

@@ -43,7 +43,7 @@ def transfer_shapes(
     """
     import numpy as np
 
-    from meshmatch.api.blend_shapes import check_shapes_output
+    from meshmatch.api.blend_shapes import check_shapes_output, write_shapes
 
     transfer = Transfer(source, target, output, maps, run, picture)
     console = transfer.console
@@ -52,7 +52,7 @@ def transfer_shapes(
         given = None if shapes is None else shapes[0] if len(shapes) == 1 else shapes
         result = meshmatch.transfer_shapes(source, target, transfer, shapes=given)
         if temporary:
-            result.write(output, *temporary)
+            write_shapes(result, output, *temporary)
         else:
             result.save(output)
     names, clips = result.shapes.names, [clip.name for clip in result.shapes.clips]
