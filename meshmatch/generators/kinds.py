@@ -29,7 +29,7 @@ class Kind:
     identities: int = 1024
 
     def __post_init__(self) -> None:
-        if self.name not in GENERATORS:
+        if self.name not in tuple(GENERATORS):  # anything else may not be hashable
             raise OptionError(f"unknown kind {self.name!r}", f"choose from human, {', '.join(GENERATORS)}")
 
     def generator(self, seed: int, progress: Progress | None = None) -> Generator:

@@ -20,6 +20,7 @@ from meshmatch.arrays import Brief, Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.outputs import as_path
 from meshmatch.progress import Progress
 from meshmatch.shapes.input_files import read_json
 from meshmatch.shapes.landmark_files import LANDMARK_READERS, Space, read_landmark_file
@@ -295,6 +296,14 @@ def read_registered(folder: str | Path, template: Template) -> Float[Floats32, "
     return shapes
 
 
+def check_prepared(folder: str | Path) -> None:
+    """`InputError` for a folder that `prepare` did not make."""
+    try:
+        _facts(as_path(folder))
+    except (OSError, ValueError) as error:
+        raise _not_prepared(folder) from error
+
+
 def is_registered(folder: str | Path) -> bool:
     """Whether the shapes of a prepared folder share one connectivity; True where it is not such a folder."""
     try:
@@ -333,10 +342,14 @@ def _read(
             arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (it is no dictionary)
             found = build(arrays, file.metadata() or {})
     except (OSError, ValueError, KeyError, StopIteration, SafetensorError) as error:
-        raise InputError(f"{folder} is not a prepared folder", "run `meshmatch prepare FOLDER -o OUT` first") from error
+        raise _not_prepared(folder) from error
     if facts.get("template") != template.hash:
         raise InputError(f"{folder} was prepared for another template", "prepare it again")
     return facts, found
+
+
+def _not_prepared(folder: str | Path) -> InputError:
+    return InputError(f"{folder} is not a prepared folder", "run `meshmatch prepare FOLDER -o OUT` first")
 
 
 def _facts(folder: str | Path) -> dict[str, Any]:

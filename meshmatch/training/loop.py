@@ -78,10 +78,14 @@ class TrainConfig:
                 raise OptionError(f"{name} must be 1 or more, a whole number, not {value!r}")
         if self.draw not in get_args(Draw):
             raise OptionError(f"batches are drawn on {', '.join(get_args(Draw))}, not {self.draw!r}")
-        if not (self.rate > 0 and 0 <= self.decay <= 1 and self.workers >= 0):
+        numbers = isinstance(self.rate, int | float) and isinstance(self.decay, int | float)
+        whole = isinstance(self.workers, Integral)
+        if not (numbers and whole and self.rate > 0 and 0 <= self.decay <= 1 and self.workers >= 0):
             raise OptionError("a training needs a positive rate, a decay in 0..1 and workers of 0 or more")
-        if self.minutes is not None and not self.minutes > 0:
-            raise OptionError(f"minutes must be positive, not {self.minutes:g}")
+        if self.minutes is not None and not (isinstance(self.minutes, int | float) and self.minutes > 0):
+            raise OptionError(f"minutes must be positive, not {self.minutes!r}")
+        if not isinstance(self.loss, Objective):
+            raise OptionError(f"a loss is an Objective, not {self.loss!r}", "docs/training.md has one of your own")
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,10 @@ A file may come from anywhere: it holds plain numbers and words, all of them che
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, get_args
 
 from meshmatch.errors import InputError, MeshmatchError, OptionError, warn
 from meshmatch.geometry.kernels import KERNELS
@@ -18,6 +17,7 @@ from meshmatch.models.card import ModelCard
 from meshmatch.models.checkpoint import Storage
 from meshmatch.models.network import NetworkConfig
 from meshmatch.shapes.input_files import read_json
+from meshmatch.training.limits import filled
 from meshmatch.training.loop import OF_THE_MACHINE
 from meshmatch.training.losses import ChamferLoss, CorrespondenceLoss, Objective
 from meshmatch.training.recipes import Recipe
@@ -28,19 +28,7 @@ _LOSSES: dict[str, type[Objective]] = {
 _PARTS = {"network", "field", "recipe"}
 _HISTORY = ("start", "earlier")
 _OWN = ("deform", "storage", "template", "characters", "bodies", "stylised")
-_MOST: dict[str, float] = {
-    "shapes": 4096,
-    "scans_per_shape": 256,
-    "points": 100_000,
-    "workers": 256,
-    "bodies": 20_000,
-    "correct_points": 100_000,
-}
-_MOST |= dict.fromkeys(("holes", "outliers", "partial", "outside", "strays", "characters", "stylised", "average"), 1)
-_MOST |= {"momentum": 0.9999999}
-_LEAST = {"points": 64}
 _HINT = "give the card.json of a model, or a part of one: network, field.kernel, recipe.train, recipe.scan"
-T = TypeVar("T")
 
 
 def recipe_record(recipe: Recipe) -> dict[str, Any]:
@@ -79,14 +67,14 @@ def read_recipe(path: str | Path, usual: Recipe, started: bool = False) -> Recip
         own = _object(record.get("recipe", {}), "recipe")
         train = _object(own.get("train", {}), "recipe.train")
         loss = _loss(record, own, usual)
-        loss = _filled(loss, _object(train.get("loss", {}), "recipe.train.loss"), "recipe.train.loss")
+        loss = filled(loss, _object(train.get("loss", {}), "recipe.train.loss"), "recipe.train.loss")
         steps = {name: value for name, value in train.items() if name not in ("loss", *OF_THE_MACHINE)}
         more = {name: own[name] for name in _OWN if name in own}
         if unknown := sorted(own.keys() - {"train", "scan", "loss", *_HISTORY, *_OWN}):
             raise InputError(f"recipe.{unknown[0]} is unknown")
         network = _object(record.get("network", {}), "network")
         kernel = _object(record.get("field", {}), "field").get("kernel", usual.kernel)
-        found = _filled(usual, more, "recipe")
+        found = filled(usual, more, "recipe")
         if kernel not in tuple(KERNELS) or found.storage not in get_args(Storage):
             raise InputError("its kernel or storage is unknown")
         if Path(found.template).name != found.template:
@@ -95,8 +83,8 @@ def read_recipe(path: str | Path, usual: Recipe, started: bool = False) -> Recip
         return replace(
             found,
             network=NetworkConfig.from_dict(usual.network.to_dict() | network),
-            train=replace(_filled(usual.train, steps, "recipe.train"), loss=loss),
-            scan=_filled(usual.scan, _object(own.get("scan", {}), "recipe.scan"), "recipe.scan"),
+            train=replace(filled(usual.train, steps, "recipe.train"), loss=loss),
+            scan=filled(usual.scan, _object(own.get("scan", {}), "recipe.scan"), "recipe.scan"),
             kernel=kernel,
         )
     except MeshmatchError as error:
@@ -126,29 +114,6 @@ def _loss(record: Mapping[str, Any], own: Mapping[str, Any], usual: Recipe) -> O
     else:
         return usual.train.loss
     return usual.train.loss if type(usual.train.loss) is kind else kind()
-
-
-def _filled(values: T, changes: Mapping[str, Any], where: str) -> T:
-    """A dataclass with some of its numbers and words changed, of the kinds that they have."""
-    known = {each.name: str(each.type) for each in fields(values)}  # type: ignore[arg-type]
-    for name, value in changes.items():
-        if name not in known:
-            raise InputError(f"{where}.{name} is unknown", f"choose from {', '.join(known)}")
-        kind = known[name]
-        number = type(value) is int or (type(value) is float and math.isfinite(value))
-        right = {
-            "bool": type(value) is bool,
-            "int": type(value) is int,
-            "float": number,
-            "float | None": number or value is None,
-        }.get(kind, isinstance(value, str))
-        if not right:
-            raise InputError(f"{where}.{name} must be {kind}, not {str(value)[:40]!r}")
-        least, most = _LEAST.get(name, 0), _MOST.get(name, 2**53)
-        if type(value) is not bool and number and not least <= value <= most:
-            raise InputError(f"{where}.{name} must lie in {least}..{most:,}, not {value}")
-    changed: Any = replace(values, **changes)  # type: ignore[type-var]
-    return changed  # type: ignore[no-any-return]
 
 
 def _object(value: Any, where: str) -> dict[str, Any]:

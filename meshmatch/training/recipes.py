@@ -6,18 +6,23 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from meshmatch.errors import OptionError
+from meshmatch.generators.kinds import Kind
 from meshmatch.generators.proportions import STYLISED
 from meshmatch.geometry.kernels import KERNELS, Kernel
 from meshmatch.models.checkpoint import Storage
 from meshmatch.models.network import PAPER, NetworkConfig
 from meshmatch.models.trained import TrainedModel
-from meshmatch.templates.prepared_folder import frame_of, is_registered
+from meshmatch.templates.prepared_folder import check_prepared, frame_of, is_registered
+from meshmatch.training.limits import filled
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import ChamferLoss, CorrespondenceLoss
 from meshmatch.training.scans import ScanConfig
 
 Preset = Literal["default", "paper"]
+_OF_SCAN, _OF_LOSS = {"points"}, {"volume", "arap", "blend"}
 _PLAIN_ADAM: dict[str, Any] = {
     "warm_up": 0, "decay": 0.0, "weight_decay": 0.0, "average": 0.0, "momentum": 0.999, "clip": None,
 }  # fmt: skip
@@ -88,15 +93,16 @@ class Recipe:
         OptionError
             A setting is unknown or out of range.
         """
-        wanted = {name: value for name, value in settings.items() if value is not None}
+        given = {name: value for name, value in settings.items() if value is not None}
+        wanted = {name: value.item() if isinstance(value, np.generic) else value for name, value in given.items()}
         network = replace(self.network, field=wanted.pop("field", self.network.field))
-        scan = replace(self.scan, points=wanted.pop("points", self.scan.points))
-        weights = {name: wanted.pop(name) for name in ("volume", "arap", "blend") & wanted.keys()}
-        loss = replace(self.train.loss, **weights)
+        scan, weights = ({name: wanted.pop(name) for name in names & wanted.keys()} for names in (_OF_SCAN, _OF_LOSS))
+        train = replace(self.train, loss=wanted.pop("loss", self.train.loss))
+        train = replace(train, loss=filled(train.loss, weights))
         known = {each.name for each in fields(TrainConfig)}
         if unknown := sorted(wanted.keys() - known):
             raise OptionError(f"unknown training setting {unknown[0]!r}", f"choose from {', '.join(sorted(known))}")
-        return replace(self, network=network, scan=scan, train=replace(self.train, **({"loss": loss} | wanted)))
+        return replace(self, network=network, scan=filled(self.scan, scan), train=filled(train, wanted))
 
 
 def default() -> Recipe:
@@ -197,7 +203,7 @@ def recipe_for(
     Raises
     ------
     OptionError
-        The preset is unknown, or ``unsupervised`` is without a folder.
+        The preset or the kind is unknown, a kind is given with a folder, or ``unsupervised`` without one.
     InputError
         The folder is not prepared.
 
@@ -210,6 +216,12 @@ def recipe_for(
         raise OptionError(f"unknown preset {preset!r}", "choose default or paper")
     if shapes is None and unsupervised:
         raise OptionError("learning without correspondence needs a folder of shapes", "name it with --shapes")
+    if kind not in (None, "human"):
+        Kind(kind)  # which knows the others
+    if shapes is not None:
+        if kind is not None:
+            raise OptionError("generated shapes do not go with a folder of shapes", "leave out one of the two")
+        check_prepared(shapes)
     if shapes is not None and (unsupervised or not is_registered(shapes)):
         return paper_clouds() if preset == "paper" else clouds()
     if preset == "paper":

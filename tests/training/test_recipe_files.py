@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from meshmatch.errors import InputError, MeshmatchWarning, OptionError
@@ -111,6 +112,43 @@ def test_what_is_no_recipe_is_told(record: Any, words: str, tmp_path: Path) -> N
     with pytest.raises(InputError, match="no recipe") as caught:
         read_recipe(written(tmp_path, record), people())
     assert words in caught.value.message and caught.value.hint and "\n" not in caught.value.message
+
+
+@pytest.mark.parametrize(("settings", "words"), [
+    ({"points": 3}, "64..100,000"), ({"points": "a"}, "points must be int"), ({"seed": -1}, "seed must lie in 0.."),
+    ({"volume": -1}, "volume must lie in 0.."), ({"bf16": "maybe"}, "bf16 must be bool"), ({"rate": "x"}, "rate must be"),
+    ({"minutes": "a"}, "minutes must be"), ({"workers": "a"}, "workers must be int"),
+    ({"loss": 3}, "a loss is an Objective"),
+    ({"loss": CorrespondenceLoss}, "a loss is an Objective"), ({"stps": 3}, "unknown training setting 'stps'"),
+])  # fmt: skip
+def test_a_change_is_checked_as_a_file_is(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(OptionError) as caught:
+        people().changed(**settings)
+    assert words in caught.value.message
+
+
+def test_a_change_takes_the_numbers_of_arrays() -> None:
+    assert people().changed(steps=np.int64(5), rate=np.float32(0.5)) == people().changed(steps=5, rate=0.5)
+
+
+@pytest.mark.parametrize("settings", [{"rate": "x"}, {"workers": "a"}, {"minutes": "a"}, {"loss": None}])
+def test_settings_of_a_training_are_checked(settings: dict[str, Any]) -> None:
+    with pytest.raises(OptionError):
+        TrainConfig(**settings)
+
+
+@pytest.mark.parametrize("how", [{}, {"unsupervised": True}, {"preset": "paper"}])
+def test_a_folder_that_is_not_prepared_has_no_recipe(how: dict[str, Any], tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "gone"):
+        with pytest.raises(InputError, match="not a prepared folder"):
+            recipe_for(folder, **how)
+    with pytest.raises(InputError, match="expected a path"):
+        recipe_for(3, **how)  # type: ignore[arg-type]
+
+
+def test_a_kind_that_is_not_generated_has_no_recipe() -> None:
+    with pytest.raises(OptionError, match="unknown kind 'humn'"):
+        recipe_for(kind="humn")
 
 
 def test_files_that_are_none(tmp_path: Path) -> None:
