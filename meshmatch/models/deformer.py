@@ -134,14 +134,19 @@ class Deformer(nn.Module):
         return result
 
     def forward(self, points: torch.Tensor) -> Float[torch.Tensor, "B R 3"]:
-        """The rows of scans (B, P, 3) in the core frame; with nodes, these are their vectors.
+        """The rows of scans (B, P, 3) in the core frame, in the network's precision; with nodes, these are their vectors.
 
         `InputError` if this is not what the points are.
         """
+        if not isinstance(points, torch.Tensor):
+            raise InputError(f"points must be a tensor, not {type(points).__name__}", "torch.as_tensor makes one")
         if points.ndim != 3 or points.shape[2] != 3 or 0 in points.shape:
             raise InputError(
                 f"points must be (B, P, 3), not {tuple(points.shape)}", "one cloud is a batch: points[None]"
             )
+        if not points.isfinite().all():
+            raise InputError("points must be finite, but hold nan or infinite values", "leave such points out")
+        points = points.to(self.nodes.dtype)
         vectors = self.decoder(self.code_of(points))
         for _ in range(self.config.corrections):
             vectors = self.correct(vectors, points)

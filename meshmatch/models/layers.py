@@ -17,6 +17,7 @@ from torch import nn
 from torch.distributed.nn.functional import all_reduce as over_processes
 
 from meshmatch.arrays import Float, Int
+from meshmatch.errors import InputError
 from meshmatch.fields.field import pack
 from meshmatch.geometry.oriented import quick_tree
 
@@ -27,13 +28,15 @@ _FREQUENCY = 1.5  # standard deviation of the encoding's frequencies, in waves p
 def nearest_index(
     queries: Float[torch.Tensor, "B Q D"], points: Float[torch.Tensor, "B P D"]
 ) -> Int[torch.Tensor, "B Q"]:
-    """Index of the nearest of ``points``: trees on a CPU, where comparing all pairs is far slower."""
+    """Index of the nearest of ``points``: trees on a CPU, where comparing all pairs is far slower, and which `InputError`
+    tells if they are not finite."""
     if queries.device.type != "cpu":
         return nearest_of_all(queries, points)
-    found = [
-        quick_tree(cloud).query(query)[1]
-        for query, cloud in zip(queries.detach().numpy(), points.detach().numpy(), strict=True)
-    ]
+    pairs = zip(queries.detach().numpy(), points.detach().numpy(), strict=True)
+    try:
+        found = [quick_tree(cloud).query(query)[1] for query, cloud in pairs]
+    except ValueError as error:
+        raise InputError(f"no point is nearest: {error}", "are points and weights finite?") from error
     return torch.from_numpy(np.stack(found))
 
 

@@ -142,6 +142,21 @@ def test_points_are_a_batch_of_clouds(networks: dict[str, Deformer], config) -> 
 
 
 @CONFIGS
+def test_points_are_finite_tensors_of_any_precision(networks: dict[str, Deformer], config) -> None:
+    points = clouds()
+    for wrong, words in ((points.numpy(), "a tensor, not ndarray"), (points * float("nan"), "must be finite")):
+        with pytest.raises(InputError, match=words) as caught:
+            networks[config.encoder](wrong)
+        assert caught.value.hint
+    assert torch.equal(networks[config.encoder](points.double()), networks[config.encoder](points))
+
+
+def test_features_of_points_that_are_not_finite_are_refused(networks: dict[str, Deformer]) -> None:
+    with pytest.raises(InputError, match="no point is nearest"):
+        networks["basis"].encoder.features(clouds() * float("inf"))
+
+
+@CONFIGS
 def test_it_is_differentiable_up_to_the_points(networks: dict[str, Deformer], config) -> None:
     model = deepcopy(networks[config.encoder]).double().eval()
     assert torch.autograd.gradcheck(model, clouds(2).double().requires_grad_(), fast_mode=True)
