@@ -11,7 +11,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import Field, fields
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,6 +38,14 @@ Ints = NDArray[np.int64]
 Ints32 = NDArray[np.int32]
 UInts8 = NDArray[np.uint8]
 Bools = NDArray[np.bool_]
+
+
+class TensorLike(Protocol):
+    """A tensor of torch for annotations, which load no torch; see `is_tensor`."""
+
+    def detach(self) -> Any: ...
+
+    def numpy(self, *, force: bool = False) -> NDArray[Any]: ...
 
 
 def read_only(values: Any, dtype: type, label: str) -> NDArray[Any]:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from meshmatch import blender
-from meshmatch.arrays import Bool, Bools, Float, Floats, as_numbers, off_torch
+from meshmatch.arrays import Bool, Bools, Float, Floats, TensorLike, as_numbers, off_torch
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import as_path, plain_text, replace_on_success
 from meshmatch.shapes import tables
@@ -294,7 +294,11 @@ class HasPoints(Protocol):
     def points(self) -> ArrayLike: ...
 
 
-ShapeLike: TypeAlias = Shape | str | Path | NDArray[np.generic] | tuple[ArrayLike, ArrayLike] | HasVertices | HasPoints
+Rows: TypeAlias = ArrayLike | TensorLike
+"""Vertices or faces, as arrays, lists or tensors."""
+ShapeLike: TypeAlias = (
+    Shape | str | Path | NDArray[np.generic] | TensorLike | tuple[Rows, Rows] | HasVertices | HasPoints
+)
 """A shape; its file; points (N, 3); vertices and faces, ((V, 3), (F, 3)); or an object of another library."""
 
 

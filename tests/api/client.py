@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import assert_type
 
 import numpy as np
+import torch
 
 import meshmatch
 from meshmatch import FitConfig, Matcher
@@ -30,7 +31,7 @@ assert_type(result, meshmatch.MatchResult)
 assert_type(result.map, meshmatch.VertexMap)
 assert_type(result.source_fit.residual, float)
 matcher = Matcher("human")
-fits = matcher.fit_all(["a.ply", verts])
+fits = matcher.fit_all(["a.ply", verts, torch.zeros(4, 3), (torch.zeros(4, 3), torch.from_numpy(faces))])
 assert_type(matcher.fit_all(["a.ply"], errors="return"), list[meshmatch.Fit | meshmatch.MeshmatchError])
 assert_type(matcher.map(fits[0], fits[1], agree=False), meshmatch.VertexMap)
 assert_type(meshmatch.register("a.ply"), meshmatch.Fit | meshmatch.ImplicitFit)
