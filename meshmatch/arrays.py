@@ -135,6 +135,14 @@ def is_tensor(values: Any) -> bool:
     return hasattr(values, "detach") and hasattr(values, "numpy")
 
 
+def as_array(values: Any, name: str, hint: str = "") -> NDArray[Any]:
+    """The values as an array of whatever they are; `InputError` where there is none, such as rows of different lengths."""
+    try:
+        return np.asarray(off_torch(values))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: not an array ({error})", hint) from error
+
+
 def as_numbers(values: ArrayLike, name: str, finite: bool = False) -> Floats:
     """An array of numbers; `InputError` where they are something else, such as words or rows of different lengths."""
     try:

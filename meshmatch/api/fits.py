@@ -7,11 +7,12 @@ from pathlib import Path
 
 from meshmatch.api.inputs import as_model, usable
 from meshmatch.errors import InputError, ModelError, OptionError
-from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit import Fit, check_fit
 from meshmatch.maps.fit_files import load_words, read_fit, write_fit
 from meshmatch.maps.places import PlacedFit
 from meshmatch.models.registry import NO_MODEL, list_models
 from meshmatch.models.trained import TrainedModel
+from meshmatch.outputs import as_path
 from meshmatch.shapes.tables import check_suffix
 
 _SUFFIX = ".safetensors"
@@ -41,8 +42,7 @@ def save_fit(path: str | Path, fit: Fit) -> None:
     >>> meshmatch.save_fit("climber.safetensors", meshmatch.register("templates/samples/climber.ply"))
     >>> meshmatch.load_fit("climber.safetensors").verdict
     """
-    if not isinstance(fit, Fit):
-        raise InputError(f"{type(fit).__name__} is not a fit", "register and Matcher.fit make one")
+    check_fit(fit)
     check_suffix(path, (_SUFFIX,), "fits")
     if fit.model == NO_MODEL:
         raise OptionError("a fit without a model cannot be saved: it is of the other shape", "save the map: save_map")
@@ -79,7 +79,7 @@ def load_fit(path: str | Path, model: str | Path | TrainedModel | None = None) -
     >>> climber = meshmatch.load_fit("climber.safetensors")
     >>> meshmatch.Matcher("human").map(climber, meshmatch.register("templates/samples/dancer.ply"))
     """
-    path = Path(path)
+    path = as_path(path)
     if model is None:
         model = str(load_words(path)[0]["model"])
         if model == NO_MODEL:

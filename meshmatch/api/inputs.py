@@ -97,6 +97,12 @@ def checked_threads(threads: int | None) -> int:
     return int(threads)
 
 
+def check_seed(seed: object) -> None:
+    """Refuse what no random numbers can begin with (`OptionError`)."""
+    if not isinstance(seed, Integral) or seed < 0:
+        raise OptionError(f"a seed is a whole number of 0 or more, not {seed!r}")
+
+
 def check_config(config: object) -> None:
     """Refuse what is no `FitConfig` (`OptionError`)."""
     if not isinstance(config, FitConfig):

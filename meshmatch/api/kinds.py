@@ -339,7 +339,7 @@ def error_unit(name: UnitName, target: Shape) -> ErrorUnit:
 
     `OptionError` if there is no such unit.
     """
-    if name not in get_args(UnitName):
+    if not isinstance(name, str) or name not in get_args(UnitName):
         raise OptionError(f"invalid unit {name!r}", f"choose one of {', '.join(get_args(UnitName))}")
     if name == "x100":
         return X100

@@ -29,7 +29,7 @@ from meshmatch.api.inputs import (
 from meshmatch.api.results import MatchResult, maps_of_fits, shape_of
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.agree import agreed_fits
-from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit import Fit, check_fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter, check_landmarks, fits_with_landmarks
 from meshmatch.gathering import Gathering
@@ -232,10 +232,11 @@ class Matcher:
         OptionError
             The last fit is of another template.
         MeshmatchError
-            As for `fit`.
+            It is no fit; or as for `fit`.
         """
         from meshmatch.fitting.following import follow
 
+        check_fit(last)
         last.check_template(self.model.template.hash)
         clean = validated(as_shape(shape))
         with thread_limit(1):

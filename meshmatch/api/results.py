@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from meshmatch.api.inputs import check_seed
 from meshmatch.api.kinds import UnitName, error_unit
 from meshmatch.arrays import Brief, Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.build import build_map
-from meshmatch.maps.evaluate import CM, Evaluation, SurfaceDistance, evaluate_map
+from meshmatch.maps.evaluate import Evaluation, SurfaceDistance, evaluate_map
 from meshmatch.maps.files import load_map
 from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.places import PlacedFit, Places, surface_distance
@@ -432,10 +433,11 @@ def evaluate(
     for each in (vertex_map, *([] if backward is None else [backward])):
         check_map(each)
     known = truth if isinstance(truth, tuple) and len(truth) == 2 else (None, truth)
+    check_seed(seed)
     rng = np.random.default_rng(seed)
     with thread_limit(1):
         # Whether the target is a person takes a moment to find out: not where there are no errors to tell.
-        told = CM if truth is None and unit == "auto" else error_unit(unit, target)
+        told = error_unit("cm" if truth is None and str(unit) == "auto" else unit, target)
         return evaluate_map(
             vertex_map, source, target, *known, backward=backward, unit=told, rng=rng, progress=progress
         )
@@ -480,6 +482,10 @@ def measure_distance(
         there, here = (repair(as_shape(each, what)).shape for each, what in ((shape, "shape"), (fitted, "fitted")))
         if here.is_cloud:
             raise InputError(f"{here.name or 'what was fitted'} has no faces", "a cloud can be the shape alone")
+        for each, what in ((there, "the shape"), (here, "what was fitted")):
+            if not each.vertex_areas.sum() > 0:
+                hint = "are all its points the same, or on a line?"
+                raise InputError(f"{each.name or what} has no surface area", hint)
         told = error_unit(unit, there)
         times = 1.0 if told.name == "file" else told.factor / float(np.sqrt(here.area))
         mean, most = surface_distance(there, here, one_way)

@@ -13,7 +13,7 @@ from typing import Any
 
 from meshmatch.errors import InputError, OutputError, needs
 from meshmatch.locks import locked
-from meshmatch.outputs import make_folder, sweep
+from meshmatch.outputs import as_path, make_folder, sweep
 
 LOCK = ".lock"
 
@@ -32,7 +32,7 @@ class Store:
     @classmethod
     def of(cls, location: str | Path) -> Store:
         """A path becomes absolute: workers may have another working directory."""
-        return cls(str(location).rstrip("/") if is_url(location) else os.path.abspath(location))
+        return cls(str(location).rstrip("/") if is_url(location) else os.path.abspath(as_path(location)))
 
     @property
     def remote(self) -> bool:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints, Pickled, table_html
-from meshmatch.errors import OptionError
+from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.judge.reasons import Reason, Verdict
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.geometry.frames import Frame
@@ -181,6 +181,12 @@ class Fit(Pickled):
                 f"the fit is of another template ({self.template_hash}, not {expected})",
                 "use the model that made the fit",
             )
+
+
+def check_fit(fit: object) -> None:
+    """Refuse what is no `Fit` (`InputError`)."""
+    if not isinstance(fit, Fit):
+        raise InputError(f"{type(fit).__name__} is not a fit", "register and Matcher.fit make one")
 
 
 def judged_fit(

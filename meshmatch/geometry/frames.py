@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Brief, Float, Floats, Pickled, off_torch, read_only
+from meshmatch.arrays import Brief, Float, Floats, Pickled, as_numbers, off_torch, read_only
 from meshmatch.errors import InputError
 
 
@@ -39,14 +39,15 @@ class Frame(Brief, Pickled):
     def __post_init__(self) -> None:
         rotation = read_only(self.rotation, np.float64, "a frame's rotation")
         center = read_only(self.center, np.float64, "a frame's center")
+        scale = as_numbers(self.scale, "a frame's scale")
         if rotation.shape != (3, 3) or center.shape != (3,):
             raise InputError(f"a frame needs a (3, 3) rotation and a (3,) center, not {rotation.shape}, {center.shape}")
-        if not (np.isfinite(self.scale) and self.scale > 0 and np.isfinite(center).all()):
+        if not (scale.ndim == 0 and np.isfinite(scale) and scale > 0 and np.isfinite(center).all()):
             raise InputError(f"a frame's scale must be positive and finite, not {self.scale}", "has it any size?")
         small = (np.abs(rotation) < 2).all()  # else the product could overflow
         if not (small and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)):
             raise InputError("a frame's rotation must be orthonormal")
-        for name, value in (("scale", float(self.scale)), ("rotation", rotation), ("center", center)):
+        for name, value in (("scale", float(scale)), ("rotation", rotation), ("center", center)):
             object.__setattr__(self, name, value)
 
     @classmethod

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Brief, Float, Floats, Floats32, Pickled, frozen, off_torch, table_html
+from meshmatch.arrays import Brief, Float, Floats, Floats32, Pickled, as_array, as_numbers, frozen, table_html
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import dot, squared_lengths, triangle_vectors
 from meshmatch.maps.folds import Folds
@@ -23,6 +23,7 @@ CM_PER_UNIT = 100.0 * float(np.sqrt(SKIN_M2))
 """Centimetres in one sqrt(area) of a person with 1.9 m2 of skin."""
 LOST_CM = 15.0
 """An error above this is a point on the wrong limb; a pair whose mean lies above it is a left-right flip."""
+_TRUTH = "give one target vertex for every source vertex, or a pair of lists of the same length"
 _LOST = 0.1  # the same of other shapes, in units of sqrt(area)
 
 
@@ -139,7 +140,7 @@ class Errors(Brief, Pickled):
     values: Float[Floats32, " N"]
 
     def __post_init__(self) -> None:
-        values = np.array(self.values, dtype=np.float32).reshape(-1)
+        values = as_numbers(self.values, "errors").astype(np.float32).reshape(-1)
         if not values.size or not np.isfinite(values).all() or values.min() < 0:
             raise InputError("there must be errors, all finite and 0 or more")
         object.__setattr__(self, "values", frozen(values))
@@ -224,13 +225,12 @@ def map_errors(
     `index` (V_source,) is the map; both kinds of points (N,) are vertices, `geodesics` those of the target.
     `InputError` if the lists are no integers, differ in length, or name a vertex that is not there.
     """
-    index, a, b = (np.asarray(off_torch(ids)) for ids in (index, source_points, target_points))
+    index, a, b = (as_array(ids, "the truth", _TRUTH) for ids in (index, source_points, target_points))
     for ids in (a, b):
         if ids.dtype.kind not in "iu":
             raise InputError(f"the truth must be numbers of vertices, not {ids.dtype}", "integers, counted from 0")
     if a.shape != b.shape or a.ndim != 1 or not a.size:
-        hint = "give one target vertex for every source vertex, or a pair of lists of the same length"
-        raise InputError(f"the truth has {a.shape} vertices of the source and {b.shape} of the target", hint)
+        raise InputError(f"the truth has {a.shape} vertices of the source and {b.shape} of the target", _TRUTH)
     for ids, size, side in ((a, len(index), "source"), (b, geodesics.V, "target")):
         if ids.min() < 0 or ids.max() >= size:
             raise InputError(f"the truth names points that are not among the {size} vertices of the {side}")

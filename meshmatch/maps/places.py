@@ -18,7 +18,8 @@ import numpy as np
 from scipy.sparse import csr_matrix, identity, vstack
 
 from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, Floats32, Int, Ints, Ints32
-from meshmatch.fitting.fit import Fit
+from meshmatch.errors import InputError
+from meshmatch.fitting.fit import Fit, check_fit
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import blend, share_areas, triangle_areas, vertex_areas, vertex_normals
 from meshmatch.maps.footpoints import Footpoints, Surface, closest_footpoints, in_core_frame, template_footpoints
@@ -72,6 +73,10 @@ class Places(Brief):
     @classmethod
     def of(cls, part: Repaired, fit: Fit, before: Fit | None = None, workers: int = 1) -> Places:
         """The places of a repaired shape; ``before`` is its fit before it agreed with others."""
+        if not isinstance(part, Repaired):
+            hint = "a fit of a collection has its places: fit.places"
+            raise InputError(f"places are of a repaired shape (fit.repaired), not of {type(part).__name__}", hint)
+        check_fit(fit)
         foot, resting = template_footpoints(part.shape, fit, workers)
         distance, spread, moved = foot.distance, None, None
         height = heights(part.shape, fit, foot)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, Pickled, as_numbers, frozen, off_torch
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, Pickled, as_array, as_numbers, frozen
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.shapes.shape import Shape, checked_shape
@@ -127,8 +127,10 @@ class VertexMap(Pickled):
         check_range(vertex, self.target_vertices, label)
         size = len(vertex)
         faces = np.full(size, -1) if self.face is None else _whole_numbers(self.face, f"{label}: face")
-        weights = np.array(np.eye(1, 3).repeat(size, 0) if self.barycentric is None else self.barycentric, np.float64)
-        given = np.full(size, np.nan) if self.confidence is None else np.array(self.confidence, np.float64)
+        corner = np.eye(1, 3).repeat(size, 0) if self.barycentric is None else self.barycentric
+        weights = np.array(as_numbers(corner, f"{label}: barycentric"))
+        unknown = np.full(size, np.nan)
+        given = unknown if self.confidence is None else as_numbers(self.confidence, f"{label}: confidence")
         trust = np.clip(given, -1, 2).astype(np.float32)  # a short float holds no 1e300, which is refused below
         arrays: dict[str, NDArray[Any]] = {"index": vertex, "face": faces, "barycentric": weights, "confidence": trust}
         for name, array in arrays.items():
@@ -169,7 +171,7 @@ class VertexMap(Pickled):
             As for the class, or a face that the target does not have.
         """
         fields = _side("source", source) | _side("target", target)
-        return cls(index=np.asarray(index), target_faces=target.faces, **fields, **rest)
+        return cls(index=as_array(index, "index"), target_faces=target.faces, **fields, **rest)
 
     @classmethod
     def identity(cls, shape: Shape) -> VertexMap:
@@ -184,8 +186,14 @@ class VertexMap(Pickled):
         -------
         VertexMap
             Every vertex to itself, with confidence 1.
+
+        Raises
+        ------
+        InputError
+            It is no `Shape`.
         """
-        return cls.between(shape, shape, np.arange(shape.V), confidence=np.ones(shape.V), verdict="good")
+        V = checked_shape(shape, "the shape").V
+        return cls.between(shape, shape, np.arange(V), confidence=np.ones(V), verdict="good")
 
     @property
     def assumed_confidence(self) -> Float[Floats32, " V_source"]:
@@ -474,7 +482,7 @@ def check_range(index: Int[Ints, ...], target_vertices: int, label: str) -> None
 
 @np.errstate(invalid="ignore")  # of a nan that is rounded; it is refused
 def _whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
-    array = np.asarray(off_torch(values))
+    array = as_array(values, label)
     whole = array.dtype.kind == "f" and np.array_equal(array, np.round(array))
     if whole and (np.abs(array.astype(np.float64)) < 2**53).all():
         return array.astype(np.int64)  # MATLAB's numbers are doubles

@@ -107,6 +107,9 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
     @torch.no_grad()
     def drawn(self, generator: torch.Generator) -> Float[Tensor, "N V 3"]:
         """Shapes of the source, which is ours if it draws on a GPU, and looked at nowhere else."""
+        if not callable(self.source):
+            hint = "docs/training.md has one of your own"
+            raise InputError(f"a source is a function that draws shapes, not {type(self.source).__name__}", hint)
         found = self.source(self.shapes, generator)
         return found if self.faces.device.type != "cpu" else _checked(found, self.shapes, int(self.faces.max()) + 1)
 
@@ -171,7 +174,10 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
 
 def _checked(found: Any, count: int, V: int) -> Float[Tensor, "N V 3"]:
     """What a source drew, in float32; `InputError` if these are not so many shapes of at least V vertices."""
-    verts: Tensor = torch.as_tensor(found).float()
+    try:
+        verts: Tensor = torch.as_tensor(found).float()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"a source must give vertices, not {type(found).__name__}", "it returns a tensor") from error
     if verts.ndim != 3 or len(verts) != count or verts.shape[1] < V or verts.shape[2] != 3:
         wanted = f"({count}, V, 3) with the template's vertices"
         raise InputError(
@@ -179,6 +185,8 @@ def _checked(found: Any, count: int, V: int) -> Float[Tensor, "N V 3"]:
         )
     if not verts.isfinite().all():
         raise InputError("a source gave vertices that are nan or infinite", "look at the shapes that it draws")
+    if not (verts.amax(1) > verts.amin(1)).any(1).all():
+        raise InputError("a source gave a shape whose vertices are all in one place", "look at what it draws")
     return verts
 
 

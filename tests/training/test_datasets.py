@@ -142,11 +142,15 @@ def test_a_source_gives_shapes_on_the_templates_vertices(egg: Template, network:
         return replace(data, source=lambda count, generator: change(data.source(count, generator)))[0]
 
     assert torch.equal(drawing(lambda verts: verts.double().numpy()).points, data[0].points)
-    for change in (lambda v: v[0], lambda v: v[:3], lambda v: v[:, :9], lambda v: v[..., :2]):
+    for change in (lambda v: v[0], lambda v: v[:3], lambda v: v[:, :9], lambda v: v[..., :2], lambda v: None):
         with pytest.raises(InputError, match="a source must give"):
             drawing(change)
     with pytest.raises(InputError, match="nan or infinite"):
         drawing(lambda verts: verts / 0)
+    with pytest.raises(InputError, match="all in one place"):
+        drawing(lambda verts: 0 * verts)
+    with pytest.raises(InputError, match="a function that draws shapes, not str"):
+        replace(data, source="eggs")[0]  # type: ignore[arg-type]
 
 
 def test_registered_shapes_are_drawn_wherever_they_lie() -> None:

@@ -1,0 +1,53 @@
+"""Arguments that are something else than what is asked for: told in a line, and not by whatever trips over them."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import meshmatch
+from meshmatch import MeshmatchError, VertexMap
+from meshmatch.maps.places import Places
+from tests.conftest import icosphere
+
+BALL = icosphere(1)
+SAME = VertexMap.identity(BALL)
+RAGGED: Any = [[1, 2, 3], [4, 5]]
+
+
+def evaluated(**how: Any) -> Any:
+    return meshmatch.evaluate(SAME, BALL, BALL, **{"unit": "x100"} | how)
+
+
+@pytest.mark.parametrize(("call", "words"), [
+    (lambda: evaluated(truth=RAGGED), "the truth: not an array"),
+    (lambda: evaluated(seed=-1), "a seed is"), (lambda: evaluated(seed=1.5), "a seed is"),
+    (lambda: evaluated(unit=np.zeros(3)), "invalid unit"),
+    (lambda: meshmatch.measure_distance(np.zeros((1, 3)), BALL, unit="x100"), "no surface area"),
+    (lambda: meshmatch.measure_distance(np.ones((300, 3)), BALL, unit="x100"), "no surface area"),
+    (lambda: VertexMap("a", "b", RAGGED), "index: not an array"), (lambda: VertexMap.identity("a.ply"), "must be a Shape"),
+    (lambda: VertexMap.between(BALL, BALL, RAGGED), "index: not an array"),
+    (lambda: VertexMap("a", "b", np.arange(2), confidence="x"), "confidence must be numbers"),
+    (lambda: VertexMap("a", "b", np.arange(2), barycentric=RAGGED), "barycentric must be numbers"),
+    (lambda: meshmatch.Errors("x"), "errors must be numbers"),
+    (lambda: meshmatch.Frame("x", np.eye(3), np.zeros(3)), "scale must be numbers"),
+    (lambda: meshmatch.Frame(np.ones(2), np.eye(3), np.zeros(3)), "scale must be positive"),
+    (lambda: meshmatch.load_fit(None), "expected a path"), (lambda: meshmatch.Collection(None), "expected a path"),
+    (lambda: Places.of(None, None), "repaired shape"),
+])  # fmt: skip
+def test_what_is_something_else_is_told(call: Callable[[], Any], words: str) -> None:
+    with pytest.raises(MeshmatchError) as caught:
+        call()
+    assert words in caught.value.message
+
+
+def test_the_next_frame_is_followed_from_a_fit() -> None:
+    with pytest.raises(MeshmatchError, match="Shape is not a fit"):
+        meshmatch.Matcher("human").follow(BALL, BALL)  # type: ignore[arg-type]
+
+
+def test_shapes_to_learn_are_named(tmp_path: Path) -> None:
+    with pytest.raises(MeshmatchError, match="expected a path"):
+        meshmatch.train(tmp_path / "model", shapes=3)  # type: ignore[arg-type]
