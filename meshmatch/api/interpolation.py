@@ -119,8 +119,8 @@ class Step(Brief):
         return {"time": round(self.time, 9)} | {key: round(value, 6) for key, value in asdict(self.deviation).items()}
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Interpolation(Brief):
+@dataclass(frozen=True, eq=False)
+class Interpolation:
     """A sequence of shapes with the same vertices and faces; by an implicit model, each has its own.
 
     Attributes
@@ -156,6 +156,10 @@ class Interpolation(Brief):
     to_target: float | None
     seconds: float
     notes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        way = f"{len(self.steps)} frames, {len(self.fits)} fits"
+        return f"Interpolation({way}, {self.place!r}, {self.seconds:.1f} s, {len(self.notes)} notes)"
 
 
 def interpolate(

@@ -86,6 +86,10 @@ class Fitted:
     model: str
     elsewhere: Mapping[str, str] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{count} {verdict}" for verdict, count in self.counts.items() if count)
+        return f"Fitted(model {self.model!r}, {counts or 'nothing'}, {len(self.elsewhere)} elsewhere)"
+
     @property
     def counts(self) -> dict[str, int]:
         """How many fits are good, fair or poor, and how many shapes failed."""

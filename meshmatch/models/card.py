@@ -125,6 +125,9 @@ class ModelCard(Card):
     mirror: str = "no"  # whether fits also try a shape's mirror image: one of `MIRRORINGS`
     correspondence: bool = True  # whether it was learned from known correspondence; else its fits are fair at best
 
+    def __repr__(self) -> str:
+        return f"ModelCard({self.name!r}, category {self.category!r}, {self.steps:,} steps, {self.created})"
+
     def _check_parts(self) -> None:
         for name, keys in (("field", _FIELD_KEYS), ("frame", _OLD_FRAME)):
             if (found := getattr(self, name)).keys() != keys.keys():
@@ -157,6 +160,9 @@ class ImplicitCard(Card):
     weights_sha256: str
     created: str
     schema: int = newest
+
+    def __repr__(self) -> str:
+        return f"ImplicitCard({self.name!r}, category {self.category!r}, {len(self.shapes)} shapes, {self.created})"
 
     def _check_parts(self) -> None:
         names = set(map(str, self.shapes))

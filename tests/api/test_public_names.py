@@ -17,8 +17,13 @@ import torch
 from scipy.sparse import csr_matrix
 
 import meshmatch
+from meshmatch.api.interpolation import Interpolation, Step
+from meshmatch.collections.fit_all import Fitted
+from meshmatch.collections.setting import Record
 from meshmatch.fields.field import PointwiseField
 from meshmatch.fields.shape_functions import ShapeFunctions
+from meshmatch.shapes.shape import Shape
+from tests.models.small_model import small_card
 
 ROOT = Path(__file__).resolve().parents[2]
 PUBLIC = {name: getattr(meshmatch, name) for name in meshmatch.__all__ if name != "__version__"}
@@ -107,6 +112,17 @@ def test_values_of_arrays_are_shown_by_their_sizes() -> None:
         "ShapeFunctions(phi: 4 x 2)",
         "PointwiseField(points: 5 x 3, gradient_points: 2 x 3, motion=<built-in function id>, D=3)",
     ]
+
+
+def test_results_of_many_shapes_are_shown_in_a_line() -> None:
+    few, many = (Fitted((Record("a", "a.ply", "good"),) * n + (Record("b", "b.ply"),), n, "human") for n in (2, 1000))
+    assert repr(few) == "Fitted(model 'human', 2 good, 1 failed, 0 elsewhere)"
+    step = Step(0.0, Shape(np.eye(3), np.array([[0, 1, 2]])))
+    short, long = (Interpolation((step,) * n, (), (), "files", 0.1, 2.0, ("a note",) * n) for n in (3, 60))
+    assert repr(short) == "Interpolation(3 frames, 0 fits, 'files', 2.0 s, 3 notes)"
+    card = small_card(metrics={f"set {n}": {"mean_cm": 1.0} for n in range(1000)})
+    assert repr(card) == "ModelCard('blob', category 'blobs', 3 steps, 2026-01-31)"
+    assert max(len(repr(each)) for each in (many, long)) < 80
 
 
 def imported(name: str) -> Any:
