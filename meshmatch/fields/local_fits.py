@@ -46,10 +46,12 @@ class LocalFits:
         """
         xp = namespace(points)
         at, of_node = support_pairs(plain(points), plain(nodes), plain(radii)) if pairs is None else pairs
-        scale = alike(support_scale(at, of_node, plain(radii), len(points))[at], points)
+        rows, columns = at, of_node
         at, of_node = alike(at, points), alike(of_node, points)
         offset = points[at] - nodes[of_node]
-        weight, slope = KERNELS[kernel](length(offset), radii[of_node])
+        distance = length(offset)
+        scale = alike(support_scale(rows, columns, plain(radii), len(points), plain(distance))[rows], points)
+        weight, slope = KERNELS[kernel](distance, radii[of_node])
         basis = xp.concatenate([xp.ones_like(offset[:, :1]), -offset / scale[:, None]], 1)
         moment = sums(weight[:, None] * outer(basis), at, len(points)).reshape(-1, 4, 4)
         if flat:

@@ -34,6 +34,7 @@ from meshmatch.arrays import Brief, Float, Floats, Int, Ints, as_numbers
 from meshmatch.errors import InputError, OptionError, TemplateError, warn
 from meshmatch.fields.local_fits import LocalFits
 from meshmatch.geometry.kernels import KERNELS, Kernel
+from meshmatch.shapes.shape import LARGEST
 
 FieldName = Literal["mls", "rbf", "pointwise"]
 FIELDS: tuple[FieldName, ...] = get_args(FieldName)
@@ -136,6 +137,8 @@ def checked_radii(radius: ArrayLike, K: int) -> Float[Floats, " K"]:
     if radii.shape not in ((), (K,)) or not (radii > 0).all():
         what = f"the radius must be positive, one number or one for each of {K} nodes"
         raise InputError(f"{what}, not {radii if radii.ndim == 0 else radii.shape}")
+    if not radii.max() < LARGEST:
+        raise InputError("the radius is too large", "measure it in another unit")
     return np.broadcast_to(radii, (K,))
 
 

@@ -16,8 +16,9 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.trees import cKDTree
 
 Kernel = Literal["cubic", "smooth"]
-# Smallest accepted eigenvalue of the scaled moment matrix, relative to its trace. Set by hand, as is the margin below.
+# Smallest accepted eigenvalue of the scaled moment matrix, relative to its trace. Set by hand, as are the numbers below.
 MINIMUM_EIGENVALUE = 1e-6
+_WIDE = 10.0
 
 
 def _cubic(distance: Any, radius: Any) -> tuple[Any, Any]:
@@ -63,15 +64,19 @@ def support_pairs(
 
 
 def support_scale(
-    row: Int[Ints, " N"], column: Int[Ints, " N"], radii: Float[Floats, " K"], P: int
+    row: Int[Ints, " N"], column: Int[Ints, " N"], radii: Float[Floats, " K"], P: int, distance: Float[Floats, " N"]
 ) -> Float[Floats, " P"]:
     """In what length offsets from each of P points are measured: the largest radius of a node that reaches it, so that
-    moment matrices are as well conditioned among wide nodes as among narrow ones."""
+    moment matrices are as well conditioned among wide nodes as among narrow ones; or, where that is `_WIDE` times the
+    largest ``distance`` of a node from its point, the latter: nodes lie no more in a plane for reaching further."""
     if radii.min() == radii.max():
-        return np.full(P, radii.mean())
-    scale = np.zeros(P)
-    np.maximum.at(scale, row, radii[column])
-    return np.where(scale > 0, scale, radii.mean())
+        scale = np.full(P, radii.mean())
+    else:
+        scale = np.zeros(P)
+        np.maximum.at(scale, row, radii[column])
+        scale = np.where(scale > 0, scale, radii.mean())
+    farthest = distance.max(initial=0.0)
+    return np.where((scale > _WIDE * farthest) & (farthest > 0), farthest, scale)
 
 
 def poorly_supported(
@@ -85,8 +90,9 @@ def poorly_supported(
     radii = np.broadcast_to(np.asarray(radius, np.float64), (len(nodes),))
     row, column = support_pairs(points, nodes, radii)
     offset = points[row] - nodes[column]
-    weight = KERNELS[kernel](np.linalg.norm(offset, axis=1), radii[column])[0]
-    scale = support_scale(row, column, radii, len(points))
+    distance = np.linalg.norm(offset, axis=1)
+    weight = KERNELS[kernel](distance, radii[column])[0]
+    scale = support_scale(row, column, radii, len(points), distance)
     basis = np.concatenate([np.ones((len(row), 1)), -offset / scale[row, None]], 1)
     moment = np.zeros((len(points), 4, 4))
     np.add.at(moment, row, weight[:, None, None] * basis[:, :, None] * basis[:, None, :])

@@ -57,6 +57,21 @@ def test_affine_motions_are_exact_in_float64() -> None:
     assert field.displacement(VECTORS[:, :1]).shape == (12, 1)  # of anything, not of positions alone
 
 
+@pytest.mark.parametrize("radius", [1e3, 1e8, 1e50])
+def test_nodes_that_reach_far_make_one_affine_motion(radius: float) -> None:
+    """All weigh alike: what NumPy's least squares find."""
+    best = np.linalg.lstsq(np.column_stack([np.ones(150), NODES]), VECTORS)[0]
+    for outside in ("error", "mask"):
+        field = node_field(POINTS, NODES, radius, outside=outside)  # type: ignore[arg-type]
+        assert field.reached.all()
+        assert field.displacement(VECTORS) == pytest.approx(best[0] + POINTS @ best[1:], abs=1e-5)
+        assert field.gradient(VECTORS) == pytest.approx(np.broadcast_to(best[1:].T, (12, 3, 3)), abs=1e-5)
+    with pytest.raises(TemplateError, match="non-coplanar"):
+        node_field(POINTS, NODES * [1, 1, 0], radius)
+    with pytest.raises(InputError, match="the radius is too large"):
+        node_field(POINTS, NODES, 1e300)
+
+
 @pytest.mark.parametrize("what", ["displacement", "deformation_gradient", "second_derivative"])
 def test_torch_has_gradients_to_vectors_points_nodes_and_radii(what: str) -> None:
     given = [torch.tensor(each, requires_grad=True) for each in (POINTS[:3], NODES, np.full(150, 0.8), VECTORS)]
