@@ -11,7 +11,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import Field, fields
 from html import escape
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,6 +46,9 @@ class TensorLike(Protocol):
     def detach(self) -> Any: ...
 
     def numpy(self, *, force: bool = False) -> NDArray[Any]: ...
+
+
+SomeTensor = TypeVar("SomeTensor", bound=TensorLike)
 
 
 def read_only(values: Any, dtype: type, label: str) -> NDArray[Any]:
@@ -143,7 +146,19 @@ def as_array(values: Any, name: str, hint: str = "") -> NDArray[Any]:
         raise InputError(f"{name}: not an array ({error})", hint) from error
 
 
-def as_numbers(values: ArrayLike, name: str, finite: bool = False) -> Floats:
+@np.errstate(invalid="ignore")  # of a nan that is rounded; it is refused
+def whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
+    """An array of integers, which may be given as floats; `InputError` for anything else."""
+    array = as_array(values, label)
+    whole = array.dtype.kind == "f" and np.array_equal(array, np.round(array))
+    if whole and (np.abs(array.astype(np.float64)) < 2**53).all():
+        return array.astype(np.int64)  # MATLAB's numbers are doubles
+    if array.dtype.kind not in "iu":
+        raise InputError(f"{label} must be whole numbers, not {array.dtype}")
+    return np.array(array, dtype=np.int64)
+
+
+def as_numbers(values: ArrayLike | TensorLike, name: str, finite: bool = False) -> Floats:
     """An array of numbers; `InputError` where they are something else, such as words or rows of different lengths."""
     try:
         found = np.asarray(off_torch(values))

@@ -10,9 +10,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_array, csr_matrix
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints, as_numbers, is_tensor
 from meshmatch.errors import TemplateError
 from meshmatch.geometry.kernels import CURVATURES, KERNELS, MINIMUM_EIGENVALUE, Kernel, support_pairs, support_scale
 
@@ -159,6 +159,17 @@ def sums(values: Any, at: Any, P: int) -> Any:
     if isinstance(values, np.ndarray):
         return csr_matrix((np.ones(len(at)), (at, np.arange(len(at)))), (P, len(at))) @ values
     return values.new_zeros(P, values.shape[1]).index_add(0, at, values)
+
+
+def product(matrix: csr_array, values: Any) -> Any:
+    """A sparse matrix of SciPy times numbers (K,) or (K, C); of a tensor in its precision, and with its gradient."""
+    if not is_tensor(values):
+        return np.asarray(matrix @ as_numbers(values, "values"))
+    values = values if values.is_floating_point() else values.double()
+    row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+    row, column, weight = (alike(each, values) for each in (row, matrix.indices.astype(np.int64), matrix.data))
+    found = sums(weight[:, None] * values.reshape(len(values), -1)[column], row, matrix.shape[0])
+    return found.reshape(-1, *values.shape[1:])
 
 
 def weak(moment: Float[Floats, "P 4 4"]) -> Int[Ints, " N"]:

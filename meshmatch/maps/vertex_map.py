@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass, replace
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, Pickled, as_array, as_numbers, frozen
+from meshmatch.arrays import (
+    Bool,
+    Bools,
+    Float,
+    Floats,
+    Floats32,
+    Int,
+    Ints,
+    Pickled,
+    SomeTensor,
+    as_numbers,
+    frozen,
+    whole_numbers,
+)
 from meshmatch.errors import InputError
+from meshmatch.fields.local_fits import product
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.shapes.shape import Shape, checked_shape
 
@@ -119,18 +133,17 @@ class VertexMap(Pickled):
     @np.errstate(invalid="ignore")  # of a nan that signals; it is refused
     def _checked_arrays(self, label: str) -> dict[str, NDArray[Any]]:
         """Copies of the arrays, if they are what the class says."""
-        vertex = _whole_numbers(self.index, f"{label}: index")
-        if vertex.ndim != 1 or vertex.size == 0:
+        vertex = whole_numbers(self.index, f"{label}: index")
+        if vertex.ndim != 1 or (size := len(vertex)) == 0:
             raise InputError(f"{label}: index must be a list of (V_source,) vertices, not an array of {vertex.shape}")
         if self.target_vertices != UNKNOWN and self.target_vertices < 1:
             raise InputError(f"{label}: a target needs vertices, not {self.target_vertices}")
         check_range(vertex, self.target_vertices, label)
-        size = len(vertex)
-        faces = np.full(size, -1) if self.face is None else _whole_numbers(self.face, f"{label}: face")
+        faces = np.full(size, -1) if self.face is None else whole_numbers(self.face, f"{label}: face")
         corner = np.eye(1, 3).repeat(size, 0) if self.barycentric is None else self.barycentric
         weights = np.array(as_numbers(corner, f"{label}: barycentric"))
-        unknown = np.full(size, np.nan)
-        given = unknown if self.confidence is None else as_numbers(self.confidence, f"{label}: confidence")
+        trusted = np.full(size, np.nan) if self.confidence is None else self.confidence
+        given = as_numbers(trusted, f"{label}: confidence")
         trust = np.clip(given, -1, 2).astype(np.float32)  # a short float holds no 1e300, which is refused below
         arrays: dict[str, NDArray[Any]] = {"index": vertex, "face": faces, "barycentric": weights, "confidence": trust}
         for name, array in arrays.items():
@@ -171,7 +184,7 @@ class VertexMap(Pickled):
             As for the class, or a face that the target does not have.
         """
         fields = _side("source", source) | _side("target", target)
-        return cls(index=as_array(index, "index"), target_faces=target.faces, **fields, **rest)
+        return cls(index=whole_numbers(index, "index"), target_faces=target.faces, **fields, **rest)
 
     @classmethod
     def identity(cls, shape: Shape) -> VertexMap:
@@ -192,8 +205,8 @@ class VertexMap(Pickled):
         InputError
             It is no `Shape`.
         """
-        V = checked_shape(shape, "the shape").V
-        return cls.between(shape, shape, np.arange(V), confidence=np.ones(V), verdict="good")
+        index = np.arange(checked_shape(shape, "the shape").V)
+        return cls.between(shape, shape, index, confidence=np.ones(len(index)), verdict="good")
 
     @property
     def assumed_confidence(self) -> Float[Floats32, " V_source"]:
@@ -326,7 +339,11 @@ class VertexMap(Pickled):
         matrix.sum_duplicates()
         return matrix
 
-    def apply(self, values: ArrayLike) -> Floats:
+    @overload
+    def apply(self, values: SomeTensor) -> SomeTensor: ...
+    @overload
+    def apply(self, values: ArrayLike) -> Floats: ...
+    def apply(self, values: ArrayLike | SomeTensor) -> Any:
         """Pull values of the *target's* vertices back to the source, interpolated within the target's faces.
 
         Parameters
@@ -337,7 +354,7 @@ class VertexMap(Pickled):
         Returns
         -------
         (V_source,) or (V_source, D) float64
-            At each source vertex the value at its matched point.
+            At each source vertex the value at its matched point; of a tensor, a tensor like it, with its gradient.
 
         Raises
         ------
@@ -349,7 +366,7 @@ class VertexMap(Pickled):
         if numbers.ndim not in (1, 2) or len(numbers) != matrix.shape[1]:
             needed = f"values (V,) or (V, D) of the {matrix.shape[1]} vertices of its target"
             raise InputError(f"the map {_way(self)} needs {needed}, not an array of {numbers.shape}")
-        return np.asarray(matrix @ numbers)
+        return product(matrix, values)
 
     def functional(
         self, basis_source: ArrayLike, basis_target: ArrayLike, mass: ArrayLike | None = None
@@ -478,17 +495,6 @@ def check_range(index: Int[Ints, ...], target_vertices: int, label: str) -> None
         matched = f"{label}: vertex {int(np.argmax(index))} is matched to vertex {int(index.max())}"
         hint = "it looks 1-based: subtract 1" if one_based else "is it a map to another shape, or the other way round?"
         raise InputError(f"{matched}, but the target has only {target_vertices} vertices", hint)
-
-
-@np.errstate(invalid="ignore")  # of a nan that is rounded; it is refused
-def _whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
-    array = as_array(values, label)
-    whole = array.dtype.kind == "f" and np.array_equal(array, np.round(array))
-    if whole and (np.abs(array.astype(np.float64)) < 2**53).all():
-        return array.astype(np.int64)  # MATLAB's numbers are doubles
-    if array.dtype.kind not in "iu":
-        raise InputError(f"{label} must be whole numbers, not {array.dtype}")
-    return np.array(array, dtype=np.int64)
 
 
 def _side(side: str, shape: Shape) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from meshmatch.errors import InputError
 from meshmatch.maps.vertex_map import VertexMap
@@ -172,6 +173,20 @@ def test_maps_that_do_not_meet_are_not_joined() -> None:
         ab.compose(VertexMap("b", "x", np.arange(15)))
     with pytest.raises(InputError, match="matched to vertex"):
         VertexMap("a", "b", np.array([0, 20])).compose(VertexMap("b", "x", np.arange(15)))
+
+
+def test_apply_keeps_the_gradient_of_a_tensor() -> None:
+    m = random_map(A, C, 3)
+    values = torch.tensor(C.verts, requires_grad=True)
+    found = m.apply(values)
+    assert found.detach().numpy() == pytest.approx(m.apply(C.verts), abs=1e-12)
+    weights = torch.arange(3.0 * A.V, dtype=torch.float64).reshape(A.V, 3)
+    (found * weights).sum().backward()
+    assert values.grad is not None and values.grad.numpy() == pytest.approx(m.sparse().T @ weights.numpy())
+    assert m.apply(values[:, 0].float()).dtype == torch.float32 and m.apply(values[:, 0]).shape == (A.V,)
+    assert m.apply(torch.arange(C.V)).tolist() == pytest.approx(m.apply(np.arange(C.V)).tolist())
+    with pytest.raises(InputError, match="vertices of its target"):
+        m.apply(values[:-1])
 
 
 def test_apply_interpolates_on_the_target() -> None:
