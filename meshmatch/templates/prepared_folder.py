@@ -277,14 +277,14 @@ def read_samples(folder: str | Path, template: Template) -> ShapeSamples:
             raise KeyError("arrays that do not belong together")
         return found
 
-    return _read(Path(folder), "points", template, samples)[1]
+    return _read(as_path(folder), "points", template, samples)[1]
 
 
 def read_registered(folder: str | Path, template: Template) -> Float[Floats32, "N V 3"]:
     """Registered shapes of a prepared folder; `InputError` if it is none, was prepared for another template or scale, or
     its shapes are not registered.
     """
-    words, shapes = _read(Path(folder), "shapes", template, lambda arrays, _: arrays["verts"])
+    words, shapes = _read(as_path(folder), "shapes", template, lambda arrays, _: arrays["verts"])
     if words.get("scale", "area") != "area":
         problem = (
             f"{folder} was prepared with --scale {words['scale']}, but registered shapes are learned at equal areas"

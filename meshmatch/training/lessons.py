@@ -17,6 +17,7 @@ from meshmatch.generators.kinds import Kind
 from meshmatch.generators.proportions import STYLISED
 from meshmatch.models.registry import TEMPLATE
 from meshmatch.models.trained import TrainedModel
+from meshmatch.outputs import as_path
 from meshmatch.progress import Progress
 from meshmatch.shapes.normalise import Mirroring
 from meshmatch.templates.prepared_folder import (
@@ -98,7 +99,7 @@ def template_of(
     if isinstance(shapes, RegisteredShapes):
         return shapes.template
     if shapes is not None:
-        return read_template(Path(shapes) / TEMPLATE)
+        return read_template(as_path(shapes) / TEMPLATE)
     if isinstance(kind, Kind):
         return None if start.template.name == kind.name else shipped_template(kind.name)
     return read_template((kind.template if kind else None) or recipe.template)
@@ -157,4 +158,4 @@ def lessons(
         frame = {"orientation": shapes.orientation, "scale": "area"}
         sides: Mirroring = "auto" if shapes.mirror else "no"
         return Lessons(shapes.template, source, "", f"{known}, without a model", frame, sides, digest=digest)
-    return prepared(Path(shapes), recipe)
+    return prepared(as_path(shapes), recipe)

@@ -10,7 +10,10 @@ import pytest
 import meshmatch
 from meshmatch import MeshmatchError, VertexMap
 from meshmatch.maps.places import Places
+from meshmatch.templates.prepared_folder import read_registered
+from meshmatch.training.recipes import Recipe, default
 from tests.conftest import icosphere
+from tests.models.small_model import small_template
 
 BALL = icosphere(1)
 SAME = VertexMap.identity(BALL)
@@ -48,6 +51,12 @@ def test_the_next_frame_is_followed_from_a_fit() -> None:
         meshmatch.Matcher("human").follow(BALL, BALL)  # type: ignore[arg-type]
 
 
-def test_shapes_to_learn_are_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("recipe", [None, default()])
+def test_shapes_to_learn_are_named(recipe: Recipe | None, tmp_path: Path) -> None:
     with pytest.raises(MeshmatchError, match="expected a path"):
-        meshmatch.train(tmp_path / "model", shapes=3)  # type: ignore[arg-type]
+        meshmatch.train(tmp_path / "model", shapes=3, recipe=recipe)  # type: ignore[arg-type]
+
+
+def test_shapes_to_measure_on_are_named() -> None:
+    with pytest.raises(MeshmatchError, match="expected a path"):
+        read_registered(3, small_template())  # type: ignore[arg-type]
