@@ -17,7 +17,8 @@ from meshmatch.geometry.triangles import (
     triangle_vectors,
     unit,
 )
-from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.maps.named_places import corners_of
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.faces import turn_faces
 from meshmatch.shapes.shape import Shape
 

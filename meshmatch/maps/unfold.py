@@ -38,7 +38,8 @@ from meshmatch.geometry.triangles import (
 )
 from meshmatch.maps.folds import CRUSHED, area_ratios, facing, known_normals, normals_at, wound_alike
 from meshmatch.maps.mapped_mesh import MappedMesh, invert_map, length_of
-from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.maps.named_places import corners_of
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.faces import seams
 from meshmatch.shapes.normalise import in_single_precision
 from meshmatch.shapes.shape import Shape

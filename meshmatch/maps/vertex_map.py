@@ -26,10 +26,10 @@ from meshmatch.arrays import (
 from meshmatch.errors import InputError
 from meshmatch.fields.local_fits import product
 from meshmatch.geometry.triangles import interpolate
+from meshmatch.maps.named_places import UNKNOWN as UNKNOWN
+from meshmatch.maps.named_places import check_faces, check_range, corners_of
 from meshmatch.shapes.shape import Shape, checked_shape
 
-UNKNOWN = -1
-"""A number of vertices that is not known."""
 DIRECTION = "index[i] is the vertex of the target matched to vertex i of the source"
 VERDICTS = ("good", "fair", "poor", "unknown")
 _UPS = ("", "+x", "-x", "+y", "-y", "+z", "-z")
@@ -467,34 +467,6 @@ def check_map(found: object) -> None:
     if not isinstance(found, VertexMap):
         hint = "pass a VertexMap: a MatchResult has one as .map, and VertexMap.between makes one of an index"
         raise InputError(f"{type(found).__name__} is not a map", hint)
-
-
-def check_faces(face: Int[Ints, " V_source"], target_faces: int, label: str) -> None:
-    """Refuse faces that a target of so many does not have (`InputError`)."""
-    if face.max() >= target_faces:
-        raise InputError(f"{label} names face {int(face.max())}, but its target has only {target_faces} faces")
-
-
-def corners_of(faces: Int[Ints, "F 3"] | None, face: Int[Ints, " N"], vertex: Int[Ints, " N"]) -> Int[Ints, "N 3"]:
-    """Corners of faces (N,); where the face is -1, three times the vertex itself."""
-    inside = face >= 0
-    if faces is not None and inside.all():
-        return faces.take(face, 0)
-    corners = np.repeat(vertex[:, None], 3, axis=1)
-    if faces is not None:
-        corners[inside] = faces[face[inside]]
-    return corners
-
-
-def check_range(index: Int[Ints, ...], target_vertices: int, label: str) -> None:
-    if index.min() < 0:
-        first = int(np.argmin(index))
-        raise InputError(f"{label}: vertex {first} is matched to {int(index.min())}; indices start at 0")
-    if target_vertices != UNKNOWN and index.max() >= target_vertices:
-        one_based = index.min() >= 1 and index.max() == target_vertices
-        matched = f"{label}: vertex {int(np.argmax(index))} is matched to vertex {int(index.max())}"
-        hint = "it looks 1-based: subtract 1" if one_based else "is it a map to another shape, or the other way round?"
-        raise InputError(f"{matched}, but the target has only {target_vertices} vertices", hint)
 
 
 def _side(side: str, shape: Shape) -> dict[str, Any]:

@@ -16,7 +16,8 @@ from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import triangle_areas
 from meshmatch.maps.folds import known_normals
 from meshmatch.maps.mapped_mesh import MappedMesh, discontinuous_faces, mean_around
-from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.maps.named_places import corners_of
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
 NO_LABEL = -1

@@ -16,7 +16,8 @@ from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import dot, triangle_vectors, unit
 from meshmatch.maps.mapped_mesh import length_of
-from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.maps.named_places import corners_of
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.faces import seams
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.clean_weights import same_at

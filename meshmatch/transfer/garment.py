@@ -21,7 +21,8 @@ from meshmatch.geometry.smoothing import laplacian, solved
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import dot, edge_lengths, edges_of, interpolate, same_rows, unit
 from meshmatch.maps.mapped_mesh import MappedMesh, length_of
-from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.maps.named_places import corners_of
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.repair import turned_outwards
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.local_frames import local_frames

@@ -19,7 +19,8 @@ from meshmatch.errors import InputError, warn
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.folds import known_normals
 from meshmatch.maps.mapped_mesh import MappedMesh, discontinuous_faces
-from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.maps.named_places import corners_of
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes import tables
 from meshmatch.shapes.landmark_files import (
     LANDMARK_READERS,

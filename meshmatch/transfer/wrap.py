@@ -14,7 +14,7 @@ from meshmatch.geometry.triangles import dot, edge_lengths, interpolate, same_ro
 from meshmatch.maps.deformed import surface_rotations
 from meshmatch.maps.folds import known_normals
 from meshmatch.maps.mapped_mesh import MappedMesh, length_of
-from meshmatch.maps.vertex_map import corners_of
+from meshmatch.maps.named_places import corners_of
 from meshmatch.shapes.shape import Shape
 
 # All set by hand; lengths in units of sqrt(area).

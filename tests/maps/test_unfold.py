@@ -10,8 +10,9 @@ from meshmatch.geometry.disks import Disk
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.folds import Folds
 from meshmatch.maps.mapped_mesh import MappedMesh, invert_map
+from meshmatch.maps.named_places import corners_of
 from meshmatch.maps.unfold import _Images, _ratios, unfolded, unfolded_both_ways
-from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
 MOVED = np.array([100, 300, 500])
