@@ -420,12 +420,14 @@ def transfer_landmarks(
     match
         As in `find_maps`.
     rule
-        Landmarks of less confidence than its minimum are counted, and kept.
+        Landmarks of less confidence than its minimum are missing on the target: a place near by would be no
+        measurement. A minimum of 0 keeps them all.
 
     Returns
     -------
     Transferred
-        ``data.points`` (N, 3) in the target's frame and unit; also their vertex, or face and barycentric weights.
+        ``data.points`` (N, 3) in the target's frame and unit; also their vertex, or face and barycentric weights. Of
+        missing ones, nan and -1.
 
     Raises
     ------
@@ -444,7 +446,9 @@ def transfer_landmarks(
     maps = find_maps(source, target, match)
     with thread_limit(1):
         found = push_landmarks(maps.forward, maps.source, maps.target, given)
-    low = LowConfidence(len(found.names), int((found.confidence < rule.minimum).sum()))
+    found = found.without(found.missing | (found.confidence < rule.minimum))
+    lost = int(found.missing.sum())
+    low = LowConfidence(len(found.names), lost, lost)
     file = Path(target) if isinstance(target, str | Path) else None
     return Transferred(found, found.confidence, low, maps, partial(_write_landmarks, found, maps.target, file))
 

@@ -195,6 +195,8 @@ def transfer_weights(
 
 def _landmark_table(table: Path, given: Mapping[str, Any], source: str, written: Mapping[str, Path]) -> str:
     """Write the landmarks of SRC and all targets as one table."""
+    import numpy as np
+
     from meshmatch.shapes.landmark_files import mesh_space
     from meshmatch.transfer.landmarks import landmark_positions, load_landmarks, save_specimens
 
@@ -203,7 +205,10 @@ def _landmark_table(table: Path, given: Mapping[str, Any], source: str, written:
     specimens = {source: own.points} | {name: landmark_positions(file) for name, file in written.items()}
     with replace_on_success(table) as temporary:
         save_specimens(temporary, specimens, own.names)
-    return f"wrote {table}: {len(own.names)} landmarks of {len(specimens)} specimens, {source} among them"
+    lost = {name: int(np.isnan(points).any(axis=1).sum()) for name, points in specimens.items()}
+    missing = ", ".join(f"{count} of {name}" for name, count in lost.items() if count)
+    told = f"wrote {table}: {len(own.names)} landmarks of {len(specimens)} specimens, {source} among them"
+    return told + (f"; missing are {missing}" if missing else "")
 
 
 @grouped
@@ -222,7 +227,7 @@ def transfer_landmarks(
     ),
     maps: MapOptionsWithPairs,
     run: RunOptions,
-    min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Landmarks below this confidence are listed."),
+    min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Landmarks below this confidence are missing on TGT."),
     table: Path | None = optional(
         "FILE",
         "With several targets, also one table of all specimens, SRC among them: .csv, .tps, Morphologika's .txt, or .npz.",
@@ -233,7 +238,8 @@ def transfer_landmarks(
 
     For each landmark, .csv and .json files have its vertex, position, face with barycentric weights, and confidence;
     .pp, .fcsv and .mrk.json files its name and position, .tps files positions alone. A position in FILE stands for the
-    nearest point of SRC.
+    nearest point of SRC. Landmarks below --min-confidence, as on a part that TGT lacks, are named in a warning, and missing
+    in the files: NA in .tps. --min-confidence 0 keeps them all.
     """
     import numpy as np
 
@@ -249,15 +255,17 @@ def transfer_landmarks(
         result = meshmatch.transfer_landmarks(a, target, given, transfer, rule=meshmatch.ConfidenceRule(min_confidence))
         found, b = result.data, result.maps.target
         result.writer(temporary, output)
-    low = np.flatnonzero(found.confidence < min_confidence)
+    low = np.flatnonzero(found.missing)
     if len(low):
         told = [f"{found.names[k]} ({found.confidence[k]:.2f})" for k in low[:10].tolist()]
         more = f" and {len(low) - 10} more" if len(low) > 10 else ""
-        console.warn(f"{transfer.names[1]}: landmarks of confidence below {min_confidence:g}: {', '.join(told)}{more}")
-    console.say(f"wrote {output}: {len(found.names)} landmarks on {transfer.names[1]}")
+        listed = f"{', '.join(told)}{more}"
+        console.warn(f"{transfer.names[1]}: missing are landmarks of confidence below {min_confidence:g}: {listed}")
+    console.say(f"wrote {output}: {len(found.names) - len(low)} landmarks on {transfer.names[1]}")
     if picture is not None:
         from meshmatch.render.compose import compose_points
 
-        transfer.draw(result.maps, compose_points((a, b), (given.points, found.points)))
+        there = ~found.missing
+        transfer.draw(result.maps, compose_points((a, b), (given.points[there], found.points[there])))
     counts = {"landmarks": len(found.names), "min_confidence": min_confidence, "low_confidence": len(low)}
     return transfer.record({"picture": picture} | counts, result.maps, float(result.maps.forward.confidence.mean()))

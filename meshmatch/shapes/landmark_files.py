@@ -394,11 +394,12 @@ def _read_pp(path: Path) -> list[Record]:
         raise InputError(f"it is not XML: {error}") from error
     if root.tag != "PickedPoints":
         raise InputError(f"it is not a file of MeshLab's picked points: its root is '{root.tag}'")
-    return [
-        {"name": point.get("name"), "position": [number(point.get(axis, "")) for axis in "xyz"]}
-        for point in root.iter("point")
-        if point.get("active", "1") != "0"  # the name of a template that nobody has placed
-    ]
+    records: list[Record] = []
+    for point in root.iter("point"):
+        is_placed = point.get("active", "1") != "0"  # else it is the name of a template's point that nobody has placed
+        position = [number(point.get(axis, "")) for axis in "xyz"] if is_placed else None
+        records.append({"name": point.get("name"), "position": position})
+    return records
 
 
 LANDMARK_READERS: Mapping[str, Callable[..., list[Record]]] = {
@@ -416,32 +417,40 @@ READERS_OF_SEVERAL = (_read_tps, _read_table)  # those that take the name of one
 
 
 def tps_lines(specimens: Mapping[str, Floats]) -> Iterable[str]:
-    """The lines of a .tps file, from the positions (L, 3) of each specimen's landmarks."""
+    """The lines of a .tps file, from the positions (L, 3) of each specimen's landmarks; nan is written as NA."""
     for name, points in specimens.items():
         yield f"LM3={len(points)}"
-        yield from (f"{x!r} {y!r} {z!r}" for x, y, z in points.tolist())
+        yield from map(_three_words, points.tolist())
         yield f"ID={_one_line(name)}"
 
 
 def morphologika_lines(specimens: Mapping[str, Floats]) -> Iterable[str]:
-    """The lines of Morphologika's text, from the positions (L, 3) of each specimen's landmarks."""
+    """The lines of Morphologika's text, from the positions (L, 3) of each specimen's landmarks; nan is written as NA."""
     names = [_one_line(name) for name in specimens]
     length = len(next(iter(specimens.values())))
     yield from ("[individuals]", str(len(names)), "[landmarks]", str(length), "[dimensions]", "3", "[names]", *names)
     yield "[rawpoints]"
     for name, points in zip(names, specimens.values(), strict=True):
         yield f"'{name}"
-        yield from (f"{x!r} {y!r} {z!r}" for x, y, z in points.tolist())
+        yield from map(_three_words, points.tolist())
+
+
+def _three_words(position: Sequence[float]) -> str:
+    """As R, with its package geomorph, reads a position, and one that is missing."""
+    return " ".join("NA" if math.isnan(each) else repr(each) for each in position)
 
 
 def fcsv_lines(points: Iterable[tuple[str, Sequence[float], float]], space: Space) -> Iterable[str]:
-    """The lines of 3D Slicer's fiducials, from names, positions and confidences, in a frame."""
+    """The lines of 3D Slicer's fiducials, from names, positions and confidences, in a frame. The format knows of none that
+    are missing: 3D Slicer leaves out lines without a position, which those of nan are.
+    """
     yield "# Markups fiducial file version = 4.11"
     yield f"# CoordinateSystem = {space}"
     yield f"# columns = {_FCSV_COLUMNS}"
     for k, (name, (x, y, z), confidence) in enumerate(points, 1):
+        xyz = ["", "", ""] if math.isnan(x + y + z) else [repr(x), repr(y), repr(z)]
         label = '"' + name.replace('"', '""') + '"' if set(name) & set('",') else name
-        yield f"{k},{x!r},{y!r},{z!r},0.0,0.0,0.0,1.0,1,1,0,{label},{_description(confidence)},"
+        yield f"{k},{','.join(xyz)},0.0,0.0,0.0,1.0,1,1,0,{label},{_description(confidence)},"
 
 
 def _description(confidence: float) -> str:
@@ -452,18 +461,14 @@ def markups_record(
     points: Iterable[tuple[str, Sequence[float], float]], space: Space, lists: Sequence[Markup] = ()
 ) -> dict[str, Any]:
     """3D Slicer's markups (.mrk.json), from names, positions and confidences, in a frame; in the lists that they come from,
-    such as curves.
+    such as curves. A position that is nan is undefined.
     """
-    controls = [
-        {
-            "id": str(k),
-            "label": name,
-            "description": _description(confidence),
-            "position": list(position),
-            "positionStatus": "defined",
-        }
-        for k, (name, position, confidence) in enumerate(points, 1)
-    ]
+    controls: list[dict[str, Any]] = []
+    for k, (name, position, confidence) in enumerate(points, 1):
+        controls.append({"id": str(k), "label": name, "description": _description(confidence)})
+        is_set = not any(map(math.isnan, position))
+        controls[-1] |= {"position": list(position)} if is_set else {}  # 3D Slicer refuses a file with an empty one
+        controls[-1]["positionStatus"] = "defined" if is_set else "undefined"
     schema = "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
     pairs = zip(lists or [(0, _POINTS)] * len(controls), controls, strict=True)
     markups = [

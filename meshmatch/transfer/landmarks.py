@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Brief, Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, Int, Ints
 from meshmatch.errors import InputError, warn
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.folds import known_normals
@@ -52,7 +52,7 @@ _HINT = "a row each: name,vertex or name,x,y,z; MeshLab's .pp, 3D Slicer's .mrk.
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Landmarks(Brief):
-    """Named points on a shape, in its own frame and unit."""
+    """Named points on a shape, in its own frame and unit. What is missing on it has the position nan, and vertex -1."""
 
     names: tuple[str, ...]
     points: Float[Floats, "N 3"]
@@ -62,6 +62,18 @@ class Landmarks(Brief):
     confidence: Float[Floats, " N"]  # 0 (a guess) to 1 (certain)
     notes: tuple[str, ...] = ()  # what was left out or turned while they were read
     lists: tuple[Markup, ...] = ()  # the list of 3D Slicer that each is in, such as a curve; of other files none
+
+    @property
+    def missing(self) -> Bool[Bools, " N"]:
+        """Which are missing on the shape."""
+        return np.asarray(np.isnan(self.points).any(axis=1))
+
+    def without(self, lost: Bool[Bools, " N"]) -> Landmarks:
+        """The same, with some (N,) missing; how little they were trusted stays."""
+        nowhere = np.where(lost[:, None], np.nan, 0.0)
+        vertex, face = np.where(lost, -1, self.vertex), np.where(lost, -1, self.face)
+        points, weights = self.points + nowhere, self.barycentric + nowhere
+        return replace(self, points=points, vertex=vertex, face=face, barycentric=weights)
 
 
 def at_vertices(shape: Shape, vertex: Int[Ints, " N"], names: tuple[str, ...] = ()) -> Landmarks:
@@ -135,7 +147,8 @@ def joined(parts: Sequence[Landmarks], order: Ints | None = None) -> Landmarks:
 
 def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: Landmarks) -> Landmarks:
     """Landmarks of the source on the surface of the target, along a map from source to target. A point of a face goes
-    nearest to the mean of where its corners go; where the map is discontinuous there, with its heaviest corner.
+    nearest to the mean of where its corners go; where the map is discontinuous there, with its heaviest corner. What is
+    missing stays so.
     """
     at = landmarks.vertex
     vertex, face, weights = forward.index[at], forward.face[at], forward.barycentric[at]
@@ -151,7 +164,7 @@ def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: 
         vertex[inside], face[inside], weights[inside] = places.vertex, places.face, places.barycentric
         confidence[inside] = np.einsum("nk,nk->n", share, forward.confidence[corners])
     found = _on_surface(target, landmarks.names, vertex, face, weights, np.clip(confidence, 0, 1))
-    return replace(found, lists=landmarks.lists)
+    return replace(found, lists=landmarks.lists).without(landmarks.missing)
 
 
 def load_landmarks(path: str | Path, shape: Shape, space: Space = "") -> tuple[Landmarks, float]:
@@ -256,7 +269,7 @@ def _on_shape(found: LandmarkFile, shape: Shape) -> tuple[Landmarks, float]:
 
 
 def save_landmarks(path: Path, landmarks: Landmarks, space: Space = "LPS", name: str = "", specimen: str = "") -> None:
-    """Write landmarks; `OptionError` if the suffix is not one of `LANDMARK_SUFFIXES`.
+    """Write landmarks, and which are missing; `OptionError` if the suffix is not one of `LANDMARK_SUFFIXES`.
 
     `space` is the frame that a file for 3D Slicer (.fcsv, .mrk.json) states; it takes a mesh that states none to be in
     LPS. `name` is what the file will be called, where `path` is a temporary name. `specimen` is what a .tps file calls
@@ -267,6 +280,7 @@ def save_landmarks(path: Path, landmarks: Landmarks, space: Space = "LPS", name:
     sure = tables.short_floats(landmarks.confidence)
     rows = list(zip(landmarks.names, *(column.tolist() for column in columns), sure, strict=True))
     points = zip(landmarks.names, landmarks.points.tolist(), landmarks.confidence.tolist(), strict=True)
+    missing = landmarks.missing.tolist()
     if suffix == ".tps":
         save_specimens(path, {specimen or Path(name or path.name).stem: landmarks.points}, landmarks.names)
     elif suffix == ".fcsv":
@@ -274,16 +288,21 @@ def save_landmarks(path: Path, landmarks: Landmarks, space: Space = "LPS", name:
     elif (name or path.name).lower().endswith(".mrk.json"):
         tables.write_json(path, markups_record(points, space, landmarks.lists), indent=1)
     elif suffix == ".csv":
-        cells = ([name, vertex, *xyz, face, *weights, trust] for name, vertex, xyz, face, weights, trust in rows)
+        cells = [[name, vertex, *xyz, face, *weights, trust] for name, vertex, xyz, face, weights, trust in rows]
+        cells = [[own[0], *[""] * 8, own[-1]] if lost else own for own, lost in zip(cells, missing, strict=True)]
         tables.write_rows(path, ["name", "vertex", "x", "y", "z", "face", "w0", "w1", "w2", "confidence"], cells)
     elif suffix == ".json":
         keys = ("name", "vertex", "position", "face", "barycentric", "confidence")
         records = [dict(zip(keys, row, strict=True)) for row in rows]
+        nowhere = dict.fromkeys(keys[1:-1])
+        records = [record | nowhere if lost else record for record, lost in zip(records, missing, strict=True)]
         tables.write_json(path, {"format": "meshmatch landmarks 1", "landmarks": records}, indent=1)
     else:
         root = ElementTree.Element("PickedPoints")
-        for name, _, (x, y, z), *_ in rows:
-            ElementTree.SubElement(root, "point", x=repr(x), y=repr(y), z=repr(z), name=name, active="1")
+        for (name, _, xyz, *_), lost in zip(rows, missing, strict=True):
+            # MeshLab has points of a template that are not placed.
+            x, y, z = ("0", "0", "0") if lost else map(repr, xyz)
+            ElementTree.SubElement(root, "point", x=x, y=y, z=z, name=name, active="0" if lost else "1")
         ElementTree.indent(root, " ")
         text = ElementTree.tostring(root, encoding="unicode")
         path.write_text(f"<!DOCTYPE PickedPoints>\n{text}\n", encoding="utf-8")
@@ -305,7 +324,7 @@ def landmark_positions(path: Path) -> Float[Floats, "L 3"]:
 def save_specimens(path: Path, specimens: Mapping[str, Float[Floats, "L 3"]], names: Sequence[str]) -> None:
     """Write one table of the same landmarks of several specimens, for R and other programs; `OptionError` if it has another
     suffix than .csv (specimen,landmark,x,y,z), .tps, .txt (Morphologika), .npz (points (S, L, 3), specimens, landmarks);
-    `InputError` if a specimen has more or fewer landmarks.
+    `InputError` if a specimen has more or fewer landmarks. Missing ones are empty cells, NA in .tps and .txt, nan in .npz.
     """
     suffix = check_table_suffix(path)
     for specimen, points in specimens.items():
@@ -317,7 +336,11 @@ def save_specimens(path: Path, specimens: Mapping[str, Float[Floats, "L 3"]], na
         tables.write_npz(path, {"points": points, "specimens": list(specimens), "landmarks": list(names)})
     elif suffix == ".csv":
         each = ((specimen, zip(names, points.tolist(), strict=True)) for specimen, points in specimens.items())
-        rows = ([specimen, name, *xyz] for specimen, landmarks in each for name, xyz in landmarks)
+        rows = (
+            [specimen, name, *("" if np.isnan(each) else each for each in xyz)]
+            for specimen, landmarks in each
+            for name, xyz in landmarks
+        )
         tables.write_rows(path, ["specimen", "landmark", "x", "y", "z"], rows)
     else:
         lines = tps_lines(specimens) if suffix == ".tps" else morphologika_lines(specimens)

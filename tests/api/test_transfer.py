@@ -1,5 +1,6 @@
 """Attributes in Python: from a map at hand, as files and as arrays; nothing is fitted."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,17 @@ def test_arrays_of_all_kinds(pair: tuple[Shape, Shape, VertexMap]) -> None:
     assert np.allclose(points.points, target.verts[[3, 5]])
     places = meshmatch.transfer_landmarks(source, target, source.verts[[3, 5]], found).data
     assert np.allclose(places.points, points.points)
+
+
+def test_landmarks_that_are_not_trusted_are_missing(pair: tuple[Shape, Shape, VertexMap]) -> None:
+    source, target, found = pair
+    unsure = replace(found, confidence=np.where(np.arange(source.V) == 5, 0.2, 0.9))
+    moved = meshmatch.transfer_landmarks(source, target, [3, 5], unsure)
+    assert moved.data.missing.tolist() == [False, True]
+    assert moved.confidence == pytest.approx([0.9, 0.2])
+    assert (moved.low.low, moved.low.blank) == (1, 1)
+    every = meshmatch.transfer_landmarks(source, target, [3, 5], unsure, rule=meshmatch.ConfidenceRule(0))
+    assert np.allclose(every.data.points, target.verts[[3, 5]])
 
 
 def test_what_is_not_trusted_is_kept_filled_or_blank(pair: tuple[Shape, Shape, VertexMap]) -> None:

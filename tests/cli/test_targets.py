@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,11 @@ import pytest
 
 from meshmatch.api import matching
 from meshmatch.api.results import MatchResult
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.landmarks import landmark_positions
-from tests.cli.conftest import FakeMatching, Run, refused, well
+from tests.cli.conftest import FakeMatching, Run, nearest_map, refused, well
 
 LABELS = ("transfer-labels", "a.ply", "in", "--labels", "labels.txt", "-o", "out")
 VERBS = {
@@ -215,6 +217,16 @@ def test_landmarks_of_all_are_one_table(run: Run, files: Path, stub: FakeMatchin
     assert answer.status == 1 and "wrote all.csv: 2 landmarks of 3 specimens" in answer.err
     rows = Path("all.csv").read_text().splitlines()
     assert (rows[0], len(rows), rows[3].startswith("b,0,")) == ("specimen,landmark,x,y,z", 7, True)
+
+
+def test_what_a_target_lacks_is_missing_in_the_table(run: Run, files: Path, stub: FakeMatching) -> None:
+    def unsure(a: Shape, b: Shape, **words: Any) -> VertexMap:
+        return replace(nearest_map(a, b, **words), confidence=np.where(np.arange(a.V) == 5, 0.1, 0.9))
+
+    stub.make_map = unsure
+    answer = well(run(*LANDMARKS, "--table", "all.tps"))
+    assert "; missing are 1 of b, 1 of sub/c" in answer.err
+    assert Path("all.tps").read_text().splitlines()[6] == "NA NA NA"
 
 
 @pytest.mark.parametrize(

@@ -272,7 +272,10 @@ def test_unsure_landmarks_are_named(run: Run, pair: Path, doubtful: np.ndarray) 
     x = load_shape("a.ply").verts[:, 0]
     Path("marks.csv").write_text(f"name,vertex\nleft,{x.argmin()}\nright,{x.argmax()}\n")
     answer = well(run(*call("landmarks --quiet")))
-    assert answer.err == "warning: b.ply: landmarks of confidence below 0.3: right (0.01)\n"
+    assert answer.err == "warning: b.ply: missing are landmarks of confidence below 0.3: right (0.01)\n"
+    assert load_landmarks("out.csv", load_shape("b.ply"))[0].names == ("left",)
+    well(run(*call("landmarks --min-confidence 0 --quiet")))
+    assert load_landmarks("out.csv", load_shape("b.ply"))[0].names == ("left", "right")
     Path("marks.csv").write_text("vertex\n" + f"{x.argmax()}\n" * 15)
     answer = well(run(*call("landmarks --quiet")))
     assert len(answer.err.splitlines()) == 1

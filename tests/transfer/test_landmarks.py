@@ -18,6 +18,7 @@ from meshmatch.transfer.landmarks import (
     at_points,
     at_vertices,
     joined,
+    landmark_positions,
     load_landmarks,
     push_landmarks,
     save_landmarks,
@@ -248,6 +249,23 @@ def test_bad_landmarks_are_told_in_words(tmp_path: Path, case: str) -> None:
         load_landmarks(tmp_path / name, COARSE)
 
 
+@pytest.mark.parametrize("suffix", LANDMARK_SUFFIXES)
+def test_what_is_missing_is_read_as_missing(tmp_path: Path, suffix: str) -> None:
+    given = some().without(np.array([True, False, True, False]))
+    save_landmarks(tmp_path / f"l{suffix}", given)
+    found, _ = load_landmarks(tmp_path / f"l{suffix}", COARSE)
+    assert np.abs(found.points - some().points[[1, 3]]).max() < 1e-12
+    assert found.names == (given.names[1::2] if suffix != ".tps" else ("1", "3"))
+    assert "and 1 more are missing: left out" in found.notes[0]
+    assert np.array_equal(np.isnan(landmark_positions(tmp_path / f"l{suffix}")).all(axis=1), given.missing)
+
+
+def test_what_is_missing_goes_nowhere() -> None:
+    found = push_landmarks(FORWARD, COARSE, FINE, some().without(np.array([False, True, True, False])))
+    assert found.missing.tolist() == [False, True, True, False]
+    assert found.vertex[1:3].tolist() == [-1, -1]
+
+
 def test_names_cannot_break_a_file(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(json.dumps({"a\nb\x00\x1b<&": 3}))
     found, _ = load_landmarks(tmp_path / "a.json", COARSE)
@@ -261,10 +279,13 @@ def test_names_cannot_break_a_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", [".csv", ".tps", ".txt"])
 def test_a_table_of_specimens_is_read_again(tmp_path: Path, suffix: str) -> None:
     own, names = some().points, some().names
+    own[2] = np.nan
     save_specimens(tmp_path / f"all{suffix}", {"a\nb": own + 0.1, "sphere1": own, "sphere1.x": own - 0.1}, names)
     found, _ = load_landmarks(tmp_path / f"all{suffix}", COARSE)
-    assert np.abs(found.points - own).max() < 1e-12
-    assert found.names == (names if suffix == ".csv" else ("0", "1", "2", "3"))
+    assert np.abs(found.points - own[[0, 1, 3]]).max() < 1e-12
+    assert found.names == ((*names[:2], names[3]) if suffix == ".csv" else ("0", "1", "3"))
+    if suffix != ".csv":
+        assert (tmp_path / f"all{suffix}").read_text().count("\nNA NA NA\n") == 3  # as geomorph asks for
     with pytest.raises(InputError, match="landmarks of 3 shapes, 0 of them of x"):
         load_landmarks(tmp_path / f"all{suffix}", Shape(COARSE.verts, COARSE.faces, "x.ply"))
 
