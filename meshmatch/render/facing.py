@@ -86,15 +86,19 @@ def facing_matched(source: Shape, target: Shape, vertex_map: VertexMap, rotation
     known = source.valid
     if not known.any():
         return rotation
-    return facing_alike(target, vertex_map.points(target)[known], source.verts[known] @ rotation.T)
+    # By surface: hands, where vertices are dense, would outweigh the trunk, and arms that move would turn a body around.
+    weights = source.vertex_areas[known]
+    return facing_alike(target, vertex_map.points(target)[known], source.verts[known] @ rotation.T, weights)
 
 
-def facing_alike(shape: Shape, points: Points, seen: Points) -> Rotation:
+def facing_alike(shape: Shape, points: Points, seen: Points, weights: Float[Floats, " N"] | None = None) -> Rotation:
     """Rotation that shows a shape from the side from which another one is seen; if it stands by itself, upright. ``points``
-    are of this shape, in its file's frame; ``seen`` the same of the other one, y up and z to the viewer.
+    are of this shape, in its file's frame; ``seen`` the same of the other one, y up and z to the viewer; ``weights`` say
+    how much each counts.
     """
-    a, b = points - points.mean(axis=0), seen - seen.mean(axis=0)
-    left, sizes, right = np.linalg.svd(b.T @ a)
+    weights = None if weights is None or not weights.sum() > 0 else weights / weights.sum()
+    a, b = (each - np.average(each, axis=0, weights=weights) for each in (points, seen))
+    left, sizes, right = np.linalg.svd((b if weights is None else b * weights[:, None]).T @ a)
     if not sizes[1] > 1e-9 * sizes[0]:  # everything was matched to a line or a point
         return facing(shape)
     turn = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right)) or 1.0]) @ right

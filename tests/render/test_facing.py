@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import OptionError
-from meshmatch.render.facing import facing, facing_alike, upright
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.render.facing import facing, facing_alike, facing_matched, upright
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import load_template
+from tests.conftest import icosphere
 from tests.render.test_picture import box
 
 AXES = {sign + name: (-1 if sign else 1) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in ("", "-")}
@@ -111,6 +113,17 @@ def test_another_shape_is_seen_from_the_same_side(torus: Shape) -> None:
     rotation = facing_alike(other, other.verts, seen)
     there = (other.verts - other.verts.mean(axis=0)) @ rotation.T / 17
     assert there == pytest.approx(seen - seen.mean(axis=0), abs=1e-9)
+
+
+def test_dense_vertices_do_not_turn_the_other_shape_around() -> None:
+    """A hand has many vertices and little surface: where it goes says little about the side."""
+    hand = icosphere(3)
+    trunk = box((1.0, 3.0, 0.6))
+    stretched, folded = (
+        joined(trunk, Shape(0.05 * hand.verts + [side * 1.5, 0.5, 0.4], hand.faces)) for side in (1.0, -1.0)
+    )
+    same = VertexMap.between(stretched, folded, np.arange(stretched.V))
+    assert facing_matched(stretched, folded, same, np.eye(3))[2, 2] > 0.9
 
 
 def test_a_standing_body_stays_upright_beside_one_that_leans() -> None:
