@@ -27,7 +27,7 @@ _NONE = ("none", "null")  # missing among numbers; a category such as "no treatm
 
 @dataclass(frozen=True, eq=False)
 class Covariates:
-    """Cells of a table as text, a row for each of the shapes, in their order."""
+    """Cells of a table as text, a row for each of the shapes, in their order; numbers with decimal points."""
 
     names: tuple[str, ...]
     cells: dict[str, tuple[str, ...]]
@@ -78,7 +78,11 @@ def covariates(table: str | Path | Columns | None, names: Sequence[str], sizes: 
         )
         key = next((k for k, title in enumerate(header) if title.lower() == NAMES), 0)
         order = _matched([row[key] for row in rows], names, Path(table).name)
-        found = {title: tuple(rows[k][column] for k in order) for column, title in enumerate(header) if column != key}
+        found = {
+            title: _with_points([rows[k][column] for k in order])
+            for column, title in enumerate(header)
+            if column != key
+        }
     else:
         found = _in_order(
             {str(title): ["" if cell is None else str(cell) for cell in table[title]] for title in table}, names
@@ -98,6 +102,13 @@ def _read(path: Path) -> tuple[list[str], list[list[str]]]:
     if twice is not None:
         raise InputError(f"two columns are called {twice or 'nothing'}", "the first row has the names of columns")
     return header, rows
+
+
+def _with_points(cells: Sequence[str]) -> tuple[str, ...]:
+    """The cells of a column; numbers with decimal commas, or minus signs of typographers, as every program reads them."""
+    if not _are_numbers(cells):
+        return tuple(cells)
+    return tuple(cell.replace(",", ".").replace("\N{MINUS SIGN}", "-") for cell in cells)
 
 
 def _in_order(cells: dict[str, list[str]], names: Sequence[str]) -> dict[str, tuple[str, ...]]:

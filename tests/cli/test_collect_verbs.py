@@ -195,20 +195,21 @@ def test_originals_of_the_verb(fits: Path, run: Run, tmp_path: Path) -> None:
 
 def test_coordinates_are_exported_as_tables(fits: Path, run: Run, tmp_path: Path) -> None:
     collection = Collection(fits)
-    (tmp_path / "table.csv").write_text("shape,sex,verdict\ndancer.ply,f,yes\nclimber,m,no\n")
+    (tmp_path / "table.csv").write_text("shape;sex;verdict;age\ndancer.ply;f;yes;62,5\nclimber;m;no;30\n")
     for suffix in (".csv", ".npz"):
         words = ["export", fits, "-o", tmp_path / suffix, "--format", suffix, "--place", "template", "-q"]
         assert run(*words, "--metadata", tmp_path / "table.csv").status == 0
     with np.load(tmp_path / ".npz" / "coords.npz", allow_pickle=False) as found:
         points, faces, names = found["points"], found["faces"], found["names"].tolist()
-        sizes, mirrored = found["centroid_size"], found["mirrored"]
+        sizes, mirrored = found["centroid_size"].tolist(), found["mirrored"]
     np.testing.assert_allclose(sizes, np.sqrt(((points - points.mean(axis=1, keepdims=True)) ** 2).sum(axis=(1, 2))))
     rows = (tmp_path / ".csv" / "metadata.csv").read_text().splitlines()
     assert (
         rows
         == [
-            "name,centroid_size,mirrored,verdict,sex",
-            *(f"{name},{size!r},0,good,{sex}" for name, size, sex in zip(names, sizes.tolist(), "mf", strict=True)),
+            "name,centroid_size,mirrored,verdict,sex,age",
+            f"climber,{sizes[0]!r},0,good,m,30",
+            f"dancer,{sizes[1]!r},0,good,f,62.5",
         ]
         and not mirrored.any()
     )
