@@ -15,6 +15,7 @@ from meshmatch.models.registry import check_model
 from meshmatch.outputs import replace_on_success
 
 if TYPE_CHECKING:
+    from meshmatch.api.kinds import UnitName
     from meshmatch.maps.evaluate import Evaluation
 
 
@@ -147,6 +148,19 @@ def register(
         print_json(record | words.fit_record(loaded.name, fit) | {"notes": list(fit.notes)})
 
 
+def surfaces_apart(
+    result: "meshmatch.MatchResult",
+    moved: "meshmatch.Shape",
+    onto: "meshmatch.Shape",
+    unit: "UnitName" = "auto",
+    one_way: bool = False,
+) -> "meshmatch.SurfaceDistance":
+    """How far a mesh lies from the shape that it was laid on; one way from what is only a part, or if that is asked for."""
+    parts = [isinstance(fit, meshmatch.Fit) and fit.partial for fit in (result.source_fit, result.target_fit)]
+    begins = (moved, onto) if parts[0] and not onto.is_cloud else (onto, moved)
+    return meshmatch.measure_distance(*begins, one_way=one_way or any(parts), unit=unit)
+
+
 def _register_onto(
     shape: Path, onto: Path, output: Path, picture: Path | None, how: FitOptions, run: RunOptions, console: Console
 ) -> None:
@@ -186,14 +200,12 @@ def _register_onto(
 
         compose_fit(b, moved, result.rotations[1], what=f"the mesh of {names[0]}").render(picture)
     words.tell_match(console, result, names)
-    parts = [isinstance(fit, meshmatch.Fit) and fit.partial for fit in (result.source_fit, result.target_fit)]
-    begins = (moved, b) if parts[0] and not b.is_cloud else (b, moved)  # from what is only a part
-    apart = meshmatch.measure_distance(*begins, one_way=any(parts))
+    apart = surfaces_apart(result, moved, b)
     console.say(str(apart))
     words.tell_verdict(console, found.verdict, found.reasons, "the registration")
     if plan.is_turned(binding, turn):
         console.say(f"note: a node turns {names[0]} upright, along y")
-    where = " ".join(map(str, plan.files))
+    where = ", ".join(map(str, plan.files))
     console.say(f"wrote {where}: the mesh of {names[0]} on {names[1]}, {moved.V} vertices ({result.seconds:.1f} s)")
     if picture is not None:
         console.say(f"drew {picture}: the mesh over {names[1]}, and their distance")

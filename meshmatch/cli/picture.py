@@ -29,7 +29,9 @@ class PictureOptions:
     """What is shown."""
 
     map: Path | None = options.optional(
-        "MAP", "Map between two shapes, SOURCE TARGET: corresponding points in the same color."
+        "MAP",
+        "Map between two shapes, SOURCE TARGET, or a folder with the fits of both that `meshmatch fit` wrote: corresponding "
+        "points in the same color.",
     )
     confidence: bool = Option(False, "--confidence", help="With --map: show its confidence as a color map.")
     truth: options.Truth = None
@@ -225,7 +227,10 @@ def _compose_map(shown: PictureOptions, file: Path, shapes: "list[meshmatch.Shap
     from meshmatch.render.compose import compose_confidence, compose_errors, compose_match
 
     source, target = shapes
-    found = meshmatch.load_map(file, source, target)
+    if file.is_dir():
+        found = meshmatch.Collection(file).maps_between(source, target).forward
+    else:
+        found = meshmatch.load_map(file, source, target)
     if shown.confidence:
         return compose_confidence(source, target, found, look)
     known = options.load_truth(shown.truth, shown.points, source)

@@ -107,7 +107,7 @@ def transfer_texture(
                 transfer.console.say(f"note: a node turns {b.name} upright, along y")
     textures = f"{len(tiles)} textures" if tiles else "a texture"
     what = "with vertex colors" if painted else f"with {textures} of {size} x {size}"
-    transfer.console.say(f"wrote {' '.join(str(file) for file in files)}: {transfer.names[1]} {what}")
+    transfer.console.say(f"wrote {', '.join(str(file) for file in files)}: {transfer.names[1]} {what}")
     if picture is not None:
         from meshmatch.render.compose import compose_shapes
 

@@ -7,6 +7,7 @@ from typer import Argument
 
 import meshmatch
 from meshmatch.cli import words
+from meshmatch.cli.match import surfaces_apart
 from meshmatch.cli.options import PairOptions, RunOptions, check_outputs, grouped, optional, output_option
 from meshmatch.cli.transfer_options import Picture
 from meshmatch.cli.words import Console, print_json
@@ -38,7 +39,8 @@ def wrap(
     """Lay a mesh of your own onto a scan.
 
     Its vertex order, polygons, texture coordinates and groups stay. BASE is matched to SCAN, deformed, and drawn onto
-    the surface, smoothly at first and ever finer. Its distance from the surface is printed, in the unit of SCAN.
+    the surface, smoothly at first and ever finer. Printed are, in the unit of SCAN, the distance of its vertices from the
+    surface, and how far both surfaces lie apart.
     """
     import numpy as np
 
@@ -73,14 +75,16 @@ def wrap(
     numbers = {"mean": apart.mean(), "95 %": np.quantile(apart, 0.95), "worst": apart.max()} if len(apart) else {}
     told = ", ".join(f"{what} {value:.4g}" for what, value in numbers.items())
     kept = f"; {len(np.unique(rows))} vertices kept their shape" if len(rows) else ""
-    console.say(f"distance to {names[1]} (whose sqrt(area) is {np.sqrt(b.area):.4g}): {told}{kept}")
+    console.say(f"vertices to {names[1]} (whose sqrt(area) is {np.sqrt(b.area):.4g}): {told}{kept}")
+    # What is free, such as eyes, is not to lie on the scan.
+    surfaces = surfaces_apart(result.match, result.shape, b, "file", one_way=bool(result.free.any()))
+    console.say(str(surfaces))
     if binding is not None and output.suffix.lower() == ".glb":
         console.say(f"the {len(binding.rig.joints)} joints of {names[0]} have moved along")
     if plan.is_turned(binding, result.turn):
         console.say(f"note: a node turns {names[0]} upright, along y")
-    console.say(
-        f"wrote {' '.join(map(str, plan.files))}: {names[0]} on {names[1]} ({result.match.seconds + result.seconds:.1f} s)"
-    )
+    written = ", ".join(map(str, plan.files))
+    console.say(f"wrote {written}: {names[0]} on {names[1]} ({result.match.seconds + result.seconds:.1f} s)")
     if picture is not None:
         from meshmatch.render.compose import compose_fit
 
@@ -89,6 +93,7 @@ def wrap(
     if run.json:
         record = {"output": output, "files": [str(file) for file in plan.files], "picture": picture, "vertices": a.V}
         record |= {"free": int(result.free.sum()), "distance": {key: float(each) for key, each in numbers.items()}}
+        record["surfaces"] = surfaces.as_dict()
         record |= words.map_record(found, names) | how.record(result.match.source_fit)
         print_json(
             record | {"notes": list(result.match.notes), "seconds": round(result.match.seconds + result.seconds, 3)}

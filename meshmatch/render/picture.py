@@ -133,10 +133,11 @@ def _image(panels: list[Panel], look: Look) -> Image.Image:
     image = Image.fromarray(_on_background(_trace(figures, page.feet, page.viewport, look), background))
     dark = background is not None and np.dot(background, (0.3, 0.59, 0.11)) < 110
     ink: Ink = (226, 228, 232) if dark else (52, 54, 60)
-    for name, (x, y), room in zip(names, page.names.tolist(), page.room.tolist(), strict=True):
-        text, size = fitting(name, page.font_size, room)
-        if text:
-            write(image, (x, y), text, size, ink)
+    places = list(zip(names, page.names.tolist(), page.room.tolist(), strict=True))
+    size = min(fitting(name, page.font_size, room)[1] for name, _, room in places)
+    for name, (x, y), room in places:
+        if name:
+            write(image, (x, y), fitting(name, size, room)[0], size, ink)
     if look.legend is not None:
         draw_legend(image, look.legend, page.legend, 0.9 * page.font_size, ink)
     return image
@@ -213,8 +214,11 @@ def lay_out(
     viewport = raster.Viewport(width, height, left, float(middle[1] + (upper / 2 + 0.15 * margin) * pixel), pixel)
     at = (feet + seen[:, :, 0].mean(axis=1) - left) / pixel
     places = np.stack([at, np.full(len(at), height - under + 0.42 * names)], axis=1)
-    room = np.minimum((np.ptp(seen[:, :, 0], axis=1) + _GAP) / pixel if len(boxes) > 1 else np.inf, 0.94 * width)
-    return Page(viewport, feet, font_size, places, np.broadcast_to(room, len(at)), height - under + names)
+    room = 2 * (np.minimum(at, width - at) - 0.4 * margin)  # to the edges of the page
+    if len(boxes) > 1:
+        gap = feet[1] + seen[1, 0, 0] - feet[0] - seen[0, 1, 0]
+        room = np.minimum(room, (np.ptp(seen[:, :, 0], axis=1) + 0.8 * gap) / pixel)
+    return Page(viewport, feet, font_size, places, room, height - under + names)
 
 
 def _row(boxes: Float[Floats, "N 2 2"], aspect: float) -> tuple[Float[Floats, " N"], Float[Floats, "2 2"]]:

@@ -30,7 +30,9 @@ def test_the_text_stays_and_the_distance_is_printed(run: Run, files: Path) -> No
     assert set(record["distance"]) == {"mean", "95 %", "worst"}
     assert record["distance"]["95 %"] < 0.003
     assert (record["files"], record["free"], record["vertices"]) == (["out.obj"], 0, rod().V)
-    assert "distance to scan.ply (whose sqrt(area) is" in answer.err
+    assert "vertices to scan.ply (whose sqrt(area) is" in answer.err
+    assert "\nsurfaces lie " in answer.err and record["surfaces"]["unit"] == "file"
+    assert 0 < record["surfaces"]["mean"] < 0.01
     lines, before = (Path(name).read_text().splitlines() for name in ("out.obj", "base.obj"))
     assert [line for line in lines if line[:2] != "v "] == [line for line in before if line[:2] != "v "]
     radius = np.linalg.norm(load_shape("out.obj").verts[:-2, [0, 2]], axis=1)

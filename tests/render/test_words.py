@@ -133,6 +133,8 @@ def test_figures_stand_on_one_line_inside_the_margins() -> None:
         gaps = page.feet[1] + boxes[1][0, 0] - page.feet[0] - boxes[0][1, 0]
         assert gaps > 0.1
         assert (page.names[:, 1] == page.names[0, 1]).all()
+        ends = page.names[:, :1] + 0.5 * page.room[:, None] * [-1, 1]
+        assert ends[0, 0] > 0 and ends[0, 1] < ends[1, 0] and ends[1, 1] < window.width
 
 
 def test_without_a_size_the_picture_takes_the_room_that_the_shapes_need() -> None:
