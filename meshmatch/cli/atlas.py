@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from meshmatch.collections.atlas_files import Findings
     from meshmatch.collections.registered import Registered
 
-_ODD = 3.0  # sizes further apart than this are probably units
-
 
 @dataclass(frozen=True)
 class AtlasOptions:
@@ -185,11 +183,11 @@ def _shapes(fits: str, how: AtlasOptions) -> AbstractContextManager["Registered"
 
 def _warn(console: Console, made: Any, how: AtlasOptions) -> None:
     from meshmatch.collections.covariates import some
-    from meshmatch.collections.registered import outlying, size_ratio
+    from meshmatch.collections.registered import mixed_units, outlying
 
-    times = size_ratio(made.sizes)
-    if how.scale == "keep" and times > _ODD:
-        console.warn(f"the largest shape is {times:.3g} times as large as the smallest: do the files have one unit?")
+    units = mixed_units(made.names, made.sizes)
+    if how.scale == "keep" and units:
+        console.warn(units)
     elif len(rows := outlying(made.distances)) and not how.robust:
         share = sum(made.scores[rows, 0] ** 2) / sum(made.scores[:, 0] ** 2)
         console.warn(

@@ -13,7 +13,7 @@ from meshmatch.cli import options
 from meshmatch.cli.options import FitOptions, grouped, optional, output_option
 from meshmatch.cli.words import Console, map_record, print_json
 from meshmatch.errors import OptionError, PoorFit
-from meshmatch.models.registry import AUTO, check_model
+from meshmatch.models.registry import AUTO, NO_MODEL, check_model
 from meshmatch.outputs import plain_text, replace_on_success
 
 if TYPE_CHECKING:
@@ -69,7 +69,6 @@ def fit(
     """
     from meshmatch.collections.fit_all import elsewhere_words
     from meshmatch.collections.setting import FAILED, LEFT_OUT
-    from meshmatch.models.registry import NO_MODEL
 
     how.check()
     if how.model != NO_MODEL:
@@ -92,16 +91,25 @@ def fit(
     console.say(*elsewhere_words(made.elsewhere))
     if counts["poor"] and not how.try_harder:
         console.say("the same command with --try-harder searches for longer where a fit is poor")
-    near = [each for each in made.records if each.verdict in ("good", "fair") and each.distance >= 0]
-    if near and made.model == NO_MODEL:
-        mean, most = sum(each.distance for each in near) / len(near), max(each.furthest for each in near)
-        console.say(f"surfaces lie {mean:.2g} apart on average, {most:.2g} at most, in the unit of the files")
+    _tell_lengths(console, made.records, made.model)
     if made.agreed:
         console.say(f"{made.agreed} fits agreed on how the template stretches")
     if json:
         print_json({"output": output, "model": made.model, "seed": how.seed, "agreed": made.agreed, "verdicts": counts})
     if strict and (counts["poor"] or counts[FAILED]):
         raise PoorFit(f"not every fit is to be trusted: {told}", f"see {output}/fits.csv")
+
+
+def _tell_lengths(console: Console, records: "Sequence[Record]", model: str) -> None:
+    """Say how near the fits are, in the unit of the files; warn where these seem to have several."""
+    from meshmatch.collections.registered import mixed_units
+
+    near = [each for each in records if each.verdict in ("good", "fair") and each.distance >= 0 and each.scale > 0]
+    if units := mixed_units([each.name for each in near], [each.scale for each in near]):
+        console.warn(units)
+    elif near and model == NO_MODEL:
+        mean, most = sum(each.distance for each in near) / len(near), max(each.furthest for each in near)
+        console.say(f"surfaces lie {mean:.2g} apart on average, {most:.2g} at most, in the unit of the files")
 
 
 def _some(files: Sequence[str]) -> str:

@@ -16,14 +16,27 @@ if TYPE_CHECKING:
     from meshmatch.shapes.parts import Parts
     from meshmatch.shapes.shape import Shape
 
+_ARRAYS = {  # of a .npz that is no map
+    "atlas": {"mean", "modes", "deviations"},
+    "blendshapes": {"names", "moves"},
+    "skin weights": {"names", "joints", "weights"},
+    "landmarks of several specimens": {"points", "specimens", "landmarks"},
+    "registered shapes": {"points", "faces", "names"},
+}
 _SHOWN_PARTS, _MOST_PARTS = 20, 1000  # of a mesh: in words, and with --json
 
 
 def info(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A shape, a map or a template bundle.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="A shape, a map, a template bundle or landmarks; or the folder of a collection or an atlas.",
+        ),
+    ],
     json: options.Json = False,
 ) -> None:
-    """Describe a file: a shape, a map or a template.
+    """Describe a file: a shape, a map or a template; or say what else it is.
 
     Of a shape also what repair would do. Nothing is written.
     """
@@ -31,8 +44,12 @@ def info(
 
     suffix = file.suffix.lower()
     about = _shape
-    if suffix == ".safetensors":
+    if file.is_dir():
+        about = _folder
+    elif suffix == ".safetensors":
         about = _template
+    elif suffix in (".fcsv", ".pp", ".pts", ".tps"):
+        about = _landmarks
     elif suffix in MAP_SUFFIXES and (suffix != ".npy" or _is_list(file)):
         about = _map
     record: Json = {"file": str(file)} | about(file)
@@ -145,11 +162,62 @@ def _map(file: Path) -> Json:
     from meshmatch.maps.files import load_map
     from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN
 
-    found = load_map(file)
+    try:
+        found = load_map(file)
+    except InputError:
+        if not (other := _no_map(file)):
+            raise
+        return other
     record: Json = {"kind": "map"} | map_record(found, (found.source, found.target))
     if found.target_vertices == UNKNOWN:
         record["target_vertices"] = None
     return record | {"confidence_mean": known_number(found.confidence.mean()), "direction": DIRECTION}
+
+
+def _no_map(file: Path) -> Json:
+    """What a file is that might be a map by its suffix; nothing if that is not known either."""
+    from zipfile import BadZipFile, ZipFile
+
+    if file.suffix.lower() != ".npz":
+        try:
+            return _landmarks(file)
+        except InputError:
+            return {}
+    try:
+        with ZipFile(file) as arrays:
+            names = [name.removesuffix(".npy") for name in arrays.namelist()]
+    except (OSError, BadZipFile):
+        return {}
+    kind = next((kind for kind, own in _ARRAYS.items() if own <= set(names)), None)
+    return {} if kind is None else {"kind": kind, "arrays": names}
+
+
+def _landmarks(file: Path) -> Json:
+    from meshmatch.shapes.landmark_files import LANDMARK_READERS, read_landmark_file
+    from meshmatch.shapes.tables import read_by_suffix
+
+    found = read_by_suffix(file, dict.fromkeys(LANDMARK_READERS, read_landmark_file), "landmarks", "")
+    missing = sum(place.kind == "missing" for place in found.places)
+    return {"kind": "landmarks", "landmarks": len(found.places), "missing": missing} | (
+        {"names": [place.name for place in found.places]} if found.has_names else {}
+    )
+
+
+def _folder(file: Path) -> Json:
+    """Fits of a collection, or an atlas."""
+    import csv
+
+    from meshmatch.collections.settle import read_about
+    from meshmatch.collections.stores import Store
+
+    if (about := read_about(Store.of(file))) is not None:
+        with (file / "fits.csv").open(encoding="utf-8", newline="") as table:
+            verdicts = Counter(str(row.get("verdict")) for row in csv.DictReader(table))
+        told = [f"{count} {verdict}" for verdict, count in verdicts.items()]
+        return {"kind": "fits of a collection", "model": about["model"], "shapes": told}
+    if (file / "atlas.npz").is_file():
+        return {"kind": "atlas"}
+    raise InputError(f"{file} is a folder", "give the name of a file, or a folder that `meshmatch fit` or `atlas` made")
 
 
 def _template(file: Path) -> Json:

@@ -17,7 +17,7 @@ from meshmatch.api.upright import turn_of_fit
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.covariates import SIZE, Covariates, covariates
 from meshmatch.collections.motion import area_strain, smoothed
-from meshmatch.collections.registered import held
+from meshmatch.collections.registered import held, mixed_units
 from meshmatch.collections.sources import folder_of
 from meshmatch.collections.superimpose import Superimposed
 from meshmatch.errors import InputError, OptionError, warn
@@ -269,6 +269,8 @@ class _Facts:
         """A row a shape: what is known, then the cells of the user's table."""
         own = {"name": self.names, "centroid_size": self.sizes, "mirrored": [int(each) for each in self.mirrored]}
         own["verdict"] = self.verdicts
+        if units := mixed_units(self.names, self.sizes):
+            warn(units)
         more = {} if table is None else {title: cells for title, cells in table.cells.items() if title not in own}
         if set(more.get(SIZE, ())) == {"nan"}:  # which a table without it has been given
             del more[SIZE]

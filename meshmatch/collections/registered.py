@@ -26,6 +26,7 @@ from meshmatch.shapes.tables import read_by_suffix
 
 _IN_MEMORY = 256 * 2**20  # bytes; more are kept in a temporary file
 _TELLING, _UNLIKE = 8, 6.0  # shapes; deviations, by the median absolute one
+_ODD = 3.0  # sizes further apart than this are probably units
 _LINE = 200  # bytes of memory for a line
 _ONE_A_LINE = (
     "write one name a line; of a table of specimens, --metadata TABLE --model 'shape ~ COLUMN' compares groups"
@@ -168,6 +169,14 @@ def read_group(path: str | Path, shapes: Registered) -> list[str]:
 def size_ratio(sizes: Sequence[float] | Floats) -> float:
     """How many times as large the largest shape is as the smallest."""
     return float(np.max(sizes) / np.min(sizes))
+
+
+def mixed_units(names: Sequence[str], sizes: Sequence[float] | Floats) -> str:
+    """What to say where sizes of shapes are so unlike that their files may have several units; else empty."""
+    if len(sizes) == 0 or (times := size_ratio(sizes)) <= _ODD:
+        return ""
+    large, small = names[int(np.argmax(sizes))], names[int(np.argmin(sizes))]
+    return f"{large} is {times:.3g} times as large as {small}: do the files have one unit?"
 
 
 def outlying(distances: Float[Floats, " S"]) -> Int[Ints, " N"]:

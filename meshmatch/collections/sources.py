@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -61,6 +62,8 @@ def find_sources(
             apart = len({each.folder.location for each in alike}) > 1
             hint = "give the folder that both folders are in, or rename one" if apart else "rename one"
             both = " and ".join(each.path for each in alike)
+            if len({os.path.realpath(each.path) for each in alike}) == 1:
+                raise InputError(f"{alike[0].path} is named {len(alike)} times", "name each file once")
             raise InputError(f"two shapes are called {source.name}: {both}", hint)
     return found, left_out
 

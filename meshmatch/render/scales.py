@@ -27,6 +27,9 @@ _WARM = ((0.93, 0.025, 85), (0.86, 0.12, 88), (0.74, 0.165, 58), (0.58, 0.20, 28
 _COLD = ((0.93, 0.025, 85), (0.80, 0.09, 230), (0.62, 0.14, 252), (0.44, 0.15, 264), (0.30, 0.11, 275))
 _FINE = 256
 _NO_CHARACTER = "\ufffe"
+# Latin letters that are no letter with an accent.
+_PLAIN = {"ß": "ss", "ẞ": "SS", "æ": "ae", "Æ": "AE", "œ": "oe", "Œ": "OE", "ø": "o", "Ø": "O", "ł": "l", "Ł": "L"}
+_PLAIN |= {"đ": "d", "Đ": "D", "ð": "d", "Ð": "D", "þ": "th", "Þ": "Th", "ħ": "h", "Ħ": "H", "ı": "i"}
 _FINER = 4  # shapes are drawn this many times larger and then shrunk: smooth corners
 
 
@@ -170,10 +173,10 @@ def width_of(text: str, size: float) -> float:
 
 
 def readable(text: str) -> str:
-    """The text on one line in letters that the font has: without accents if necessary, else "?"."""
+    """The text on one line in letters that the font has: Latin ones without accents if necessary, others as "?"."""
     out = []
     for letter in " ".join(text.split()):
-        plain = letter if _has(letter) else unicodedata.normalize("NFKD", letter)
+        plain = letter if _has(letter) else _PLAIN.get(letter) or unicodedata.normalize("NFKD", letter)
         kept = "".join(part for part in plain if _has(part) and not unicodedata.combining(part))
         out.append(kept or ("" if unicodedata.combining(letter) else "?"))
     return "".join(out)

@@ -146,7 +146,7 @@ class Table:
         if odd is not None:
             count = f"{len(rows[odd])} cell{'s' if len(rows[odd]) > 1 else ''}"
             uneven = f"line {self._line(odd)} has {count}, the first {width}: its rows are not equally long"
-            raise InputError(uneven, DECIMAL_COMMA if "," in self.text else "")
+            raise InputError(uneven, DECIMAL_COMMA if "," in self.text and self.separator not in ("\t", ";") else "")
 
     def numbers(self) -> tuple[tuple[str, ...], Float[Floats, "R C"]]:
         """The names of the columns, () if the table has none, and its numbers, nan where one is missing.
@@ -186,7 +186,7 @@ class Table:
             try:
                 table[k] = _floats(row) if is_plain else [number(cell) for cell in row]
             except ValueError as error:
-                hint = DECIMAL_COMMA if any("," in cell for cell in row) else ""
+                hint = DECIMAL_COMMA if any("," in cell and not is_number(cell) for cell in row) else ""
                 raise InputError(f"line {self._line(k + is_header)}: {error}", hint) from error
         self.check_marks(rows)
         return names or self._named_by_comment(table.shape[1]), table

@@ -11,8 +11,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from meshmatch.cli.collect import _tell_lengths
+from meshmatch.cli.words import Console
 from meshmatch.collections.collection import Collection
 from meshmatch.collections.export import Export, Fits, export
+from meshmatch.collections.setting import Record
 from meshmatch.collections.sources import frame_times
 from meshmatch.collections.superimpose import Superimposed
 from meshmatch.errors import InputError
@@ -71,6 +74,15 @@ def test_what_is_said(fits: Path, run: Run) -> None:
     assert (record["model"], record["agreed"], record["seed"]) == ("human", 2, 0)
     strict = run(*words, "--strict", "-q")
     assert strict.status == 1 and "not every fit is to be trusted: 2 good, 1 failed" in strict.err
+
+
+def test_lengths_have_one_unit_or_none_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    fit = Record("a", "a.ply", "good", distance=0.2, furthest=3.0, scale=90.0)
+    _tell_lengths(Console(False), [fit, replace(fit, name="b", scale=110.0)], "none")
+    assert "surfaces lie 0.2 apart on average, 3 at most, in the unit of the files" in capsys.readouterr().err
+    _tell_lengths(Console(False), [fit, replace(fit, name="metres", scale=0.09)], "none")
+    told = " ".join(capsys.readouterr().err.split())
+    assert told == "warning: a is 1e+03 times as large as metres: do the files have one unit?"
 
 
 def test_maps_of_names(fits: Path, run: Run, tmp_path: Path) -> None:

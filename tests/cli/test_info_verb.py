@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from meshmatch.collections.settle import SCHEMA
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
@@ -126,6 +127,35 @@ def test_a_file_that_is_none_of_these_is_an_error(run: Run, tmp_path: Path, name
     assert answer.status == 1
     assert answer.out == ""
     assert name in answer.err
+
+
+def test_what_is_no_map_is_called_what_it_is(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("name;x;y;z\ntip;0,5;1,5;2\nend;;;\n")
+    (tmp_path / "a.fcsv").write_text("# columns = id,x,y,z,label\n1,0,0,1,tip\n2,,,,end\n")
+    points = [{"label": "tip", "position": [0, 0, 1]}, {"label": "end", "positionStatus": "undefined"}]
+    (tmp_path / "a.mrk.json").write_text(json.dumps({"markups": [{"controlPoints": points}]}))
+    for name in ("a.csv", "a.fcsv", "a.mrk.json"):
+        found = record(run, tmp_path / name)
+        assert (found["kind"], found["names"], found["missing"]) == ("landmarks", ["tip", "end"], 1)
+    np.savez(tmp_path / "a.npz", names=["smile"], moves=np.zeros((1, 3, 3)))
+    assert record(run, tmp_path / "a.npz")["kind"] == "blendshapes"
+    (tmp_path / "t.csv").write_text("name;age\nanna;30,5\n")
+    refused = run("info", tmp_path / "t.csv")
+    assert refused.status == 1 and "'anna' is not a number" in refused.err and "decimal comma" not in refused.err
+
+
+def test_folders_are_called_what_they_are(run: Run, tmp_path: Path) -> None:
+    assert "fit` or `atlas` made" in run("info", tmp_path).err
+    words = ("schema", "template", "model", "only", "without", "sequence", "fit")
+    (tmp_path / "collection.json").write_text(
+        json.dumps(dict.fromkeys(words, "") | {"schema": SCHEMA, "model": "hand"})
+    )
+    (tmp_path / "fits.csv").write_text("name,verdict\na,good\nb,poor\nc,good\n")
+    found = record(run, tmp_path)
+    assert (found["kind"], found["model"], found["shapes"]) == ("fits of a collection", "hand", ["2 good", "1 poor"])
+    (tmp_path / "atlas").mkdir()
+    (tmp_path / "atlas" / "atlas.npz").touch()
+    assert record(run, tmp_path / "atlas")["kind"] == "atlas"
 
 
 def test_materials_and_their_textures(run: Run, tmp_path: Path, sphere: Shape) -> None:

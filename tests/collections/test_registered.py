@@ -7,7 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch.collections.registered import Registered, held, matching, read_group, registered_meshes, size_ratio
+from meshmatch.collections.registered import (
+    Registered,
+    held,
+    matching,
+    mixed_units,
+    read_group,
+    registered_meshes,
+    size_ratio,
+)
 from meshmatch.errors import InputError, MeshmatchWarning
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
@@ -123,3 +131,5 @@ def test_cut_shapes_among_whole_ones_are_told() -> None:
 
 def test_sizes_that_are_far_apart_are_told() -> None:
     assert size_ratio([2.0, 1.0, 5.0]) == 5
+    assert mixed_units(["a", "b", "c"], [2.0, 1.0, 5.0]) == "c is 5 times as large as b: do the files have one unit?"
+    assert mixed_units(["a", "b"], [2.0, 1.0]) == mixed_units([], []) == ""

@@ -18,6 +18,7 @@ INK = (10, 20, 30)
         ("plain words 1.5", "plain words 1.5"),
         ("two\nlines\t", "two lines"),
         ("Körper", "Korper"),
+        ("Größe, Łódź, Æsop", "Grosse, Lodz, AEsop"),
         ("e\u0301tude", "etude"),
         ("m²", "m2"),
         ("心臓", "??"),
