@@ -72,6 +72,7 @@ CASES = {
     "pair": Case(("match", "climber@10000", "dancer@10000", "-o", "@map.npy"), 3.0, 0.5),
     "million": Case(("match", "dancer@1000000", "climber@10000", "-o", "@map.npy"), 8.0, 1.0),
     "onto a million": Case(("match", "climber@10000", "dancer@1000000", "-o", "@map.npy"), 8.0, 1.0),
+    "scans": Case(("match", "climber@50000", "dancer@50000", "-o", "@map.npy"), 10.0, 1.0),
     "noisy": Case(("match", "climber@10000+noise", "dancer@10000+noise", "-o", "@map.npy"), 5.0),
     "partial": Case(("match", "dancer@10000+upper", "climber@10000", "--partial", "-o", "@map.npy"), 7.0),
     "direct": Case(("match", "climber@10000", "dancer@10000", "--model", "none", "-o", "@map.npy"), 8.0, 1.0),
