@@ -154,7 +154,7 @@ class TrainOptions(Options):
         help="Products with TensorFloat-32, on GPUs that have it; default: the preset's choice.",
     )
     compile: bool | None = Option(
-        None, "--compile/--no-compile", help="Compile the loss by torch, which takes a minute. Default: no."
+        None, "--compile/--no-compile", help="Compile the loss by torch, which takes a minute or two. Default: no."
     )
     device: Literal["auto", "cpu", "cuda", "mps"] = Option(
         "auto", help="Where the network is trained. auto: a GPU of CUDA if there is one, else the CPU."
