@@ -24,6 +24,7 @@ from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.places import PlacedFit, Places, surface_distance
 from meshmatch.maps.unfold_pair import unfolded_pair
 from meshmatch.maps.vertex_map import VertexMap, check_map
+from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
@@ -138,9 +139,9 @@ class MatchResult:
     @property
     def rotations(self) -> tuple[Floats | None, Floats | None]:
         """(3, 3) of source and target: from their files into the orientation of the template, for pictures; an implicit
-        model knows none that is upright.
+        model knows none that is upright, and fits without a model lie on each other, which arms may turn around.
         """
-        known = isinstance(self.source_fit, Fit)
+        known = isinstance(self.source_fit, Fit) and self.source_fit.model != NO_MODEL
         return (self.source_fit.frame.turn, self.target_fit.frame.turn) if known else (None, None)
 
     def backward(self) -> VertexMap:

@@ -86,24 +86,50 @@ def facing_matched(source: Shape, target: Shape, vertex_map: VertexMap, rotation
     known = source.valid
     if not known.any():
         return rotation
-    # By surface: hands, where vertices are dense, would outweigh the trunk, and arms that move would turn a body around.
-    weights = source.vertex_areas[known]
-    return facing_alike(target, vertex_map.points(target)[known], source.verts[known] @ rotation.T, weights)
+    points, seen = vertex_map.points(target)[known], source.verts[known] @ rotation.T
+    normals = None
+    if not (source.is_cloud or target.is_cloud):
+        there = target.vertex_normals[vertex_map.index[known]]
+        normals = there, source.vertex_normals[known] @ rotation.T
+    # By surface: hands, where vertices are dense, would outweigh the trunk.
+    return facing_alike(target, points, seen, source.vertex_areas[known], normals)
 
 
-def facing_alike(shape: Shape, points: Points, seen: Points, weights: Float[Floats, " N"] | None = None) -> Rotation:
+def facing_alike(
+    shape: Shape,
+    points: Points,
+    seen: Points,
+    weights: Float[Floats, " N"] | None = None,
+    normals: tuple[Points, Points] | None = None,
+) -> Rotation:
     """Rotation that shows a shape from the side from which another one is seen; if it stands by itself, upright. ``points``
     are of this shape, in its file's frame; ``seen`` the same of the other one, y up and z to the viewer; ``weights`` say
-    how much each counts.
+    how much each counts. Where ``normals`` of both are known these decide: an arm that moves has them on all sides, while
+    its places would turn a body around.
     """
-    weights = None if weights is None or not weights.sum() > 0 else weights / weights.sum()
+    weights = (
+        np.full(len(points), 1 / len(points)) if weights is None or not weights.sum() > 0 else weights / weights.sum()
+    )
     a, b = (each - np.average(each, axis=0, weights=weights) for each in (points, seen))
-    left, sizes, right = np.linalg.svd((b if weights is None else b * weights[:, None]).T @ a)
+    places = (b * weights[:, None]).T @ a
+    sizes = np.linalg.svd(places, compute_uv=False)
     if not sizes[1] > 1e-9 * sizes[0]:  # everything was matched to a line or a point
         return facing(shape)
-    turn = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right)) or 1.0]) @ right
+    if normals is None:
+        turn = _nearest_rotation(places)
+    else:
+        sides = (normals[1] * weights[:, None]).T @ normals[0]
+        # of two meshes one may be inside out
+        turn = max(
+            (_nearest_rotation(each) for each in (sides, -sides)), key=lambda found: float((found * places).sum())
+        )
     upward, stands = _upward(_samples(shape)[0], None)
     return _standing(upward, turn[2]) if stands and upward @ turn[1] >= 0.5 else np.asarray(turn)
+
+
+def _nearest_rotation(matrix: Float[Floats, "3 3"]) -> Rotation:
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right)) or 1.0]) @ right)
 
 
 def _standing(upward: Direction, ahead: Direction) -> Rotation:

@@ -1,5 +1,6 @@
 """Which way up a shape is shown, and from which side."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +125,18 @@ def test_dense_vertices_do_not_turn_the_other_shape_around() -> None:
     )
     same = VertexMap.between(stretched, folded, np.arange(stretched.V))
     assert facing_matched(stretched, folded, same, np.eye(3))[2, 2] > 0.9
+
+
+def test_arms_that_cross_do_not_turn_the_other_shape_around() -> None:
+    """They have much surface, far from the middle; but their normals look to all sides."""
+    trunk, arm, place = box((1.0, 3.0, 0.6)), box((2.0, 0.4, 0.4)), np.array([2.0, 0.5, 0.0])
+    left, right = Shape(arm.verts + place, arm.faces), Shape(arm.verts + place * [-1, 1, 1], arm.faces)
+    stretched, folded = joined(joined(trunk, left), right), joined(joined(trunk, right), left)
+    same = VertexMap.between(stretched, folded, np.arange(stretched.V))
+    assert facing_alike(folded, folded.verts, stretched.verts, stretched.vertex_areas)[2, 2] < 0
+    assert facing_matched(stretched, folded, same, np.eye(3))[2, 2] > 0.9
+    inside_out = Shape(folded.verts, folded.faces[:, ::-1])
+    assert facing_matched(stretched, inside_out, replace(same, target_faces=None), np.eye(3))[2, 2] > 0.9
 
 
 def test_a_standing_body_stays_upright_beside_one_that_leans() -> None:
