@@ -38,13 +38,6 @@ _OF_CATEGORY = {
         seeds=(1, 2, 3, 4),
         date="2026-11-29",
     ),
-    "hand": Calibration(
-        weights=(0.465, 1.596, 0.572, 1.603, 4.7, 3.124),
-        offset=12.995,
-        data="three cases of 17 families that may tune",
-        seeds=(1, 2, 3, 4),
-        date="2026-11-29",
-    ),
 }
 
 
