@@ -37,7 +37,7 @@ _OF_CATEGORY = {
         data="three cases of 17 families of seeds 1 and 2, and four of twelve of seeds 3 and 4, of families that may tune",
         seeds=(1, 2, 3, 4),
         date="2026-11-29",
-    ),
+    )
 }
 
 
