@@ -36,9 +36,9 @@ def info(
     ],
     json: options.Json = False,
 ) -> None:
-    """Describe a file: a shape, a map or a template; or say what else it is.
+    """Describe a file: a shape, a map or a template.
 
-    Of a shape also what repair would do. Nothing is written.
+    Of a shape also what repair would do. Of other files that meshmatch writes or reads what they are. Nothing is written.
     """
     from meshmatch.maps import MAP_SUFFIXES
 
@@ -211,8 +211,10 @@ def _folder(file: Path) -> Json:
     from meshmatch.collections.stores import Store
 
     if (about := read_about(Store.of(file))) is not None:
-        with (file / "fits.csv").open(encoding="utf-8", newline="") as table:
-            verdicts = Counter(str(row.get("verdict")) for row in csv.DictReader(table))
+        verdicts: Counter[str] = Counter()
+        if (file / "fits.csv").is_file():  # which is written last
+            with (file / "fits.csv").open(encoding="utf-8", newline="") as table:
+                verdicts.update(str(row.get("verdict")) for row in csv.DictReader(table))
         told = [f"{count} {verdict}" for verdict, count in verdicts.items()]
         return {"kind": "fits of a collection", "model": about["model"], "shapes": told}
     if (file / "atlas.npz").is_file():
