@@ -2,7 +2,7 @@
 
 A point of the target finds its place on the source as the closest point of that image; those of all its vertices are
 the inverse of a map. Where several parts of the image pass by, the most trustworthy wins: facing the same way, mapped
-with confidence, near, and never a triangle that the map has pulled apart.
+with confidence, near, on the same connected part of the target, and never a triangle that the map has pulled apart.
 
 The search is exact for triangles of any size, which an image needs: a map stretches some and shrinks others, and
 leaves vertices without a triangle. `meshmatch.maps.footpoints` says how other searches differ.
@@ -17,11 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+from meshmatch.derived import derived
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.geometry.triangles import closest_on_triangles, covering_balls, interpolate, squared_lengths
+from meshmatch.geometry.triangles import closest_on_triangles, covering_balls, face_parts, interpolate, squared_lengths
 from meshmatch.maps.folds import known_normals, normals_at
 from meshmatch.maps.footpoints import Footpoints, reassign_islands
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.faces import seams
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map
 
@@ -30,6 +32,9 @@ from meshmatch.threads import parallel_map
 _DISTANCE_SCALE = 0.03
 # By how much a part of the image that faces the other way is further away than it is.
 _FACING = 0.15
+# By how much a part of the image that lies on another connected part of the target is further away than it is: walls of
+# two chambers may touch.
+_ELSEWHERE = 0.03
 # How much a distance on the source counts compared with one on the target, where a nearby point of the source is given.
 _NEAR = 0.2
 # Above this confidence the closest point wins. A less certain part of the image counts as further away, by little: by
@@ -68,6 +73,7 @@ class MappedMesh:
         self.confidence = source_to_target.assumed_confidence.astype(np.float64)
         self.unit = length_of(target)
         self.normals = normals_at(source_to_target, target)
+        self.part = connected_parts(target)[source_to_target.index]
         kept = np.flatnonzero(~discontinuous_faces(source_to_target, source, target) & source.valid_faces)
         lone = source.valid
         lone[source.faces[kept].ravel()] = False
@@ -94,13 +100,17 @@ class MappedMesh:
         normals: Float[Floats, "N 3"] | None = None,
         workers: int = 1,
         near: Float[Floats, "N 3"] | None = None,
+        parts: Int[Ints, " N"] | None = None,
     ) -> MappedFootpoints:
         """Points on the source of points on the target, in its file's frame, where it has these unit normals (zeros
-        where unknown). `near` are points of the source, in its file's frame, which select one of two sheets that touch.
+        where unknown). `near` are points of the source, in its file's frame, which select one of two sheets that touch;
+        ``parts`` are the `connected_parts` of the target that the points are on.
         """
         points = np.asarray(points, np.float64)
         facing = np.zeros((len(points), 3)) if normals is None else normals
-        item, weights = self._search(points, facing, workers, None if near is None else near / self._source_unit)
+        near = None if near is None else near / self._source_unit
+        parts = None if (self.part == self.part[0]).all() else parts
+        item, weights = self._search(points, facing, workers, near, parts)
         corners = self.corners[item]
         distance = np.sqrt(squared_lengths(interpolate(self.points, corners, weights) - points))
         beyond = np.maximum(distance - self._gap, 0.0)
@@ -112,7 +122,9 @@ class MappedMesh:
         weights[face < 0] = (1.0, 0.0, 0.0)
         return MappedFootpoints(vertex, face, weights, distance, confidence)
 
-    def _search(self, points: Floats, normals: Floats, workers: int, near: Floats | None) -> tuple[Ints, Floats]:
+    def _search(
+        self, points: Floats, normals: Floats, workers: int, near: Floats | None, parts: Ints | None
+    ) -> tuple[Ints, Floats]:
         """The best triangle or lone vertex of each point, with weights: exact until `_MAX_TRIED` of a size were tried."""
         N = len(points)
         best, item, weights = np.full(N, np.inf), np.zeros(N, np.int64), np.zeros((N, 3))
@@ -124,6 +136,9 @@ class MappedMesh:
             if near is not None:
                 place = interpolate(self._source, self.corners[items], found)
                 costs = costs + (_NEAR * self.unit) ** 2 * squared_lengths(place - near[rows])
+            if parts is not None:
+                elsewhere = (self.part[self.corners[items]] != parts[rows][:, None]).all(axis=1)
+                costs = costs + (_ELSEWHERE * self.unit) ** 2 * elsewhere
             order = np.lexsort((items, costs, rows))
             first = order[np.flatnonzero(np.diff(rows[order], prepend=-1))]
             row = rows[first]
@@ -208,6 +223,19 @@ def mean_around(corners: Int[NDArray[Any], "N K"], values: Float[Floats, " N"], 
     return np.asarray(total / np.maximum(np.bincount(corners.ravel(), minlength=V), 1))
 
 
+@derived
+def connected_parts(shape: Shape) -> Int[Ints, " V"]:
+    """The number of the connected part that each vertex of a mesh is in, copies along the seams of a file being one;
+    -1 without a face.
+    """
+    faces = shape.faces[shape.valid_faces]
+    part = np.full(shape.V, -1, np.int64)
+    if len(faces):
+        twin = seams(shape.verts, faces)
+        part[faces] = face_parts(twin[faces], shape.V)[:, None]
+    return part
+
+
 def length_of(shape: Shape) -> float:
     """The length that others are compared with: sqrt(area), or the diagonal of a shape without area."""
     return float(np.sqrt(shape.area)) or shape.diagonal or 1.0
@@ -223,8 +251,8 @@ def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, worker
     if source.hash == target.hash and target.invalid is None and identical:
         return replace(checked, source=target.name, target=source.name)
     image = MappedMesh(checked, source, target)
-    normals = known_normals(target)
-    found = image.query(target.verts, normals, workers)
+    normals, parts = known_normals(target), connected_parts(target)
+    found = image.query(target.verts, normals, workers, parts=parts)
     several, vertex = _meeting_vertices(checked, source, target.V)
     weights = np.tile([1.0, 0.0, 0.0], (len(several), 1))
     confidence = checked.assumed_confidence[vertex].astype(np.float64)
@@ -238,7 +266,9 @@ def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, worker
             target.vertex_areas,
             found,
             lambda places: places.values(source.faces, source.verts) / source_length,
-            lambda rows, near: image.query(target.verts[rows], normals[rows], workers, near * source_length),
+            lambda rows, near: image.query(
+                target.verts[rows], normals[rows], workers, near * source_length, parts[rows]
+            ),
             _ROUNDS,
         )
     sure = np.where(target.valid, np.clip(found.confidence, 0.0, 1.0), 0.0)

@@ -423,10 +423,10 @@ class _Images:
         return np.asarray(splu(matrix.tocsc()).solve(right[rows] - held + _HOLD * self.points[rows]))
 
     def _on_surface(self, rows: Ints, wanted: Floats, facing: Floats) -> _Places:
-        """Where points of these rows lie on the target's surface, where it faces so."""
+        """Where points of these rows lie on the target's surface, where it faces so, on the part that they were on."""
         if self.surface is None:
             self.surface = MappedMesh.of(self.target)
-        foot = self.surface.query(wanted, self.side * facing, self.workers)
+        foot = self.surface.query(wanted, self.side * facing, self.workers, parts=self.surface.part[self.index[rows]])
         points = foot.values(self.target.faces, self.target.verts)
         normals = self.side * unit(foot.values(self.target.faces, self.upwards))
         return _Places(foot.vertex, foot.face, foot.barycentric, points, normals)

@@ -310,3 +310,29 @@ def test_seams_of_the_target_are_not_in_the_way(monkeypatch: pytest.MonkeyPatch)
         monkeypatch.setattr(f"meshmatch.maps.unfold.{name}", ())
     assert Folds.of(found, source, cut).flipped > 0.003
     assert Folds.of(unfolded(found, source, cut), source, cut).flipped == 0
+
+
+def touching(subdivisions: int, turn: float = 0.0) -> tuple[Shape, Ints]:
+    """Two halves of a ball, each closed by a wall that lies on the other's; and which half each vertex is of."""
+    halves = [ball(subdivisions, turn).verts.copy() for _ in range(2)]
+    for half, side in zip(halves, (1.0, -1.0), strict=True):
+        half[:, 0] = side * np.maximum(side * half[:, 0], 0.0)
+    faces = icosphere(subdivisions).faces
+    shape = Shape(np.concatenate(halves), np.concatenate([faces, faces + len(halves[0])]))
+    return shape, np.repeat([0, 1], len(halves[0]))
+
+
+def test_no_image_leaves_its_part_where_another_one_touches_it() -> None:
+    (source, own), (target, theirs) = touching(3, 0.3), touching(3)
+    places = source.verts.copy()
+    places[own == 0] *= [1.0, 0.9, 0.9]
+    foot = MappedMesh.of(target).query(places, parts=own)
+    rest = {"face": foot.face, "barycentric": foot.barycentric, "confidence": np.ones(source.V, np.float32)}
+    before = VertexMap.between(source, target, foot.vertex, **rest)
+    np.testing.assert_array_equal(theirs[before.index], own)
+    there, back = unfolded_both_ways(before, invert_map(before, source, target), source, target)
+    np.testing.assert_array_equal(theirs[there.index], own)
+    np.testing.assert_array_equal(own[back.index], theirs)
+    alone = unfolded(before, source, target)
+    assert (alone.points(target) != before.points(target)).any()
+    np.testing.assert_array_equal(theirs[alone.index], own)
