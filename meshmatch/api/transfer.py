@@ -182,12 +182,16 @@ def transfer_values(
             found = pull_values(maps.backward, numbers)
         confidence = maps.backward.confidence.astype(np.float64)
         found, low = replace_low_values(found, confidence < rule.minimum, maps.target, blank, rule.fill)
-    write = partial(_write_values, found, maps.target)
+    write = partial(_write_values, found, maps.target, _file_of(target))
     return Transferred(found, confidence, low, maps, write)
 
 
-def _write_values(values: Floats, target: Shape, path: Path, final: Path) -> None:
-    save_values(path, Values(values), target)
+def _file_of(shape: ShapeLike) -> Path | None:
+    return Path(shape) if isinstance(shape, str | Path) else None
+
+
+def _write_values(values: Floats, target: Shape, file: Path | None, path: Path, final: Path) -> None:
+    save_values(path, Values(values), target, file)
 
 
 def transfer_colors(
@@ -245,8 +249,8 @@ def transfer_colors(
             found = colors_of_vertices(maps.source, colors, maps.target, maps.backward)
         confidence = maps.backward.confidence.astype(np.float64)
         found, low = replace_low_values(found, confidence < rule.minimum, maps.target, blank, rule.fill)
-    colors, file = seen(found), Path(target) if isinstance(target, str | Path) else None
-    return Transferred(colors, confidence, low, maps, partial(_write_colors, colors, maps, file))
+    colors = seen(found)
+    return Transferred(colors, confidence, low, maps, partial(_write_colors, colors, maps, _file_of(target)))
 
 
 def _write_colors(colors: Floats, maps: MapPair, file: Path | None, path: Path, final: Path) -> None:
@@ -300,6 +304,7 @@ def transfer_labels(
     >>> labels = ["upper" if y > dancer.verts[:, 1].mean() else "lower" for y in dancer.verts[:, 1]]
     >>> meshmatch.transfer_labels(dancer, "templates/samples/climber.ply", labels).data.values
     """
+    file = _file_of(target)
     source, target = as_shape(source, "source"), as_shape(target, "target")
     if isinstance(labels, str | Path):
         given = load_labels(labels, source)
@@ -325,11 +330,11 @@ def transfer_labels(
         doubted = confidence < rule.minimum
         found, low = replace_low_labels(found, doubted, target, blank is not None, rule.fill, kind == "faces")
     labeled = named(found, given, kind, blank)
-    return Transferred(labeled, confidence, low, maps, partial(_write_labels, labeled, target))
+    return Transferred(labeled, confidence, low, maps, partial(_write_labels, labeled, target, file))
 
 
-def _write_labels(labels: Labels, target: Shape, path: Path, final: Path) -> None:
-    save_labels(path, labels, target)
+def _write_labels(labels: Labels, target: Shape, file: Path | None, path: Path, final: Path) -> None:
+    save_labels(path, labels, target, file)
 
 
 def transfer_weights(

@@ -63,7 +63,7 @@ def transfer_color(
             result.writer(temporary, output)
         else:
             result = meshmatch.transfer_values(a, target, given.numbers, transfer, directions=directions, rule=rule)
-            value_files.save_values(temporary, value_files.Values(result.data, given.names), result.maps.target)
+            value_files.save_values(temporary, value_files.Values(result.data, given.names), result.maps.target, target)
     b = result.maps.target
     low = transfer.tell_low(result.low, rule.minimum)
     what = "colors" if given is None else f"{columns} number{'s' if columns > 1 else ''} each"
@@ -115,9 +115,9 @@ def transfer_labels(
     rule = rules.rule(rules.blank)
     check_labels_suffix(output)
     with transfer.outputs(labels) as (temporary,):
-        a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
+        a = meshmatch.load_shape(source)
         given = load_labels(labels, a, on)
-        result = meshmatch.transfer_labels(a, b, given, transfer, to=to, rule=rule)
+        result = meshmatch.transfer_labels(a, target, given, transfer, to=to, rule=rule)
         found = result.data
         result.writer(temporary, output)
     low = transfer.tell_low(result.low, rule.minimum, found.on)
@@ -131,7 +131,7 @@ def transfer_labels(
         names = [str(name) for name in given.names]
         theirs = np.where(found.codes < len(names), found.codes, -1)  # a blank comes after the names
         faces = given.on == "faces", found.on == "faces"
-        transfer.draw(result.maps, compose_labels((a, b), (given.codes, theirs), names, faces))
+        transfer.draw(result.maps, compose_labels((a, result.maps.target), (given.codes, theirs), names, faces))
     record = {"picture": picture, "from": given.on, "to": found.on, "labels": used} | low
     return transfer.record(record, result.maps, float(result.maps.backward.confidence.mean()))
 

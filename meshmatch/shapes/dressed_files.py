@@ -14,7 +14,7 @@ from meshmatch.errors import OptionError, warn
 from meshmatch.outputs import replace_all_on_success
 from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
 from meshmatch.shapes.files import save_shape
-from meshmatch.shapes.formats import Textured, gltf, gltf_out, obj, obj_text
+from meshmatch.shapes.formats import Textured, gltf, gltf_out, obj, obj_text, ply, ply_edit, vtk, vtp_edit
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_dressed import colored, dressed
 from meshmatch.shapes.formats.gltf_edit import remembering
@@ -142,18 +142,24 @@ def save_textured(path: str | Path, mesh: Textured, image: Pixels) -> None:
 
 
 def save_colored(path: Path, shape: Shape, file: Path | None, turn: Float[Floats, "3 3"]) -> None:
-    """Write a shape with its colors. A glb or an obj that it was read from stays what it was, but for the colors; a file
-    without axes is turned upright in a glb. What the format does not hold is told.
+    """Write a shape with its colors. A glb, obj, ply or vtp that it was read from stays what it was, but for the colors; a
+    file without axes is turned upright in a glb. What the format does not hold is told.
     """
     suffix, colors = path.suffix.lower(), shape.colors
+    kept = ply_edit.data_of(file, shape) if suffix == ".ply" else None
+    kept = vtp_edit.data_of(file, shape) if suffix == ".vtp" else kept
     assert colors is not None
     if suffix in (".glb", ".vrm"):
-        name, data, kept = glb_base(file, shape)
-        turned = np.eye(3) if kept else turn
+        name, data, as_it_is = glb_base(file, shape)
+        turned = np.eye(3) if as_it_is else turn
         made = gltf.understood(name, data, "scene makes", lambda doc: colored(doc, colors, turned))
         path.write_bytes(remembering(made, shape))
     elif suffix == ".obj" and file is not None and file.suffix.lower() == ".obj":
         path.write_bytes(obj_text.with_colors(file.name, read_bytes(file), colors))
+    elif file is not None and kept is not None and suffix == ".ply":
+        path.write_bytes(ply_edit.with_columns(file.name, kept, ply.color_columns(colors), {}))
+    elif file is not None and kept is not None:
+        path.write_bytes(vtp_edit.with_arrays(file.name, kept, {"Colors": vtk.bytes_of(colors)}, {}))
     else:
         save_shape(path, shape)
 

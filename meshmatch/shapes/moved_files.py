@@ -1,5 +1,5 @@
-"""Meshes whose vertices have moved, in files: a glb stays what it was but for the positions, and an obj keeps its text and
-takes its materials along.
+"""Meshes whose vertices have moved, in files: a glb or a ply stays what it was but for the positions, and an obj keeps its
+text and takes its materials along.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from meshmatch.shapes.appearance import Appearance, BakedMaterial
 from meshmatch.shapes.colors import bytes_of
 from meshmatch.shapes.dressed_files import Dressed
 from meshmatch.shapes.files import check_suffix, save_shape
-from meshmatch.shapes.formats import gltf, obj_look, obj_text
+from meshmatch.shapes.formats import gltf, obj_look, obj_text, ply_edit
 from meshmatch.shapes.formats.gltf_dressed import dressed
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_join import joined
@@ -87,7 +87,7 @@ class MovedFile:
     def turns_normals(self) -> bool:
         """Whether directions at vertices of the original are turned, rather than made anew."""
         before, after = "" if self.original is None else self.original.suffix.lower(), self.output.suffix.lower()
-        return before == after == ".obj" or (before in gltf.SUFFIXES and after == ".glb")
+        return before == after in (".obj", ".ply") or (before in gltf.SUFFIXES and after == ".glb")
 
     @property
     def files(self) -> list[Path]:
@@ -148,6 +148,8 @@ class MovedFile:
             places[0].write_bytes(text)
             return
         as_it_came = None
+        if original is not None and suffix == ".ply" and (data := ply_edit.data_of(original, shape)) is not None:
+            as_it_came = ply_edit.with_positions(original.name, data, shape.verts_or_nan, turns)
         if original is not None and suffix == ".glb" and original.suffix.lower() in gltf.SUFFIXES:
             as_it_came = _scene(self.output, original, shape, turns, still and not self.told)
         if as_it_came is not None:

@@ -224,9 +224,10 @@ def _read_json(path: Path, shape: Shape, on: On | None) -> tuple[list[Any], str 
     return labels, members_are
 
 
-def save_labels(path: Path, labels: Labels, shape: Shape) -> None:
-    """Write labels of `shape`, each with a name; `OptionError` for another suffix than `LABEL_SUFFIXES`, or too large a
-    number for the format.
+def save_labels(path: Path, labels: Labels, shape: Shape, file: Path | None = None) -> None:
+    """Write labels of `shape`, each with a name; a .ply or .vtp ``file`` that it was read from keeps all else.
+
+    `OptionError` for another suffix than `LABEL_SUFFIXES`, or too large a number for the format.
     """
     suffix = check_labels_suffix(path)
     largest = {".npy": 2**63, ".ply": 2**31, ".vtp": 2**63}.get(suffix)
@@ -244,12 +245,12 @@ def save_labels(path: Path, labels: Labels, shape: Shape) -> None:
         record = {"format": "meshmatch labels 1", "on": labels.on, "shape": shape.name, "labels": cells}
         tables.write_json(path, record)
     else:
-        _write_shape(path, labels, shape, suffix)
+        _write_shape(path, labels, shape, suffix, file)
 
 
-def _write_shape(path: Path, labels: Labels, shape: Shape, suffix: str) -> None:
+def _write_shape(path: Path, labels: Labels, shape: Shape, suffix: str, file: Path | None) -> None:
     """Whole numbers as they are; words by their number, which comments at the beginning explain."""
-    from meshmatch.shapes.formats import ply, vtk
+    from meshmatch.shapes.formats import ply, ply_edit, vtk, vtp_edit
 
     numbers = [k if labels.are_words else int(name) for k, name in enumerate(labels.names)]
     comments = [f"label {k} {name}" for k, name in enumerate(labels.names)] if labels.are_words else []
@@ -259,10 +260,18 @@ def _write_shape(path: Path, labels: Labels, shape: Shape, suffix: str) -> None:
     if suffix == ".vtp":
         wide = max(map(abs, numbers)) >= 2**31
         arrays = {"label": np.array(numbers, np.int64 if wide else np.int32)[labels.codes], "Colors": colors}
-        on = {"arrays": arrays} if labels.on == "vertices" else {"of_faces": arrays}
-        vtk.write_vtp(path, plain, comments=comments, **on)
+        of_points, of_faces = (arrays, {}) if labels.on == "vertices" else ({}, arrays)
+        data = vtp_edit.data_of(file, shape, faces=labels.on == "faces")
+        if file is not None and data is not None:
+            path.write_bytes(vtp_edit.with_arrays(file.name, data, of_points, of_faces, comments))
+        else:
+            vtk.write_vtp(path, plain, of_points, of_faces, comments)
         return
     columns: dict[str, Any] = {"label": np.array(numbers, np.int32)[labels.codes]}
     columns |= {channel: colors[:, k] for k, channel in enumerate(("red", "green", "blue"))}
-    where: Any = {"vertex" if labels.on == "vertices" else "face": columns}
-    ply.write(path, plain, comments=comments, **where)
+    where: Any = {"vertex": columns, "face": {}} if labels.on == "vertices" else {"vertex": {}, "face": columns}
+    data = ply_edit.data_of(file, shape, faces=labels.on == "faces")
+    if file is not None and data is not None:
+        path.write_bytes(ply_edit.with_columns(file.name, data, comments=comments, **where))
+    else:
+        ply.write(path, plain, comments=comments, **where)

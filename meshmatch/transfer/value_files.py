@@ -19,7 +19,7 @@ from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.shapes import tables
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.dressed_files import save_colored
-from meshmatch.shapes.formats import ply, vtk
+from meshmatch.shapes.formats import ply, ply_edit, vtk, vtp_edit
 from meshmatch.shapes.input_files import read_npy
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import read_table
@@ -88,8 +88,11 @@ def _is_row_number(column: Floats) -> bool:
     return any(np.array_equal(column, np.arange(len(column)) + first) for first in (0, 1))
 
 
-def save_values(path: Path, values: Values, shape: Shape) -> None:
-    """Write numbers of the vertices of `shape`; `OptionError` if the suffix is not one of `VALUE_SUFFIXES`."""
+def save_values(path: Path, values: Values, shape: Shape, file: Path | None = None) -> None:
+    """Write numbers of the vertices of `shape`; a .ply or .vtp ``file`` that it was read from keeps all else.
+
+    `OptionError` if the suffix is not one of `VALUE_SUFFIXES`.
+    """
     suffix, numbers = check_values_suffix(path), values.numbers
     table = numbers if numbers.ndim == 2 else numbers[:, None]
     columns = table.shape[1]
@@ -99,9 +102,12 @@ def save_values(path: Path, values: Values, shape: Shape) -> None:
     elif suffix == ".csv":
         tables.write_rows(path, ["vertex", *names], ([k, *row] for k, row in enumerate(table.tolist())))
     elif suffix in (".vtp", ".vtk"):
-        write = vtk.write_vtp if suffix == ".vtp" else vtk.write_vtk
-        own = _different([name or "value" for name in names], set())
-        write(path, shape, dict(zip(own, table.T, strict=True)))
+        arrays = dict(zip(_different([name or "value" for name in names], set()), table.T, strict=True))
+        data = vtp_edit.data_of(file, shape) if suffix == ".vtp" else None
+        if file is not None and data is not None:
+            path.write_bytes(vtp_edit.with_arrays(file.name, data, arrays, {}))
+        else:
+            (vtk.write_vtp if suffix == ".vtp" else vtk.write_vtk)(path, shape, arrays)
     else:
         words = ["".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in name) for name in names]
         own = _different([word or "value" for word in words], _RESERVED)
@@ -111,7 +117,11 @@ def save_values(path: Path, values: Values, shape: Shape) -> None:
         whole = (table == np.rint(table)) & (np.abs(table) < 2**53)
         if (off > np.where(whole, 0.0, _VISIBLE * np.abs(table))).any():
             warn(f"{path.name} has 32-bit numbers, which change some of these; .csv, .npy and .vtp keep them")
-        ply.write(path, shape, vertex=dict(zip(own, written.T, strict=True)))
+        columns, data = dict(zip(own, written.T, strict=True)), ply_edit.data_of(file, shape)
+        if file is not None and data is not None:
+            path.write_bytes(ply_edit.with_columns(file.name, data, columns, {}))
+        else:
+            ply.write(path, shape, vertex=columns)
 
 
 def _different(names: list[str], taken: set[str]) -> list[str]:

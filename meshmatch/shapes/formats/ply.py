@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import InputError, warn
 from meshmatch.shapes.formats import (
     NO_FACES,
@@ -37,13 +37,15 @@ _NAMES = {
     "face": ("faces", "triangle", "triangles", "polygon", "polygons", "facet", "facets", "cell", "cells"),
     "tristrips": ("tristrip", "tri_strips", "tri_strip", "triangle_strips", "triangle_strip"),
 }
-_END = re.compile(rb"(?<=[\r\n])end_header[ \t]*(?:\r\n|[\r\n]|\Z)")
+END = re.compile(rb"(?<=[\r\n])end_header[ \t]*(?:\r\n|[\r\n]|\Z)")
 _DATA = re.compile(rb"^DATA[ \t]+(ascii|binary)[ \t]*\r?\n", re.MULTILINE)
-_CHANNELS = ("red", "green", "blue", "alpha")
+CHANNELS = ("red", "green", "blue", "alpha")
 _PREFIXES = ("", "diffuse_", "color_", "vertex_", "vertex_color_", "face_", "face_color_", "ambient_")
+KINDS = {"uint8": "uchar", "int32": "int", "float32": "float"}
+"""How arrays are written that are no doubles."""
 Columns: TypeAlias = Mapping[str, NDArray[Any]]
 _NONE: Columns = MappingProxyType({})
-_NUMBERS = ("x", "y", "z", *_CHANNELS, "r", "g", "b", "a")
+_NUMBERS = ("x", "y", "z", *CHANNELS, "r", "g", "b", "a")
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,8 @@ class Content:
     faces: list[Element]
     strips: list[Element]
     unread: list[Element]  # others whose lists look like those of faces
+    elements: list[Element]  # all of the header
+    order: str | None  # of bytes; None for text
 
 
 def read(path: Path, data: bytes) -> Raw:
@@ -100,7 +104,7 @@ def parsed(name: str, data: bytes) -> Content:
     some = [element for element in elements if element.count and element.properties]
     faces, strips, others = ([each for each in some if each.role == role] for role in ("face", "tristrips", ""))
     unread = [element for element in others if any(p.count_kind and _is_usual(p) for p in element.properties)]
-    return Content(comments, vertices, faces, strips, unread)
+    return Content(comments, vertices, faces, strips, unread, elements, order)
 
 
 def _give_roles(elements: Sequence[Element]) -> None:
@@ -179,7 +183,7 @@ def write(
 ) -> None:
     """Binary little-endian; positions as float where that loses nothing, else double; `comments` go into the header.
 
-    `vertex` and `face` are further properties, arrays (V,) or (F,) by name: uint8, int32, float32, or else double. Names are
+    `vertex` and `face` are further properties, arrays (V,) or (F,) by name, of a kind in `KINDS`, or else double. Names are
     words of ASCII letters, digits and "_".
     """
     with np.errstate(over="ignore"):  # what is too large for a float is not equal to it
@@ -191,7 +195,7 @@ def write(
     header += [f"property {word} {axis}" for axis in "xyz"]
     table: dict[str, NDArray[Any]] = dict(zip("xyz", shape.verts_or_nan.T, strict=True))
     if shape.colors is not None:
-        table |= zip(_CHANNELS, np.rint(np.clip(shape.colors.T, 0, 1) * 255).astype(np.uint8), strict=True)
+        table |= color_columns(shape.colors)
     body = _rows(table | dict(vertex), shape.V, [(axis, kind) for axis in "xyz"], header)
     if not shape.is_cloud:
         header += [f"element face {shape.F}", "property list uchar int vertex_indices"]
@@ -200,12 +204,16 @@ def write(
     path.write_bytes("\n".join([*header, "end_header\n"]).encode() + body)
 
 
+def color_columns(colors: Float[Floats, "V 4"]) -> Columns:
+    """Bytes of red, green, blue and alpha in 0..1."""
+    return dict(zip(CHANNELS, np.rint(np.clip(colors.T, 0, 1) * 255).astype(np.uint8), strict=True))
+
+
 def _rows(table: dict[str, NDArray[Any]], count: int, fields: list[Any], header: list[str]) -> bytes:
     """The rows of a table; its columns that have no field yet get one, and a line in the header."""
-    kinds = {"uint8": ("u1", "uchar"), "int32": ("<i4", "int"), "float32": ("<f4", "float")}
     for label in list(table)[len(fields) :]:
-        kind, word = kinds.get(table[label].dtype.name, ("<f8", "double"))
-        fields.append((label, kind))
+        word = KINDS.get(table[label].dtype.name, "double")
+        fields.append((label, f"<{TYPES[word]}"))
         header.append(f"property {word} {label}")
     rows = np.empty(count, fields)
     for label, values in table.items():
@@ -217,7 +225,7 @@ def _header(name: str, data: bytes) -> tuple[str | None, list[Element], int, lis
     """Byte order (None: text), elements, where the body starts, and comments."""
     if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r", b" "):
         raise InputError(f"{name} is not a ply file: it does not begin with 'ply'", WRONG_SUFFIX)
-    end = _END.search(data)
+    end = END.search(data)
     if not end:
         raise damaged(name, "the header has no end")
     if data.count(b"element", 0, end.start()) + data.count(b"property", 0, end.start()) > _MOST_LINES:
@@ -272,18 +280,26 @@ def faces_of(corners: Ints, sizes: Ints) -> Ints:
 
 def _colors(element: Element) -> Floats | None:
     """(N, 4) sRGB colors and alpha of the rows of an element; None if it has none."""
-    kinds = {p.name.lower(): p for p in element.properties if not p.count_kind}
-    prefix = next((p for p in _PREFIXES if all(p + channel in kinds for channel in _CHANNELS[:3])), None)
-    names = [f"{prefix}{channel}" for channel in _CHANNELS] if prefix is not None else list("rgba")
-    if not all(name in kinds for name in names[:3]):
-        packed = next((kinds[name] for name in ("rgb", "rgba") if name in kinds and kinds[name].kind[1:] == "4"), None)
-        return None if packed is None else _unpacked(element, packed)
-    alpha = next((name for name in (names[3], "alpha", "a") if name in kinds), None)
+    found = color_properties(element)
+    if len(found) == 1:
+        return _unpacked(element, found[0])
     out = np.ones((element.count, 4))
-    for first, last, group in ((0, 3, names[:3]), (3, 4, [alpha] if alpha else [])):
-        values = [element.table[kinds[name].name].astype(np.float64) for name in group]
-        small = all(kinds[name].kind[0] == "f" for name in group) and not any((each > 1).any() for each in values)
-        for k, name, each in zip(range(first, last), group, values, strict=False):
-            largest = 1.0 if small else 65535.0 if kinds[name].kind == "u2" else 255.0
-            out[:, k] = np.clip(np.nan_to_num(each) / largest, 0.0, 1.0)
-    return out
+    for group in (found[:3], found[3:]):
+        values = [element.table[p.name].astype(np.float64) for p in group]
+        small = all(p.kind[0] == "f" for p in group) and not any((each > 1).any() for each in values)
+        for p, each in zip(group, values, strict=True):
+            largest = 1.0 if small else 65535.0 if p.kind == "u2" else 255.0
+            out[:, found.index(p)] = np.clip(np.nan_to_num(each) / largest, 0.0, 1.0)
+    return out if found else None
+
+
+def color_properties(element: Element) -> list[Property]:
+    """The properties that hold colors: red, green, blue and perhaps alpha; or one with all of them; or none."""
+    kinds = {p.name.lower(): p for p in element.properties if not p.count_kind}
+    prefix = next((p for p in _PREFIXES if all(p + channel in kinds for channel in CHANNELS[:3])), None)
+    names = [f"{prefix}{channel}" for channel in CHANNELS] if prefix is not None else list("rgba")
+    if not all(name in kinds for name in names[:3]):
+        packed = [kinds[name] for name in ("rgb", "rgba") if name in kinds and kinds[name].kind[1:] == "4"]
+        return packed[:1]
+    alpha = [name for name in (names[3], "alpha", "a") if name in kinds]
+    return [kinds[name] for name in names[:3] + alpha[:1]]

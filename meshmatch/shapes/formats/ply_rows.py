@@ -37,6 +37,8 @@ class Element:
     """One of vertex, face and tristrips; empty for what makes no shape."""
     table: dict[str, Any] = field(default_factory=dict)
     """What was read, by property; see `Body.element`."""
+    bytes: slice = field(default_factory=lambda: slice(0))
+    """Where in a binary file."""
 
 
 class Body:
@@ -59,8 +61,11 @@ class Body:
         """
         kinds = [self._dtype(p.count_kind or p.kind) for p in element.properties]
         self._check(element, self.at + element.count * sum(kind.itemsize for kind in kinds))
+        begin = self.at
         table = self._equal_rows(element) if element.count else None
-        return table if table is not None else self._walk(element)
+        table = table if table is not None else self._walk(element)
+        element.bytes = slice(begin, self.at)
+        return table
 
     def rows_left(self, element: Element) -> int:
         """How many whole rows of an element without lists there may be from here on."""

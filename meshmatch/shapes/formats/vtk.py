@@ -182,10 +182,10 @@ def write_vtk(path: Path, shape: Shape, arrays: Arrays | None = None) -> None:
         f"\nPOINT_DATA {shape.V}\n".encode(),
     ]
     if shape.colors is not None:
-        parts += [b"COLOR_SCALARS Colors 4\n", _bytes(shape.colors).tobytes(), b"\n"]
+        parts += [b"COLOR_SCALARS Colors 4\n", bytes_of(shape.colors).tobytes(), b"\n"]
     if arrays:
         parts.append(f"FIELD FieldData {len(arrays)}\n".encode())
-        for name, values in _plain(arrays):
+        for name, values in plain(arrays):
             kind = {"f4": "float", "f8": "double", "i4": "int", "i8": "vtktypeint64", "u1": "unsigned_char"}
             words = f"{'_'.join(name.split())} {values.shape[1]} {len(values)} {kind[values.dtype.str[1:]]}\n"
             parts += [words.encode(), values.astype(values.dtype.newbyteorder(">")).tobytes(), b"\n"]
@@ -199,12 +199,12 @@ def write_vtp(
     cells = np.arange(shape.V)[:, None] if shape.is_cloud else shape.faces
     ends = np.arange(1, len(cells) + 1) * cells.shape[1]
     group, counts = ("Verts", (len(cells), 0)) if shape.is_cloud else ("Polys", (0, len(cells)))
-    data = [] if shape.colors is None else [_element("Colors", _bytes(shape.colors))]
-    data += [_element(name, values) for name, values in _plain(arrays or {})]
-    own = [_element(name, values) for name, values in _plain(of_faces or {})]
+    data = [] if shape.colors is None else [_element("Colors", bytes_of(shape.colors))]
+    data += [_element(name, values) for name, values in plain(arrays or {})]
+    own = [_element(name, values) for name, values in plain(of_faces or {})]
     lines = [
         '<?xml version="1.0"?>',
-        *(f"<!-- {html.escape(comment).replace('--', '- -').rstrip('-')} -->" for comment in comments),
+        *map(comment_of, comments),
         '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
         f'<PolyData><Piece NumberOfPoints="{shape.V}" NumberOfVerts="{counts[0]}" NumberOfLines="0" NumberOfStrips="0" '
         f'NumberOfPolys="{counts[1]}">',
@@ -217,6 +217,11 @@ def write_vtp(
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
+def comment_of(text: str) -> str:
+    """A comment of XML."""
+    return f"<!-- {html.escape(text).replace('--', '- -').rstrip('-')} -->"
+
+
 def _element(name: str, values: NDArray[Any]) -> str:
     kind = {"f4": "Float32", "f8": "Float64", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}[values.dtype.str[1:]]
     width = f' NumberOfComponents="{values.shape[1]}"' if values.ndim > 1 else ""
@@ -225,7 +230,7 @@ def _element(name: str, values: NDArray[Any]) -> str:
     return f'<DataArray type="{kind}" Name="{html.escape(name)}"{width} format="binary">{text}</DataArray>'
 
 
-def _plain(arrays: Arrays) -> Iterable[tuple[str, NDArray[Any]]]:
+def plain(arrays: Arrays) -> Iterable[tuple[str, NDArray[Any]]]:
     """(V, D) arrays of types that VTK has."""
     for name, values in arrays.items():
         kind = values.dtype.str[1:]
@@ -234,5 +239,5 @@ def _plain(arrays: Arrays) -> Iterable[tuple[str, NDArray[Any]]]:
         yield name, values.reshape(len(values), -1)
 
 
-def _bytes(colors: Floats) -> NDArray[np.uint8]:
+def bytes_of(colors: Floats) -> NDArray[np.uint8]:
     return np.round(255 * colors).astype(np.uint8)

@@ -33,7 +33,7 @@ from meshmatch.shapes.formats import (
 )
 from meshmatch.shapes.formats.vtk_cells import Cells, raw_of
 
-_TYPES = {
+TYPES = {
     **{f"Float{8 * n}": f"f{n}" for n in (4, 8)},
     **{f"{word}{8 * n}": f"{letter}{n}" for word, letter in (("Int", "i"), ("UInt", "u")) for n in (1, 2, 4, 8)},
 }
@@ -47,6 +47,21 @@ _APPENDED = re.compile(rb"<AppendedData\b([^>]{0,200})>\s*_")
 def read(path: Path, data: bytes) -> Raw:
     """The points of all pieces and their faces; colors where a piece has three or four bytes a point."""
     return _File(path.name, data).raw()
+
+
+def surface_of(name: str, data: bytes) -> tuple[int, Ints | None] | None:
+    """How many points a PolyData of one piece has, and how many corners each of its polygons; None for the latter where it
+    has other cells as well, and for both where it has several pieces, or is none.
+    """
+    file = _File(name, data)
+    pieces = file.root.findall("./*/Piece")
+    if len(pieces) != 1 or file.root.get("type") != "PolyData":
+        return None
+    count, polygons = (_count(name, pieces[0], f"NumberOf{what}") for what in ("Points", "Polys"))
+    if any(_count(name, pieces[0], f"NumberOf{what}") for what in ("Verts", "Lines", "Strips")) or not polygons:
+        return count, None
+    ends = file.named(pieces[0], "Polys", "offsets")
+    return None if ends is None else (count, np.diff(np.concatenate([[0], ends.astype(np.int64)])))
 
 
 class _File:
@@ -72,6 +87,7 @@ class _File:
         self.order = ">" if self.root.get("byte_order") == "BigEndian" else "<"
         self.header = np.dtype(self.order + ("u8" if self.root.get("header_type") == "UInt64" else "u4"))
         self.compressor = str(self.root.get("compressor") or "")
+        self.left = 64 * (FEW_PLACES + self.size // 12)  # bytes that may be unpacked
 
     def raw(self) -> Raw:
         pieces = self.root.findall("./*/Piece")
@@ -81,10 +97,9 @@ class _File:
         )
         check_places(self.name, self.size, sum(counts), faces)
         self.points, self.triangles = sum(counts), 0
-        self.left = 64 * (FEW_PLACES + self.size // 12)  # bytes that may be unpacked
         verts, colors, cells, first = [np.zeros((0, 3))], [], [], 0
         for piece, count in zip(pieces, counts, strict=True):
-            points = self._named(piece, "Points", None)
+            points = self.named(piece, "Points", None)
             if points is None or points.size != 3 * count:
                 raise damaged(self.name, f"a piece has other than the {count} points that it promises")
             verts.append(points.reshape(-1, 3).astype(np.float64))
@@ -100,11 +115,11 @@ class _File:
             many = _count(self.name, piece, f"NumberOf{group}")
             if not many:
                 continue
-            corners = self._named(piece, group, "connectivity")
-            ends = self._named(piece, group, "offsets")
+            corners = self.named(piece, group, "connectivity")
+            ends = self.named(piece, group, "offsets")
             if corners is None or ends is None or len(ends) != many:
                 raise damaged(self.name, f"a piece has other than the {many} cells that it promises")
-            kinds = self._named(piece, group, "types") if kind is None else np.full(len(ends), kind)
+            kinds = self.named(piece, group, "types") if kind is None else np.full(len(ends), kind)
             if kinds is None or len(kinds) != len(ends):
                 raise damaged(self.name, "it does not say of what kind its cells are")
             sizes = np.diff(np.concatenate([[0], ends.astype(np.int64)]))
@@ -123,14 +138,14 @@ class _File:
                     return painted(found.reshape(count, -1) / 255.0)
         return None
 
-    def _named(self, piece: ElementTree.Element, group: str, name: str | None) -> NDArray[Any] | None:
+    def named(self, piece: ElementTree.Element, group: str, name: str | None) -> NDArray[Any] | None:
         for element in piece.findall(f"./{group}/DataArray"):
             if name is None or element.get("Name") == name:
                 return self._array(element)
         return None
 
     def _array(self, element: ElementTree.Element) -> NDArray[Any]:
-        kind = _TYPES.get(str(element.get("type")))
+        kind = TYPES.get(str(element.get("type")))
         if kind is None:
             raise damaged(self.name, f"numbers of the unknown type {str(element.get('type'))[:40]}")
         form, text = element.get("format", "ascii"), (element.text or "").strip().encode()

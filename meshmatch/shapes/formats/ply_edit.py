@@ -1,0 +1,226 @@
+"""A PLY file with other numbers at its vertices or faces: polygons, other properties and elements, and comments stay."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.errors import warn
+from meshmatch.shapes.formats import damaged, runs
+from meshmatch.shapes.formats.ply import CHANNELS, END, KINDS, Columns, color_properties, corners_of, parsed
+from meshmatch.shapes.formats.ply_rows import TYPES, Element, Property
+from meshmatch.shapes.input_files import read_bytes
+from meshmatch.shapes.shape import Shape
+
+_NAMED = re.compile(rb"comment label -?\d+ ")
+
+
+def with_positions(name: str, data: bytes, verts: Float[Floats, "V 3"], turns: Float[Floats, "V 3 3"]) -> bytes:
+    """The bytes of a ply whose vertices have moved; normals turn by the rotation around each vertex."""
+    normals = [f"n{axis}" for axis in "xyz"]
+    vertices = parsed(name, data).vertices
+    columns = dict(zip("xyz", verts.T, strict=True))
+    if set(normals) <= set(vertices.table):
+        before = np.stack([vertices.table[each].astype(np.float64) for each in normals], axis=1)
+        columns |= zip(normals, np.einsum("vij,vj->iv", turns, before), strict=True)
+    return _edited(name, data, columns, {}, ())
+
+
+def with_columns(name: str, data: bytes, vertex: Columns, face: Columns, comments: Sequence[str] = ()) -> bytes:
+    """The bytes of a ply with further properties.
+
+    Parameters
+    ----------
+    name
+        Of the file, for words.
+    data
+        What `ply.read` can read.
+    vertex
+        Arrays (V,) by the name of a property; what has that name already is replaced, which is said but of colors.
+    face
+        Arrays (F,) for its triangles as `ply.read` makes them: a polygon has what most of its triangles have, by the first
+        of the arrays. None of a file with strips, whose triangles have no rows.
+    comments
+        Go into its header, where comments on labels make room for them.
+    """
+    content = parsed(name, data)
+    if face:
+        _, sizes = corners_of(name, content.faces[0])
+        chosen = most_frequent(next(iter(face.values())), np.maximum(sizes - 2, 0))
+        face = {label: np.append(values, values.dtype.type(0))[chosen] for label, values in face.items()}
+    for element, columns in ((content.vertices, vertex), *((each, face) for each in content.faces)):
+        colored = {p.name for p in color_properties(element)} | set(CHANNELS)
+        again = [p.name for p in element.properties if p.name in columns and p.name not in colored]
+        if again:
+            warn(f"{name} has {', '.join(again)} of each {element.name} already, which is replaced")
+    return _edited(name, data, vertex, face, comments)
+
+
+def data_of(file: Path | None, shape: Shape, faces: bool = False) -> bytes | None:
+    """The bytes of the ply that a shape was read from; None where it came from elsewhere, or has other vertices by now, or
+    where its ``faces`` need rows and the file has strips.
+    """
+    if file is None or file.suffix.lower() != ".ply":
+        return None
+    data = read_bytes(file)
+    content = parsed(file.name, data)
+    rows = len(content.faces) == 1 and not content.strips
+    return data if content.vertices.count == shape.V and (rows or not faces) else None
+
+
+def most_frequent(values: NDArray[Any], triangles: Int[Ints, " P"]) -> Int[Ints, " P"]:
+    """For polygons of so many triangles one that has the value of most of them; -1 for a polygon without any."""
+    polygon = np.repeat(np.arange(len(triangles)), triangles)
+    code = np.unique(values, return_inverse=True)[1].reshape(-1)
+    _, which, counts = np.unique(polygon * (code.max(initial=0) + 1) + code, return_inverse=True, return_counts=True)
+    order = np.lexsort((np.arange(len(values)), -counts[which.reshape(-1)], polygon))
+    found = np.full(len(triangles), -1)
+    owners, first = np.unique(polygon[order], return_index=True)
+    found[owners] = order[first]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """What becomes of an element: which of its properties go, and the columns that it gets."""
+
+    element: Element
+    gone: frozenset[str]
+    columns: Columns
+
+    @classmethod
+    def of(cls, element: Element, columns: Columns, colored: bool) -> _Plan:
+        """A property whose kind can hold its new numbers keeps its place; what else has its name goes, and so do earlier
+        colors where there are new ones.
+        """
+        colors = {p.name for p in color_properties(element)} if colored and element.role else set[str]()
+        gone = {p.name for p in element.properties if p.name in columns and not _holds(p, columns[p.name])}
+        return cls(element, frozenset(gone | (colors - set(columns))), columns)
+
+    @property
+    def changes(self) -> bool:
+        return bool(self.gone or self.columns)
+
+    @property
+    def kept(self) -> list[Property]:
+        return [p for p in self.element.properties if p.name not in self.gone]
+
+    @property
+    def added(self) -> list[Property]:
+        """Properties behind those that are kept."""
+        there = {p.name for p in self.kept}
+        kinds = {label: KINDS.get(values.dtype.name, "double") for label, values in self.columns.items()}
+        return [Property(label, kind) for label, kind in kinds.items() if label not in there]
+
+
+def _holds(p: Property, values: NDArray[Any]) -> bool:
+    return not p.count_kind and np.can_cast(values.dtype, p.kind, "same_kind" if p.kind[0] == "f" else "safe")
+
+
+def _edited(name: str, data: bytes, vertex: Columns, face: Columns, comments: Sequence[str]) -> bytes:
+    content, end = parsed(name, data), END.search(data)
+    assert end is not None
+    columns = {id(content.vertices): vertex} | {id(each): face for each in content.faces}
+    colored = CHANNELS[0] in {*vertex, *face}
+    plans = [_Plan.of(each, columns.get(id(each), {}), colored) for each in content.elements]
+    head = _head(data[: end.start()], plans, comments)
+    rows = (
+        _texts(name, data[end.end() :], plans)
+        if content.order is None
+        else _bytes(data, end.end(), plans, content.order)
+    )
+    return head + b"".join(rows)
+
+
+def _head(head: bytes, plans: Sequence[_Plan], comments: Sequence[str]) -> bytes:
+    lines, waiting = [], iter(plans)
+    plan: _Plan | None = None
+    for line in _lines(head.rstrip()):
+        words = line.split()
+        if words[:1] == [b"element"]:
+            lines += _declared(plan)
+            plan = next(waiting)
+        named = words[-1].decode("latin-1") if words[:1] == [b"property"] else ""
+        if not (plan and named in plan.gone) and not (comments and _NAMED.match(line)):
+            lines.append(line)
+        if words[:1] == [b"format"]:
+            lines += [f"comment {' '.join(comment.split())}".encode() for comment in comments]
+    return b"\n".join([*lines, *_declared(plan), b"end_header\n"])
+
+
+def _lines(text: bytes) -> list[bytes]:
+    return text.replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n")
+
+
+def _declared(plan: _Plan | None) -> list[bytes]:
+    return [f"property {p.kind} {p.name}".encode() for p in plan.added] if plan else []
+
+
+def _texts(name: str, body: bytes, plans: Sequence[_Plan]) -> Iterator[bytes]:
+    """The lines of a text, one for each row."""
+    lines = [line for line in _lines(body) if line.strip()]
+    at = 0
+    for plan in plans:
+        rows = lines[at : at + plan.element.count]
+        at += len(rows) if plan.element.properties else 0
+        if plan.element.properties:
+            yield from (_changed(name, plan, rows) if plan.changes else (row + b"\n" for row in rows))
+    yield from (line + b"\n" for line in lines[at:])
+
+
+def _changed(name: str, plan: _Plan, rows: Sequence[bytes]) -> Iterator[bytes]:
+    kinds = {p.name: p.kind for p in plan.kept} | {p.name: TYPES[p.kind] for p in plan.added}
+    texts = {label: values.astype(kinds[label]).astype(np.bytes_).tolist() for label, values in plan.columns.items()}
+    for k, row in enumerate(rows):
+        words, at, out = row.split(), 0, list[bytes]()
+        for p in plan.element.properties:
+            size = 1 + int(words[at]) if p.count_kind and at < len(words) else 1
+            if p.name not in plan.gone:
+                out += [texts[p.name][k]] if p.name in texts else words[at : at + size]
+            at += size
+        if at != len(words):
+            raise damaged(name, f"a line of its {plan.element.name} is not one row")
+        yield b" ".join([*out, *(texts[p.name][k] for p in plan.added)]) + b"\n"
+
+
+def _bytes(data: bytes, at: int, plans: Sequence[_Plan], order: str) -> Iterator[bytes]:
+    """The rows of a binary file; what lies behind the last element that changes is not looked at."""
+    last = max((k for k, plan in enumerate(plans) if plan.changes), default=-1)
+    for plan in plans[: last + 1]:
+        if plan.element.properties:
+            yield _packed(plan, order) if plan.changes else data[plan.element.bytes]
+            at = plan.element.bytes.stop
+    yield data[at:]
+
+
+def _packed(plan: _Plan, order: str) -> bytes:
+    """Rows of an element whose lists may differ in length: each property's bytes are put where they belong."""
+    N, parts = plan.element.count, list[tuple[NDArray[np.uint8], Ints]]()
+
+    def put(values: NDArray[Any], kind: str, sizes: Ints | int = 1) -> None:
+        dtype = np.dtype(order + kind)
+        parts.append((values.astype(dtype).view(np.uint8).reshape(-1), np.broadcast_to(sizes, N) * dtype.itemsize))
+
+    for p in plan.kept:
+        if p.count_kind:
+            items, sizes = plan.element.table[p.name]
+            put(sizes, p.count_kind)
+            put(items, p.kind, sizes)
+        else:
+            put(plan.columns.get(p.name, plan.element.table[p.name]), p.kind)
+    for p in plan.added:
+        put(plan.columns[p.name], TYPES[p.kind])
+    lengths = np.stack([each for _, each in parts])
+    ends = np.cumsum(lengths.sum(axis=0))
+    begins = np.cumsum(lengths, axis=0) - lengths + (ends - lengths.sum(axis=0))
+    out = np.empty(int(lengths.sum()), np.uint8)
+    for (values, sizes), begin in zip(parts, begins, strict=True):
+        out[runs(begin, sizes)] = values
+    return out.tobytes()

@@ -1,0 +1,75 @@
+"""Transfers and moved meshes: a .ply or .vtp of the target keeps polygons and numbers of its own."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import meshmatch
+from meshmatch.shapes.formats.ply import parsed
+from meshmatch.shapes.moved_files import save_moved
+
+VERTICES = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0.5, 0)]
+PLY = (
+    "ply\nformat ascii 1.0\ncomment of mine\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n"
+    "property float thickness\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    + "".join(f"{x} {y} {z} {k}.5\n" for k, (x, y, z) in enumerate(VERTICES))
+    + "4 0 1 2 3\n3 1 4 2\n"
+)
+VTP = (
+    '<VTKFile type="PolyData" byte_order="LittleEndian"><PolyData><Piece NumberOfPoints="5" NumberOfPolys="2"><PointData>'
+    '<DataArray type="Float32" Name="thickness" format="ascii">0.5 1.5 2.5 3.5 4.5</DataArray></PointData><Points>'
+    f'<DataArray type="Float32" NumberOfComponents="3">{" ".join(str(x) for v in VERTICES for x in v)}</DataArray></Points>'
+    '<Polys><DataArray type="Int32" Name="connectivity">0 1 2 3 1 4 2</DataArray>'
+    '<DataArray type="Int32" Name="offsets">4 7</DataArray></Polys></Piece></PolyData></VTKFile>'
+)
+
+
+@pytest.fixture(params=["ply", "vtp"])
+def target(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    path = tmp_path / f"target.{request.param}"
+    path.write_text(PLY if request.param == "ply" else VTP)
+    return path
+
+
+def is_kept(path: Path) -> bool:
+    text = path.read_bytes()
+    if path.suffix == ".vtp":
+        return b'Name="thickness"' in text and b">4 7<" in text
+    content = parsed(path.name, text)
+    polygons = content.faces[0].table["vertex_indices"][1].tolist() == [4, 3]
+    return polygons and content.comments == ["of mine"] and content.vertices.table["thickness"][4] == 4.5
+
+
+def test_a_transfer_adds_to_the_file_of_the_target(target: Path) -> None:
+    out = target.with_stem("out")
+    moves = (
+        meshmatch.transfer_labels(target, target, [3, 3, 5, 5, 3]),
+        meshmatch.transfer_labels(target, target, [3, 3, 5]),  # of faces
+        meshmatch.transfer_values(target, target, np.arange(5) / 4),
+        meshmatch.transfer_colors(target, target, colors=np.eye(5, 3)),
+    )
+    for move in moves:
+        move.save(out)
+        assert is_kept(out)
+    painted = meshmatch.load_shape(out)
+    assert painted.verts.tolist() == [list(map(float, each)) for each in VERTICES]
+    assert painted.colors is not None
+    np.testing.assert_allclose(painted.colors[:, :3], np.eye(5, 3))
+
+
+def test_without_a_file_a_shape_is_written(target: Path) -> None:
+    shape = meshmatch.load_shape(target)
+    out = target.with_stem("out")
+    meshmatch.transfer_labels(shape, shape, [3, 3, 5, 5, 3]).save(out)
+    assert b"thickness" not in out.read_bytes()
+    assert meshmatch.load_shape(out).F == 3
+
+
+def test_a_ply_that_moves_keeps_its_polygons(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_text(PLY)
+    shape = meshmatch.load_shape(tmp_path / "a.ply")
+    moved = meshmatch.Shape(shape.verts + 1, shape.faces)
+    save_moved(tmp_path / "b.ply", tmp_path / "a.ply", moved, np.tile(np.eye(3), (5, 1, 1)))
+    assert is_kept(tmp_path / "b.ply")
+    np.testing.assert_array_equal(meshmatch.load_shape(tmp_path / "b.ply").verts, shape.verts + 1)

@@ -1,0 +1,134 @@
+"""PLY files that get other numbers keep all else: polygons, properties, elements, comments, text or the order of bytes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.errors import MeshmatchWarning
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.formats import ply, ply_edit
+from meshmatch.shapes.formats.ply import parsed
+from meshmatch.shapes.shape import Shape
+
+HEAD = """ply
+format {} 1.0
+comment TextureFile skin.png
+obj_info kept too
+element camera 1
+property float view
+element vertex 5
+property float x
+property float y
+property float z
+property float nx
+property float ny
+property float nz
+property double quality
+property uchar diffuse_red
+property uchar diffuse_green
+property uchar diffuse_blue
+element face 2
+property list uchar int vertex_indices
+property list uchar float texcoord
+property uchar flags
+element edge 1
+property int vertex1
+property int vertex2
+end_header
+"""
+PLACES = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0.5, 0]], np.float32)
+POLYGONS = ([0, 1, 2, 3], [1, 4, 2])
+
+
+def example(kind: str) -> bytes:
+    """A quad and a triangle, in text or in bytes of an order."""
+    if kind == "ascii":
+        vertices = [f"{x} {y} {z} 0 0 1 {k / 3!r} 9 8 7" for k, (x, y, z) in enumerate(PLACES)]
+        faces = [" ".join(map(str, [len(p), *p, 2 * len(p), *[0.5] * 2 * len(p), 3])) for p in POLYGONS]
+        return "\n".join([HEAD.format(kind).rstrip(), "0.5", *vertices, *faces, "0 4", ""]).encode()
+    order = {"binary_little_endian": "<", "binary_big_endian": ">"}[kind]
+    out = np.array(0.5, order + "f4").tobytes()
+    for k, place in enumerate(PLACES):
+        out += np.array([*place, 0, 0, 1], order + "f4").tobytes() + np.array(k / 3, order + "f8").tobytes()
+        out += bytes([9, 8, 7])
+    for polygon in POLYGONS:
+        out += bytes([len(polygon)]) + np.array(polygon, order + "i4").tobytes()
+        out += bytes([2 * len(polygon)]) + np.array([0.5] * 2 * len(polygon), order + "f4").tobytes() + bytes([3])
+    return HEAD.format(kind).encode() + out + np.array([0, 4], order + "i4").tobytes()
+
+
+def table(data: bytes, name: str) -> dict[str, np.ndarray]:
+    return next(each for each in parsed("a.ply", data).elements if each.name == name).table
+
+
+def edge(kind: str) -> bytes:
+    return b"\n0 4\n" if kind == "ascii" else example(kind)[-8:]
+
+
+KINDS = ["ascii", "binary_little_endian", "binary_big_endian"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_numbers_of_vertices_are_added_and_all_else_stays(kind: str) -> None:
+    before = example(kind)
+    colors = ply.color_columns(np.tile([1.0, 0.0, 0.5, 1.0], (5, 1)))
+    label = np.arange(5, dtype=np.int32)
+    after = ply_edit.with_columns("a.ply", before, {"label": label, **colors}, {}, ["label 0 head"])
+    head = after.split(b"end_header")[0]
+    for line in HEAD.format(kind).replace("end_header\n", "").splitlines():
+        assert (line.encode() in head) != ("diffuse" in line)  # earlier colors make room
+    assert head.index(b"comment label 0 head") < head.index(b"element")
+    was, now = table(before, "vertex"), table(after, "vertex")
+    for each in ("x", "y", "z", "nx", "nz", "quality"):
+        np.testing.assert_array_equal(now[each], was[each])
+    np.testing.assert_array_equal(now["label"], label)
+    np.testing.assert_array_equal(now["blue"], 128)
+    for each in ("vertex_indices", "texcoord"):
+        for first, second in zip(table(before, "face")[each], table(after, "face")[each], strict=True):
+            np.testing.assert_array_equal(first, second)
+    assert after.endswith(edge(kind))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_polygon_has_what_most_of_its_triangles_have(kind: str) -> None:
+    after = ply_edit.with_columns("a.ply", example(kind), {}, {"label": np.array([4, 4, 7], np.int32)})
+    faces = table(after, "face")
+    np.testing.assert_array_equal(faces["label"], [4, 7])
+    np.testing.assert_array_equal(faces["vertex_indices"][1], [4, 3])
+    np.testing.assert_array_equal(faces["flags"], 3)
+    np.testing.assert_array_equal(table(after, "vertex")["quality"], np.arange(5) / 3)
+    assert after.endswith(edge(kind))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_vertices_move_and_normals_turn_with_them(kind: str, tmp_path: Path) -> None:
+    tipped = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    after = ply_edit.with_positions("a.ply", example(kind), PLACES @ tipped.T, np.tile(tipped, (5, 1, 1)))
+    now = table(after, "vertex")
+    np.testing.assert_allclose(np.stack([now[f"n{axis}"] for axis in "xyz"], 1), [[0, -1, 0]] * 5)
+    (tmp_path / "a.ply").write_bytes(after)
+    np.testing.assert_allclose(load_shape(tmp_path / "a.ply").verts, PLACES @ tipped.T)
+    head = after.split(b"end_header")[0]
+    assert head == example(kind).split(b"end_header")[0]  # kinds of numbers too
+
+
+def test_what_is_replaced_is_said() -> None:
+    with pytest.warns(MeshmatchWarning, match="a.ply has quality of each vertex already, which is replaced"):
+        after = ply_edit.with_columns("a.ply", example("ascii"), {"quality": np.ones(5, np.float32)}, {})
+    np.testing.assert_array_equal(table(after, "vertex")["quality"], 1.0)
+    assert after.count(b"quality") == 1
+
+
+def test_only_the_file_of_a_shape_is_edited(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    path.write_bytes(example("ascii"))
+    shape = load_shape(path)
+    assert ply_edit.data_of(path, shape) == example("ascii")
+    assert ply_edit.data_of(path, shape, faces=True) is not None
+    assert ply_edit.data_of(path, Shape(shape.verts[:4], shape.faces[:2])) is None
+    assert ply_edit.data_of(None, shape) is None
+    strips = example("ascii").replace(b"element face", b"element tristrips")
+    path.write_bytes(strips)
+    assert ply_edit.data_of(path, shape, faces=True) is None
+    assert ply_edit.data_of(path, shape) == strips

@@ -1,0 +1,115 @@
+"""A .vtp that gets arrays keeps all else: polygons, arrays of points and cells, and how its numbers are written."""
+
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.errors import MeshmatchWarning
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.formats import vtk, vtp_edit
+from meshmatch.shapes.formats.vtk_xml import _File
+
+PLACES = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0.5, 0]])
+
+
+def appended(*arrays: np.ndarray) -> tuple[list[int], bytes]:
+    """Raw blocks that zlib compressed, and where each begins."""
+    places, out = [], b""
+    for array in arrays:
+        data = array.tobytes()
+        packed = zlib.compress(data)
+        places.append(len(out))
+        out += np.array([1, len(data), 0, len(packed)], "<u4").tobytes() + packed
+    return places, out
+
+
+def example(data: str = "<PointData Scalars='t'>\n{}</PointData>", more: str = "") -> bytes:
+    """A quad and a triangle with thicknesses, as ParaView writes them."""
+    arrays = PLACES, np.arange(5) / 3, np.array([0, 1, 2, 3, 1, 4, 2]), np.array([4, 7])
+    at, blocks = appended(*arrays)
+    thick = f'<DataArray type="Float64" Name="thickness" format="appended" offset="{at[1]}"/>\n'
+    return (
+        (
+            '<?xml version="1.0"?>\n<VTKFile type="PolyData" version="0.1" byte_order="LittleEndian" header_type="UInt32" '
+            'compressor="vtkZLibDataCompressor">\n<PolyData>\n<Piece NumberOfPoints="5" NumberOfPolys="2">\n'
+            + data.format(thick)
+            + more
+            + f'<Points><DataArray type="Float64" NumberOfComponents="3" format="appended" offset="{at[0]}"/></Points>\n'
+            f'<Polys><DataArray type="Int64" Name="connectivity" format="appended" offset="{at[2]}"/>\n'
+            f'<DataArray type="Int64" Name="offsets" format="appended" offset="{at[3]}"/></Polys>\n'
+            '</Piece></PolyData>\n<AppendedData encoding="raw">\n_'
+        ).encode()
+        + blocks
+        + b"\n</AppendedData></VTKFile>\n"
+    )
+
+
+def arrays_of(data: bytes, group: str) -> dict[str, np.ndarray]:
+    file = _File("a.vtp", data)
+    found = file.root.findall(f"./*/Piece/{group}/DataArray")
+    return {str(each.get("Name")): file._array(each) for each in found}
+
+
+@pytest.mark.parametrize("data", ["<PointData Scalars='t'>\n{}</PointData>", "<PointData/>", ""])
+def test_arrays_of_points_are_added_and_all_else_stays(data: str, tmp_path: Path) -> None:
+    before = example(data)
+    after = vtp_edit.with_arrays(
+        "a.vtp", before, {"a <b>": np.arange(5) / 7, "Colors": np.full((5, 3), 9, np.uint8)}, {}, ["m"]
+    )
+    found = arrays_of(after, "PointData")
+    np.testing.assert_array_equal(found["a <b>"], np.arange(5) / 7)
+    if "{}" in data:
+        np.testing.assert_array_equal(found["thickness"], np.arange(5) / 3)
+    assert b"<!-- m -->" in after
+    assert after.endswith(before[before.index(b"<Points>") :])
+    path = tmp_path / "a.vtp"
+    path.write_bytes(after)
+    shape = load_shape(path)
+    np.testing.assert_array_equal(shape.verts, PLACES)
+    np.testing.assert_allclose(shape.colors, [[9 / 255] * 3 + [1.0]] * 5)
+    assert vtp_edit.data_of(path, shape) == after
+
+
+def test_a_cell_has_what_most_of_its_triangles_have(tmp_path: Path) -> None:
+    path = tmp_path / "a.vtp"
+    path.write_bytes(example())
+    shape = load_shape(path)
+    data = vtp_edit.data_of(path, shape, faces=True)
+    assert data is not None
+    after = vtp_edit.with_arrays("a.vtp", data, {}, {"label": np.array([4, 4, 7], np.int32)})
+    np.testing.assert_array_equal(arrays_of(after, "CellData")["label"], [4, 7])
+    again = vtp_edit.with_arrays("a.vtp", after, {"x": np.ones(5)}, {})
+    np.testing.assert_array_equal(arrays_of(again, "CellData")["label"], [4, 7])
+
+
+def test_what_is_replaced_is_said() -> None:
+    with pytest.warns(MeshmatchWarning, match="a.vtp has an array thickness already, which is replaced"):
+        after = vtp_edit.with_arrays("a.vtp", example(), {"thickness": np.ones(5)}, {})
+    np.testing.assert_array_equal(arrays_of(after, "PointData")["thickness"], 1.0)
+
+
+def test_files_that_cannot_be_edited_are_told_apart(tmp_path: Path) -> None:
+    path = tmp_path / "a.vtp"
+    path.write_bytes(example())
+    shape = load_shape(path)
+    path.write_bytes(example().replace(b'NumberOfPolys="2"', b'NumberOfPolys="2" NumberOfLines="1"'))
+    assert vtp_edit.data_of(path, shape, faces=True) is None
+    assert vtp_edit.data_of(path, shape) is not None
+    pieces = example().replace(b"</Piece>", b"</Piece><Piece></Piece>")
+    path.write_bytes(pieces)
+    assert vtp_edit.data_of(path, shape) is None
+    assert vtp_edit.data_of(tmp_path / "a.ply", shape) is None
+
+
+def test_what_the_package_wrote_can_be_edited(tmp_path: Path) -> None:
+    path = tmp_path / "a.vtp"
+    path.write_bytes(example())
+    shape = load_shape(path)
+    vtk.write_vtp(path, shape, {"height": shape.verts[:, 1]})
+    data = vtp_edit.data_of(path, shape)
+    assert data is not None
+    found = arrays_of(vtp_edit.with_arrays("a.vtp", data, {"label": np.arange(5)}, {}), "PointData")
+    np.testing.assert_array_equal(found["height"], PLACES[:, 1])
+    np.testing.assert_array_equal(found["label"], np.arange(5))
