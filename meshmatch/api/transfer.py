@@ -192,6 +192,7 @@ def _file_of(shape: ShapeLike) -> Path | None:
 
 def _write_values(values: Floats, target: Shape, file: Path | None, path: Path, final: Path) -> None:
     save_values(path, Values(values), target, file)
+    tell_lost(file, final)
 
 
 def transfer_colors(
@@ -335,6 +336,7 @@ def transfer_labels(
 
 def _write_labels(labels: Labels, target: Shape, file: Path | None, path: Path, final: Path) -> None:
     save_labels(path, labels, target, file)
+    tell_lost(file, final)
 
 
 def transfer_weights(

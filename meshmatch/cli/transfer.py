@@ -46,6 +46,7 @@ def transfer_color(
     They are interpolated within the faces of SRC. The VALUE of --blank is a number, one number for each column
     (1,0,0), or a color (#ff0000).
     """
+    from meshmatch.shapes.dressed_files import tell_lost
     from meshmatch.transfer import value_files
 
     if directions and values is None:
@@ -64,6 +65,7 @@ def transfer_color(
         else:
             result = meshmatch.transfer_values(a, target, given.numbers, transfer, directions=directions, rule=rule)
             value_files.save_values(temporary, value_files.Values(result.data, given.names), result.maps.target, target)
+            tell_lost(target, output)
     b = result.maps.target
     low = transfer.tell_low(result.low, rule.minimum)
     what = "colors" if given is None else f"{columns} number{'s' if columns > 1 else ''} each"

@@ -180,13 +180,18 @@ def tell_lost(file: Path | None, path: Path) -> None:
     """Say what an output in this format does not have of the file that it was made of."""
     before, after = ("" if each is None else each.suffix.lower() for each in (file, path))
     after = ".glb" if blender.is_converted(path) else after  # by way of which it is written
-    if file is None or before == after or after not in (".glb", ".obj", ".ply", ".off"):
+    if file is None or before == after or after not in (".glb", ".obj", ".ply", ".off", ".vtp", ".vtk"):
         return
-    lost: list[str] = []
-    if before in gltf.SUFFIXES and after != ".glb":
-        lost = gltf.understood(file, read_bytes(file), "scene makes", Document.beyond_triangles)
-    elif before == ".obj":
-        lost = obj_text.beyond_triangles(file.name, read_bytes(file))
-    if lost:
+    lost = beyond_triangles(file)
+    if lost and not (before in gltf.SUFFIXES and after == ".glb"):
         several = f"{', '.join(lost[:-1])} and {lost[-1]}" if lost[1:] else lost[0]
         warn(f"{path.name} does not have the {several} of {file.name}")
+
+
+def beyond_triangles(file: Path) -> list[str]:
+    """What a file has besides the triangles of one mesh and its material or colors, in words."""
+    suffix = file.suffix.lower()
+    if suffix in gltf.SUFFIXES:
+        return gltf.understood(file, read_bytes(file), "scene makes", Document.beyond_triangles)
+    told = {".obj": obj_text.beyond_triangles, ".ply": ply_edit.beyond_triangles, ".vtp": vtp_edit.beyond_triangles}
+    return told[suffix](file.name, read_bytes(file)) if suffix in told else []

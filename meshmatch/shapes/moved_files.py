@@ -19,7 +19,7 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.outputs import make_folder, replace_all_on_success
 from meshmatch.shapes.appearance import Appearance, BakedMaterial
 from meshmatch.shapes.colors import bytes_of
-from meshmatch.shapes.dressed_files import Dressed
+from meshmatch.shapes.dressed_files import Dressed, beyond_triangles
 from meshmatch.shapes.files import check_suffix, save_shape
 from meshmatch.shapes.formats import gltf, obj_look, obj_text, ply_edit
 from meshmatch.shapes.formats.gltf_dressed import dressed
@@ -276,9 +276,9 @@ def _lost(original: Path | None, look: Appearance | None, textured: bool) -> str
     lost = []
     if look is not None and not textured and (look.textured or len(look.materials) > 1):
         lost += ["the texture coordinates", "the materials"]
-    if suffix == ".obj":
-        lost += [f"the {word}" for word in obj_text.beyond_triangles(original.name, read_bytes(original))]
-    elif suffix in gltf.SUFFIXES:
+    if suffix not in gltf.SUFFIXES:
+        lost += [f"the {word}" for word in beyond_triangles(original)]
+    else:
         lost += ["other maps than the base color", "skins", "morph targets", "the nodes"]
     lost = list(dict.fromkeys(lost))
     return " and ".join([", ".join(lost[:-1]), lost[-1]]) if len(lost) > 1 else "".join(lost)

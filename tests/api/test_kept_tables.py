@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import meshmatch
+from meshmatch.errors import MeshmatchWarning
 from meshmatch.shapes.formats.ply import parsed
 from meshmatch.shapes.moved_files import save_moved
 
@@ -56,6 +57,19 @@ def test_a_transfer_adds_to_the_file_of_the_target(target: Path) -> None:
     assert painted.verts.tolist() == [list(map(float, each)) for each in VERTICES]
     assert painted.colors is not None
     np.testing.assert_allclose(painted.colors[:, :3], np.eye(5, 3))
+
+
+def test_what_another_format_does_not_hold_is_told(target: Path) -> None:
+    word = "property" if target.suffix == ".ply" else "array"
+    other = target.with_name(f"out.{'vtp' if target.suffix == '.ply' else 'ply'}")
+    told = rf"^{other.name} does not have the polygons and {word} thickness of {target.name}$"
+    with pytest.warns(MeshmatchWarning, match=told):
+        meshmatch.transfer_labels(target, target, [3, 3, 5, 5, 3]).save(other)
+    with pytest.warns(MeshmatchWarning, match=told):
+        meshmatch.transfer_values(target, target, np.arange(5) / 4).save(other)
+    shape = meshmatch.load_shape(target)
+    with pytest.warns(MeshmatchWarning, match=rf"^out.stl does not have .*the {word} thickness of {target.name}$"):
+        save_moved(target.with_name("out.stl"), target, shape, np.tile(np.eye(3), (5, 1, 1)))
 
 
 def test_without_a_file_a_shape_is_written(target: Path) -> None:

@@ -19,6 +19,8 @@ from meshmatch.shapes.formats.ply_rows import TYPES, Element, Property
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
+# Positions, normals and texture coordinates.
+_OF_SURFACES = {*"xyzstuv", "nx", "ny", "nz", "texture_u", "texture_v", "texnumber"}
 _NAMED = re.compile(rb"comment label -?\d+ ")
 
 
@@ -73,6 +75,18 @@ def data_of(file: Path | None, shape: Shape, faces: bool = False) -> bytes | Non
     content = parsed(file.name, data)
     rows = len(content.faces) == 1 and not content.strips
     return data if content.vertices.count == shape.V and (rows or not faces) else None
+
+
+def beyond_triangles(name: str, data: bytes) -> list[str]:
+    """What a file has besides triangles and their colors, in words."""
+    content = parsed(name, data)
+    named, polygons = [p.name for p in content.vertices.properties], False
+    for element in content.faces:
+        named += [p.name for p in element.properties if not p.count_kind]
+        polygons |= bool((corners_of(name, element)[1] > 3).any())
+    colors = {p.name for element in (content.vertices, *content.faces) for p in color_properties(element)}
+    others = [each for each in dict.fromkeys(named) if each not in colors | _OF_SURFACES]
+    return ["polygons"] * polygons + [f"property {each}" for each in others]
 
 
 def most_frequent(values: NDArray[Any], triangles: Int[Ints, " P"]) -> Int[Ints, " P"]:

@@ -64,6 +64,14 @@ def surface_of(name: str, data: bytes) -> tuple[int, Ints | None] | None:
     return None if ends is None else (count, np.diff(np.concatenate([[0], ends.astype(np.int64)])))
 
 
+def arrays_of(name: str, data: bytes) -> list[str]:
+    """The names of arrays of points and cells that are no colors or normals."""
+    root = _File(name, data).root
+    found = [each for group in ("PointData", "CellData") for each in root.findall(f"./*/Piece/{group}/DataArray")]
+    kept = [each for each in found if each.get("type") != "UInt8" or each.get("NumberOfComponents") not in ("3", "4")]
+    return [label for label in dict.fromkeys(str(each.get("Name")) for each in kept) if label != "Normals"]
+
+
 class _File:
     def __init__(self, name: str, data: bytes) -> None:
         self.name, self.size, self.appended, self.encoding = name, len(data), b"", b""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from meshmatch.errors import warn
 from meshmatch.shapes.formats.ply_edit import most_frequent
 from meshmatch.shapes.formats.vtk import Arrays, comment_of, plain
-from meshmatch.shapes.formats.vtk_xml import TYPES, surface_of
+from meshmatch.shapes.formats.vtk_xml import TYPES, arrays_of, surface_of
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
@@ -64,6 +64,13 @@ def data_of(file: Path | None, shape: Shape, faces: bool = False) -> bytes | Non
     if found is None or found[0] != shape.V or (faces and found[1] is None):
         return None
     return data
+
+
+def beyond_triangles(name: str, data: bytes) -> list[str]:
+    """What a file has besides triangles and their colors, in words."""
+    found = surface_of(name, data)
+    polygons = found is not None and found[1] is not None and bool((found[1] > 3).any())
+    return ["polygons"] * polygons + [f"array {each}" for each in arrays_of(name, data)]
 
 
 def _with(name: str, head: bytes, group: bytes, arrays: dict[str, NDArray[Any]]) -> bytes:
