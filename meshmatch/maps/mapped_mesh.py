@@ -11,6 +11,7 @@ leaves vertices without a triangle. `meshmatch.maps.footpoints` says how other s
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -73,7 +74,7 @@ class MappedMesh:
         self.confidence = source_to_target.assumed_confidence.astype(np.float64)
         self.unit = length_of(target)
         self.normals = normals_at(source_to_target, target)
-        self.part = connected_parts(target)[source_to_target.index]
+        self._target, self._index = target, source_to_target.index
         kept = np.flatnonzero(~discontinuous_faces(source_to_target, source, target) & source.valid_faces)
         lone = source.valid
         lone[source.faces[kept].ravel()] = False
@@ -94,6 +95,11 @@ class MappedMesh:
         # A cloud has gaps between its points, which are no reason for low confidence.
         self._gap = self.unit / np.sqrt(len(np.unique(self.points, axis=0))) if source.is_cloud else 0.0
 
+    @cached_property
+    def part(self) -> Int[Ints, " V_source"]:
+        """Which of the target's `connected_parts` the vertices of the source are on."""
+        return connected_parts(self._target)[self._index]
+
     def query(
         self,
         points: Float[Floats, "N 3"],
@@ -109,7 +115,7 @@ class MappedMesh:
         points = np.asarray(points, np.float64)
         facing = np.zeros((len(points), 3)) if normals is None else normals
         near = None if near is None else near / self._source_unit
-        parts = None if (self.part == self.part[0]).all() else parts
+        parts = None if parts is None or (self.part == self.part[0]).all() else parts
         item, weights = self._search(points, facing, workers, near, parts)
         corners = self.corners[item]
         distance = np.sqrt(squared_lengths(interpolate(self.points, corners, weights) - points))
