@@ -92,9 +92,9 @@ class Collection(FitsFolder):
 
         With the model "none" the shapes themselves make a template: one of them is fitted to all others, and then their
         mean, twice. They are of one kind, in any pose; mirror images and cut ones are found. Nothing agrees then, and
-        five fits or more are judged by comparison with each other. A run that was stopped goes on where it was, and
-        shapes that were added since are fitted; the fits are those of a run that nobody stopped, bit for bit. A shape
-        that cannot be read or fitted is a record and stops nothing else.
+        five fits or more are judged by comparison with each other. A run that was stopped goes on where it was, bit for
+        bit. Shapes of before stay in the collection as long as their files are there, and those that are added are
+        fitted. A shape that cannot be read or fitted is a record and stops nothing else.
 
         Parameters
         ----------
@@ -128,10 +128,10 @@ class Collection(FitsFolder):
             There is no shape, two have the same name, none could be fitted, or the folder holds fits of another model
             or made in another way, or another process writes to it.
         """
-        sources, left_out = find_sources(shapes, self.store)
+        given, left_out = find_sources(shapes, self.store)
         wish = Setting(self.store, str(model), config or FitConfig(), tuple(only), tuple(without), sequence)
         with self.store.alone(), hired(self.workers) as crew:
-            setting = settled(wish, sources)
+            setting = settled(wish, sources := self._with_earlier(given))
             if model == AUTO:
                 made = fit_all_kinds(setting, wish, sources, crew, agree, self.progress, tell)
             else:

@@ -16,9 +16,11 @@ from meshmatch.collections.setting import (
     ALONE,
     FAILED,
     FIRST,
+    FITS,
     LEFT_OUT,
     SECOND,
     SECOND_TEMPLATE,
+    SUFFIX,
     TEMPLATE,
     Record,
     Setting,
@@ -44,12 +46,13 @@ from meshmatch.collections.tasks import (
     save_array,
 )
 from meshmatch.collections.workers import Died, Item, Result, Workers
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, warn
 from meshmatch.fitting.solve.agreement import AgreeConfig, held_mean, log_stretch, stretch_of
 from meshmatch.fitting.usual import FAIR
 from meshmatch.fitting.without_model import stand_alike
 from meshmatch.maps.vertex_map import VERDICTS
 from meshmatch.models.registry import NO_MODEL
+from meshmatch.outputs import plain_text
 from meshmatch.progress import ProgressCallback
 
 TABLE = "fits.csv"
@@ -142,6 +145,7 @@ def fit_all(
         for record in records:
             tell(record)
     setting.store.remove(AGREEING)
+    _drop_others(setting.store, records)
     _write_table(setting.store, records)
     return Fitted(tuple(records), len(agreeing) if groups else 0, setting.model)
 
@@ -251,9 +255,24 @@ def elsewhere_words(elsewhere: Mapping[str, str]) -> list[str]:
     lines = []
     for where in dict.fromkeys(elsewhere.values()):
         names = [name for name in elsewhere if elsewhere[name] == where]
-        more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-        lines.append(f"{', '.join(names[:_MOST_NAMED])}{more}: of another kind, see {where}")
+        lines.append(f"{_named(names)}: of another kind, see {where}")
     return lines
+
+
+def _named(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    return f"{', '.join(map(plain_text, names[:_MOST_NAMED]))}{more}"
+
+
+def _drop_others(store: Store, records: Sequence[Record]) -> None:
+    """Remove finished fits of shapes that failed now, or are no longer there: these are named."""
+    fitted = {record.name: record.fitted for record in records}
+    names = [file.removesuffix(SUFFIX) for file in store.names(FITS)]
+    others = [name for name in names if not fitted.get(name)]
+    for name in others:
+        store.remove(f"{FITS}/{name}{SUFFIX}")
+    if gone := [name for name in others if name not in fitted]:
+        warn(f"{store.location}: no longer in it, for their files are gone or have other names: {_named(gone)}")
 
 
 @dataclass(frozen=True)

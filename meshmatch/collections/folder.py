@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Self
 
-from meshmatch.collections.fit_all import TABLE
-from meshmatch.collections.setting import FITS, SUFFIX, finished_fit
+from meshmatch.collections.fit_all import TABLE, files_of
+from meshmatch.collections.setting import FITS, SUFFIX, Source, finished_fit
 from meshmatch.collections.settle import read_about
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError
@@ -30,6 +31,19 @@ class FitsFolder:
         if not found:
             raise InputError(f"{self.store.location} holds no finished fit", "run `meshmatch fit` to its end")
         return found
+
+    def _with_earlier(self, given: Sequence[Source]) -> list[Source]:
+        """The given shapes, and those that are here from before, where their files are still there; sorted by name."""
+        names, paths = {each.name for each in given}, {each.path for each in given}
+        files: dict[str, str] = {}
+        with suppress(InputError):  # a new folder has no table
+            files = files_of(self.store)
+        found = list(given)
+        for name in (name.removesuffix(SUFFIX) for name in self.store.names(FITS)):
+            folder, _, file = files.get(name, "").rpartition("/")
+            if name not in names and file and files[name] not in paths and Store.of(folder).exists(file):
+                found.append(Source(name, Store.of(folder), file))
+        return sorted(found, key=lambda source: source.name)
 
     def _others(self) -> list[Self]:
         """The collections of shapes of other kinds within this one that hold fits."""

@@ -62,7 +62,7 @@ def fit_alone(task: FitTask) -> Record:
         harder = digest_of(digest, "try_harder")
         known = _known(setting.store, file, (digest, harder))
         if known is not None and (known.verdict != "poor" or known.digest == harder or not setting.config.try_harder):
-            return known
+            return replace(known, file=source.path)  # it may lie elsewhere now
         last = None if task.last is None else setting.read(task.folder, task.last.name).fit
         fit = setting.fit(source.load(setting.only, setting.without), last, task.other_side, task.whole)
         assert fit.repaired is not None

@@ -478,6 +478,28 @@ def test_where_no_fit_is_to_be_trusted_maps_can_be_made(tmp_path: Path) -> None:
     assert collection.save_maps(tmp_path / "maps") == 6
 
 
+def test_a_collection_has_the_shapes_of_before_as_long_as_their_files_are_there(shapes: Path, tmp_path: Path) -> None:
+    """A specimen that is added by itself joins the others; one that was deleted, renamed or damaged is in it no more."""
+    scans, moved = tmp_path / "scans", tmp_path / "moved"
+    shutil.copytree(shapes, scans)
+    collection = meshmatch.Collection(tmp_path / "fits", workers=1)
+
+    def fitted(*given: Path) -> dict[str, bool]:
+        made = collection.fit(given, model="human", config=QUICK, agree=False)
+        assert collection.names == sorted(record.name for record in made.records if record.fitted)
+        return {record.name: record.fitted for record in made.records}
+
+    assert fitted(scans / "dancer.ply", scans / "turned.obj") == {"dancer": True, "turned": True}
+    assert fitted(scans / "climber.ply") == dict.fromkeys(NAMES, True)
+    scans.rename(moved)
+    assert fitted(moved) == {"broken": False} | dict.fromkeys(NAMES, True)
+    assert fitted(moved / "dancer.ply") == dict.fromkeys(NAMES, True)  # the others are known where they lie now
+    (moved / "dancer.ply").rename(moved / "anna.ply")
+    (moved / "turned.obj").write_text("damaged")
+    with pytest.warns(MeshmatchWarning, match="no longer in it, for their files are gone or have other names: dancer$"):
+        assert fitted(moved) == {"anna": True, "broken": False, "climber": True, "turned": False}
+
+
 def test_a_shape_of_another_kind_is_called_so(tmp_path: Path) -> None:
     """And a file that no reader knows has a row, too."""
     shutil.copy(SAMPLES / "dancer.ply", tmp_path)
