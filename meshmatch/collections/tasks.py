@@ -24,6 +24,7 @@ from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.fitting.agree import member_of, with_vectors
 from meshmatch.fitting.alike import is_finer
+from meshmatch.fitting.fitter import side_words
 from meshmatch.fitting.judge.calibration import calibration_of
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree_step, log_stretch
 from meshmatch.fitting.solve.regularity import Regularity
@@ -77,6 +78,11 @@ def fit_alone(task: FitTask) -> Record:
         if fit.signs is not None and not doubted:
             likely = fit.signs.p_correct(calibration_of(setting.trained.card.category))
         distance, furthest = surface_distance(fit.repaired.shape, fit.shape, fit.partial)
+        said = list(fit.repaired.notes[:1]) if fit.left_out else []
+        if setting.model == NO_MODEL:
+            said += fit.notes
+        elif fit.frame.mirrored:
+            said.append(side_words(setting.trained.card))
         record = Record(
             name=source.name,
             file=source.path,
@@ -97,7 +103,7 @@ def fit_alone(task: FitTask) -> Record:
             vertices=fit.repaired.original.V,
             seconds=round(time.monotonic() - began, 3),
             digest=harder if setting.config.try_harder else digest,
-            notes=fit.repaired.notes[0] if fit.left_out else "; ".join(fit.notes) if fit.model == NO_MODEL else "",
+            notes="; ".join(said),
             kind=other,
         )
         words = {"record": asdict(record), "roughness": fit.repaired.shape.roughness}

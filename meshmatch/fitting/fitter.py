@@ -109,9 +109,14 @@ def _spoken_against(fit: Fit) -> bool:
     return any(reason.code != "doubt" for reason in fit.reasons)
 
 
+def side_words(card: ModelCard) -> str:
+    """What is said of a shape that is fitted as a mirror image."""
+    return f"taken for the mirror image of what {card.name} knows"
+
+
 def with_side(notes: Sequence[str], name: str, card: ModelCard, mirrored: bool) -> tuple[str, ...]:
     """What is said of a fit, with whether its shape was taken for a mirror image."""
-    of_mirror_image = f"{name}: taken for the mirror image of what {card.name} knows"
+    of_mirror_image = f"{name}: {side_words(card)}"
     return (*([of_mirror_image] if mirrored else []), *(note for note in notes if note != of_mirror_image))
 
 

@@ -61,6 +61,13 @@ def test_the_mirror_image_is_fitted_in_its_place(one_sided: None) -> None:
     assert volume(dense) > 0
 
 
+def test_a_collection_names_mirror_images(one_sided: None, tmp_path: Path) -> None:
+    quick = FitConfig(mirror="auto", refine="none", copies=16, careful=1)
+    made = meshmatch.Collection(tmp_path / "fits", workers=1).fit(DANCER, model="human", config=quick, agree=False)
+    (record,) = made.records
+    assert (record.mirrored, record.notes) == (1, "taken for the mirror image of what human knows")
+
+
 @pytest.mark.slow
 def test_a_shape_and_its_mirror_image_are_matched(one_sided: None) -> None:
     dancer = meshmatch.load_shape(DANCER)
