@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from meshmatch.api.inputs import check_seed
 from meshmatch.api.kinds import UnitName, error_unit
-from meshmatch.arrays import Brief, Float, Floats
+from meshmatch.arrays import Brief, Float, Floats, off_torch
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.build import build_map
@@ -398,7 +398,7 @@ def evaluate(
         As in `match`.
     truth
         The true target vertex of every source vertex (V_source,); or N vertices of the source and those of the target,
-        ((N,), (N,)).
+        ((N,), (N,)), or an array of such pairs (N, 2).
     backward
         A map from target to source, or its file, for ``bijectivity``; for instance ``result.backward()`` of a match.
     unit
@@ -434,6 +434,9 @@ def evaluate(
     for each in (vertex_map, *([] if backward is None else [backward])):
         check_map(each)
     known = truth if isinstance(truth, tuple) and len(truth) == 2 else (None, truth)
+    if tuple(getattr(truth, "shape", ()))[1:] == (2,):
+        first, second = np.asarray(off_torch(truth)).T
+        known = first, second
     check_seed(seed)
     rng = np.random.default_rng(seed)
     with thread_limit(1):

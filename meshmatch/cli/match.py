@@ -264,7 +264,7 @@ def evaluate(
         found, back = both.forward, both.backward
     else:
         found = meshmatch.load_map(map_file, *shapes)
-    known = options.load_truth(truth, points, shapes[0])
+    known = options.load_truth(truth, points, shapes, (source, target))
     console = Console()
     with console.progress() as report:
         result = meshmatch.evaluate(found, *shapes, known, backward=back, unit=unit, seed=seed, progress=report)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 from typer import Argument, Context, Option
 
 import meshmatch
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.fitting.fit_config import Refine
 from meshmatch.models.registry import AUTO, implicit_folder
 from meshmatch.outputs import replace_on_success
@@ -54,7 +54,8 @@ Points = Annotated[
     tuple[Path, Path] | None,
     Option(
         metavar="FILE FILE",
-        help="Ground truth as two lists: vertices of SOURCE, and the corresponding vertices of TARGET.",
+        help="Ground truth as two lists: vertices of SOURCE, and the corresponding vertices of TARGET; or landmarks of "
+        "both, with the same names, in any format of `transfer-landmarks`.",
     ),
 ]
 PAIRS_HELP = (
@@ -124,25 +125,48 @@ class _Enough(Exception):
 
 
 def load_truth(
-    truth: Path | None, points: tuple[Path, Path] | None, source: meshmatch.Shape
+    truth: Path | None,
+    points: tuple[Path, Path] | None,
+    shapes: tuple[meshmatch.Shape, meshmatch.Shape],
+    files: tuple[Path, Path] | None = None,
 ) -> tuple[Ints, Ints] | None:
-    """True points on source and target, where they are known."""
+    """True points on source and target, where they are known; the shapes' files may say the frame of landmarks."""
     import numpy as np
 
     from meshmatch.shapes import vertex_lists
 
     if points is not None:
-        return vertex_lists.load_points(points[0]), vertex_lists.load_points(points[1])
+        return _load_points(points, shapes, files)
     if truth is None:
         return None
-    rows = vertex_lists.load_truth(truth)
-    if rows.shape[1] == 2:
-        return rows[:, 0], rows[:, 1]
-    column = rows[:, 0]
-    if len(column) != source.V:
-        hint = "ground truth in one column needs an entry for every vertex of the source"
-        raise InputError(f"{truth.name} has {len(column)} entries, but {source.name} has {source.V} vertices", hint)
-    return np.arange(source.V), column
+    rows, source = vertex_lists.load_truth(truth), shapes[0]
+    if rows.shape[1] == 1:
+        if len(rows) != source.V:
+            hint = "ground truth in one column needs an entry for every vertex of the source"
+            raise InputError(f"{truth.name} has {len(rows)} entries, but {source.name} has {source.V} vertices", hint)
+        rows = np.column_stack([np.arange(source.V), rows])
+    known = rows[(rows >= 0).all(axis=1)]
+    if len(known) < len(rows):
+        warn(f"{truth.name}: {len(rows) - len(known)} of {len(rows)} vertices have no counterpart: left out")
+    return known[:, 0], known[:, 1]
+
+
+def _load_points(
+    points: tuple[Path, Path], shapes: tuple[meshmatch.Shape, meshmatch.Shape], files: tuple[Path, Path] | None
+) -> tuple[Ints, Ints]:
+    """Two lists of vertices; or else two files of landmarks."""
+    from meshmatch.shapes import vertex_lists
+    from meshmatch.shapes.landmark_files import mesh_space
+    from meshmatch.transfer.landmarks import known_pairs
+
+    try:
+        return vertex_lists.load_points(points[0]), vertex_lists.load_points(points[1])
+    except InputError as error:
+        try:
+            return known_pairs(points, shapes, [mesh_space(file) for file in files or ()] or ["", ""])
+        except InputError as other:
+            lists = {".csv", ".txt", ".npy"} >= {each.suffix.lower() for each in points}
+            raise (error if lists else other) from None
 
 
 class Options:

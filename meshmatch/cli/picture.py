@@ -233,7 +233,7 @@ def _compose_map(shown: PictureOptions, file: Path, shapes: "list[meshmatch.Shap
         found = meshmatch.load_map(file, source, target)
     if shown.confidence:
         return compose_confidence(source, target, found, look)
-    known = options.load_truth(shown.truth, shown.points, source)
+    known = options.load_truth(shown.truth, shown.points, (source, target))
     if known is None:
         return compose_match(source, target, found, look=look)
     from meshmatch.api.kinds import error_unit

@@ -232,8 +232,9 @@ def map_errors(
     if a.shape != b.shape or a.ndim != 1 or not a.size:
         raise InputError(f"the truth has {a.shape} vertices of the source and {b.shape} of the target", _TRUTH)
     for ids, size, side in ((a, len(index), "source"), (b, geodesics.V, "target")):
-        if ids.min() < 0 or ids.max() >= size:
-            raise InputError(f"the truth names points that are not among the {size} vertices of the {side}")
+        if (wrong := ids[(ids < 0) | (ids >= size)]).size:
+            hint = "vertices are counted from 0 (subtract 1 from those of MATLAB and R), and those of the source come first"
+            raise InputError(f"the truth names vertex {wrong[0]} of the {side}, which has {size}", hint)
     return Errors(geodesics.between(index[a], b, progress).astype(np.float32))
 
 

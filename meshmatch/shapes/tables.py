@@ -407,7 +407,8 @@ def read_by_suffix(path: str | Path, readers: Mapping[str, Callable[[Path], T]],
         words = error.message if error.message.startswith(path.name) else f"{path.name}: {error.message}"
         raise type(error)(words, error.hint or hint) from error
     except _DAMAGE as error:
-        raise InputError(f"{path.name} does not hold {what} that can be read: {error}", hint) from error
+        why = "it is not text" if isinstance(error, UnicodeDecodeError) else error
+        raise InputError(f"{path.name} does not hold {what} that can be read: {why}", hint) from error
 
 
 def is_numbered(numbers: ArrayLike | Sequence[str]) -> bool:

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.input_files import read_npy
 from meshmatch.shapes.tables import DECIMAL_COMMA, read_by_suffix, read_table, whole
 
-_PAIRS = "one pair a line: a vertex of the source, then a vertex of the target, counted from 0"
-_POINTS = "one vertex a line, counted from 0"
+_PAIRS = "one pair a line of text (or .npy): a vertex of the source, then a vertex of the target, counted from 0"
+_POINTS = "one vertex a line of text (or .npy), counted from 0"
 _TRUTH = f"{_PAIRS}; or for each vertex of the source the target's alone"
 
 
@@ -31,15 +33,20 @@ def load_points(path: str | Path) -> Int[Ints, " N"]:
 
 
 def load_truth(path: str | Path) -> Int[Ints, "N columns"]:
-    """Read pairs as `load_pairs`, in two columns, or for each vertex of the source its partner, in one."""
-    return _vertices(Path(path), (1, 2), _TRUTH)
+    """Read pairs as `load_pairs`, in two columns, or for each vertex of the source its partner, in one; -1 for none."""
+    return _vertices(Path(path), (1, 2), _TRUTH, missing=True)
 
 
-def _vertices(path: Path, columns: tuple[int, ...], hint: str) -> Ints:
-    """(N, columns) numbers of vertices."""
+def _vertices(path: Path, columns: tuple[int, ...], hint: str, missing: bool = False) -> Ints:
+    """(N, columns) numbers of vertices; some may be ``missing``, in the file -1 or nan."""
     suffix = path.suffix.lower()
     read = read_npy if suffix == ".npy" else lambda path: read_table(path, comments="ends", whole=True).numbers()[1]
-    rows = read_by_suffix(path, {suffix: lambda path: whole(read(path))}, "vertices", hint)
+
+    def numbers(path: Path) -> Ints:
+        found = read(path)
+        return whole(np.nan_to_num(found, nan=-1.0) if missing and found.dtype.kind == "f" else found)
+
+    rows = read_by_suffix(path, {suffix: numbers}, "vertices", hint)
     if rows.ndim == 1 and 1 in columns:
         rows = rows[:, None]
     if rows.size == 0:
@@ -49,6 +56,6 @@ def _vertices(path: Path, columns: tuple[int, ...], hint: str) -> Ints:
         comma = f"; {DECIMAL_COMMA}" if columns == (1,) and rows.shape[1:] == (2,) else ""
         asked = " or ".join(str(n) for n in columns)
         raise InputError(f"{path.name} has {shape} numbers, not {asked} a line", hint + comma)
-    if rows.min() < 0:
+    if rows.min() < (-1 if missing else 0):
         raise InputError(f"{path.name} names vertex {int(rows.min())}", hint)
     return rows

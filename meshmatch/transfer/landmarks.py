@@ -208,6 +208,28 @@ def landmarks_with_warnings(path: str | Path, shape: Shape, space: Space = "") -
     return found
 
 
+def known_pairs(
+    files: tuple[Path, Path], shapes: tuple[Shape, Shape], spaces: Sequence[Space] = ("", "")
+) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
+    """The same landmarks on two shapes, by their names, or in their order where no name is in both files: the vertices
+    nearest to them, for a truth. `InputError` as `load_landmarks`; warns of those that are in one file alone.
+    """
+    read = [landmarks_with_warnings(*each) for each in zip(files, shapes, spaces, strict=True)]
+    rows = [{name: row for row, name in enumerate(each.names)} for each in read]
+    if both := [name for name in rows[0] if name in rows[1]]:
+        for k in range(2):
+            if alone := [name for name in rows[k] if name not in rows[1 - k]]:
+                told = ", ".join(alone[:5]) + ", ..." * (len(alone) > 5)
+                warn(f"{files[k].name}: {files[1 - k].name} has no {told}: left out")
+        first, second = (each.vertex[[row[name] for name in both]] for each, row in zip(read, rows, strict=True))
+        return first, second
+    if len(read[0].names) != len(read[1].names):
+        counts = " and ".join(f"{len(each.names)} in {file.name}" for each, file in zip(read, files, strict=True))
+        raise InputError(f"no landmark is in both files by its name: {counts}", "give the same names in both")
+    warn(f"{files[0].name} and {files[1].name} have no name in common: their landmarks are taken in order")
+    return read[0].vertex, read[1].vertex
+
+
 def warn_of_far_ones(shape: Shape, furthest: float) -> None:
     """Warn where the landmark that lies furthest from a shape is clearly not on it."""
     if furthest > _FAR * shape.diagonal:

@@ -74,6 +74,43 @@ def test_every_form_of_the_truth_gives_the_same_errors(evaluate: Callable[[str],
     assert 0.05 < record["share_over_threshold"] <= 64 / V
 
 
+@pytest.mark.parametrize("nothing", ["-1", "nan", "NA"])
+def test_vertices_without_a_counterpart_are_left_out(run: Run, folder: Path, nothing: str) -> None:
+    Path("column.txt").write_text("\n".join(nothing if i % 2 else str(i) for i in range(V)))
+    answer = well(run("evaluate", "map.npy", "a.ply", "b.ply", "--truth", "column.txt", "--json"))
+    assert json.loads(answer.out)["points"] == V // 2
+    assert f"column.txt: {V // 2} of {V} vertices have no counterpart: left out" in answer.err
+
+
+def fcsv(*names: str) -> str:
+    """Landmarks of 3D Slicer at the first vertices of the sphere."""
+    at = load_shape("a.ply").verts
+    rows = (f"{k},{x},{y},{z},0,0,0,1,1,1,0,{names[k]},," for k, (x, y, z) in enumerate(at[: len(names)]))
+    return "# CoordinateSystem = LPS\n" + "\n".join(rows)
+
+
+def test_landmarks_of_both_shapes_are_a_truth(run: Run, folder: Path) -> None:
+    """By their names, in whatever order, as files of 3D Slicer or as tables that meshmatch wrote."""
+    rows = zip(("groove", "notch", "spur"), load_shape("b.ply").verts[[2, 0, 1]], strict=True)
+    Path("a.fcsv").write_text(fcsv("notch", "condyle", "groove"))
+    Path("b.csv").write_text("name,x,y,z\n" + "\n".join(f"{name},{x},{y},{z}" for name, (x, y, z) in rows))
+    answer = well(run("evaluate", "map.npy", "a.ply", "b.ply", "--points", "a.fcsv", "b.csv", "--json"))
+    record = json.loads(answer.out)
+    assert (record["points"], record["mean"]) == (2, 0.0)
+    assert "a.fcsv: b.csv has no condyle: left out" in answer.err and "b.csv: a.fcsv has no spur" in answer.err
+    Path("other.csv").write_text("name,vertex\nA,0\nB,1\nC,2")
+    answer = well(run("evaluate", "map.npy", "a.ply", "b.ply", "--points", "a.fcsv", "other.csv", "--json"))
+    assert (
+        json.loads(answer.out)["mean"] == 0.0 and "no name in common: their landmarks are taken in order" in answer.err
+    )
+
+
+def test_pairs_are_a_truth_in_python_too(folder: Path) -> None:
+    pairs = np.array([[0, 0], [641, 641]])
+    found = meshmatch.evaluate("map.npy", "a.ply", "b.ply", pairs)
+    assert found.errors is not None and found.errors.values.shape == (2,) and found.errors.values[0] == 0
+
+
 @pytest.mark.parametrize(("pairs", "right"), [("0 0\n5 5\n577 577\n", True), ("641 641\n", False)])
 def test_truth_about_good_vertices_alone_is_0(evaluate: Callable[[str], Answer], pairs: str, right: bool) -> None:
     Path("t.txt").write_text(pairs)
@@ -140,7 +177,10 @@ def test_units_draw_different_curves(evaluate: Callable[[str], Answer]) -> None:
         ("--truth short.txt", "3 entries"),
         ("--truth none.txt", "none.txt"),
         ("--truth wide.txt", "not 1 or 2 a line"),
-        ("--truth outside.txt", "not among the 642 vertices"),
+        ("--truth outside.txt", "names vertex 642 of the target, which has 642"),
+        ("--truth outside.txt", "subtract 1"),
+        ("--truth none.mat", "it is not text"),
+        ("--points a.fcsv b.fcsv", "no landmark is in both files"),
         ("--truth short.txt --points short.txt short.txt", "choose one"),
         ("--curve c.png", "needs ground truth"),
         ("--truth pairs.csv --curve c.jpg", "c.jpg"),
@@ -155,6 +195,9 @@ def test_what_cannot_be_is_told_before_the_work(run: Run, folder: Path, words: s
     Path("short.txt").write_text("0\n1\n2\n")
     Path("wide.txt").write_text("0 1 2\n")
     Path("outside.txt").write_text("0 642\n")
+    Path("none.mat").write_bytes(bytes(range(256)))
+    Path("a.fcsv").write_text(fcsv("a", "b"))
+    Path("b.fcsv").write_text(fcsv("c"))
     answer = run("evaluate", "map.npy", "a.ply", "b.ply", *words.split())
     refused(answer, told, folder, {path.name for path in folder.iterdir()})
 
