@@ -1,6 +1,6 @@
 """``meshmatch fit`` and ``map``: many shapes fitted once, and maps of any two of them."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from itertools import count
 from pathlib import Path
@@ -101,9 +101,14 @@ def fit(
 
 
 def _tell_lengths(console: Console, records: "Sequence[Record]", model: str) -> None:
-    """Say how near the fits are, in the unit of the files; warn where these seem to have several."""
+    """Say how near the fits are, in the unit of the files; warn where these seem to have several, or are copies."""
     from meshmatch.collections.registered import mixed_units
 
+    same = defaultdict(list)
+    for each in (each for each in records if each.fitted and each.digest):
+        same[each.digest].append(each.name)
+    for names in (names for names in same.values() if len(names) > 1):
+        console.warn(f"{' and '.join(names)} are copies of one file: an atlas counts it as often")
     near = [each for each in records if each.verdict in ("good", "fair") and each.distance >= 0 and each.scale > 0]
     if units := mixed_units([each.name for each in near], [each.scale for each in near]):
         console.warn(units)

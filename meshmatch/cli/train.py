@@ -2,6 +2,7 @@
 
 import math
 import os
+import shlex
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -435,9 +436,10 @@ def _summary(
         before = [now.validation for now in reports if now.validation is not None and now.step <= _APART * card.steps]
         falls = f", {'still falling' if distance < _FALLS * before[-1] else 'no longer falling'}" if before else ""
         console.say(f"off by {100 * distance:.2g} % of sqrt(area) on shapes that were not learned{falls}")
+    own = shlex.quote(str(output))
     console.say(
         f"wrote model {card.name}, learned from {card.data}, to {output} after step {card.steps}; use it with "
-        f"--model {output}, or add it: meshmatch models add {output}"
+        f"--model {own}, or add it: meshmatch models add {own}"
     )
     if card.steps < steps:
         console.say(f"unfinished: step {card.steps:,} of {steps:,}; the same command goes on")

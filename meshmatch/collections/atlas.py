@@ -117,7 +117,7 @@ class Atlas(Brief, Pickled):
         Parameters
         ----------
         points
-            (S, V, 3), which may be a list or a memory-mapped array.
+            (S, V, 3), which may be a list, also of `Shape`, or a memory-mapped array.
         faces
             (F, 3).
         names
@@ -152,6 +152,8 @@ class Atlas(Brief, Pickled):
             raise OptionError(f"invalid scale {scale!r}", f"choose one of {', '.join(get_args(Scale))}")
         if modes < 1:
             raise OptionError(f"an atlas has one mode or more, not {modes}")
+        if not hasattr(points, "shape"):
+            points = [np.asarray(getattr(each, "verts", each)) for each in points]
         called = tuple(names) if names is not None else tuple(f"shape-{k:03d}" for k in range(len(points)))
         if len(called) != len(points) or len(set(called)) < len(called):
             raise InputError(f"{len(points)} shapes need as many different names", "one for each, in their order")

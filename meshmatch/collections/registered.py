@@ -176,7 +176,8 @@ def mixed_units(names: Sequence[str], sizes: Sequence[float] | Floats) -> str:
     if len(sizes) == 0 or (times := size_ratio(sizes)) <= _ODD:
         return ""
     large, small = names[int(np.argmax(sizes))], names[int(np.argmin(sizes))]
-    return f"{large} is {times:.3g} times as large as {small}: do the files have one unit?"
+    words = f"{times:,.0f}" if times >= 100 else f"{times:.3g}"
+    return f"{large} is {words} times as large as {small}: do the files have one unit?"
 
 
 def outlying(distances: Float[Floats, " S"]) -> Int[Ints, " N"]:

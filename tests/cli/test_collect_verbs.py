@@ -82,7 +82,15 @@ def test_lengths_have_one_unit_or_none_is_told(capsys: pytest.CaptureFixture[str
     assert "surfaces lie 0.2 apart on average, 3 at most, in the unit of the files" in capsys.readouterr().err
     _tell_lengths(Console(False), [fit, replace(fit, name="metres", scale=0.09)], "none")
     told = " ".join(capsys.readouterr().err.split())
-    assert told == "warning: a is 1e+03 times as large as metres: do the files have one unit?"
+    assert told == "warning: a is 1,000 times as large as metres: do the files have one unit?"
+
+
+def test_copies_of_one_file_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    a = Record("a", "a.ply", "good", distance=0.2, furthest=3.0, scale=90.0, digest="1")
+    _tell_lengths(Console(False), [a, replace(a, name="other", digest="2"), replace(a, name="again")], "none")
+    assert "warning: a and again are copies of one file: an atlas counts it as often" in capsys.readouterr().err
+    _tell_lengths(Console(False), [a, replace(a, name="b", digest="2")], "none")
+    assert "warning" not in capsys.readouterr().err
 
 
 def test_maps_of_names(fits: Path, run: Run, tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> Recorder:
 
 
 def test_defaults(run: Run, stub: Recorder, tmp_path: Path) -> None:
-    answer = run("train", "-o", tmp_path / "mine")
+    answer = run("train", "-o", tmp_path / "my own", "--name", "mine")
     assert (answer.status, answer.out) == (0, "")
     assert stub.bodies == ("human-T", 4096, 0)
     called = stub.called
@@ -81,7 +81,7 @@ def test_defaults(run: Run, stub: Recorder, tmp_path: Path) -> None:
     assert called["recipe"] == recipe_for()
     assert "step 2 of 2: total 0.25, validation 0.0321 (8 s)" in answer.err
     assert "off by 3.2 % of sqrt(area) on shapes that were not learned, still falling" in answer.err
-    assert f"meshmatch models add {tmp_path / 'mine'}" in answer.err
+    assert f"meshmatch models add '{tmp_path / 'my own'}'" in answer.err
     assert "unfinished: step 2 of 13,000; the same command goes on" in answer.err
 
 

@@ -14,6 +14,7 @@ from meshmatch.collections.atlas_arrays import FILE
 from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.triangles import vertex_areas
+from meshmatch.shapes.shape import Shape
 from tests.collections.ellipsoids import AXES, SPREAD, ellipsoids, moved
 from tests.conftest import icosphere, some_fit
 
@@ -42,6 +43,12 @@ def test_three_octahedra_by_hand() -> None:
     assert np.allclose(atlas.distance_from_mean("a"), [0, 0, 0, 0, 1, 1])
     assert np.allclose(atlas.sizes**2, [(1 + 4 + 4) / 3, (1 + 4 + 9) / 3, (1 + 4 + 16) / 3])
     assert np.allclose(atlas.compactness, 1)
+
+
+def test_shapes_and_generators_are_points_too() -> None:
+    points = OCTAHEDRON * (1 + np.array([-1, 0, 1])[:, None, None] / 3 * [0, 0, 1])
+    for given in ([Shape(each, OCTAHEDRON_FACES) for each in points], (each for each in points)):
+        assert np.array_equal(Atlas.of(given, OCTAHEDRON_FACES).mean, Atlas.of(points, OCTAHEDRON_FACES).mean)
 
 
 def test_the_textbook_says_the_same() -> None:

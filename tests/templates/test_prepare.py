@@ -98,11 +98,17 @@ def test_what_cannot_be_read_is_noted_and_left_out(folder: Path, tmp_path: Path,
     (folder / "empty.off").touch()
     (folder / "notes.txt").write_text("not a shape")
     np.save(folder / "point.npy", np.zeros((300, 3)))  # has no area
+    for name in ("left/old", ".hidden", "tables"):
+        (folder / name).mkdir(parents=True)
+    save_shape(folder / "left" / "old" / "a.ply", sphere)
+    save_shape(folder / ".hidden" / "a.ply", sphere)
+    (folder / "tables" / "a.csv").touch()
     save_shape(folder / "dirty.obj", Shape(np.concatenate([sphere.verts, FAR[None]]), sphere.faces))
     made = prepared(folder, tmp_path / "out", FEW, align="none", mirror="no")
     notes = "\n".join(made.notes)
     for name in ("broken.ply left out", "empty.off left out", "point.npy left out", "dirty.obj: 1 vertex"):
         assert name in notes
+    assert f"left out, for they lie in folders of {folder.name}: shapes of left" in made.notes
     assert len(made.names) == 4
 
 
