@@ -456,7 +456,7 @@ def transfer_landmarks(
     found = found.without(found.missing | (found.confidence < rule.minimum))
     lost = int(found.missing.sum())
     low = LowConfidence(len(found.names), lost, lost)
-    file = Path(target) if isinstance(target, str | Path) else None
+    file = _file_of(target)
     return Transferred(found, found.confidence, low, maps, partial(_write_landmarks, found, maps.target, file))
 
 

@@ -32,7 +32,7 @@ def transfer_color(
     rules: RuleOptions,
     run: RunOptions,
     values: Path | None = optional(
-        "FILE", "Transfer these numbers, a row per vertex of SRC (.npy or .csv), not its colors."
+        "FILE", "Transfer these numbers, a row per vertex of SRC (.npy, .csv, or a .vtp with arrays), not its colors."
     ),
     directions: bool = Option(
         False,

@@ -272,7 +272,8 @@ def _drop_others(store: Store, records: Sequence[Record]) -> None:
     for name in others:
         store.remove(f"{FITS}/{name}{SUFFIX}")
     if gone := [name for name in others if name not in fitted]:
-        warn(f"{store.location}: no longer in it, for their files are gone or have other names: {_named(gone)}")
+        why = "no longer in it, for their files are gone or have other names"
+        warn(f"{store.location}: {why}: {_named(gone)}; shapes that are given again join it again")
 
 
 @dataclass(frozen=True)

@@ -250,7 +250,7 @@ def save_labels(path: Path, labels: Labels, shape: Shape, file: Path | None = No
 
 def _write_shape(path: Path, labels: Labels, shape: Shape, suffix: str, file: Path | None) -> None:
     """Whole numbers as they are; words by their number, which comments at the beginning explain."""
-    from meshmatch.shapes.formats import ply, ply_edit, vtk, vtp_edit
+    from meshmatch.shapes.formats import ply, ply_edit, vtk, vtk_xml, vtp_edit
 
     numbers = [k if labels.are_words else int(name) for k, name in enumerate(labels.names)]
     comments = [f"label {k} {name}" for k, name in enumerate(labels.names)] if labels.are_words else []
@@ -265,7 +265,8 @@ def _write_shape(path: Path, labels: Labels, shape: Shape, suffix: str, file: Pa
         if file is not None and data is not None:
             path.write_bytes(vtp_edit.with_arrays(file.name, data, of_points, of_faces, comments))
         else:
-            vtk.write_vtp(path, plain, of_points, of_faces, comments)
+            kept = {name: each for name, each in vtk_xml.point_arrays(file).items() if name not in arrays}
+            vtk.write_vtp(path, plain, {**kept, **of_points}, of_faces, comments)
         return
     columns: dict[str, Any] = {"label": np.array(numbers, np.int32)[labels.codes]}
     columns |= {channel: colors[:, k] for k, channel in enumerate(("red", "green", "blue"))}

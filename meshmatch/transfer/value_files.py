@@ -19,7 +19,7 @@ from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.shapes import tables
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.dressed_files import save_colored
-from meshmatch.shapes.formats import ply, ply_edit, vtk, vtp_edit
+from meshmatch.shapes.formats import ply, ply_edit, vtk, vtk_xml, vtp_edit
 from meshmatch.shapes.input_files import read_npy
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import read_table
@@ -29,7 +29,7 @@ _COLOR_SUFFIXES = (".ply", ".glb", ".vrm", ".obj", ".off", ".vtp", ".vtk", ".npy
 check_values_suffix = partial(tables.check_suffix, suffixes=VALUE_SUFFIXES, what="values")
 check_color_suffix = partial(tables.check_suffix, suffixes=_COLOR_SUFFIXES, what="vertex colors")
 _VISIBLE = 1e-7  # share of a number, unless it is whole, that a 32-bit one may differ by
-_HINT = "one row of numbers for each vertex of the source, in the order of its file: .npy or .csv"
+_HINT = "one row of numbers for each vertex of the source, in the order of its file: .npy, .csv or .vtp"
 # Properties that a ply has already.
 _RESERVED = {"x", "y", "z", "red", "green", "blue", "alpha", "r", "g", "b", "a"}
 
@@ -45,6 +45,7 @@ class Values:
 def load_values(path: str | Path, shape: Shape) -> Values:
     """Read numbers of the vertices of `shape`; `InputError` if there is not one row for each."""
     readers = {".npy": _read_npy} | dict.fromkeys((".csv", ".txt"), lambda path: _read_text(path, shape.V))
+    readers |= dict.fromkeys(vtk_xml.SUFFIXES, _read_arrays)
     found: Values = tables.read_by_suffix(path, readers, "values", _HINT)
     name, rows = Path(path).name, len(found.numbers)
     if rows != shape.V:
@@ -59,6 +60,17 @@ def _read_npy(path: Path) -> Values:
     if array.dtype.kind not in "fiub" or array.ndim not in (1, 2):
         raise InputError(f"it holds an array of {array.shape} {array.dtype}, not numbers")
     return Values(array.astype(np.float64))
+
+
+def _read_arrays(path: Path) -> Values:
+    """All arrays of the points, such as those of ParaView and 3D Slicer; of vectors a column for each number."""
+    arrays = vtk_xml.point_arrays(path)
+    if not arrays:
+        raise InputError(f"{path.name} has no numbers at its points")
+    columns = {name: values.reshape(len(values), -1).astype(np.float64) for name, values in arrays.items()}
+    names = [f"{n}_{k}" if len(v.T) > 1 else n for n, v in columns.items() for k in range(len(v.T))]
+    table = np.column_stack(list(columns.values()))
+    return Values(table[:, 0] if len(names) == 1 else table, tuple(names))
 
 
 def _read_text(path: Path, count: int) -> Values:
@@ -102,12 +114,14 @@ def save_values(path: Path, values: Values, shape: Shape, file: Path | None = No
     elif suffix == ".csv":
         tables.write_rows(path, ["vertex", *names], ([k, *row] for k, row in enumerate(table.tolist())))
     elif suffix in (".vtp", ".vtk"):
-        arrays = dict(zip(_different([name or "value" for name in names], set()), table.T, strict=True))
+        there = vtk_xml.point_arrays(file) if suffix == ".vtp" else {}
+        own = _different([name or "value" for name in names], set(there))
+        arrays = dict(zip(own, table.T, strict=True))
         data = vtp_edit.data_of(file, shape) if suffix == ".vtp" else None
         if file is not None and data is not None:
             path.write_bytes(vtp_edit.with_arrays(file.name, data, arrays, {}))
         else:
-            (vtk.write_vtp if suffix == ".vtp" else vtk.write_vtk)(path, shape, arrays)
+            (vtk.write_vtp if suffix == ".vtp" else vtk.write_vtk)(path, shape, {**there, **arrays})
     else:
         words = ["".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in name) for name in names]
         own = _different([word or "value" for word in words], _RESERVED)

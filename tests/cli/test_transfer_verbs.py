@@ -15,6 +15,8 @@ import pytest
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.formats.vtk import write_vtp
+from meshmatch.shapes.formats.vtk_xml import point_arrays
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.transfer.label_files import load_labels
@@ -58,6 +60,17 @@ def call(words: str, map: str = "ab.npz", out: str = "") -> list[str]:
 def record(answer: Answer) -> dict[str, Any]:
     found: dict[str, Any] = json.loads(well(answer).out)
     return found
+
+
+def test_a_vtp_keeps_its_arrays(run: Run, pair: Path) -> None:
+    a, b = load_shape("a.ply"), load_shape("b.ply")
+    write_vtp(Path("a.vtp"), a, {"height": a.verts[:, 2]})
+    write_vtp(Path("b.vtp"), b, {"thickness": np.arange(b.V)})
+    given = {"color": ["--values", "a.vtp"], "labels": ["--labels", "labels.npy"]}
+    for noun, options in given.items():
+        well(run(f"transfer-{noun}", "a.ply", "b.vtp", "-o", f"{noun}.vtp", *options, "--map", "ab.npz"))
+    assert list(point_arrays(Path("color.vtp"))) == ["thickness", "height"]
+    assert list(point_arrays(Path("labels.vtp"))) == ["thickness", "label"]
 
 
 @pytest.mark.parametrize("out", ["out.ply", "out.glb", "out.obj", "out.off", "out.npy", "out.csv"])

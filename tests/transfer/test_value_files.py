@@ -11,7 +11,10 @@ import pytest
 from meshmatch.errors import InputError, MeshmatchWarning, OptionError
 from meshmatch.shapes.colors import seen
 from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.formats.vtk import write_vtp
+from meshmatch.shapes.formats.vtk_xml import point_arrays
 from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.label_files import labels_of, save_labels
 from meshmatch.transfer.value_files import (
     Values,
     _different,
@@ -132,6 +135,25 @@ def test_what_cannot_stand_for_nothing(text: str) -> None:
     for columns, given in ((3, text), (1, text if "," not in text else "#ff0000")):
         with pytest.raises(OptionError, match="needed"):
             parse_blank(given, columns)
+
+
+def test_arrays_of_vtk_are_values_and_stay(tmp_path: Path) -> None:
+    """Of a file that ParaView shows: read as values, and kept beside those that are transferred to its shape."""
+    own = tmp_path / "own.vtp"
+    thick, normals = NUMBERS[:, 0], SHAPE.vertex_normals
+    write_vtp(own, painted(), {"thickness": thick, "Normals": normals, "site": np.arange(SHAPE.V)})
+    found = load_values(own, SHAPE)
+    assert found.names == ("thickness", "Normals_0", "Normals_1", "Normals_2", "site")
+    assert np.array_equal(found.numbers, np.column_stack([thick, normals, np.arange(SHAPE.V)]))
+    save_values(tmp_path / "out.vtp", Values(NUMBERS[:, :2], ("site", "age")), SHAPE, own)
+    arrays = point_arrays(tmp_path / "out.vtp")
+    assert list(arrays) == ["thickness", "Normals", "site", "site_", "age"]
+    assert np.array_equal(arrays["site_"], NUMBERS[:, 0]) and np.array_equal(arrays["Normals"], normals)
+    save_labels(tmp_path / "labels.vtp", labels_of(["a"] * SHAPE.V, SHAPE), SHAPE, own)
+    assert {"thickness", "site", "label"} < set(point_arrays(tmp_path / "labels.vtp"))
+    write_vtp(own, painted())
+    with pytest.raises(InputError, match=r"own\.vtp has no numbers at its points"):
+        load_values(own, SHAPE)
 
 
 @pytest.mark.parametrize("name", ["v.obj", "v"])

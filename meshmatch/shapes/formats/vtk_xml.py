@@ -32,6 +32,9 @@ from meshmatch.shapes.formats import (
     painted,
 )
 from meshmatch.shapes.formats.vtk_cells import Cells, raw_of
+from meshmatch.shapes.input_files import read_bytes
+
+SUFFIXES = (".vtp", ".vtu")
 
 TYPES = {
     **{f"Float{8 * n}": f"f{n}" for n in (4, 8)},
@@ -72,6 +75,15 @@ def arrays_of(name: str, data: bytes) -> list[str]:
     return [label for label in dict.fromkeys(str(each.get("Name")) for each in kept) if label != "Normals"]
 
 
+def point_arrays(path: Path | None) -> dict[str, NDArray[Any]]:
+    """Numbers (V,) or (V, D) of the points of a file by name, of several pieces those that all have; but no colors. None of
+    a file of another format.
+    """
+    if path is None or path.suffix.lower() not in SUFFIXES:
+        return {}
+    return _File(path.name, read_bytes(path)).point_arrays()
+
+
 class _File:
     def __init__(self, name: str, data: bytes) -> None:
         self.name, self.size, self.appended, self.encoding = name, len(data), b"", b""
@@ -95,7 +107,7 @@ class _File:
         self.order = ">" if self.root.get("byte_order") == "BigEndian" else "<"
         self.header = np.dtype(self.order + ("u8" if self.root.get("header_type") == "UInt64" else "u4"))
         self.compressor = str(self.root.get("compressor") or "")
-        self.left = 64 * (FEW_PLACES + self.size // 12)  # bytes that may be unpacked
+        self._may_unpack()
 
     def raw(self) -> Raw:
         pieces = self.root.findall("./*/Piece")
@@ -116,6 +128,28 @@ class _File:
             first += count
         painted_ = joined_colors(colors, counts) if pieces else None
         return raw_of(self.name, self.size, np.concatenate(verts), cells, painted_)
+
+    def point_arrays(self) -> dict[str, NDArray[Any]]:
+        parts = [self._of_points(piece) for piece in self.root.findall("./*/Piece")]
+        names = [name for name in parts[0] if all(name in part for part in parts)] if parts else []
+        widths = {name: {part[name].shape[1:] for part in parts} for name in names}
+        return {name: np.concatenate([part[name] for part in parts]) for name in names if len(widths[name]) == 1}
+
+    def _of_points(self, piece: ElementTree.Element) -> dict[str, NDArray[Any]]:
+        found, count = {}, _count(self.name, piece, "NumberOfPoints")
+        for element in piece.findall("./PointData/DataArray"):
+            components = element.get("NumberOfComponents", "1")
+            width = int(components) if re.fullmatch("[1-9][0-9]{0,3}", components) else 1
+            if element.get("type") in TYPES and not (element.get("type") == "UInt8" and width in (3, 4)):
+                self._may_unpack()
+                values = self._array(element)
+                if values.size == count * width:
+                    found[element.get("Name", "value")] = values.reshape(count, width) if width > 1 else values
+        return found
+
+    def _may_unpack(self) -> None:
+        """So many bytes from now on."""
+        self.left = 64 * (FEW_PLACES + self.size // 12)
 
     def _cells(self, piece: ElementTree.Element) -> list[Cells]:
         found = []
