@@ -11,7 +11,7 @@ from meshmatch.cli.options import RuleOptions, RunOptions, grouped, optional, ou
 from meshmatch.cli.targets import to_targets
 from meshmatch.cli.transfer_options import MapOptions, MapOptionsWithPairs, Picture, Source, Target, Transfer
 from meshmatch.cli.words import Json
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import replace_on_success
 
 On = Literal["vertices", "faces"]
@@ -199,14 +199,20 @@ def _landmark_table(table: Path, given: Mapping[str, Any], source: str, written:
     """Write the landmarks of SRC and all targets as one table."""
     import numpy as np
 
+    from meshmatch.collections.registered import mixed_units
     from meshmatch.shapes.landmark_files import mesh_space
-    from meshmatch.transfer.landmarks import landmark_positions, load_landmarks, save_specimens
+    from meshmatch.transfer.landmarks import landmark_positions, load_landmarks, save_specimens, size_beside
 
     path = given["source"]
     own, _ = load_landmarks(given["landmarks"], meshmatch.load_shape(path), mesh_space(path))
     specimens = {source: own.points} | {name: landmark_positions(file) for name, file in written.items()}
     with replace_on_success(table) as temporary:
         save_specimens(temporary, specimens, own.names)
+    sizes = {name: size_beside(points, own.points) for name, points in specimens.items()}
+    if units := mixed_units(
+        known := [name for name, size in sizes.items() if size > 0], [sizes[name] for name in known]
+    ):
+        warn(units)
     lost = {name: int(np.isnan(points).any(axis=1).sum()) for name, points in specimens.items()}
     missing = ", ".join(f"{count} of {name}" for name, count in lost.items() if count)
     told = f"wrote {table}: {len(own.names)} landmarks of {len(specimens)} specimens, {source} among them"

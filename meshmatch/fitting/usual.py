@@ -114,6 +114,7 @@ class Usual:
         reasons = [reason for reason in fit.reasons if reason.code not in _ALONE]
         if self.stands_out(stretch):
             much = f"stretched or compressed {np.exp(stretch):.1f}-fold, {np.exp(self.stretch):.1f}-fold is usual"
+            reasons = [reason for reason in reasons if reason.code != "crushed"]  # said already
             reasons.insert(0, Reason("outlier", f"stands out of {self.whom}: the template had to be {much}"))
         elif residual > _STANDS_OUT * self.residual:
             apart = f"{100 * residual:.1f} % of sqrt(area) apart, {100 * self.residual:.1f} % is usual"

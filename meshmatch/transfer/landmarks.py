@@ -343,6 +343,15 @@ def landmark_positions(path: Path) -> Float[Floats, "L 3"]:
     return tables.read_by_suffix(path, dict.fromkeys(LANDMARK_READERS, read), "landmarks", _HINT)
 
 
+def size_beside(points: Float[Floats, "L 3"], others: Float[Floats, "L 3"]) -> float:
+    """How many times as far apart landmarks are as the same ones of another shape; 0 where fewer than two are on both."""
+    both = np.isfinite(points + others).all(axis=1)
+    size, other = (
+        np.linalg.norm(each[both] - each[both].mean(axis=0)) if both.any() else 0.0 for each in (points, others)
+    )
+    return float(size / other) if other > 0 else 0.0
+
+
 def save_specimens(path: Path, specimens: Mapping[str, Float[Floats, "L 3"]], names: Sequence[str]) -> None:
     """Write one table of the same landmarks of several specimens, for R and other programs; `OptionError` if it has another
     suffix than .csv (specimen,landmark,x,y,z), .tps, .txt (Morphologika), .npz (points (S, L, 3), specimens, landmarks);

@@ -219,6 +219,16 @@ def test_landmarks_of_all_are_one_table(run: Run, files: Path, stub: FakeMatchin
     assert (rows[0], len(rows), rows[3].startswith("b,0,")) == ("specimen,landmark,x,y,z", 7, True)
 
 
+def test_a_table_of_several_units_is_told(run: Run, files: Path, stub: FakeMatching, sphere: Shape) -> None:
+    save_shape("in/b.ply", Shape(1.1 * sphere.verts, sphere.faces))
+    save_shape("in/sub/c.glb", Shape(sphere.verts, sphere.faces))
+    stub.make_map = lambda a, b, **words: VertexMap.between(a, b, np.arange(a.V))
+    assert "one unit" not in well(run(*LANDMARKS, "--table", "all.csv")).err
+    save_shape("in/sub/c.glb", Shape(0.001 * sphere.verts, sphere.faces))
+    answer = well(run(*LANDMARKS, "--table", "all.csv"))
+    assert "b is 1,100 times as large as sub/c: do the files have one unit?" in " ".join(answer.err.split())
+
+
 def test_what_a_target_lacks_is_missing_in_the_table(run: Run, files: Path, stub: FakeMatching) -> None:
     def unsure(a: Shape, b: Shape, **words: Any) -> VertexMap:
         return replace(nearest_map(a, b, **words), confidence=np.where(np.arange(a.V) == 5, 0.1, 0.9))

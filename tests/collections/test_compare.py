@@ -71,6 +71,9 @@ def test_more_of_a_residual_counts_and_what_a_fit_says_of_itself_stays() -> None
     torn = replace(fit, reasons=(Reason("ambiguous", "two are as good"), UNSURE))
     assert [reason.code for reason in usual.judged(torn, some[0]).reasons] == ["ambiguous"]
     assert usual.judged(torn, some[0]).verdict == "fair"
+    crushed = replace(fit, reasons=(Reason("crushed", "stretched 2.0-fold on average"), Reason("torn", "torn")))
+    told = usual.judged(crushed, replace(some[0], stretch=0.7)).reasons
+    assert [reason.code for reason in told] == ["outlier", "torn"]  # stretch is told once
     assert usual.judged(replace(fit, verdict="poor"), some[0]).verdict == "poor"
     assert usual.judged(fit, replace(some[0], likely=0.3)).verdict == "poor"
 
