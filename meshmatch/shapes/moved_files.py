@@ -22,7 +22,7 @@ from meshmatch.shapes.colors import bytes_of
 from meshmatch.shapes.dressed_files import Dressed, beyond_triangles
 from meshmatch.shapes.files import check_suffix, save_shape
 from meshmatch.shapes.formats import gltf, obj_look, obj_text, ply_edit
-from meshmatch.shapes.formats.gltf_dressed import dressed
+from meshmatch.shapes.formats.gltf_dressed import dressed, laid
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_join import joined
 from meshmatch.shapes.formats.gltf_moved import moved
@@ -30,7 +30,7 @@ from meshmatch.shapes.formats.gltf_rigged import Binding, rigged
 from meshmatch.shapes.formats.gltf_vrm import SUFFIX, check_character
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.textured_files import find_appearance
+from meshmatch.shapes.textured_files import find_appearance, load_coordinates
 
 _WHITE = (1.0, 1.0, 1.0, 1.0)
 
@@ -155,14 +155,17 @@ class MovedFile:
         if as_it_came is not None:
             places[0].write_bytes(as_it_came)
             return
-        look = _look_of(original, shape)
-        worn = _one_image(shape, look) if suffix == ".glb" and look is not None else None
+        look = _look_of(original, shape, suffix == ".glb" and not self.told)
+        uv = _coordinates_of(original, shape) if suffix == ".glb" else None
+        worn = _one_image(shape, look, uv) if suffix == ".glb" and look is not None else None
         if worn is not None:
             worn.write(self.output, places[:1])
         else:
             save_shape(places[0], shape)
+            if uv is not None:
+                places[0].write_bytes(_laid(self.output, places[0].read_bytes(), shape, uv))
         if not self.told:
-            tell_left(self.output, original, _lost(original, look, worn is not None))
+            tell_left(self.output, original, _lost(original, look, worn is not None, uv is not None))
 
 
 def save_moved(
@@ -194,17 +197,19 @@ def check_into(file: Path | None, output: Path) -> None:
 
 
 def with_look(glb: bytes, original: Path | None, shape: Shape) -> tuple[bytes, str]:
-    """A glb that was made of a shape, with the texture or the one color that the shape's file gives it; and what else of a
-    file that is no glTF a glb does not have, for `tell_left`.
+    """A glb that was made of a shape, with the texture coordinates, and the texture or the one color that the shape's file
+    gives it; and what else of a file that is no glTF a glb does not have, for `tell_left`.
     """
     if original is None or original.suffix.lower() in gltf.SUFFIXES:
         return glb, ""
-    look = _look_of(original, shape)
-    worn = None if look is None else _one_image(shape, look)
+    look, uv = _look_of(original, shape), _coordinates_of(original, shape)
+    worn = None if look is None else _one_image(shape, look, uv)
     if worn is not None:
         adding = partial(dressed, uv=worn.uv, own=False, material=worn.material, turn=worn.turn)
         glb = gltf.understood(original, glb, "scene makes", adding)
-    return glb, _lost(original, look, worn is not None)
+    elif uv is not None:
+        glb = _laid(original, glb, shape, uv)
+    return glb, _lost(original, look, worn is not None, uv is not None)
 
 
 def tell_left(output: Path, original: Path | None, lost: str) -> None:
@@ -213,11 +218,32 @@ def tell_left(output: Path, original: Path | None, lost: str) -> None:
         warn(f"{output.name} does not have {lost} of {original.name}")
 
 
-def _look_of(original: Path | None, shape: Shape) -> Appearance | None:
-    """The look of a mesh in its file; an image that is not there is no reason to lose the mesh."""
+def _look_of(original: Path | None, shape: Shape, wanted: bool = True) -> Appearance | None:
+    """The look of a mesh in its file; an image that is not there is told if it is ``wanted``; the mesh is not lost."""
+    if original is None or shape.is_cloud:
+        return None
+    try:
+        return find_appearance(original, shape, plain=True)
+    except InputError as error:
+        if wanted:
+            warn(f"the look of {original.name} is left out: {error.message}")
+        return None
+
+
+def _coordinates_of(original: Path | None, shape: Shape) -> Floats | None:
+    """The texture coordinates of each corner in its file, whatever its materials are; None where a face has none."""
     with suppress(InputError):
-        return None if original is None or shape.is_cloud else find_appearance(original, shape, plain=True)
+        return None if original is None or shape.is_cloud else load_coordinates(original, shape)
     return None
+
+
+def _laid(name: Path, glb: bytes, shape: Shape, uv: Floats) -> bytes:
+    """A glb that was made of a shape, maybe of its valid faces alone, with texture coordinates."""
+
+    def adding(document: gltf.Document) -> bytes:
+        return laid(document, uv if len(document.faces()) == len(uv) else uv[shape.valid_faces])
+
+    return gltf.understood(name, glb, "scene makes", adding)
 
 
 def _turned(document: gltf.Document, turn: Float[Floats, "3 3"]) -> bytes:
@@ -256,26 +282,27 @@ def _scene(output: Path, original: Path, shape: Shape, turns: Float[Floats, "V 3
     return None if found is None else found[0]
 
 
-def _one_image(shape: Shape, look: Appearance) -> Dressed | None:
-    """The mesh with its texture, or its one color, if that is all that its look says."""
+def _one_image(shape: Shape, look: Appearance, coordinates: Floats | None) -> Dressed | None:
+    """The mesh with its texture, or its one color on the coordinates that it has, if that is all that its look says."""
     made = look.materials[0]
     if len(look.materials) != 1 or look.colors is not None or (made.image is None and made.factor == _WHITE):
         return None
     image, uv = made.image, look.uv
     if image is None:
         color = np.append(bytes_of(np.array(made.factor[:3], np.float32)), np.uint8(round(255 * made.factor[3])))
-        image, uv = np.tile(color.astype(np.uint8), (4, 4, 1)), np.full_like(uv, 0.5)
+        image = np.tile(color.astype(np.uint8), (4, 4, 1))
+        uv = np.full_like(look.uv, 0.5) if coordinates is None else coordinates
     return Dressed(shape, None, uv, False, BakedMaterial(image, made.alpha, made.cutoff, made.name))
 
 
-def _lost(original: Path | None, look: Appearance | None, textured: bool) -> str:
+def _lost(original: Path | None, look: Appearance | None, textured: bool, laid_out: bool) -> str:
     """What an output in this format does not have of the original, in words."""
     if original is None:
         return ""
     suffix = original.suffix.lower()
     lost = []
     if look is not None and not textured and (look.textured or len(look.materials) > 1):
-        lost += ["the texture coordinates", "the materials"]
+        lost += ["the materials"] if laid_out else ["the texture coordinates", "the materials"]
     if suffix not in gltf.SUFFIXES:
         lost += [f"the {word}" for word in beyond_triangles(original)]
     else:

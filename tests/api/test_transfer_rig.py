@@ -1,6 +1,8 @@
 """Rigs on other shapes: maps are made by construction."""
 
 import json
+import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from meshmatch.shapes.formats.gltf import Document, digest
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_rig import read_rig
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.textured_files import load_appearance
+from meshmatch.shapes.textured_files import load_appearance, load_coordinates
 from tests.shapes.painted import encoded, quarters, write_document
 from tests.transfer.rigs import AROUND, BEND, KNEE, NODES, played, tube, volume, write_tube
 
@@ -383,6 +385,38 @@ def test_a_mesh_of_an_obj_keeps_its_texture(source: Path) -> None:
     assert np.allclose(kept.uv, given.uv, atol=1e-6)
     assert np.array_equal(kept.materials[0].image, given.materials[0].image)
     assert before.hash in after.made_of  # and so takes its maps
+
+
+@pytest.mark.parametrize(
+    ("library", "told"),
+    [
+        (None, None),
+        ("newmtl one\nKd 1 0 0\n", None),
+        ("newmtl one\nmap_Kd lost.png\n", "the look of target.obj is left out: .*lost.png"),
+        ("newmtl one\nKd 1 0 0\nnewmtl two\nKd 0 1 0\n", "does not have the materials of target.obj"),
+    ],
+)
+def test_a_mesh_of_an_obj_keeps_its_texture_coordinates(source: Path, library: str | None, told: str | None) -> None:
+    """Also without a material, with one color, a lost image, or materials that a glb cannot have."""
+    target, shape = source.with_name("target.obj"), tube()
+    uv = np.random.default_rng(0).random((shape.F, 3, 2))
+    lines = [f"v {x} {y} {z}" for x, y, z in 2 * shape.verts] + [f"vt {u} {v}" for u, v in uv.reshape(-1, 2)]
+    for k, face in enumerate(shape.faces + 1):
+        if k in (0, 5):
+            lines.append("usemtl two" if k and library and "two" in library else "usemtl one")
+        lines.append("f " + " ".join(f"{vertex}/{3 * k + c + 1}" for c, vertex in enumerate(face)))
+    if library is not None:
+        target.with_suffix(".mtl").write_text(library)
+        lines.insert(0, "mtllib target.mtl")
+    target.write_text("\n".join([*lines, ""]))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        out, _ = rigged(source, target)
+    assert [bool(re.search(told, str(each.message))) for each in said] == [True] if told else not said
+    laid = load_coordinates(out, load_shape(out))
+    assert laid is not None and np.allclose(laid, np.stack([uv[..., 0], 1 - uv[..., 1]], axis=2), atol=1e-6)
+    assert load_shape(target).hash in load_shape(out).made_of
+    assert Document(out, out.read_bytes()).json["meshes"][0]["name"] == "target"
 
 
 def test_a_cloud_is_rigged_too(source: Path) -> None:

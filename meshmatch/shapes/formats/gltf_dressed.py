@@ -83,6 +83,21 @@ def dressed(
     return editor.to_bytes()
 
 
+def laid(document: Document, uv: Float[Floats, "F 3 2"]) -> bytes:
+    """The scene as a glb with other texture coordinates of each corner, in the order of its triangles, v down, and the
+    materials that it has; vertices at seams are copied, behind the others.
+    """
+    editor, seen = Editor(document), 0
+    for number, parts in drawn(document).items():
+        mesh = editor.own_mesh(number)
+        for k, part in parts.items():
+            V, faces = document.count(part["attributes"]["POSITION"]), document.triangles(part)
+            corners = uv[seen : seen + len(faces)]
+            seen += len(faces)
+            _lay(editor, document, V, mesh["primitives"][k], split_at_seams(V, faces, corners))
+    return editor.to_bytes()
+
+
 def colored(document: Document, colors: Float[Floats, "V 4"], turn: Float[Floats, "3 3"]) -> bytes:
     """The scene as a glb with other colors of its vertices (sRGB and alpha, 0..1), and turned. Materials that do not show
     them are told.

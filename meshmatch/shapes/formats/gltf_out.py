@@ -45,7 +45,7 @@ def glb_of(shape: Shape, turn: Float[Floats, "3 3"] | None = None) -> bytes:
         attributes["NORMAL"] = smooth_normals(shape.verts, shape.faces)
     if shape.colors is not None:
         attributes["COLOR_0"] = light(shape.colors)
-    return _glb(shape.name, attributes, shape.faces, turn=turn)
+    return _glb(Path(shape.name).stem, attributes, shape.faces, turn=turn)
 
 
 def write_morphs(
@@ -65,7 +65,7 @@ def write_morphs(
     if seconds is not None:  # at each key one target, or none
         weights = np.eye(len(targets) + 1)[:, 1:]
         keys = seconds, np.concatenate([weights, weights[:1]])[: len(seconds)]
-    path.write_bytes(_glb(shape.name, attributes, shape.faces, moves, keys=keys))
+    path.write_bytes(_glb(Path(shape.name).stem, attributes, shape.faces, moves, keys=keys))
 
 
 def center_of(verts: Float[Floats, "V 3"]) -> Float[Floats, " 3"]:
