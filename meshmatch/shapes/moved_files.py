@@ -20,7 +20,7 @@ from meshmatch.outputs import make_folder, replace_all_on_success
 from meshmatch.shapes.appearance import Appearance, BakedMaterial
 from meshmatch.shapes.colors import bytes_of
 from meshmatch.shapes.dressed_files import Dressed, beyond_triangles
-from meshmatch.shapes.files import check_suffix, save_shape
+from meshmatch.shapes.files import check_suffix, load_shape, save_shape
 from meshmatch.shapes.formats import gltf, obj_look, obj_text, ply_edit
 from meshmatch.shapes.formats.gltf_dressed import dressed, laid
 from meshmatch.shapes.formats.gltf_edit import Editor
@@ -155,8 +155,9 @@ class MovedFile:
         if as_it_came is not None:
             places[0].write_bytes(as_it_came)
             return
-        look = _look_of(original, shape, suffix == ".glb" and not self.told)
-        uv = _coordinates_of(original, shape) if suffix == ".glb" else None
+        read = _as_read(original, shape) if suffix == ".glb" else shape
+        look = _look_of(original, read, suffix == ".glb" and not self.told)
+        uv = _coordinates_of(original, read) if suffix == ".glb" else None
         worn = _one_image(shape, look, uv) if suffix == ".glb" and look is not None else None
         if worn is not None:
             worn.write(self.output, places[:1])
@@ -216,6 +217,11 @@ def tell_left(output: Path, original: Path | None, lost: str) -> None:
     """Say what an output does not have of the file that it was made of, if there is anything."""
     if original is not None and lost:
         warn(f"{output.name} does not have {lost} of {original.name}")
+
+
+def _as_read(original: Path | None, shape: Shape) -> Shape:
+    """The mesh as its file has it: where its vertices are says how polygons were split, whose corners have coordinates."""
+    return load_shape(original) if original is not None and original.suffix.lower() in (".obj", ".ply") else shape
 
 
 def _look_of(original: Path | None, shape: Shape, wanted: bool = True) -> Appearance | None:

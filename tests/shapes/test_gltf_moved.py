@@ -17,7 +17,7 @@ from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_morphs import read_morphs
 from meshmatch.shapes.moved_files import save_moved
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.textured_files import load_appearance
+from meshmatch.shapes.textured_files import load_appearance, load_coordinates
 from meshmatch.templates.location import bundled_folder
 from meshmatch.transfer.bake import colors_of_vertices
 from tests.shapes.morphs import SCALE, TURN, UP, write_morphs
@@ -128,6 +128,20 @@ def test_a_node_turns_what_lies_upright(tmp_path: Path, original: bool) -> None:
         assert np.allclose(load_shape(out).verts, expected, atol=1e-6)
     document = Document(tmp_path / "out.glb", (tmp_path / "out.glb").read_bytes())
     assert "upright" in [node.get("name") for node in document.nodes]
+
+
+@pytest.mark.filterwarnings("ignore:out.glb does not have the polygons")
+def test_polygons_keep_their_texture_coordinates(tmp_path: Path) -> None:
+    """Also one that is no longer convex, which a reader would split along the other diagonal."""
+    path, out = tmp_path / "quad.obj", tmp_path / "out.glb"
+    corners = ["0 0", "1 0", "1 1", "0 1"]
+    path.write_text("".join([f"v {c} 0\nvt {c}\n" for c in corners] + ["f 1/1 2/2 3/3 4/4\n"]))
+    shape = load_shape(path)
+    dented = np.array([[0, 0, 0], [0.3, 0.7, 0], [1, 1, 0], [0, 1, 0]])
+    save_moved(out, path, Shape(dented, shape.faces, shape.name), np.tile(np.eye(3), (4, 1, 1)))
+    laid = load_coordinates(out, load_shape(out))
+    assert laid is not None and np.array_equal(load_shape(out).faces, shape.faces)
+    assert np.allclose(laid, shape.verts[shape.faces][..., :2] * [1, -1] + [0, 1])
 
 
 def test_copies_of_a_mesh_become_one_mesh_each(tmp_path: Path) -> None:
