@@ -23,7 +23,7 @@ from meshmatch.shapes.dressed_files import Dressed, beyond_triangles
 from meshmatch.shapes.files import check_suffix, load_shape, save_shape
 from meshmatch.shapes.formats import gltf, obj_look, obj_text, ply_edit
 from meshmatch.shapes.formats.gltf_dressed import dressed, laid
-from meshmatch.shapes.formats.gltf_edit import Editor
+from meshmatch.shapes.formats.gltf_edit import Editor, remembering
 from meshmatch.shapes.formats.gltf_join import joined
 from meshmatch.shapes.formats.gltf_moved import moved
 from meshmatch.shapes.formats.gltf_rigged import Binding, rigged
@@ -266,7 +266,8 @@ def _added(document: gltf.Document, shape: Shape, binding: Binding | None, into:
         rows = np.arange(shape.V) if len(verts) == shape.V else cKDTree(shape.verts).query(verts)[1]
         binding = binding.of(rows)
     if into is not None:
-        return gltf.understood(into, read_bytes(into), "scene makes", lambda body: joined(body, document, binding))
+        both = gltf.understood(into, read_bytes(into), "scene makes", lambda body: joined(body, document, binding))
+        return remembering(both, load_shape(into))
     assert binding is not None
     return rigged(document, binding)[0]
 

@@ -8,7 +8,7 @@ import pytest
 
 import meshmatch
 from meshmatch.api.bound import carried_along
-from meshmatch.errors import MeshmatchWarning, OptionError
+from meshmatch.errors import InputError, MeshmatchWarning, OptionError
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_rig import read_rig
@@ -103,6 +103,20 @@ def test_images_of_both_are_kept(body: Path) -> None:
         replace(result, body=None).save(out, join=True)
     with pytest.raises(OptionError, match="cannot hold the target"):
         result.save(out.with_suffix(".obj"), join=True)
+
+
+def test_another_garment_follows_by_the_same_map(body: Path) -> None:
+    """What the first was put into still takes the maps of the body; not as a source, which would be dressed."""
+    out, more = body.with_name("out.glb"), body.with_name("more.glb")
+    garment, shape = body.with_name("stocking.ply"), load_shape(body)
+    save_shape(garment, stocking())
+    made = same_numbers(shape, shape)
+    meshmatch.transfer_garment(garment, body, body, made).save(out, join=True)
+    meshmatch.transfer_garment(garment, body, out, made).save(more, join=True)
+    assert load_shape(more).V == shape.V + 2 * stocking().V
+    assert set(load_shape(more).made_of) == {shape.hash, load_shape(out).hash}
+    with pytest.raises(InputError, match="the wrong way"):
+        meshmatch.transfer_garment(garment, out, body, made)
 
 
 def test_its_own_joints_go_where_the_skin_goes(body: Path) -> None:
