@@ -14,7 +14,7 @@ from meshmatch.api.results import MapPair
 from meshmatch.api.transfer import MapLike, find_maps
 from meshmatch.api.upright import trust
 from meshmatch.arrays import Brief
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.shapes import tables
 from meshmatch.shapes.files import ShapeLike, as_scene, as_shape, load_shape
@@ -187,7 +187,11 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     a = load_shape(source)
     if source.suffix.lower() not in gltf.SUFFIXES:
         raise InputError(f"{a.name} has no skeleton", f"rigs come in {', '.join(gltf.SUFFIXES)}")
-    rig, weights = read_rig(source, read_bytes(source)), load_weights(source, a)
+    data = read_bytes(source)
+    rig, weights = read_rig(source, data), load_weights(source, a)
+    if physics := gltf.understood(source, data, "scene makes", lambda doc: gltf_vrm.springs_and_constraints(doc.json)):
+        what = "a spring or constraint, which is" if physics == 1 else f"{physics} springs and constraints, which are"
+        warn(f"{a.name} has {what} not transferred")
     b = as_shape(target, "target")
     path, data, in_gltf = as_scene(target, b)
     hanging = gltf.understood(path, data, "scene makes", hanging_groups)

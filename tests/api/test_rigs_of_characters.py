@@ -109,6 +109,7 @@ def test_bones_of_a_character_are_those_that_move_it(tmp_path: Path, source: int
     assert np.abs(shift[(height < 0.75) | (height > 1.95)]).max() < 1e-5
 
 
+@pytest.mark.filterwarnings("ignore:[ab].vrm has .* not transferred")
 def test_what_a_character_loses_is_told(tmp_path: Path) -> None:
     a, old, new = tmp_path / "a.vrm", tmp_path / "old.vrm", tmp_path / "new.vrm"
     write(a, 1)
@@ -123,6 +124,7 @@ def test_what_a_character_loses_is_told(tmp_path: Path) -> None:
         meshmatch.transfer_rig(a, new).save(tmp_path / "out.vrm")
 
 
+@pytest.mark.filterwarnings("ignore:[ab].vrm has .* not transferred")
 @pytest.mark.parametrize("version", [0, 1])
 def test_a_glb_of_a_character_keeps_its_bones(tmp_path: Path, version: int) -> None:
     """They move nothing, but nothing is said of others."""
@@ -136,6 +138,7 @@ def test_a_glb_of_a_character_keeps_its_bones(tmp_path: Path, version: int) -> N
     assert read_rig(out, out.read_bytes()).names[0] == "a"
 
 
+@pytest.mark.filterwarnings("ignore:[ab].vrm has .* not transferred")
 def test_bones_that_nobody_names_make_no_character(tmp_path: Path) -> None:
     a, b, plain = tmp_path / "a.glb", tmp_path / "b.vrm", tmp_path / "plain.glb"
     write(b, 1)
@@ -150,3 +153,14 @@ def test_bones_that_nobody_names_make_no_character(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=r"out.vrm would be no character: plain.glb has no VRM extension"):
         meshmatch.transfer_rig(b, plain).save(tmp_path / "out.vrm")
     assert not (tmp_path / "out.vrm").exists()
+
+
+@pytest.mark.parametrize(
+    ("version", "told"), [(0, "a spring or constraint, which is"), (1, "2 springs and constraints, which are")]
+)
+def test_what_moves_the_source_beside_clips_is_told(tmp_path: Path, version: int, told: str) -> None:
+    a, b = tmp_path / "a.vrm", tmp_path / "b.glb"
+    write(a, version)
+    write_tube(b)
+    with pytest.warns(MeshmatchWarning, match=f"^a.vrm has {told} not transferred$"):
+        meshmatch.transfer_rig(a, b)

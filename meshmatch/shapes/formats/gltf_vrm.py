@@ -132,6 +132,13 @@ def moving_textures(json: Json, materials: Mapping[int, str]) -> list[str]:
     return found
 
 
+def springs_and_constraints(json: Json) -> int:
+    """How many there are that move joints, in either version."""
+    springs = [*entries(json, "extensions", OLD, "secondaryAnimation", "boneGroups")]
+    springs += entries(json, "extensions", SPRINGS, "springs")
+    return len(springs) + sum(CONSTRAINT in node.get("extensions", {}) for node in json["nodes"])
+
+
 def part(held: Any, *keys: str) -> Any:
     """What lies at the end of these keys; None where there is nothing."""
     for key in keys:
