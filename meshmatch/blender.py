@@ -35,7 +35,8 @@ _HINT = (
     f"install Blender (blender.org), or `pip install bpy` for a Python 3.11 of its own, and set {VARIABLE} to that "
     "program"
 )
-_done: OrderedDict[tuple[str, int, int], bytes] = OrderedDict()
+_POLYGONS = "with polygons"  # what the script says of a file that has some
+_done: OrderedDict[tuple[str, int, int], tuple[bytes, bool]] = OrderedDict()
 _lock = threading.Lock()
 
 
@@ -71,6 +72,15 @@ def glb_of(path: Path) -> bytes:
 
     `InputError` if Blender cannot read it, `OptionError` if there is no Blender.
     """
+    return _converted(path)[0]
+
+
+def has_polygons(path: Path) -> bool:
+    """Whether a file has faces of more than three corners, of which its glb has triangles; errors as `glb_of`."""
+    return _converted(path)[1]
+
+
+def _converted(path: Path) -> tuple[bytes, bool]:
     found = path.stat()
     key = os.path.realpath(path), found.st_mtime_ns, found.st_size
     with _lock:
@@ -79,10 +89,11 @@ def glb_of(path: Path) -> bytes:
                 raise InputError(f"{path.name} is larger than {_LARGEST >> 30} GiB", "export it as .glb")
             with tempfile.TemporaryDirectory(prefix="meshmatch-") as folder:
                 glb = Path(folder, "converted.glb")
-                if (trouble := _run(path, glb)) is not None:
-                    hint = trouble.hint or "is it damaged? export it as .glb"
-                    raise InputError(f"{path.name} cannot be read: {trouble.why}", hint)
-                _done[key] = glb.read_bytes()
+                said = _run(path, glb)
+                if isinstance(said, _Trouble):
+                    hint = said.hint or "is it damaged? export it as .glb"
+                    raise InputError(f"{path.name} cannot be read: {said.why}", hint)
+                _done[key] = glb.read_bytes(), _POLYGONS in said
         _done.move_to_end(key)
         while len(_done) > _KEPT:
             _done.popitem(last=False)
@@ -104,9 +115,10 @@ def from_glb(glb: Path, place: Path, path: Path) -> dict[Path, bytes]:
     """
     with tempfile.TemporaryDirectory(prefix="meshmatch-") as folder:
         output = Path(folder, path.name)
-        if (trouble := _run(glb, output)) is not None:
-            hint = trouble.hint or "write a .glb, and open that in the other program"
-            raise OutputError(f"cannot write {path}: {trouble.why}", hint)
+        said = _run(glb, output)
+        if isinstance(said, _Trouble):
+            hint = said.hint or "write a .glb, and open that in the other program"
+            raise OutputError(f"cannot write {path}: {said.why}", hint)
         made = [file for file in sorted(Path(folder).iterdir()) if file != output and file.is_file()]
         new = [file for file in made if not is_converted(file) and _is_new(path.parent / file.name, file, path)]
         shutil.copyfile(output, place)
@@ -123,8 +135,8 @@ def _is_new(copy: Path, file: Path, path: Path) -> bool:
     return False
 
 
-def _run(source: Path, output: Path) -> _Trouble | None:
-    """Let Blender convert a file; why it did not, None if it did. What it leaves out is told."""
+def _run(source: Path, output: Path) -> _Trouble | list[str]:
+    """Let Blender convert a file; why it did not, or the lines that it said. What it leaves out is told."""
     script = SCRIPTS / "convert.py"
     theirs = (source if output.suffix == ".glb" else output).name  # the other one is ours, and temporary
     words = [*command(theirs), str(script)]
@@ -149,4 +161,4 @@ def _run(source: Path, output: Path) -> _Trouble | None:
     notes = dict.fromkeys(line.removeprefix("note: ") for line in lines if line.startswith("note: "))
     for line in list(notes)[:8]:
         warn(f"{theirs}: {line}")
-    return None
+    return lines

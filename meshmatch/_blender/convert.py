@@ -105,6 +105,12 @@ def prepare():
     return not with_shapes
 
 
+def tell_polygons():
+    """Say whether there are faces of more than three corners."""
+    if any(face.loop_total > 3 for each in shown() for face in each.data.polygons):
+        print("with polygons", flush=True)
+
+
 def image_above(socket):
     """The socket of the first image that something is made of; None if there is none."""
     for link in socket.links:
@@ -288,7 +294,9 @@ def main(source, output):
         raise SystemExit("there is no mesh in it")
     leave_out_strangers(os.path.dirname(source))
     suffix = os.path.splitext(output)[1].lower()
-    if suffix != ".glb":
+    if suffix == ".glb":
+        tell_polygons()
+    else:
         lay_images_bare()
     if suffix in (".fbx", ".usdz", ".dae"):
         tell_clips(suffix)

@@ -182,8 +182,13 @@ def tell_lost(file: Path | None, path: Path) -> None:
     after = ".glb" if blender.is_converted(path) else after  # by way of which it is written
     if file is None or before == after or after not in (".glb", ".obj", ".ply", ".off", ".vtp", ".vtk"):
         return
-    lost = beyond_triangles(file)
-    if lost and not (before in gltf.SUFFIXES and after == ".glb"):
+    if after == ".glb" and blender.is_converted(file):
+        lost = ["polygons"] if blender.has_polygons(file) else []
+    elif after == ".glb" and before in gltf.SUFFIXES:
+        lost = []
+    else:
+        lost = beyond_triangles(file)
+    if lost:
         several = f"{', '.join(lost[:-1])} and {lost[-1]}" if lost[1:] else lost[0]
         warn(f"{path.name} does not have the {several} of {file.name}")
 

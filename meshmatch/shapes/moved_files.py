@@ -154,6 +154,8 @@ class MovedFile:
             as_it_came = _scene(self.output, original, shape, turns, still and not self.told)
         if as_it_came is not None:
             places[0].write_bytes(as_it_came)
+            if not self.told:
+                tell_left(self.output, original, _polygons(original))
             return
         read = _as_read(original, shape) if suffix == ".glb" else shape
         look = _look_of(original, read, suffix == ".glb" and not self.told)
@@ -199,10 +201,10 @@ def check_into(file: Path | None, output: Path) -> None:
 
 def with_look(glb: bytes, original: Path | None, shape: Shape) -> tuple[bytes, str]:
     """A glb that was made of a shape, with the texture coordinates, and the texture or the one color that the shape's file
-    gives it; and what else of a file that is no glTF a glb does not have, for `tell_left`.
+    gives it; and what else of its file a glb does not have, for `tell_left`.
     """
     if original is None or original.suffix.lower() in gltf.SUFFIXES:
-        return glb, ""
+        return glb, _polygons(original)
     look, uv = _look_of(original, shape), _coordinates_of(original, shape)
     worn = None if look is None else _one_image(shape, look, uv)
     if worn is not None:
@@ -217,6 +219,12 @@ def tell_left(output: Path, original: Path | None, lost: str) -> None:
     """Say what an output does not have of the file that it was made of, if there is anything."""
     if original is not None and lost:
         warn(f"{output.name} does not have {lost} of {original.name}")
+
+
+def _polygons(original: Path | None) -> str:
+    """The polygons of a file that becomes a glb by way of Blender, in words."""
+    there = original is not None and blender.is_converted(original) and blender.has_polygons(original)
+    return "the polygons" if there else ""
 
 
 def _as_read(original: Path | None, shape: Shape) -> Shape:

@@ -14,12 +14,13 @@ from meshmatch import blender
 from meshmatch.errors import InputError, MeshmatchWarning, OptionError, OutputError
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.appearance import BakedMaterial
-from meshmatch.shapes.dressed_files import Dressed, save_textured
+from meshmatch.shapes.dressed_files import Dressed, save_textured, tell_lost
 from meshmatch.shapes.formats import gltf_out
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_rig import read_rig
 from meshmatch.shapes.input_files import read_bytes
+from meshmatch.shapes.moved_files import save_moved, tell_left, with_look
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import find_appearance, load_appearance
 from meshmatch.transfer.weight_files import load_weights
@@ -41,6 +42,15 @@ text.use_module = True
 driver = thing.driver_add("location", 0).driver
 driver.type, driver.expression = "SCRIPTED", f"(open({touched + '-driver'!r}, 'w').close(), 0.0)[1]"
 bpy.data.libraries.write(output, {bpy.context.scene, text}, fake_user=True)
+sys.stdout.flush()
+os._exit(0)
+"""
+SOLIDS = """
+import bpy, os, sys
+for name in ("cube", "ico_sphere"):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    getattr(bpy.ops.mesh, f"primitive_{name}_add")()
+    bpy.ops.wm.save_as_mainfile(filepath=os.path.join(sys.argv[-1], f"{name}.blend"))
 sys.stdout.flush()
 os._exit(0)
 """
@@ -180,6 +190,30 @@ def test_what_is_left_out_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     (tmp_path / "a.fbx").write_bytes(gltf_out.glb_of(tube()))
     with pytest.warns(MeshmatchWarning, match=r"a\.fbx: left out skin\.png"):
         meshmatch.load_shape(tmp_path / "a.fbx")
+
+
+def test_polygons_that_become_triangles_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """When something is made of the file, not when it is read."""
+    stand_in(tmp_path, monkeypatch, "print('with polygons'); shutil.copyfile(source, output)")
+    path, out = tmp_path / "a.fbx", tmp_path / "out.fbx"
+    path.write_bytes(gltf_out.glb_of(tube()))
+    shape = meshmatch.load_shape(path)
+    told = r"^out\.fbx does not have the polygons of a\.fbx$"
+    with pytest.warns(MeshmatchWarning, match=told):
+        save_moved(out, path, shape, np.tile(np.eye(3), (shape.V, 1, 1)))
+    with pytest.warns(MeshmatchWarning, match=told):
+        tell_lost(path, out)
+    _, lost = with_look(gltf_out.glb_of(tube()), path, shape)
+    with pytest.warns(MeshmatchWarning, match=told):
+        tell_left(out, path, lost)
+
+
+@needs_blender
+def test_blender_says_whether_there_are_polygons(tmp_path: Path) -> None:
+    (tmp_path / "make.py").write_text(SOLIDS)
+    run_inside(tmp_path / "make.py", tmp_path)
+    for name in ("cube", "ico_sphere"):
+        assert blender.has_polygons(tmp_path / f"{name}.blend") == (name == "cube")
 
 
 def test_works_of_an_artist_beside_shapes_of_a_folder_are_left_alone(tmp_path: Path) -> None:
