@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from numbers import Integral
+from pathlib import Path
 
 import numpy as np
 
@@ -155,7 +156,8 @@ def transfer_texture(
             each[..., 3] = 255
     progress(1.0)
     torn = float(target.face_areas[locator.discontinuous].sum()) / max(target.area, 1e-300)
-    plain = BakedMaterial(image, alpha, color.sampler.cutoff, _name_of(look))
+    name = _name_of(look) or Path(target.name).stem
+    plain = BakedMaterial(image, alpha, color.sampler.cutoff, name)
     material = _finished(plain, look, dict(zip(painters, others, strict=True)))
     return Baked(material, float(inside.mean()), untrusted, torn)
 

@@ -253,6 +253,14 @@ def test_several_materials_with_images_factors_and_vertex_colors() -> None:
     np.testing.assert_array_equal(found[5, 5], blue)
 
 
+@pytest.mark.parametrize(
+    ("names", "called"), [(("skin", "skin"), "skin"), (("skin", "cloth"), "square"), (("", ""), "square")]
+)
+def test_one_material_of_several_is_called_as_the_target(names: tuple[str, str], called: str) -> None:
+    look = Appearance(tuple(Material(name, noise(4)) for name in names), np.array([0, 1]), OWN)
+    assert worn(SQUARE, look, replace(SQUARE, name="square.ply"), uv=OWN).material.name == called
+
+
 def test_materials_that_share_an_image_share_what_is_known_of_it() -> None:
     """Each half of the picture lies under another material: neither may take the other's for background."""
     image = quarters(32)
