@@ -109,6 +109,28 @@ def test_coordinates_that_a_transform_moves_become_plain_ones(tmp_path: Path) ->
     assert load_shape(out).V == 4  # nothing is copied
 
 
+@pytest.mark.parametrize("other", [False, True])
+def test_images_that_nobody_reads_go_when_they_are_replaced(tmp_path: Path, other: bool) -> None:
+    """And what a program needs for them; unless another map is of that kind."""
+    path, needed = tmp_path / "small.glb", "KHR_texture_basisu"
+    write_gltf(
+        path,
+        images=[b"KTX 20", b"KTX 20 too"][: 1 + other],
+        primitives=[{"material": 0}],
+        textures=[{"extensions": {needed: {"source": k}}} for k in range(1 + other)],
+        materials=[
+            {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+            | ({"normalTexture": {"index": 1}} if other else {})
+        ],
+        extensionsUsed=[needed],
+        extensionsRequired=[needed],
+    )
+    after = read(dressed(path, own=True)).json
+    assert after.get("extensionsRequired") == after.get("extensionsUsed") == ([needed] if other else None)
+    assert [image.get("name") for image in after["images"]].count("paint") == 1
+    assert len(after["images"]) == 1 + other
+
+
 def scene(path: Path, **more: Any) -> None:
     """Two squares with materials of their own, normals, a second set of coordinates, colors, and a morph target."""
     arrays = [

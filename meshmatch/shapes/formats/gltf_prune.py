@@ -9,8 +9,9 @@ from typing import Any
 from meshmatch.shapes.formats import gltf_vrm
 
 # Extensions that refer to nothing but textures of materials, or what is found below; with others nothing is taken out.
+_OF_TEXTURES = re.compile(r"KHR_texture_basisu|EXT_texture_webp|EXT_texture_avif|MSFT_texture_dds")
 _KNOWN = re.compile(
-    r"KHR_(?:materials_\w+|texture_transform|mesh_quantization|lights_punctual|node_visibility)|EXT_texture_webp"
+    r"KHR_(?:materials_\w+|texture_transform|mesh_quantization|lights_punctual|node_visibility)|" + _OF_TEXTURES.pattern
 )
 _KINDS = ("textures", "images", "samplers", "accessors", "bufferViews")
 Json = dict[str, Any]
@@ -25,7 +26,9 @@ def unused(json: Json) -> dict[str, set[int]]:
 
 
 def prune(json: Json, before: dict[str, set[int]]) -> bool:
-    """Take out what is not used, but for what was not used ``before``; returns whether there was any."""
+    """Take out what is not used, but for what was not used ``before``, and kinds of images that are no more; returns whether
+    there was any.
+    """
     if not all(_KNOWN.fullmatch(name) or gltf_vrm.KNOWN.fullmatch(name) for name in _extensions(json)):
         return False
     some = False
@@ -39,6 +42,11 @@ def prune(json: Json, before: dict[str, set[int]]) -> bool:
             json[kind] = [json[kind][old] for old in number]
             if not json[kind]:
                 del json[kind]
+    left = {name for texture in json.get("textures", []) for name in texture.get("extensions", {})}
+    for key in ("extensionsUsed", "extensionsRequired") if some else ():
+        named = [name for name in json.get(key, []) if name in left or not _OF_TEXTURES.fullmatch(name)]
+        json.pop(key, None)
+        json |= {key: named} if named else {}
     return some
 
 
