@@ -91,7 +91,9 @@ def _following(
     beside = standing + length * (moving - before)
     place = np.einsum("tij,tj->ti", frames[:, :3, :3], beside) + frames[:, :3, 3]
     parent = _worlds(target[0], target[1], int(target[0].parents[node]), times)
-    return Track(node, "translation", times, _beside(parent, place), "LINEAR")
+    chains = _chain(source[0], node) | _chain(source[0], anchor)
+    steps = {track.interpolation for (moved, _), track in source[1].items() if moved in chains} == {"STEP"}
+    return Track(node, "translation", times, _beside(parent, place), "STEP" if steps else "LINEAR")
 
 
 def _beside(frames: Float[Floats, "T 4 4"], places: Float[Floats, "T 3"]) -> Float[Floats, "T 3"]:

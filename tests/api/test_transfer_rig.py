@@ -153,6 +153,7 @@ def test_other_interpolations_are_kept(source: Path, interpolation: str) -> None
     foot = next(track for track in after if track.moves == "translation" and result.rig.names[track.node] == "foot")
     values = before[2].values[1::3] if interpolation == "CUBICSPLINE" else before[2].values
     assert np.allclose(foot.values, 200 * values, atol=0.02)
+    assert foot.interpolation == ("STEP" if interpolation == "STEP" else "LINEAR")
 
 
 def two_parts(path: Path, hanging: bool = False) -> dict[str, Any]:
