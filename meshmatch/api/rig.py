@@ -34,6 +34,7 @@ from meshmatch.transfer.weight_files import SkinWeights, load_weights
 
 Pose = Literal["rest", "source"]
 """How a rigged target stands: as it came, or as the source does."""
+_EVEN = 1.05  # a joint's longest side over its shortest; set by hand
 check_rig_suffix = partial(tables.check_suffix, suffixes=(".glb", gltf_vrm.SUFFIX), what="rigs")
 
 
@@ -147,6 +148,15 @@ def check_rig_output(path: Path, source: Path, target: Path | None) -> Person | 
     return person
 
 
+def _tell_stretched(name: str, rig: Rig) -> None:
+    """Say that clips will look different where joints of the source are longer one way than another."""
+    sizes = np.linalg.svd(rig.worlds()[rig.joints][:, :3, :3], compute_uv=False)
+    stretched = rig.joints[sizes[:, 0] > _EVEN * sizes[:, 2]]
+    if len(stretched) and rig.clips:
+        which = f"{len(stretched)} of {len(rig.joints)} joints of {name}, such as {rig.names[stretched[0]]},"
+        warn(f"{which} have a scale that differs by axis, and clips will look different: apply it before the export")
+
+
 def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *, pose: Pose = "rest") -> RiggedResult:
     """The target as it came, with the skeleton, skin weights and animation clips of the source.
 
@@ -192,6 +202,7 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     if physics := gltf.understood(source, data, "scene makes", lambda doc: gltf_vrm.springs_and_constraints(doc.json)):
         what = "a spring or constraint, which is" if physics == 1 else f"{physics} springs and constraints, which are"
         warn(f"{a.name} has {what} not transferred")
+    _tell_stretched(a.name, rig)
     b = as_shape(target, "target")
     path, data, in_gltf = as_scene(target, b)
     hanging = gltf.understood(path, data, "scene makes", hanging_groups)

@@ -156,6 +156,23 @@ def test_other_interpolations_are_kept(source: Path, interpolation: str) -> None
     assert foot.interpolation == ("STEP" if interpolation == "STEP" else "LINEAR")
 
 
+@pytest.mark.parametrize("clips", [True, False])
+def test_joints_that_are_stretched_are_told(source: Path, clips: bool) -> None:
+    """If there are clips, which show it."""
+    write_tube(source, clips=clips)
+    editor = Editor(Document(source, source.read_bytes()))
+    knee = editor.json["nodes"][NODES.index("knee")]
+    knee["scale"] = [1.0, 1.5, 1.0]
+    source.write_bytes(editor.to_bytes())
+    target = source.with_name("target.ply")
+    save_shape(target, tube())
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        rigged(source, target)
+    told = "1 of 4 joints of source.glb, such as knee, have a scale that differs by axis"
+    assert [str(each.message).startswith(told) for each in said] == [True] * clips
+
+
 def two_parts(path: Path, hanging: bool = False) -> dict[str, Any]:
     """A glb or gltf with one mesh in two places, a material with an image, and more that is to stay; its document."""
     shape = tube()
