@@ -124,7 +124,7 @@ def test_two_files_become_a_walking_textured_dressed_character(tmp_path: Path, m
     assert (many > 0.02 * len(pixels) ** 2).sum() >= 4, colors  # all four quarters of the picture
     document = Document(tmp_path / "character.glb", (tmp_path / "character.glb").read_bytes())
     worn = [node for node in document.nodes if "mesh" in node]
-    assert [node.get("name") for node in worn] == ["body.ply", "jacket"]
+    assert [node.get("name") for node in worn] == ["body", "jacket"]
     first, second = (document.json["skins"][node["skin"]]["joints"] for node in worn)
     assert first == second
     skin, jacket = load_shape("textured.glb"), load_shape("character.glb").verts[load_shape("textured.glb").V :]
