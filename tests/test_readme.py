@@ -90,6 +90,12 @@ def test_the_extras_that_pages_name_exist() -> None:
     assert named <= set(PROJECT["optional-dependencies"])
 
 
+def test_the_first_tutorial_lists_every_extra() -> None:
+    text = (ROOT / "docs" / "start.md").read_text(encoding="utf-8")
+    table = text.partition("| extra |")[2].partition("\n\n")[0]
+    assert set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == set(PROJECT["optional-dependencies"])
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_call_on_a_page_is_one_that_the_program_accepts(page: Path) -> None:
     for words in calls(page.read_text(encoding="utf-8")):

@@ -140,9 +140,9 @@ def atlas(
 ) -> None:
     """Learn the mean and the modes of a collection.
 
-    Writes arrays, tables, pictures, the modes as morph targets, and page.html with a slider for each mode. With
-    --groups, also tests where two groups differ (permutation test, corrected for multiple comparisons); with --model,
-    how much of the variation the terms of a linear model explain, and where.
+    Writes arrays, tables, pictures, the modes as morph targets, and page.html with a slider for each of the first
+    modes. With --groups, also tests where two groups differ (permutation test, corrected for multiple comparisons);
+    with --model, how much of the variation the terms of a linear model explain, and where.
     """
     from meshmatch.collections.atlas_files import record, write_folder
     from meshmatch.collections.model_files import anova_rows
