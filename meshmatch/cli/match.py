@@ -82,7 +82,7 @@ def register(
     output: Path = output_option(
         "MESH",
         "The fitted template, in the frame and unit of SHAPE; with --onto, the mesh of SHAPE in those of TARGET: .ply, "
-        ".obj, .off, .stl or .glb.",
+        ".obj, .off, .stl, .glb, .vtp or .vtk.",
     ),
     how: FitOptions,
     run: RunOptions,
@@ -102,10 +102,10 @@ def register(
     """
     from meshmatch.api.matching import matcher_for
     from meshmatch.api.upright import turn_of_fit
-    from meshmatch.shapes.files import check_suffix, save_upright
+    from meshmatch.shapes.files import check_mesh_suffix, save_upright
 
     how.check(not_implicit=["dense", "onto", "template"])
-    check_suffix(output)
+    check_mesh_suffix(output)
     check_outputs([shape, onto, template], output, picture=picture)
     console = Console(run.quiet)
     if template is not None:

@@ -46,9 +46,11 @@ def wrap(
 
     from meshmatch.api.bound import carried_along
     from meshmatch.outputs import replace_all_on_success
+    from meshmatch.shapes.files import check_mesh_suffix
     from meshmatch.shapes.moved_files import MovedFile
 
     how.check()
+    check_mesh_suffix(output)
     how.refuse(["model"] if how.implicit else [], "wrap", "choose another model, or none")
     console, names = Console(run.quiet), words.names_of([base, scan])
     check_outputs([base, scan, how.known_pairs, free], output, picture=picture)

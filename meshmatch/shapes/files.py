@@ -50,6 +50,7 @@ SUFFIXES = tuple(_FORMATS)
 PLAIN_SUFFIXES = tuple(suffix for suffix in SUFFIXES if suffix not in blender.SUFFIXES)
 """Those that need no Blender: what is looked for in a folder."""
 check_suffix = partial(tables.check_suffix, suffixes=_WRITERS, what="shapes")
+_CLOUDS = (".xyz", ".npy")  # of which no file holds faces
 
 _NAMED = 10  # labels in one line
 
@@ -218,11 +219,20 @@ def mesh_list(path: str | Path) -> list[tuple[str, int]]:
     return [(names[0] if names else "(no name)", count) for names, count in meshes]
 
 
+def check_mesh_suffix(path: str | Path) -> str:
+    """As `check_suffix`; `OptionError` also for a format that holds no faces."""
+    suffix = check_suffix(path)
+    if suffix in _CLOUDS:
+        hint = f"choose one of {' '.join(each for each in _WRITERS if each not in _CLOUDS)}"
+        raise OptionError(f"a {suffix} file cannot hold faces", hint)
+    return suffix
+
+
 def save_shape(path: str | Path, shape: ShapeLike) -> None:
     """Write a shape, in the format that the suffix names. The file appears whole or not at all.
 
-    ply, obj, off, xyz and npy keep every bit of the positions; stl and glb hold 32-bit floats, and stl no shared
-    vertices. Colors go into ply, obj, off and glb. An invalid vertex is written as nan where the format allows (all but
+    All but stl and glb keep every bit of the positions; these hold 32-bit floats, and stl no shared vertices. Colors go
+    into all but stl, xyz and npy. An invalid vertex is written as nan where the format allows (all but
     stl and glb, which take its stand-in).
 
     Parameters
@@ -248,11 +258,9 @@ def save_shape(path: str | Path, shape: ShapeLike) -> None:
     >>> meshmatch.save_shape("triangle.stl", (np.eye(3), [[0, 1, 2]]))
     """
     path, shape = as_path(path), as_shape(shape)
-    suffix = check_suffix(path)
+    suffix = (check_suffix if shape.is_cloud else check_mesh_suffix)(path)
     if suffix == ".stl" and shape.is_cloud:
         raise OptionError("an stl file cannot hold a point cloud", "choose .ply, .xyz or .npy")
-    if suffix in (".xyz", ".npy") and not shape.is_cloud:
-        raise OptionError(f"a {suffix} file cannot hold faces", "choose .ply, .obj, .off, .stl or .glb")
     with replace_on_success(path) as temporary:
         _WRITERS[suffix](temporary, shape)
 

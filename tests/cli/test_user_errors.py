@@ -84,6 +84,14 @@ def test_a_few_bad_vertices_are_no_error(run: Run, two: tuple[Path, Path], tmp_p
         run("register", tmp_path / "nan.ply", "-o", tmp_path / "fitted.ply", "--model", "human")
 
 
+@pytest.mark.parametrize("words", [("register", "a.ply"), ("wrap", "a.ply", "b.ply")])
+def test_a_mesh_needs_a_format_with_faces(run: Run, two: tuple[Path, Path], tmp_path: Path, words: tuple[str]) -> None:
+    verb, *shapes = words
+    before = set(os.listdir(tmp_path))
+    answer = run(verb, *(tmp_path / shape for shape in shapes), "-o", tmp_path / "out.xyz", "--model", "human")
+    refused(answer, "a .xyz file cannot hold faces", tmp_path, before)
+
+
 def test_a_mistyped_file_is_guessed(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "dancer.ply").write_bytes(two[0].read_bytes())
     answer = run("match", tmp_path / "dancre.ply", two[1], "-o", tmp_path / "map.npy")
