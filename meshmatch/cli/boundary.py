@@ -1,8 +1,8 @@
 """The only place where an error becomes words and an exit status, and a warning words.
 
-0 done, 1 the user's data or choice (or too little memory for it), 2 usage, 130 interrupted, 143 killed by SIGTERM, 129 by
-SIGHUP. Anything that is not a `MeshmatchError` is a bug and keeps its traceback; with MESHMATCH_DEBUG=1 so does
-everything else.
+0 done, 1 the user's data or choice (or too little memory for it, or a folder that may not be entered), 2 usage, 130
+interrupted, 143 killed by SIGTERM, 129 by SIGHUP. Anything that is not a `MeshmatchError` is a bug and keeps its
+traceback; with MESHMATCH_DEBUG=1 so does everything else.
 """
 
 import errno
@@ -43,6 +43,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 return 1
             elif _no_memory(error):
                 Console().trouble("error", "there is not enough memory for this", "take smaller shapes, or free some")
+                return 1
+            elif isinstance(error, PermissionError) and error.filename:
+                problem = f"cannot reach {os.fsdecode(error.filename)}: {error.strerror}"
+                Console().trouble("error", problem, "may you enter its folder?")
                 return 1
             else:
                 raise

@@ -77,6 +77,16 @@ def fail(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("meshmatch.shapes.files.mesh_list", load)
 
 
+def test_a_folder_that_may_not_be_entered_is_an_error_in_a_line(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    fail(PermissionError(13, "Permission denied", "locked/a.ply"), monkeypatch)
+    answer = run("info", "a.ply")
+    assert answer.status == 1
+    assert answer.err.splitlines() == [
+        "error: cannot reach locked/a.ply: Permission denied",
+        "hint: may you enter its folder?",
+    ]
+
+
 def test_ctrl_c_is_one_line_and_130(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     fail(KeyboardInterrupt(), monkeypatch)
     answer = run("info", "a.ply")
