@@ -144,4 +144,8 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    """Without what needs torch where that is not installed, so that `help` and `inspect` go through."""
+    from importlib.util import find_spec
+
+    lacking = () if find_spec("torch") else ("meshmatch.implicit.", "meshmatch.training.")
+    return sorted(name for name in __all__ if not _HOMES.get(name, "").startswith(lacking))

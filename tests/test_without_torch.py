@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import meshmatch
 from meshmatch.errors import needs
 from meshmatch.shapes.files import save_shape
 from tests.fitting.eggs import egg_model, write_model
@@ -65,6 +66,23 @@ def test_the_library_says_it_too() -> None:
         "import meshmatch\ntry:\n    meshmatch.train\nexcept meshmatch.MeshmatchError as error:\n    print(error.hint)"
     )
     assert done.stdout.strip() == "pip install 'meshmatch[train]'"
+
+
+def test_dir_lists_what_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else `help(meshmatch)` and `inspect.getmembers` would end in an error."""
+    assert dir(meshmatch) == sorted(meshmatch.__all__)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    lacking = {
+        "ImplicitFit",
+        "ImplicitModel",
+        "Recipe",
+        "fit_implicit",
+        "load_implicit",
+        "recipe_for",
+        "train",
+        "train_implicit",
+    }
+    assert set(meshmatch.__all__) - set(dir(meshmatch)) == lacking
 
 
 def test_another_missing_library_is_not_taken_for_torch() -> None:
