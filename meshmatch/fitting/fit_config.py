@@ -6,7 +6,7 @@ Standard library alone, so that a command line can list them without loading mor
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from numbers import Integral
+from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from meshmatch.errors import OptionError
@@ -185,8 +185,8 @@ class FitConfig:
     Raises
     ------
     OptionError
-        An unknown refinement, axis or word for ``partial``; up and front along the same axis; or a count that is too
-        small or not an integer.
+        An unknown refinement, axis or word for ``partial``; up and front along the same axis; a count that is too small or
+        not an integer; or a value of another type.
 
     Examples
     --------
@@ -227,6 +227,13 @@ class FitConfig:
             value = getattr(self, name)
             if not isinstance(value, Integral) or value < least:
                 raise OptionError(f"{name} cannot be {value!r}", f"give an integer of {least} or more, or leave it out")
+        if not isinstance(self.tilt, Real) or not 0 <= self.tilt <= 180:
+            raise OptionError(f"tilt cannot be {self.tilt!r}", "give degrees from 0 to 180, or leave it out")
+        kinds = {"device": str, "nodes": NodeRefineConfig, "latent": LatentRefineConfig}
+        for name, kind in kinds.items():
+            if not isinstance(getattr(self, name), kind):
+                hint = f"give a {kind.__name__}, or leave it out"
+                raise OptionError(f"{name} cannot be {getattr(self, name)!r}", hint)
         axes = {axis_of(axis)[0] for axis in (self.up, self.front) if axis is not None}
         if len(axes) == 1 and None not in (self.up, self.front):
             raise OptionError("up and front lie along the same axis", "choose two different axes")

@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -83,6 +84,14 @@ def test_the_refinements_are_three(fits: dict[Refine, Fit]) -> None:
     with pytest.raises(OptionError, match="unknown refinement 'lots'") as caught:
         FitConfig(refine="lots")  # type: ignore[arg-type]
     assert "nodes" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"tilt": "a"}, {"tilt": float("nan")}, {"device": None}, {"nodes": 3}, {"latent": None}]
+)
+def test_values_of_another_type_are_refused_at_once(wrong: dict[str, Any]) -> None:
+    with pytest.raises(OptionError, match=f"{next(iter(wrong))} cannot be "):
+        FitConfig(**wrong)
 
 
 @pytest.mark.parametrize("refine", REFINEMENTS)
