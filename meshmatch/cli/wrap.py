@@ -94,8 +94,8 @@ def wrap(
         console.say(f"drew {picture}: the mesh over {names[1]}, and their distance")
     if run.json:
         record = {"output": output, "files": [str(file) for file in plan.files], "picture": picture, "vertices": a.V}
-        record |= {"free": int(result.free.sum()), "distance": {key: float(each) for key, each in numbers.items()}}
-        record["surfaces"] = surfaces.as_dict()
+        record |= {"free": int(result.free.sum()), "distance": surfaces.as_dict()}
+        record["vertices_to_surface"] = {key: float(each) for key, each in numbers.items()}
         record |= words.map_record(found, names) | how.record(result.match.source_fit)
         print_json(
             record | {"notes": list(result.match.notes), "seconds": round(result.match.seconds + result.seconds, 3)}

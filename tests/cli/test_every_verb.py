@@ -15,6 +15,7 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from tests.cli.conftest import FakeMatching, Run, nearest_map, refused
 
+ROOT = Path(__file__).resolve().parents[2]
 PAIR = {
     "match": ("map.npy",),
     "view": ("page.html",),
@@ -193,6 +194,15 @@ def test_files_of_one_name_are_told_apart(run: Run, files: Path, stub: FakeMatch
     words[words.index("b.ply")] = "other/a.ply"
     record = json.loads(run(*words).out)
     assert (record["source"], record["target"]) == ("a.ply", "other/a.ply")
+
+
+@pytest.mark.parametrize("verb", EVERY)
+def test_the_keys_that_verbs_share_are_on_the_page(run: Run, files: Path, stub: FakeMatching, verb: str) -> None:
+    page = (ROOT / "docs" / "reference" / "cli.md").read_text(encoding="utf-8")
+    record = json.loads(run(*call(verb, "--json")).out)
+    assert {key for key in record if f"`{key}`" in page} >= {"output", "verdict", "reasons", "model", "seed", "seconds"}
+    assert [key for fit in record.get("fits", ()) for key in fit if f"`{key}`" not in page] == []
+    assert set(record.get("distance", {})) <= {"mean", "most", "unit"}
 
 
 @pytest.mark.parametrize("verb", [verb for verb in EVERY if verb != "view"])

@@ -27,12 +27,12 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stub: FakeMatching) -
 def test_the_text_stays_and_the_distance_is_printed(run: Run, files: Path) -> None:
     answer = well(run("wrap", "base.obj", "scan.ply", "-o", "out.obj", "--json", "--picture", "p.png"))
     record = json.loads(answer.out)
-    assert set(record["distance"]) == {"mean", "95 %", "worst"}
-    assert record["distance"]["95 %"] < 0.003
+    assert set(record["vertices_to_surface"]) == {"mean", "95 %", "worst"}
+    assert record["vertices_to_surface"]["95 %"] < 0.003
     assert (record["files"], record["free"], record["vertices"]) == (["out.obj"], 0, rod().V)
     assert "vertices to scan.ply (whose sqrt(area) is" in answer.err
-    assert "\nsurfaces lie " in answer.err and record["surfaces"]["unit"] == "file"
-    assert 0 < record["surfaces"]["mean"] < 0.01
+    assert "\nsurfaces lie " in answer.err and record["distance"]["unit"] == "file"
+    assert 0 < record["distance"]["mean"] < 0.01
     lines, before = (Path(name).read_text().splitlines() for name in ("out.obj", "base.obj"))
     assert [line for line in lines if line[:2] != "v "] == [line for line in before if line[:2] != "v "]
     radius = np.linalg.norm(load_shape("out.obj").verts[:-2, [0, 2]], axis=1)
@@ -45,7 +45,7 @@ def test_faces_may_run_the_other_way(run: Run, files: Path) -> None:
     shape = rod()
     save_shape("base.obj", Shape(shape.verts, shape.faces[:, ::-1]))
     answer = well(run("wrap", "base.obj", "scan.ply", "-o", "out.obj", "--json"))
-    assert json.loads(answer.out)["distance"]["95 %"] < 0.003
+    assert json.loads(answer.out)["vertices_to_surface"]["95 %"] < 0.003
 
 
 @pytest.mark.parametrize(
