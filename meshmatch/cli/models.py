@@ -1,6 +1,7 @@
 """``meshmatch models``: the trained models that are at hand."""
 
 import re
+from json import loads
 from pathlib import Path
 from textwrap import shorten
 from typing import Annotated
@@ -21,7 +22,7 @@ Name = Annotated[str, typer.Argument(metavar="NAME", help="The model's name.")]
 
 @models.command("list")
 def list_all(json: options.Json = False) -> None:
-    """List built-in models and your own."""
+    """List included models and your own."""
     entries = registry.list_models()
     if json:
         keys = ("category", "created", "licence", "data")
@@ -53,12 +54,16 @@ def _in_short(data: str) -> str:
 
 
 @models.command()
-def show(name: Name) -> None:
+def show(name: Name, json: options.Json = False) -> None:
     """Show a model's card as JSON.
 
-    It names template, data, licence, recipe, time, errors and hashes.
+    It names template, data, licence, recipe, time, errors and hashes. With --json it is on one line.
     """
-    print_text(card_to_json(registry.read_any_card(registry.locate_model(name))))
+    card = card_to_json(registry.read_any_card(registry.locate_model(name)))
+    if json:
+        print_json(loads(card))
+    else:
+        print_text(card)
 
 
 @models.command()

@@ -47,7 +47,7 @@ class TrainOptions(Options):
 
     template: str | None = optional(
         "NAME",
-        "A bundled template (human-T, human-A, human-I, human-T-300), or a template file. Default: human-T; with the "
+        "An included template (human-T, human-A, human-I, human-T-300), or a template file. Default: human-T; with the "
         "preset paper human-T-300, which has the paper's 300 nodes.",
     )
     shapes: Path | None = optional(

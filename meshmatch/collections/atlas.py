@@ -354,8 +354,8 @@ class Atlas(Brief, Pickled):
         known = {name: k for k, name in enumerate(self.names)}
         for name in names:
             if name not in known:
-                some = ", ".join(self.names[:5])
-                raise InputError(f"the atlas has no shape called {name!r}", f"there are {len(known)}: {some}, ...")
+                some = ", ".join(self.names[:5]) + ", ..." * (len(known) > 5)
+                raise InputError(f"the atlas has no shape called {name!r}", f"there are {len(known)}: {some}")
         return np.array([known[name] for name in names], np.int64)
 
     def compare(

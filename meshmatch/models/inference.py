@@ -70,7 +70,8 @@ def in_torch(network: Network, K: int, device: str = "cpu") -> Deformer:
     try:
         return found.to(torch.device(device))
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        problem = f"device {device!r} cannot be used: {str(error).splitlines()[0][:80]}"
+        why = str(error).splitlines()[0][:80]  # or a list of all devices that torch has ever had
+        problem = f"device {device!r} cannot be used{'' if why.startswith('Expected one of') else f': {why}'}"
         raise OptionError(problem, "use cpu; cuda needs a GPU and a torch that was built for it") from error
 
 

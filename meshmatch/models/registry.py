@@ -259,7 +259,7 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
     for file in large:
         read_header(source / file)  # before a huge file is copied
     if (built_in_folder() / card.name).exists():
-        raise ModelError(f"a built-in model is called {card.name}", "change the name on its card")
+        raise ModelError(f"an included model is called {card.name}", "change the name on its card")
     target, temporary = user_folder() / card.name, copy_for(user_folder(), card.name)
     with changing(user_folder(), _ELSEWHERE):
         if target.exists() and not replace:
@@ -283,7 +283,7 @@ def remove_model(name: str) -> None:
     """Remove one of the user's own models: `ModelError` if there is no such model, `OutputError` if it cannot be done."""
     folder = _registered(name)
     if folder.parent == built_in_folder():
-        raise ModelError(f"{name} is a built-in model and cannot be removed", "only models that you added can be")
+        raise ModelError(f"{name} is an included model and cannot be removed", "only models that you added can be")
     with changing(user_folder(), _ELSEWHERE):
         try:
             if folder.is_symlink():

@@ -78,7 +78,7 @@ def read_recipe(path: str | Path, usual: Recipe, started: bool = False) -> Recip
         if kernel not in tuple(KERNELS) or found.storage not in get_args(Storage):
             raise InputError("its kernel or storage is unknown")
         if Path(found.template).name != found.template:
-            raise InputError("recipe.template must be the name of a bundled template")
+            raise InputError("recipe.template must be the name of an included template")
         _tell_history(path.name, own, started)
         return replace(
             found,

@@ -178,7 +178,9 @@ def light_of(shape: Shape, colors: ArrayLike | None = None) -> Float[Floats, "V 
     if colors is None:
         if shape.colors is None:
             problem = f"{shape.name or 'the source'} has no vertex colors"
-            raise InputError(problem, "give numbers with --values, or transfer its texture: meshmatch transfer-texture")
+            raise InputError(
+                problem, "transfer its texture (transfer-texture), or other numbers (--values; transfer_values)"
+            )
         return light(shape.colors)
     table = checked_colors(np.asarray(colors, np.float64))
     if len(table) != shape.V or table.ndim != 2:

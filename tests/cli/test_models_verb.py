@@ -50,6 +50,8 @@ def test_show_is_the_card(run: Run) -> None:
     card = json.loads(run("models", "show", "human").out)
     assert card["name"] == "human"
     assert {"data", "licence", "recipe", "metrics", "weights_sha256", "template_hash"} <= card.keys()
+    line = run("models", "show", "human", "--json").out
+    assert json.loads(line) == card and line.count("\n") == 1
 
 
 def test_a_mistyped_name_is_an_error_with_a_guess(run: Run) -> None:

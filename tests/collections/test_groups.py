@@ -107,8 +107,9 @@ def test_what_cannot_be_compared() -> None:
     names = atlas.names
     with pytest.raises(InputError, match="both groups"):
         atlas.compare(names[:3], names[2:])
-    with pytest.raises(InputError, match="no shape called"):
+    with pytest.raises(InputError, match="no shape called") as caught:
         atlas.compare(["nobody", "none"], names[2:])
+    assert caught.value.hint == f"there are 5: {', '.join(names)}"
     with pytest.raises(OptionError, match="two shapes"):
         atlas.compare(names[:1], names[1:])
     with pytest.raises(OptionError, match="too few"):

@@ -102,10 +102,10 @@ def test_a_card_cannot_name_a_place_outside(blob: Path, tmp_path: Path) -> None:
 
 
 def test_built_in_models_stay(blob: Path, tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="built-in model and cannot be removed"):
+    with pytest.raises(ModelError, match="included model and cannot be removed"):
         remove_model("human")
     write_model(blob, name="human")
-    with pytest.raises(ModelError, match="a built-in model is called human"):
+    with pytest.raises(ModelError, match="an included model is called human"):
         add_model(blob, replace=True)
     assert verify_model("human").name == "human"
 

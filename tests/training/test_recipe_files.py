@@ -105,7 +105,7 @@ def test_a_loss_of_ones_own_is_named_and_never_loaded(tmp_path: Path) -> None:
     ({"recipe": {"train": {"loss": {"robust": 1}}}}, "robust must be bool"), ({"network": {"code": 10**9}}, "code must be"),
     ({"network": {"size": 1}}, "unknown network"), ({"field": {"kernel": {}}}, "kernel"), ({"recipe": {"tain": {}}}, "tain"),
     ({"recipe": {"scan": {"points": 1}}}, "64..100,000"), ({"recipe": {"train": {"momentum": 7}}}, "momentum"),
-    ({"recipe": {"template": "../other"}}, "bundled template"),
+    ({"recipe": {"template": "../other"}}, "included template"),
     ({"train": {"steps": 5}}, "train is unknown"), ({"steps": 5}, "nothing of a training"), ({}, "nothing of a training"),
 ])  # fmt: skip
 def test_what_is_no_recipe_is_told(record: Any, words: str, tmp_path: Path) -> None:
