@@ -1,9 +1,11 @@
 """The tree of verbs."""
 
+import inspect
 from typing import Any
 
 import typer
 from typer.core import TyperGroup
+from typer.models import ParameterInfo
 
 from meshmatch import __version__
 from meshmatch.cli.atlas import atlas
@@ -75,5 +77,9 @@ for verb in (
     *(fit, map, export, atlas, symmetry),
     *(interpolate, picture, view, info, prepare, train, blender_addon),
 ):
+    for parameter in inspect.signature(verb).parameters.values():
+        for each in (parameter.default, *getattr(parameter.annotation, "__metadata__", ())):
+            if isinstance(each, ParameterInfo):
+                each.readable = False  # readers say what may not be read, with status 1
     app.command()(verb)
 app.add_typer(models, name="models")

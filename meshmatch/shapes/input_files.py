@@ -69,7 +69,8 @@ def existing(path: Path, hint: str = "", suffixes: tuple[str, ...] = ()) -> Path
         with path.open("rb"):  # may it be read?
             pass
     except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}", hint or "check the name") from error
+        usual = "may you read it?" if isinstance(error, PermissionError) else "check the name"
+        raise InputError(f"cannot read {path}: {error.strerror}", hint or usual) from error
     if size == 0:
         raise InputError(f"{path.name} is empty (0 bytes)", hint or "was the download or the export cut short?")
     if size > LARGEST_FILE:

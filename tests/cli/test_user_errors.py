@@ -92,6 +92,26 @@ def test_a_mesh_needs_a_format_with_faces(run: Run, two: tuple[Path, Path], tmp_
     refused(answer, "a .xyz file cannot hold faces", tmp_path, before)
 
 
+def test_readers_say_what_may_not_be_read(
+    run: Run, two: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As data that are wrong (1), not as a wrong command line (2): for typer asks nobody."""
+
+    def not_allowed(self: Path, *_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr("os.access", lambda path, mode: mode != os.R_OK)
+    monkeypatch.setattr(Path, "open", not_allowed)
+    for words in (
+        ("info", two[0]),
+        ("evaluate", tmp_path / "map.npy", *two),
+        ("match", *two, "-o", tmp_path / "m.npy"),
+    ):
+        answer = run(*words)
+        assert (answer.status, "is not readable" in answer.err) == (1, False)
+    assert "may you read it?" in run("info", two[0]).err
+
+
 def test_a_mistyped_file_is_guessed(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "dancer.ply").write_bytes(two[0].read_bytes())
     answer = run("match", tmp_path / "dancre.ply", two[1], "-o", tmp_path / "map.npy")
