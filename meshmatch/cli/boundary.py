@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 return 1
             elif isinstance(error, PermissionError) and error.filename:
                 problem = f"cannot reach {os.fsdecode(error.filename)}: {error.strerror}"
-                Console().trouble("error", problem, "may you enter its folder?")
+                Console().trouble("error", problem, "may you read and write there?")
                 return 1
             else:
                 raise

@@ -83,7 +83,7 @@ def test_a_folder_that_may_not_be_entered_is_an_error_in_a_line(run: Run, monkey
     assert answer.status == 1
     assert answer.err.splitlines() == [
         "error: cannot reach locked/a.ply: Permission denied",
-        "hint: may you enter its folder?",
+        "hint: may you read and write there?",
     ]
 
 
