@@ -21,8 +21,8 @@ class SequenceOptions(Options):
 
     frames: int = Option(9, "--frames", "-n", min=2, max=1000, help="Number of shapes.")
     through: list[Path] | None = optional("C", "A shape to pass through on the way. May be repeated.")
-    start: float = Option(0.0, "--from", metavar="T", help="Time of the first shape; below 0 is before A.")
-    stop: float = Option(1.0, "--to", metavar="T", help="Time of the last shape; above 1 is beyond B.")
+    start: float = Option(0.0, "--from", metavar="T", help="Time of the first shape, from -1; below 0 is before A.")
+    stop: float = Option(1.0, "--to", metavar="T", help="Time of the last shape, up to 2; above 1 is beyond B.")
     mesh: Literal["source", "template"] = Option(
         "source", help="Mesh that moves: that of A, with all its detail, or the model's template."
     )

@@ -231,7 +231,8 @@ def evaluate(
         None,
         min=0.0,
         metavar="LENGTH",
-        help="Report the share of errors above this, in --unit; by default 15 cm, or 10 % of the square root of the area.",
+        help="Report the share of errors above this, in --unit; by default 15 cm, or 10 % of the square root of the area "
+        "(needs ground truth).",
     ),
     curve: Path | None = optional("FILE", "Plot the cumulative error curve: .png, .svg or .pdf (needs ground truth)."),
     picture: Path | None = optional("PNG", "Draw both shapes, errors as a color map (needs ground truth)."),
@@ -249,8 +250,8 @@ def evaluate(
     told = options.check_truth(truth, points)
     if threshold is not None and isinf(threshold):
         raise OptionError("--threshold must be a length, not inf", "leave it out for the usual one")
-    for what, file in (("curve", curve), ("picture", picture)):
-        if file is not None and not told:
+    for what, given in (("curve", curve), ("picture", picture), ("threshold", threshold)):
+        if given is not None and not told:
             raise OptionError(f"a {what} of errors needs ground truth", "give it with --truth or --points")
     check_outputs([map_file, source, target, truth, backward, *(points or ())], chart=curve, picture=picture)
     shapes = meshmatch.load_shape(source), meshmatch.load_shape(target)

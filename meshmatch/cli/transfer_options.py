@@ -14,7 +14,7 @@ import meshmatch
 from meshmatch.cli import words
 from meshmatch.cli.options import PAIRS_HELP, PairOptions, RunOptions, check_outputs
 from meshmatch.cli.words import Console, Json
-from meshmatch.models.registry import AUTO, check_model
+from meshmatch.models.registry import check_model
 from meshmatch.outputs import replace_all_on_success
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class MapOptions(PairOptions):
 
     for_matching: ClassVar[tuple[str, ...]] = (
         *("up", "front", "source_up", "source_front", "target_up", "target_front"),
-        *("partial", "mirror", "try_harder", "only", "without", "known_pairs"),
+        *("model", "refine", "partial", "mirror", "try_harder", "only", "without", "known_pairs"),
     )
     map: Path | None = Option(
         None,
@@ -96,7 +96,7 @@ class Transfer:
     @property
     def _asks_for_a_match(self) -> bool:
         """Whether an option was given that only a match can follow."""
-        return self.options.model != AUTO or any(name in self.options.given for name in self.options.for_matching)
+        return any(name in self.options.given for name in self.options.for_matching)
 
     def __call__(self, source: meshmatch.Shape, target: meshmatch.Shape) -> MapPair:
         """The maps, from the file, by the same faces or by matching; judged if --strict was given."""

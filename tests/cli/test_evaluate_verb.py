@@ -158,6 +158,8 @@ def test_threshold(evaluate: Callable[[str], Answer]) -> None:
 def test_a_threshold_is_a_length(run: Run, folder: Path) -> None:
     answer = run("evaluate", "map.npy", "a.ply", "b.ply", "--threshold", "inf")
     refused(answer, "not inf", folder, {path.name for path in folder.iterdir()})
+    answer = run("evaluate", "map.npy", "a.ply", "b.ply", "--threshold", "5")
+    refused(answer, "a threshold of errors needs ground truth", folder, {path.name for path in folder.iterdir()})
 
 
 def test_seed_chooses_the_pairs_of_the_distortion(evaluate: Callable[[str], Answer]) -> None:

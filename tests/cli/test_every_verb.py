@@ -112,7 +112,16 @@ WRONG: list[tuple[str, str, tuple[str, ...]]] = [
     ("--map m.xyz", "is not a format for maps", ("match", "register", "wrap")),
     *(
         (f"--map ab.npz {words}", f"{words.split()[0]} does not go with --map", ("match", "register", "wrap"))
-        for words in ("--partial", "--source-up y", "--target-front x", "--mirror no", "--only 1", "--try-harder")
+        for words in (
+            "--model human",
+            "--refine none",
+            "--partial",
+            "--source-up y",
+            "--target-front x",
+            "--mirror no",
+            "--only 1",
+            "--try-harder",
+        )
     ),
 ]
 
