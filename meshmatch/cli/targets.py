@@ -91,6 +91,7 @@ def _transfer_all(
     maps.check()
     found = Targets.find(target, rest["source"], garment, output)
     if maps.map is None and found.fits is not None:
+        maps.refuse(maps.for_matching, "a folder of fits", "its maps are used, and nothing is matched: leave it out")
         maps = _changed(maps, map=found.fits)
     if table is not None:
         rest["table"] = None

@@ -12,6 +12,7 @@ import pytest
 
 from meshmatch.api import matching
 from meshmatch.api.results import MatchResult
+from meshmatch.collections.transfers import Targets
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
@@ -277,6 +278,15 @@ def test_a_damaged_row_is_done_again(run: Run, files: Path, stub: FakeMatching) 
     answer = well(run(*LABELS))
     assert answer.err.count("kept") == 1
     assert len(table()) == 2
+
+
+def test_fits_leave_nothing_to_match(
+    run: Run, files: Path, stub: FakeMatching, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = Targets.find([Path("in")], Path("a.ply"), None, Path("out"))
+    monkeypatch.setattr(Targets, "find", lambda *_: replace(found, fits=Path("in")))
+    before = {path.name for path in files.iterdir()}
+    refused(run(*LABELS, "--model", "human"), "--model does not go with a folder of fits", files, before)
 
 
 @pytest.mark.parametrize("name", ["../x", "sub/../../x", "/x", "x\0", ""])
