@@ -13,7 +13,18 @@ from typing import TYPE_CHECKING, Any, Literal
 from typer import Option
 
 import meshmatch
-from meshmatch.cli.options import Json, Options, Quiet, Seed, Threads, check_writable, grouped, optional, output_option
+from meshmatch.cli.options import (
+    Json,
+    Options,
+    Quiet,
+    Seed,
+    Threads,
+    check_outputs,
+    check_writable,
+    grouped,
+    optional,
+    output_option,
+)
 from meshmatch.cli.words import Console, print_json
 from meshmatch.errors import InputError, OptionError, needs
 from meshmatch.models.card import ModelCard
@@ -195,6 +206,7 @@ def train(
         from meshmatch.training.train import CHECKPOINT
 
     set_threads(how.threads)
+    check_outputs([how.shapes, how.validate, how.mhr], output)
     if how.picture is not None:
         from meshmatch.render.charts import check_chart
 

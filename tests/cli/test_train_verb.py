@@ -94,6 +94,12 @@ def test_a_card_is_a_recipe_and_options_change_it(run: Run, stub: Recorder, tmp_
     assert answer.status == 1 and "--preset does not go with --recipe" in answer.err
 
 
+def test_a_model_does_not_go_into_what_it_learns_from(run: Run, stub: Recorder, tmp_path: Path) -> None:
+    (tmp_path / "prepared").mkdir()
+    answer = run("train", "--shapes", tmp_path / "prepared", "-o", tmp_path / "prepared")
+    assert (answer.status, "is an input of this command" in answer.err) == (1, True)
+
+
 def test_half_of_the_people_are_characters_unless_another_share_is_asked_for(
     run: Run, stub: Recorder, tmp_path: Path
 ) -> None:
