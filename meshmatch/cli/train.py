@@ -324,6 +324,8 @@ def _by_template(output: Path, how: TrainOptions, console: Console) -> "tuple[in
     )  # fmt: skip
     fitted, start = _fits(how, console)
     if fitted is None:
+        if how.shapes is not None:
+            how.refuse(("template", "identities"), "a prepared folder, which has a template and shapes of its own")
         recipe = recipe_for(how.shapes, how.preset, how.unsupervised, how.kind)
     else:
         recipe = small_data() if start is None else going_on(start)

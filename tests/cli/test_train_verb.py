@@ -94,6 +94,15 @@ def test_a_card_is_a_recipe_and_options_change_it(run: Run, stub: Recorder, tmp_
     assert answer.status == 1 and "--preset does not go with --recipe" in answer.err
 
 
+@pytest.mark.parametrize("words", [("--template", "human-T"), ("--identities", "8")])
+def test_a_prepared_folder_has_its_own_template(
+    run: Run, stub: Recorder, tmp_path: Path, words: tuple[str, str]
+) -> None:
+    (tmp_path / "prepared").mkdir()
+    answer = run("train", "--shapes", tmp_path / "prepared", "-o", tmp_path / "mine", *words)
+    assert (answer.status, f"{words[0]} does not go with a prepared folder" in answer.err) == (1, True)
+
+
 def test_a_model_does_not_go_into_what_it_learns_from(run: Run, stub: Recorder, tmp_path: Path) -> None:
     (tmp_path / "prepared").mkdir()
     answer = run("train", "--shapes", tmp_path / "prepared", "-o", tmp_path / "prepared")
