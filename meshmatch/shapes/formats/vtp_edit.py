@@ -23,7 +23,7 @@ _ARRAY = rb"<DataArray\b[^>]*\bName=\"%b\"[^>]*?(?:/>|>.*?</DataArray>)\s*"
 
 
 def with_arrays(name: str, data: bytes, of_points: Arrays, of_faces: Arrays, comments: Iterable[str] = ()) -> bytes:
-    """The bytes of a file with further arrays, as text; what has the name of one already is replaced, which is said.
+    """The bytes of a file with further arrays, as text; what has the name of one already is replaced, which is said but of colors.
 
     Parameters
     ----------
@@ -87,11 +87,16 @@ def _with(name: str, head: bytes, group: bytes, arrays: dict[str, NDArray[Any]])
         inside = b"" if found[1] else head[found.end() : end].lstrip()
     for label in arrays:
         left = re.sub(_ARRAY % re.escape(html.escape(label).encode()), b"", inside, flags=re.DOTALL)
-        if left != inside:
+        if left != inside and arrays[label].dtype != np.uint8:
             warn(f"{name} has an array {label} already, which is replaced")
         inside = left
-    added = "".join(_text(label, values) for label, values in arrays.items()).encode()
-    return head[:begin] + before + added + inside + after + head[end:]
+    # the first colors are those that readers show
+    colors, others = (
+        "".join(_text(label, each) for label, each in arrays.items() if (each.dtype == np.uint8) == first).encode()
+        for first in (True, False)
+    )
+    inside = inside.rstrip() + b"\n" * bool(inside)
+    return head[:begin] + before + colors + inside + others + after + head[end:]
 
 
 def _text(name: str, values: NDArray[Any]) -> str:
