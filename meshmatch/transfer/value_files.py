@@ -114,10 +114,11 @@ def save_values(path: Path, values: Values, shape: Shape, file: Path | None = No
     elif suffix == ".csv":
         tables.write_rows(path, ["vertex", *names], ([k, *row] for k, row in enumerate(table.tolist())))
     elif suffix in (".vtp", ".vtk"):
-        there = vtk_xml.point_arrays(file) if suffix == ".vtp" else {}
-        own = _different([name or "value" for name in names], set(there))
-        arrays = dict(zip(own, table.T, strict=True))
         data = vtp_edit.data_of(file, shape) if suffix == ".vtp" else None
+        there = vtk_xml.point_arrays(file) if suffix == ".vtp" and data is None else {}
+        taken = vtk_xml.arrays_of(file.name, data) if file is not None and data is not None else there
+        own = _different([name or "value" for name in names], set(taken))
+        arrays = dict(zip(own, table.T, strict=True))
         if file is not None and data is not None:
             path.write_bytes(vtp_edit.with_arrays(file.name, data, arrays, {}))
         else:

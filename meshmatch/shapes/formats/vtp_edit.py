@@ -23,7 +23,7 @@ _ARRAY = rb"<DataArray\b[^>]*\bName=\"%b\"[^>]*?(?:/>|>.*?</DataArray>)\s*"
 
 
 def with_arrays(name: str, data: bytes, of_points: Arrays, of_faces: Arrays, comments: Iterable[str] = ()) -> bytes:
-    """The bytes of a file with further arrays, as text; what has the name of one already is replaced, which is said but of colors.
+    """The bytes of a file with further arrays, as text; what has the name of one is replaced, which is said but of colors.
 
     Parameters
     ----------
