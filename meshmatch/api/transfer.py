@@ -191,8 +191,7 @@ def _file_of(shape: ShapeLike) -> Path | None:
 
 
 def _write_values(values: Floats, target: Shape, file: Path | None, path: Path, final: Path) -> None:
-    save_values(path, Values(values), target, file)
-    tell_lost(file, final)
+    tell_lost(file, final, save_values(path, Values(values), target, file))
 
 
 def transfer_colors(
@@ -258,8 +257,7 @@ def _write_colors(colors: Floats, maps: MapPair, file: Path | None, path: Path, 
     check_character(file, final)
     along_y = Path(maps.source.name).suffix.lower() in gltf.SUFFIXES
     turn = turn_upright(maps, along_y) if path.suffix.lower() == ".glb" else None  # of an fbx a glb waits to become it
-    save_colors(path, maps.target, colors, file, turn)
-    tell_lost(file, final)
+    tell_lost(file, final, save_colors(path, maps.target, colors, file, turn))
 
 
 def transfer_labels(
@@ -335,8 +333,7 @@ def transfer_labels(
 
 
 def _write_labels(labels: Labels, target: Shape, file: Path | None, path: Path, final: Path) -> None:
-    save_labels(path, labels, target, file)
-    tell_lost(file, final)
+    tell_lost(file, final, save_labels(path, labels, target, file))
 
 
 def transfer_weights(

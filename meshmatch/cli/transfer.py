@@ -64,8 +64,8 @@ def transfer_color(
             result.writer(temporary, output)
         else:
             result = meshmatch.transfer_values(a, target, given.numbers, transfer, directions=directions, rule=rule)
-            value_files.save_values(temporary, value_files.Values(result.data, given.names), result.maps.target, target)
-            tell_lost(target, output)
+            found = value_files.Values(result.data, given.names)
+            tell_lost(target, output, value_files.save_values(temporary, found, result.maps.target, target))
     b = result.maps.target
     low = transfer.tell_low(result.low, rule.minimum)
     what = "colors" if given is None else f"{columns} number{'s' if columns > 1 else ''} each"

@@ -141,9 +141,9 @@ def save_textured(path: str | Path, mesh: Textured, image: Pixels) -> None:
     Dressed(Shape(mesh.verts, mesh.faces, path.stem), None, mesh.uv, False, material).save(path)
 
 
-def save_colored(path: Path, shape: Shape, file: Path | None, turn: Float[Floats, "3 3"]) -> None:
+def save_colored(path: Path, shape: Shape, file: Path | None, turn: Float[Floats, "3 3"]) -> bool:
     """Write a shape with its colors. A glb, obj, ply or vtp that it was read from stays what it was, but for the colors; a
-    file without axes is turned upright in a glb. What the format does not hold is told.
+    file without axes is turned upright in a glb. Returns whether a file of this format stays what it was.
     """
     suffix, colors = path.suffix.lower(), shape.colors
     kept = ply_edit.data_of(file, shape) if suffix == ".ply" else None
@@ -162,6 +162,8 @@ def save_colored(path: Path, shape: Shape, file: Path | None, turn: Float[Floats
         path.write_bytes(vtp_edit.with_arrays(file.name, kept, {"Colors": vtk.bytes_of(colors)}, {}))
     else:
         save_shape(path, shape)
+        return False
+    return True
 
 
 def glb_base(file: Path | None, shape: Shape) -> tuple[Path, bytes, bool]:
@@ -176,11 +178,18 @@ def glb_base(file: Path | None, shape: Shape) -> tuple[Path, bytes, bool]:
     return Path(f"{name}.glb"), gltf_out.glb_of(bare), False
 
 
-def tell_lost(file: Path | None, path: Path) -> None:
-    """Say what an output in this format does not have of the file that it was made of."""
+def tell_lost(file: Path | None, path: Path, kept: bool = True) -> None:
+    """Say what an output does not have of the file that it was made of: nothing, if it is of the same format and all of that
+    was ``kept``.
+    """
     before, after = ("" if each is None else each.suffix.lower() for each in (file, path))
     after = ".glb" if blender.is_converted(path) else after  # by way of which it is written
-    if file is None or before == after or after not in (".glb", ".obj", ".ply", ".off", ".vtp", ".vtk"):
+    if (
+        file is None
+        or not file.is_file()
+        or (before == after and kept)
+        or after not in (".glb", ".obj", ".ply", ".off", ".vtp", ".vtk")
+    ):
         return
     if after == ".glb" and blender.is_converted(file):
         lost = ["polygons"] if blender.has_polygons(file) else []

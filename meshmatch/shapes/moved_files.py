@@ -148,7 +148,11 @@ class MovedFile:
             places[0].write_bytes(text)
             return
         as_it_came = None
-        if original is not None and suffix == ".ply" and (data := ply_edit.data_of(original, shape)) is not None:
+        if (
+            original is not None
+            and suffix == ".ply"
+            and (data := ply_edit.data_of(original, shape, moved=True)) is not None
+        ):
             as_it_came = ply_edit.with_positions(original.name, data, shape.verts_or_nan, turns)
         if original is not None and suffix == ".glb" and original.suffix.lower() in gltf.SUFFIXES:
             as_it_came = _scene(self.output, original, shape, turns, still and not self.told)

@@ -224,8 +224,9 @@ def _read_json(path: Path, shape: Shape, on: On | None) -> tuple[list[Any], str 
     return labels, members_are
 
 
-def save_labels(path: Path, labels: Labels, shape: Shape, file: Path | None = None) -> None:
-    """Write labels of `shape`, each with a name; a .ply or .vtp ``file`` that it was read from keeps all else.
+def save_labels(path: Path, labels: Labels, shape: Shape, file: Path | None = None) -> bool:
+    """Write labels of `shape`, each with a name; a .ply or .vtp ``file`` that it was read from keeps all else. Returns
+    whether it does.
 
     `OptionError` for another suffix than `LABEL_SUFFIXES`, or too large a number for the format.
     """
@@ -245,10 +246,11 @@ def save_labels(path: Path, labels: Labels, shape: Shape, file: Path | None = No
         record = {"format": "meshmatch labels 1", "on": labels.on, "shape": shape.name, "labels": cells}
         tables.write_json(path, record)
     else:
-        _write_shape(path, labels, shape, suffix, file)
+        return _write_shape(path, labels, shape, suffix, file)
+    return True
 
 
-def _write_shape(path: Path, labels: Labels, shape: Shape, suffix: str, file: Path | None) -> None:
+def _write_shape(path: Path, labels: Labels, shape: Shape, suffix: str, file: Path | None) -> bool:
     """Whole numbers as they are; words by their number, which comments at the beginning explain."""
     from meshmatch.shapes.formats import ply, ply_edit, vtk, vtk_xml, vtp_edit
 
@@ -267,7 +269,7 @@ def _write_shape(path: Path, labels: Labels, shape: Shape, suffix: str, file: Pa
         else:
             kept = {name: each for name, each in vtk_xml.point_arrays(file).items() if name not in arrays}
             vtk.write_vtp(path, plain, {**kept, **of_points}, of_faces, comments)
-        return
+        return data is not None
     columns: dict[str, Any] = {"label": np.array(numbers, np.int32)[labels.codes]}
     columns |= {channel: colors[:, k] for k, channel in enumerate(("red", "green", "blue"))}
     where: Any = {"vertex": columns, "face": {}} if labels.on == "vertices" else {"vertex": {}, "face": columns}
@@ -276,3 +278,4 @@ def _write_shape(path: Path, labels: Labels, shape: Shape, suffix: str, file: Pa
         path.write_bytes(ply_edit.with_columns(file.name, data, comments=comments, **where))
     else:
         ply.write(path, plain, comments=comments, **where)
+    return data is not None

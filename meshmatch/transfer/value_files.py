@@ -100,8 +100,10 @@ def _is_row_number(column: Floats) -> bool:
     return any(np.array_equal(column, np.arange(len(column)) + first) for first in (0, 1))
 
 
-def save_values(path: Path, values: Values, shape: Shape, file: Path | None = None) -> None:
+def save_values(path: Path, values: Values, shape: Shape, file: Path | None = None) -> bool:
     """Write numbers of the vertices of `shape`; a .ply or .vtp ``file`` that it was read from keeps all else.
+
+    Returns whether it does.
 
     `OptionError` if the suffix is not one of `VALUE_SUFFIXES`.
     """
@@ -123,6 +125,7 @@ def save_values(path: Path, values: Values, shape: Shape, file: Path | None = No
             path.write_bytes(vtp_edit.with_arrays(file.name, data, arrays, {}))
         else:
             (vtk.write_vtp if suffix == ".vtp" else vtk.write_vtk)(path, shape, {**there, **arrays})
+        return data is not None
     else:
         words = ["".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in name) for name in names]
         own = _different([word or "value" for word in words], _RESERVED)
@@ -137,6 +140,8 @@ def save_values(path: Path, values: Values, shape: Shape, file: Path | None = No
             path.write_bytes(ply_edit.with_columns(file.name, data, columns, {}))
         else:
             ply.write(path, shape, vertex=columns)
+        return data is not None
+    return True
 
 
 def _different(names: list[str], taken: set[str]) -> list[str]:
@@ -211,13 +216,12 @@ def save_colors(
     colors: Float[Floats, "V 4"],
     file: Path | None = None,
     turn: Float[Floats, "3 3"] | None = None,
-) -> None:
+) -> bool:
     """Write `shape` with vertex colors as screens show them; or the colors alone.
 
-    `file` and `turn` as in `save_colored`.
+    `file` and `turn`, and what is returned, as in `save_colored`.
     """
     if check_color_suffix(path) in (".npy", ".csv"):
-        save_values(path, Values(colors, ("red", "green", "blue", "alpha")), shape)
-    else:
-        painted = Shape(shape.verts, shape.faces, shape.name, colors, shape.invalid)
-        save_colored(path, painted, file, np.eye(3) if turn is None else turn)
+        return save_values(path, Values(colors, ("red", "green", "blue", "alpha")), shape)
+    painted = Shape(shape.verts, shape.faces, shape.name, colors, shape.invalid)
+    return save_colored(path, painted, file, np.eye(3) if turn is None else turn)

@@ -87,3 +87,17 @@ def test_a_ply_that_moves_keeps_its_polygons(tmp_path: Path) -> None:
     save_moved(tmp_path / "b.ply", tmp_path / "a.ply", moved, np.tile(np.eye(3), (5, 1, 1)))
     assert is_kept(tmp_path / "b.ply")
     np.testing.assert_array_equal(meshmatch.load_shape(tmp_path / "b.ply").verts, shape.verts + 1)
+
+
+def test_a_file_that_cannot_be_kept_is_told(target: Path) -> None:
+    several = {
+        ".ply": PLY.replace("element face 2", "element face 1").replace(
+            "end_header", "element face 1\nproperty list uchar int vertex_indices\nend_header"
+        ),
+        ".vtp": VTP.replace('Polys="2"', 'Polys="2" NumberOfLines="0" NumberOfVerts="1"'),
+    }
+    target.write_text(several[target.suffix])
+    count = meshmatch.load_shape(target).F
+    with pytest.warns(MeshmatchWarning, match=f"^out{target.suffix} does not have the .* thickness of {target.name}$"):
+        meshmatch.transfer_labels(target, target, [3] * count).save(target.with_stem("out"))
+    target.unlink()

@@ -132,3 +132,53 @@ def test_only_the_file_of_a_shape_is_edited(tmp_path: Path) -> None:
     path.write_bytes(strips)
     assert ply_edit.data_of(path, shape, faces=True) is None
     assert ply_edit.data_of(path, shape) == strips
+
+
+@pytest.mark.parametrize("text", [" ", "\n"])
+def test_a_text_whose_rows_are_not_one_to_a_line_is_not_edited(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.ply"
+    head, _, body = example("ascii").partition(b"end_header\n")
+    lines = body.split(b"\n")
+    lines[1:3] = [text.join(lines[1].decode().split(" ", 1)).encode() + b" " + lines[2]]
+    path.write_bytes(head + b"end_header\n" + b"\n".join(lines))
+    assert ply_edit.data_of(path, load_shape(path)) is None
+
+
+def test_colors_are_bytes_whatever_they_were() -> None:
+    before = example("ascii").replace(b"uchar diffuse_", b"float ")
+    after = ply_edit.with_columns("a.ply", before, ply.color_columns(np.full((5, 4), 1 / 255)), {})
+    assert after.count(b"property uchar green") == 1 and b"property float green" not in after
+    np.testing.assert_array_equal(table(after, "vertex")["green"], 1)
+
+
+def test_names_of_earlier_labels_go() -> None:
+    words = ply_edit.with_columns(
+        "a.ply", example("ascii"), {"label": np.zeros(5, np.int32)}, {}, ["label 0 ", "label 1 b"]
+    )
+    assert words.count(b"comment label") == 2
+    with pytest.warns(MeshmatchWarning, match="label of each vertex already"):
+        numbers = ply_edit.with_columns("a.ply", words, {"label": np.ones(5, np.int32)}, {})
+    assert numbers.count(b"comment label") == 0
+
+
+def test_a_polygon_without_triangles_has_no_label() -> None:
+    before = example("ascii").replace(b"3 1 4 2 6 0.5 0.5 0.5 0.5 0.5 0.5", b"2 1 4 4 0.5 0.5 0.5 0.5")
+    after = ply_edit.with_columns("a.ply", before, {}, {"label": np.array([4, 4], np.int32)})
+    np.testing.assert_array_equal(table(after, "face")["label"], [4, -1])
+
+
+def test_a_text_keeps_digits_of_positions() -> None:
+    far = np.add(PLACES, [4500000.123, 0, 0])
+    after = ply_edit.with_positions("a.ply", example("ascii"), far, np.tile(np.eye(3), (5, 1, 1)))
+    np.testing.assert_array_equal(table(after, "vertex")["x"], far[:, 0])
+
+
+def test_a_file_that_has_changed_is_not_edited(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    path.write_bytes(example("binary_big_endian"))
+    shape = load_shape(path)
+    assert ply_edit.data_of(path, Shape(shape.verts + 1, shape.faces)) is None
+    assert ply_edit.data_of(path, Shape(shape.verts + 1, shape.faces), moved=True) is not None
+    assert ply_edit.data_of(path, Shape(shape.verts, shape.faces[:1]), faces=True) is None
+    path.unlink()
+    assert ply_edit.data_of(path, shape) is None

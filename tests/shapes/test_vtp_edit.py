@@ -10,6 +10,7 @@ from meshmatch.errors import MeshmatchWarning
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.formats import vtk, vtp_edit
 from meshmatch.shapes.formats.vtk_xml import _File
+from meshmatch.shapes.shape import Shape
 
 PLACES = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0.5, 0]])
 
@@ -113,3 +114,60 @@ def test_what_the_package_wrote_can_be_edited(tmp_path: Path) -> None:
     found = arrays_of(vtp_edit.with_arrays("a.vtp", data, {"label": np.arange(5)}, {}), "PointData")
     np.testing.assert_array_equal(found["height"], PLACES[:, 1])
     np.testing.assert_array_equal(found["label"], np.arange(5))
+
+
+TRAPS = {
+    "comment": (b"<Piece ", b"<!-- <Piece> <PointData> </PointData> --><Piece "),
+    "closed with a space": (b"</PointData>", b"</PointData >"),
+    "a sign in an attribute": (b"Scalars='t'", b"Scalars='a>b'"),
+    "a comment inside": (b"</PointData>", b"<!-- </PointData> --></PointData>"),
+    "cdata": (b"<Points>", b"<FieldData><![CDATA[ <CellData> ]]></FieldData><Points>"),
+}
+
+
+@pytest.mark.parametrize("trap", TRAPS)
+def test_what_only_looks_like_a_tag_is_none(trap: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.vtp"
+    path.write_bytes(example().replace(*TRAPS[trap]))
+    data = vtp_edit.data_of(path, load_shape(path), faces=True)
+    assert data is not None
+    after = vtp_edit.with_arrays("a.vtp", data, {"é": np.arange(5.0)}, {}, ["label 0 a---x\x01"])
+    after = vtp_edit.with_arrays("a.vtp", after, {}, {"label": np.array([4, 4, 7], np.int32)}, ["label 0 b"])
+    np.testing.assert_array_equal(arrays_of(after, "PointData")["é"], np.arange(5.0))
+    np.testing.assert_array_equal(arrays_of(after, "PointData")["thickness"], np.arange(5) / 3)
+    np.testing.assert_array_equal(arrays_of(after, "CellData")["label"], [4, 7])
+    assert after.count(b"<!-- label 0") == 1
+
+
+def test_an_array_is_replaced_however_its_name_is_written(tmp_path: Path) -> None:
+    old = "<PointData>{}<DataArray type='Int32' Name = 'a&amp;b' format='ascii'>1 2 3 4 5</DataArray ></PointData>"
+    with pytest.warns(MeshmatchWarning, match="a.vtp has an array a&b already"):
+        after = vtp_edit.with_arrays("a.vtp", example(old), {"a&b": np.full(5, 9)}, {})
+    assert list(arrays_of(after, "PointData")) == ["thickness", "a&b"]
+    np.testing.assert_array_equal(arrays_of(after, "PointData")["a&b"], 9)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("header", ["UInt32", "UInt64"])
+@pytest.mark.parametrize("packed", ["", 'compressor="vtkZLibDataCompressor"', 'compressor="vtkLZMADataCompressor"'])
+def test_arrays_are_written_as_those_of_the_file(order: str, header: str, packed: str) -> None:
+    points = " ".join(str(each) for each in PLACES.ravel())
+    data = (
+        f'<VTKFile type="PolyData" byte_order="{"Big" if order == ">" else "Little"}Endian" header_type="{header}" {packed}>'
+        f'<PolyData><Piece NumberOfPoints="5"><Points><DataArray type="Float64" NumberOfComponents="3">{points}</DataArray>'
+        "</Points></Piece></PolyData></VTKFile>"
+    ).encode()
+    values = np.array([1.5, np.nan, np.inf, -2.0, 0.0])
+    after = vtp_edit.with_arrays("a.vtp", data, {"v": values, "n": np.arange(10).reshape(5, 2)}, {})
+    np.testing.assert_array_equal(arrays_of(after, "PointData")["v"], values)
+    np.testing.assert_array_equal(arrays_of(after, "PointData")["n"], np.arange(10))
+
+
+def test_a_file_that_has_changed_is_not_edited(tmp_path: Path) -> None:
+    path = tmp_path / "a.vtp"
+    path.write_bytes(example())
+    shape = load_shape(path)
+    assert vtp_edit.data_of(path, Shape(shape.verts + 1, shape.faces)) is None
+    assert vtp_edit.data_of(path, Shape(shape.verts, shape.faces[:1]), faces=True) is None
+    path.unlink()
+    assert vtp_edit.data_of(path, shape) is None

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import warn
 from meshmatch.shapes.formats import damaged, runs
-from meshmatch.shapes.formats.ply import CHANNELS, END, KINDS, Columns, color_properties, corners_of, parsed
+from meshmatch.shapes.formats.ply import CHANNELS, END, KINDS, Columns, Content, color_properties, corners_of, parsed
 from meshmatch.shapes.formats.ply_rows import TYPES, Element, Property
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
 # Positions, normals and texture coordinates.
 _OF_SURFACES = {*"xyzstuv", "nx", "ny", "nz", "texture_u", "texture_v", "texnumber"}
-_NAMED = re.compile(rb"comment label -?\d+ ")
+_NAMED = re.compile(rb"comment label -?\d+(?: |$)")
 
 
 def with_positions(name: str, data: bytes, verts: Float[Floats, "V 3"], turns: Float[Floats, "V 3 3"]) -> bytes:
@@ -56,7 +56,7 @@ def with_columns(name: str, data: bytes, vertex: Columns, face: Columns, comment
     if face:
         _, sizes = corners_of(name, content.faces[0])
         chosen = most_frequent(next(iter(face.values())), np.maximum(sizes - 2, 0))
-        face = {label: np.append(values, values.dtype.type(0))[chosen] for label, values in face.items()}
+        face = {name: np.append(values, none_of(values))[chosen] for name, values in face.items()}
     for element, columns in ((content.vertices, vertex), *((each, face) for each in content.faces)):
         colored = {p.name for p in color_properties(element)} | set(CHANNELS)
         again = [p.name for p in element.properties if p.name in columns and p.name not in colored]
@@ -65,16 +65,39 @@ def with_columns(name: str, data: bytes, vertex: Columns, face: Columns, comment
     return _edited(name, data, vertex, face, comments)
 
 
-def data_of(file: Path | None, shape: Shape, faces: bool = False) -> bytes | None:
-    """The bytes of the ply that a shape was read from; None where it came from elsewhere, or has other vertices by now, or
-    where its ``faces`` need rows and the file has strips.
+def data_of(file: Path | None, shape: Shape, faces: bool = False, moved: bool = False) -> bytes | None:
+    """The bytes of the ply that a shape was read from, perhaps to be ``moved``.
+
+    None where it came from elsewhere, where the file is another one by now, or its text does not have a row on each line,
+    and where ``faces`` need rows and the file has strips or several kinds of faces.
     """
-    if file is None or file.suffix.lower() != ".ply":
+    if file is None or file.suffix.lower() != ".ply" or not file.is_file():
         return None
     data = read_bytes(file)
     content = parsed(file.name, data)
-    rows = len(content.faces) == 1 and not content.strips
-    return data if content.vertices.count == shape.V and (rows or not faces) else None
+    places = np.stack([content.vertices.table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    same = len(places) == shape.V and (moved or np.array_equal(places, shape.verts_or_nan, equal_nan=True))
+    if faces:
+        rows = len(content.faces) == 1 and not content.strips
+        same &= rows and int(np.maximum(corners_of(file.name, content.faces[0])[1] - 2, 0).sum()) == shape.F
+    return data if same and (content.order or _has_a_row_on_each_line(content, data)) else None
+
+
+def _has_a_row_on_each_line(content: Content, data: bytes) -> bool:
+    end = END.search(data)
+    assert end is not None
+    lines = [line for line in _lines(data[end.end() :]) if line.strip()]
+    at = 0
+    for element in content.elements:
+        rows = lines[at : at + element.count * bool(element.properties)]
+        at += len(rows)
+        if element.table and element.count:
+            words = np.full(element.count, len(element.properties))
+            for p in element.properties:
+                words += element.table[p.name][1] if p.count_kind else 0
+            if [len(row.split()) for row in rows] != words.tolist():
+                return False
+    return True
 
 
 def beyond_triangles(name: str, data: bytes) -> list[str]:
@@ -87,6 +110,11 @@ def beyond_triangles(name: str, data: bytes) -> list[str]:
     colors = {p.name for element in (content.vertices, *content.faces) for p in color_properties(element)}
     others = [each for each in dict.fromkeys(named) if each not in colors | _OF_SURFACES]
     return ["polygons"] * polygons + [f"property {each}" for each in others]
+
+
+def none_of(values: NDArray[Any]) -> NDArray[Any]:
+    """(1, ...) what a polygon without triangles has: -1 of what may be negative, else 0."""
+    return np.full_like(values[:1], 0 if values.dtype.kind == "u" else -1)
 
 
 def most_frequent(values: NDArray[Any], triangles: Int[Ints, " P"]) -> Int[Ints, " P"]:
@@ -135,7 +163,10 @@ class _Plan:
 
 
 def _holds(p: Property, values: NDArray[Any]) -> bool:
-    return not p.count_kind and np.can_cast(values.dtype, p.kind, "same_kind" if p.kind[0] == "f" else "safe")
+    """Whether a property can take new numbers."""
+    if p.count_kind or (p.name in CHANNELS and p.kind != "u1"):
+        return False
+    return bool(np.can_cast(values.dtype, p.kind, "same_kind" if p.kind[0] == "f" else "safe"))
 
 
 def _edited(name: str, data: bytes, vertex: Columns, face: Columns, comments: Sequence[str]) -> bytes:
@@ -144,7 +175,7 @@ def _edited(name: str, data: bytes, vertex: Columns, face: Columns, comments: Se
     columns = {id(content.vertices): vertex} | {id(each): face for each in content.faces}
     colored = CHANNELS[0] in {*vertex, *face}
     plans = [_Plan.of(each, columns.get(id(each), {}), colored) for each in content.elements]
-    head = _head(data[: end.start()], plans, comments)
+    head = _head(data[: end.start()], plans, comments, "label" in {*vertex, *face})
     rows = (
         _texts(name, data[end.end() :], plans)
         if content.order is None
@@ -153,16 +184,16 @@ def _edited(name: str, data: bytes, vertex: Columns, face: Columns, comments: Se
     return head + b"".join(rows)
 
 
-def _head(head: bytes, plans: Sequence[_Plan], comments: Sequence[str]) -> bytes:
+def _head(head: bytes, plans: Sequence[_Plan], comments: Sequence[str], labeled: bool) -> bytes:
     lines, waiting = [], iter(plans)
     plan: _Plan | None = None
     for line in _lines(head.rstrip()):
         words = line.split()
-        if words[:1] == [b"element"]:
+        if words[:1] == [b"element"] and len(words) > 2:
             lines += _declared(plan)
             plan = next(waiting)
-        named = words[-1].decode("latin-1") if words[:1] == [b"property"] else ""
-        if not (plan and named in plan.gone) and not (comments and _NAMED.match(line)):
+        named = words[4 if words[1:2] == [b"list"] else 2].decode("latin-1") if words[:1] == [b"property"] else ""
+        if not (plan and named in plan.gone) and not (labeled and _NAMED.match(line)):
             lines.append(line)
         if words[:1] == [b"format"]:
             lines += [f"comment {' '.join(comment.split())}".encode() for comment in comments]
@@ -190,12 +221,11 @@ def _texts(name: str, body: bytes, plans: Sequence[_Plan]) -> Iterator[bytes]:
 
 
 def _changed(name: str, plan: _Plan, rows: Sequence[bytes]) -> Iterator[bytes]:
-    kinds = {p.name: p.kind for p in plan.kept} | {p.name: TYPES[p.kind] for p in plan.added}
-    texts = {label: values.astype(kinds[label]).astype(np.bytes_).tolist() for label, values in plan.columns.items()}
+    texts = {name: values.astype(np.bytes_).tolist() for name, values in plan.columns.items()}
     for k, row in enumerate(rows):
         words, at, out = row.split(), 0, list[bytes]()
         for p in plan.element.properties:
-            size = 1 + int(words[at]) if p.count_kind and at < len(words) else 1
+            size = 1 + int(float(words[at])) if p.count_kind and at < len(words) else 1
             if p.name not in plan.gone:
                 out += [texts[p.name][k]] if p.name in texts else words[at : at + size]
             at += size

@@ -219,7 +219,8 @@ def write_vtp(
 
 def comment_of(text: str) -> str:
     """A comment of XML."""
-    return f"<!-- {html.escape(text).replace('--', '- -').rstrip('-')} -->"
+    text = re.sub(r"[\x00-\x08\x0b\x0c\x0e-\x1f]", " ", re.sub("-(?=-)", "- ", html.escape(text)))
+    return f"<!-- {text.rstrip('-')} -->"
 
 
 def _element(name: str, values: NDArray[Any]) -> str:

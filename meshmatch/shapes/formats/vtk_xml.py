@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import base64
 import binascii
+import html
 import lzma
 import re
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -19,7 +21,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import (
     FEW_PLACES,
@@ -44,7 +46,8 @@ _UNPACK: dict[str, Callable[[], Any]] = {
     "vtkZLibDataCompressor": zlib.decompressobj,
     "vtkLZMADataCompressor": lzma.LZMADecompressor,
 }
-_APPENDED = re.compile(rb"<AppendedData\b([^>]{0,200})>\s*_")
+_PACK: dict[str, Callable[[bytes], bytes]] = {"": lambda data: data, "vtkZLibDataCompressor": zlib.compress}
+APPENDED = re.compile(rb"<AppendedData\b([^>]{0,200})>\s*_")
 
 
 def read(path: Path, data: bytes) -> Raw:
@@ -52,19 +55,49 @@ def read(path: Path, data: bytes) -> Raw:
     return _File(path.name, data).raw()
 
 
-def surface_of(name: str, data: bytes) -> tuple[int, Ints | None] | None:
-    """How many points a PolyData of one piece has, and how many corners each of its polygons; None for the latter where it
-    has other cells as well, and for both where it has several pieces, or is none.
-    """
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The points of a PolyData of one piece, and how many corners its polygons have; None where it has other cells."""
+
+    verts: Float[Floats, "V 3"]
+    sizes: Int[Ints, " P"] | None
+
+
+def surface_of(name: str, data: bytes) -> Surface | None:
+    """Points and polygons of a file; None if it has several pieces, or is no PolyData."""
     file = _File(name, data)
     pieces = file.root.findall("./*/Piece")
     if len(pieces) != 1 or file.root.get("type") != "PolyData":
         return None
-    count, polygons = (_count(name, pieces[0], f"NumberOf{what}") for what in ("Points", "Polys"))
+    file._may_unpack()
+    points = file.named(pieces[0], "Points", None)
+    if points is None or points.size % 3:
+        return None
+    verts, polygons = points.reshape(-1, 3).astype(np.float64), _count(name, pieces[0], "NumberOfPolys")
     if any(_count(name, pieces[0], f"NumberOf{what}") for what in ("Verts", "Lines", "Strips")) or not polygons:
-        return count, None
+        return Surface(verts, None)
     ends = file.named(pieces[0], "Polys", "offsets")
-    return None if ends is None else (count, np.diff(np.concatenate([[0], ends.astype(np.int64)])))
+    return None if ends is None else Surface(verts, np.diff(np.concatenate([[0], ends.astype(np.int64)])))
+
+
+def element_like(head: bytes, name: str, values: NDArray[Any]) -> str:
+    """An array (V, D) as an element for a file that begins so: in its order of bytes, and compressed as it is."""
+    begin = re.search(rb"<VTKFile\b[^>]*>", head)
+    said = {} if begin is None else ElementTree.fromstring(begin[0].rstrip(b"/>") + b"/>").attrib
+    order = ">" if said.get("byte_order") == "BigEndian" else "<"
+    header = np.dtype(order + ("u8" if said.get("header_type") == "UInt64" else "u4"))
+    code = values.dtype.str[1:]
+    raw = values.astype(np.dtype(order + code)).tobytes()
+    kind = next(word for word, each in TYPES.items() if each == code)
+    opened = f'<DataArray type="{kind}" Name="{html.escape(name)}" NumberOfComponents="{values.shape[1]}" format='
+    pack = _PACK.get(said.get("compressor", ""))
+    if pack is None:
+        return f'{opened}"ascii">{" ".join(values.astype(str).ravel().tolist())}</DataArray>\n'
+    packed = pack(raw)
+    sizes = [len(raw)] if packed is raw else [1, len(raw), 0, len(packed)]
+    text = np.array(sizes, header).tobytes()
+    letters = base64.b64encode(text + raw) if packed is raw else base64.b64encode(text) + base64.b64encode(packed)
+    return f'{opened}"binary">{letters.decode()}</DataArray>\n'
 
 
 def arrays_of(name: str, data: bytes) -> list[str]:
@@ -88,7 +121,7 @@ class _File:
     def __init__(self, name: str, data: bytes) -> None:
         self.name, self.size, self.appended, self.encoding = name, len(data), b"", b""
         begin = data.find(b"<AppendedData")
-        found = _APPENDED.match(data, begin) if begin >= 0 else None
+        found = APPENDED.match(data, begin) if begin >= 0 else None
         if found:
             self.appended, self.encoding = data[found.end() :], found[1]
             data = data[: found.start()] + b"</VTKFile>"
