@@ -115,12 +115,12 @@ def test_images_that_nobody_reads_go_when_they_are_replaced(tmp_path: Path, othe
     path, needed = tmp_path / "small.glb", "KHR_texture_basisu"
     write_gltf(
         path,
-        images=[b"KTX 20", b"KTX 20 too"][: 1 + other],
+        images=[encoded(quarters()), encoded(quarters()[::-1])][: 1 + other],  # what they hold is not looked at
         primitives=[{"material": 0}],
         textures=[{"extensions": {needed: {"source": k}}} for k in range(1 + other)],
         materials=[
             {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
-            | ({"normalTexture": {"index": 1}} if other else {})
+            | ({"occlusionTexture": {"index": 1}} if other else {})
         ],
         extensionsUsed=[needed],
         extensionsRequired=[needed],
