@@ -32,11 +32,15 @@ def put(source: Shape, target: Shape, places: np.ndarray) -> VertexMap:
 
 def folded(source: Shape, target: Shape, moved: Ints = MOVED) -> VertexMap:
     """The map to the closest point, but for vertices that are pulled across a neighbour."""
+    return put(source, target, pulled(source, moved))
+
+
+def pulled(source: Shape, moved: Ints) -> np.ndarray:
     places, edges = source.verts.copy(), source.edges.vertices
     for vertex in moved:
         other = edges[(edges == vertex).any(axis=1)][0].sum() - vertex
         places[vertex] += 1.8 * (source.verts[other] - source.verts[vertex])
-    return put(source, target, places)
+    return places
 
 
 def test_folds_are_opened_and_the_rest_stays() -> None:
@@ -336,3 +340,20 @@ def test_no_image_leaves_its_part_where_another_one_touches_it() -> None:
     alone = unfolded(before, source, target)
     assert (alone.points(target) != before.points(target)).any()
     np.testing.assert_array_equal(theirs[alone.index], own)
+
+
+def test_no_image_leaves_its_layer_while_folds_are_laid_out() -> None:
+    """Of two layers that face alike, as a shirt and its lining, the means of images lie nearer to the inner one."""
+    layers = [ball(3, turn).verts * size for turn in (0.3, 0.0) for size in (1.0, 1.002)]
+    faces = icosphere(3).faces
+    V = len(layers[0])
+    twice = np.concatenate([faces, faces + V])
+    source, target = (Shape(np.concatenate(each), twice) for each in (layers[:2], layers[2:]))
+    layer = np.repeat([0, 1], V)
+    foot = MappedMesh.of(target).query(pulled(source, MOVED + V), parts=layer)
+    rest = {"face": foot.face, "barycentric": foot.barycentric, "confidence": np.ones(source.V, np.float32)}
+    before = VertexMap.between(source, target, foot.vertex, **rest)
+    after = unfolded(before, source, target)
+    assert Folds.of(before, source, target).flipped > 0.001
+    assert Folds.of(after, source, target).flipped == 0
+    np.testing.assert_array_equal(layer[after.index], layer)
