@@ -14,11 +14,13 @@ from meshmatch.errors import OptionError, warn
 from meshmatch.outputs import replace_all_on_success
 from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
 from meshmatch.shapes.files import save_shape
-from meshmatch.shapes.formats import Textured, gltf, gltf_out, obj, obj_text, ply, ply_edit, vtk, vtp_edit
+from meshmatch.shapes.formats import Textured, gltf, gltf_out, obj, obj_text, ply, vtk
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_dressed import colored, dressed
 from meshmatch.shapes.formats.gltf_edit import remembering
 from meshmatch.shapes.formats.gltf_vrm import check_character
+from meshmatch.shapes.formats.ply_edit import PlyFile
+from meshmatch.shapes.formats.vtp_edit import VtpFile
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import check_textured, files_of, image_file, tile_file
@@ -146,8 +148,6 @@ def save_colored(path: Path, shape: Shape, file: Path | None, turn: Float[Floats
     file without axes is turned upright in a glb. Returns whether a file of this format stays what it was.
     """
     suffix, colors = path.suffix.lower(), shape.colors
-    kept = ply_edit.data_of(file, shape) if suffix == ".ply" else None
-    kept = vtp_edit.data_of(file, shape) if suffix == ".vtp" else kept
     assert colors is not None
     if suffix in (".glb", ".vrm"):
         name, data, as_it_is = glb_base(file, shape)
@@ -156,10 +156,10 @@ def save_colored(path: Path, shape: Shape, file: Path | None, turn: Float[Floats
         path.write_bytes(remembering(made, shape))
     elif suffix == ".obj" and file is not None and file.suffix.lower() == ".obj":
         path.write_bytes(obj_text.with_colors(file.name, read_bytes(file), colors))
-    elif file is not None and kept is not None and suffix == ".ply":
-        path.write_bytes(ply_edit.with_columns(file.name, kept, ply.color_columns(colors), {}))
-    elif file is not None and kept is not None:
-        path.write_bytes(vtp_edit.with_arrays(file.name, kept, {"Colors": vtk.bytes_of(colors)}, {}))
+    elif suffix == ".ply" and (as_ply := PlyFile.of(file, shape)) is not None:
+        path.write_bytes(as_ply.with_columns(ply.color_columns(colors), {}))
+    elif suffix == ".vtp" and (as_vtp := VtpFile.of(file, shape)) is not None:
+        path.write_bytes(as_vtp.with_arrays({"Colors": vtk.bytes_of(colors)}, {}))
     else:
         save_shape(path, shape)
         return False
@@ -207,5 +207,7 @@ def beyond_triangles(file: Path) -> list[str]:
     suffix = file.suffix.lower()
     if suffix in gltf.SUFFIXES:
         return gltf.understood(file, read_bytes(file), "scene makes", Document.beyond_triangles)
-    told = {".obj": obj_text.beyond_triangles, ".ply": ply_edit.beyond_triangles, ".vtp": vtp_edit.beyond_triangles}
-    return told[suffix](file.name, read_bytes(file)) if suffix in told else []
+    if suffix == ".obj":
+        return obj_text.beyond_triangles(file.name, read_bytes(file))
+    readers: dict[str, type[PlyFile | VtpFile]] = {".ply": PlyFile, ".vtp": VtpFile}
+    return readers[suffix].parsed(file.name, read_bytes(file)).beyond_triangles if suffix in readers else []

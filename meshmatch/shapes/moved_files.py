@@ -21,13 +21,14 @@ from meshmatch.shapes.appearance import Appearance, BakedMaterial
 from meshmatch.shapes.colors import bytes_of
 from meshmatch.shapes.dressed_files import Dressed, beyond_triangles
 from meshmatch.shapes.files import check_suffix, load_shape, save_shape
-from meshmatch.shapes.formats import gltf, obj_look, obj_text, ply_edit
+from meshmatch.shapes.formats import gltf, obj_look, obj_text
 from meshmatch.shapes.formats.gltf_dressed import dressed, laid
 from meshmatch.shapes.formats.gltf_edit import Editor, remembering
 from meshmatch.shapes.formats.gltf_join import joined
 from meshmatch.shapes.formats.gltf_moved import moved
 from meshmatch.shapes.formats.gltf_rigged import Binding, rigged
 from meshmatch.shapes.formats.gltf_vrm import SUFFIX, check_character
+from meshmatch.shapes.formats.ply_edit import PlyFile
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import find_appearance, load_coordinates
@@ -147,13 +148,8 @@ class MovedFile:
             text = obj_text.with_positions(original.name, read_bytes(original), shape.verts_or_nan, turns)
             places[0].write_bytes(text)
             return
-        as_it_came = None
-        if (
-            original is not None
-            and suffix == ".ply"
-            and (data := ply_edit.data_of(original, shape, moved=True)) is not None
-        ):
-            as_it_came = ply_edit.with_positions(original.name, data, shape.verts_or_nan, turns)
+        ply = PlyFile.of(original, shape, moved=True) if suffix == ".ply" else None
+        as_it_came = None if ply is None else ply.with_positions(shape.verts_or_nan, turns)
         if original is not None and suffix == ".glb" and original.suffix.lower() in gltf.SUFFIXES:
             as_it_came = _scene(self.output, original, shape, turns, still and not self.told)
         if as_it_came is not None:

@@ -252,7 +252,9 @@ def save_labels(path: Path, labels: Labels, shape: Shape, file: Path | None = No
 
 def _write_shape(path: Path, labels: Labels, shape: Shape, suffix: str, file: Path | None) -> bool:
     """Whole numbers as they are; words by their number, which comments at the beginning explain."""
-    from meshmatch.shapes.formats import ply, ply_edit, vtk, vtk_xml, vtp_edit
+    from meshmatch.shapes.formats import ply, vtk, vtk_xml
+    from meshmatch.shapes.formats.ply_edit import PlyFile
+    from meshmatch.shapes.formats.vtp_edit import VtpFile
 
     numbers = [k if labels.are_words else int(name) for k, name in enumerate(labels.names)]
     comments = [f"label {k} {name}" for k, name in enumerate(labels.names)] if labels.are_words else []
@@ -263,19 +265,19 @@ def _write_shape(path: Path, labels: Labels, shape: Shape, suffix: str, file: Pa
         wide = max(map(abs, numbers)) >= 2**31
         arrays = {"label": np.array(numbers, np.int64 if wide else np.int32)[labels.codes], "Colors": colors}
         of_points, of_faces = (arrays, {}) if labels.on == "vertices" else ({}, arrays)
-        data = vtp_edit.data_of(file, shape, faces=labels.on == "faces")
-        if file is not None and data is not None:
-            path.write_bytes(vtp_edit.with_arrays(file.name, data, of_points, of_faces, comments))
+        as_vtp = VtpFile.of(file, shape, faces=labels.on == "faces")
+        if as_vtp is not None:
+            path.write_bytes(as_vtp.with_arrays(of_points, of_faces, comments))
         else:
             kept = {name: each for name, each in vtk_xml.point_arrays(file).items() if name not in arrays}
             vtk.write_vtp(path, plain, {**kept, **of_points}, of_faces, comments)
-        return data is not None
+        return as_vtp is not None
     columns: dict[str, Any] = {"label": np.array(numbers, np.int32)[labels.codes]}
     columns |= {channel: colors[:, k] for k, channel in enumerate(("red", "green", "blue"))}
     where: Any = {"vertex": columns, "face": {}} if labels.on == "vertices" else {"vertex": {}, "face": columns}
-    data = ply_edit.data_of(file, shape, faces=labels.on == "faces")
-    if file is not None and data is not None:
-        path.write_bytes(ply_edit.with_columns(file.name, data, comments=comments, **where))
+    as_ply = PlyFile.of(file, shape, faces=labels.on == "faces")
+    if as_ply is not None:
+        path.write_bytes(as_ply.with_columns(comments=comments, **where))
     else:
         ply.write(path, plain, comments=comments, **where)
-    return data is not None
+    return as_ply is not None

@@ -19,7 +19,9 @@ from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.shapes import tables
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.dressed_files import save_colored
-from meshmatch.shapes.formats import ply, ply_edit, vtk, vtk_xml, vtp_edit
+from meshmatch.shapes.formats import ply, vtk, vtk_xml
+from meshmatch.shapes.formats.ply_edit import PlyFile
+from meshmatch.shapes.formats.vtp_edit import VtpFile
 from meshmatch.shapes.input_files import read_npy
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import read_table
@@ -116,16 +118,15 @@ def save_values(path: Path, values: Values, shape: Shape, file: Path | None = No
     elif suffix == ".csv":
         tables.write_rows(path, ["vertex", *names], ([k, *row] for k, row in enumerate(table.tolist())))
     elif suffix in (".vtp", ".vtk"):
-        data = vtp_edit.data_of(file, shape) if suffix == ".vtp" else None
-        there = vtk_xml.point_arrays(file) if suffix == ".vtp" and data is None else {}
-        taken = vtk_xml.arrays_of(file.name, data) if file is not None and data is not None else there
-        own = _different([name or "value" for name in names], set(taken))
+        as_vtp = VtpFile.of(file, shape) if suffix == ".vtp" else None
+        there = vtk_xml.point_arrays(file) if suffix == ".vtp" and as_vtp is None else {}
+        own = _different([name or "value" for name in names], set(there if as_vtp is None else as_vtp.arrays))
         arrays = dict(zip(own, table.T, strict=True))
-        if file is not None and data is not None:
-            path.write_bytes(vtp_edit.with_arrays(file.name, data, arrays, {}))
+        if as_vtp is not None:
+            path.write_bytes(as_vtp.with_arrays(arrays, {}))
         else:
             (vtk.write_vtp if suffix == ".vtp" else vtk.write_vtk)(path, shape, {**there, **arrays})
-        return data is not None
+        return as_vtp is not None
     else:
         words = ["".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in name) for name in names]
         own = _different([word or "value" for word in words], _RESERVED)
@@ -135,12 +136,12 @@ def save_values(path: Path, values: Values, shape: Shape, file: Path | None = No
         whole = (table == np.rint(table)) & (np.abs(table) < 2**53)
         if (off > np.where(whole, 0.0, _VISIBLE * np.abs(table))).any():
             warn(f"{path.name} has 32-bit numbers, which change some of these; .csv, .npy and .vtp keep them")
-        columns, data = dict(zip(own, written.T, strict=True)), ply_edit.data_of(file, shape)
-        if file is not None and data is not None:
-            path.write_bytes(ply_edit.with_columns(file.name, data, columns, {}))
+        columns, as_ply = dict(zip(own, written.T, strict=True)), PlyFile.of(file, shape)
+        if as_ply is not None:
+            path.write_bytes(as_ply.with_columns(columns, {}))
         else:
             ply.write(path, shape, vertex=columns)
-        return data is not None
+        return as_ply is not None
     return True
 
 

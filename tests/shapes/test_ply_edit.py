@@ -7,8 +7,9 @@ import pytest
 
 from meshmatch.errors import MeshmatchWarning
 from meshmatch.shapes.files import load_shape
-from meshmatch.shapes.formats import ply, ply_edit
+from meshmatch.shapes.formats import ply
 from meshmatch.shapes.formats.ply import parsed
+from meshmatch.shapes.formats.ply_edit import PlyFile
 from meshmatch.shapes.shape import Shape
 
 HEAD = """ply
@@ -74,7 +75,7 @@ def test_numbers_of_vertices_are_added_and_all_else_stays(kind: str) -> None:
     before = example(kind)
     colors = ply.color_columns(np.tile([1.0, 0.0, 0.5, 1.0], (5, 1)))
     label = np.arange(5, dtype=np.int32)
-    after = ply_edit.with_columns("a.ply", before, {"label": label, **colors}, {}, ["label 0 head"])
+    after = PlyFile.parsed("a.ply", before).with_columns({"label": label, **colors}, {}, ["label 0 head"])
     head = after.split(b"end_header")[0]
     for line in HEAD.format(kind).replace("end_header\n", "").splitlines():
         assert (line.encode() in head) != ("diffuse" in line)  # earlier colors make room
@@ -92,7 +93,7 @@ def test_numbers_of_vertices_are_added_and_all_else_stays(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_polygon_has_what_most_of_its_triangles_have(kind: str) -> None:
-    after = ply_edit.with_columns("a.ply", example(kind), {}, {"label": np.array([4, 4, 7], np.int32)})
+    after = PlyFile.parsed("a.ply", example(kind)).with_columns({}, {"label": np.array([4, 4, 7], np.int32)})
     faces = table(after, "face")
     np.testing.assert_array_equal(faces["label"], [4, 7])
     np.testing.assert_array_equal(faces["vertex_indices"][1], [4, 3])
@@ -104,7 +105,7 @@ def test_a_polygon_has_what_most_of_its_triangles_have(kind: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_vertices_move_and_normals_turn_with_them(kind: str, tmp_path: Path) -> None:
     tipped = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    after = ply_edit.with_positions("a.ply", example(kind), PLACES @ tipped.T, np.tile(tipped, (5, 1, 1)))
+    after = PlyFile.parsed("a.ply", example(kind)).with_positions(PLACES @ tipped.T, np.tile(tipped, (5, 1, 1)))
     now = table(after, "vertex")
     np.testing.assert_allclose(np.stack([now[f"n{axis}"] for axis in "xyz"], 1), [[0, -1, 0]] * 5)
     (tmp_path / "a.ply").write_bytes(after)
@@ -115,7 +116,7 @@ def test_vertices_move_and_normals_turn_with_them(kind: str, tmp_path: Path) -> 
 
 def test_what_is_replaced_is_said() -> None:
     with pytest.warns(MeshmatchWarning, match="a.ply has quality of each vertex already, which is replaced"):
-        after = ply_edit.with_columns("a.ply", example("ascii"), {"quality": np.ones(5, np.float32)}, {})
+        after = PlyFile.parsed("a.ply", example("ascii")).with_columns({"quality": np.ones(5, np.float32)}, {})
     np.testing.assert_array_equal(table(after, "vertex")["quality"], 1.0)
     assert after.count(b"quality") == 1
 
@@ -124,14 +125,16 @@ def test_only_the_file_of_a_shape_is_edited(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(example("ascii"))
     shape = load_shape(path)
-    assert ply_edit.data_of(path, shape) == example("ascii")
-    assert ply_edit.data_of(path, shape, faces=True) is not None
-    assert ply_edit.data_of(path, Shape(shape.verts[:4], shape.faces[:2])) is None
-    assert ply_edit.data_of(None, shape) is None
+    same = PlyFile.of(path, shape)
+    assert same is not None
+    assert same.data == example("ascii")
+    assert PlyFile.of(path, shape, faces=True) is not None
+    assert PlyFile.of(path, Shape(shape.verts[:4], shape.faces[:2])) is None
+    assert PlyFile.of(None, shape) is None
     strips = example("ascii").replace(b"element face", b"element tristrips")
     path.write_bytes(strips)
-    assert ply_edit.data_of(path, shape, faces=True) is None
-    assert ply_edit.data_of(path, shape) == strips
+    assert PlyFile.of(path, shape, faces=True) is None
+    assert PlyFile.of(path, shape) is not None
 
 
 @pytest.mark.parametrize("text", [" ", "\n"])
@@ -141,35 +144,35 @@ def test_a_text_whose_rows_are_not_one_to_a_line_is_not_edited(tmp_path: Path, t
     lines = body.split(b"\n")
     lines[1:3] = [text.join(lines[1].decode().split(" ", 1)).encode() + b" " + lines[2]]
     path.write_bytes(head + b"end_header\n" + b"\n".join(lines))
-    assert ply_edit.data_of(path, load_shape(path)) is None
+    assert PlyFile.of(path, load_shape(path)) is None
 
 
 def test_colors_are_bytes_whatever_they_were() -> None:
     before = example("ascii").replace(b"uchar diffuse_", b"float ")
-    after = ply_edit.with_columns("a.ply", before, ply.color_columns(np.full((5, 4), 1 / 255)), {})
+    after = PlyFile.parsed("a.ply", before).with_columns(ply.color_columns(np.full((5, 4), 1 / 255)), {})
     assert after.count(b"property uchar green") == 1 and b"property float green" not in after
     np.testing.assert_array_equal(table(after, "vertex")["green"], 1)
 
 
 def test_names_of_earlier_labels_go() -> None:
-    words = ply_edit.with_columns(
-        "a.ply", example("ascii"), {"label": np.zeros(5, np.int32)}, {}, ["label 0 ", "label 1 b"]
+    words = PlyFile.parsed("a.ply", example("ascii")).with_columns(
+        {"label": np.zeros(5, np.int32)}, {}, ["label 0 ", "label 1 b"]
     )
     assert words.count(b"comment label") == 2
     with pytest.warns(MeshmatchWarning, match="label of each vertex already"):
-        numbers = ply_edit.with_columns("a.ply", words, {"label": np.ones(5, np.int32)}, {})
+        numbers = PlyFile.parsed("a.ply", words).with_columns({"label": np.ones(5, np.int32)}, {})
     assert numbers.count(b"comment label") == 0
 
 
 def test_a_polygon_without_triangles_has_no_label() -> None:
     before = example("ascii").replace(b"3 1 4 2 6 0.5 0.5 0.5 0.5 0.5 0.5", b"2 1 4 4 0.5 0.5 0.5 0.5")
-    after = ply_edit.with_columns("a.ply", before, {}, {"label": np.array([4, 4], np.int32)})
+    after = PlyFile.parsed("a.ply", before).with_columns({}, {"label": np.array([4, 4], np.int32)})
     np.testing.assert_array_equal(table(after, "face")["label"], [4, -1])
 
 
 def test_a_text_keeps_digits_of_positions() -> None:
     far = np.add(PLACES, [4500000.123, 0, 0])
-    after = ply_edit.with_positions("a.ply", example("ascii"), far, np.tile(np.eye(3), (5, 1, 1)))
+    after = PlyFile.parsed("a.ply", example("ascii")).with_positions(far, np.tile(np.eye(3), (5, 1, 1)))
     np.testing.assert_array_equal(table(after, "vertex")["x"], far[:, 0])
 
 
@@ -177,8 +180,8 @@ def test_a_file_that_has_changed_is_not_edited(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(example("binary_big_endian"))
     shape = load_shape(path)
-    assert ply_edit.data_of(path, Shape(shape.verts + 1, shape.faces)) is None
-    assert ply_edit.data_of(path, Shape(shape.verts + 1, shape.faces), moved=True) is not None
-    assert ply_edit.data_of(path, Shape(shape.verts, shape.faces[:1]), faces=True) is None
+    assert PlyFile.of(path, Shape(shape.verts + 1, shape.faces)) is None
+    assert PlyFile.of(path, Shape(shape.verts + 1, shape.faces), moved=True) is not None
+    assert PlyFile.of(path, Shape(shape.verts, shape.faces[:1]), faces=True) is None
     path.unlink()
-    assert ply_edit.data_of(path, shape) is None
+    assert PlyFile.of(path, shape) is None

@@ -8,8 +8,9 @@ import pytest
 
 from meshmatch.errors import MeshmatchWarning
 from meshmatch.shapes.files import load_shape
-from meshmatch.shapes.formats import vtk, vtp_edit
+from meshmatch.shapes.formats import vtk
 from meshmatch.shapes.formats.vtk_xml import _File
+from meshmatch.shapes.formats.vtp_edit import VtpFile
 from meshmatch.shapes.shape import Shape
 
 PLACES = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0.5, 0]])
@@ -56,8 +57,8 @@ def arrays_of(data: bytes, group: str) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("data", ["<PointData Scalars='t'>\n{}</PointData>", "<PointData/>", ""])
 def test_arrays_of_points_are_added_and_all_else_stays(data: str, tmp_path: Path) -> None:
     before = example(data)
-    after = vtp_edit.with_arrays(
-        "a.vtp", before, {"a <b>": np.arange(5) / 7, "Colors": np.full((5, 3), 9, np.uint8)}, {}, ["m"]
+    after = VtpFile.parsed("a.vtp", before).with_arrays(
+        {"a <b>": np.arange(5) / 7, "Colors": np.full((5, 3), 9, np.uint8)}, {}, ["m"]
     )
     found = arrays_of(after, "PointData")
     np.testing.assert_array_equal(found["a <b>"], np.arange(5) / 7)
@@ -70,24 +71,26 @@ def test_arrays_of_points_are_added_and_all_else_stays(data: str, tmp_path: Path
     shape = load_shape(path)
     np.testing.assert_array_equal(shape.verts, PLACES)
     np.testing.assert_allclose(shape.colors, [[9 / 255] * 3 + [1.0]] * 5)
-    assert vtp_edit.data_of(path, shape) == after
+    same = VtpFile.of(path, shape)
+    assert same is not None
+    assert same.data == after
 
 
 def test_a_cell_has_what_most_of_its_triangles_have(tmp_path: Path) -> None:
     path = tmp_path / "a.vtp"
     path.write_bytes(example())
     shape = load_shape(path)
-    data = vtp_edit.data_of(path, shape, faces=True)
-    assert data is not None
-    after = vtp_edit.with_arrays("a.vtp", data, {}, {"label": np.array([4, 4, 7], np.int32)})
+    file = VtpFile.of(path, shape, faces=True)
+    assert file is not None
+    after = file.with_arrays({}, {"label": np.array([4, 4, 7], np.int32)})
     np.testing.assert_array_equal(arrays_of(after, "CellData")["label"], [4, 7])
-    again = vtp_edit.with_arrays("a.vtp", after, {"x": np.ones(5)}, {})
+    again = VtpFile.parsed("a.vtp", after).with_arrays({"x": np.ones(5)}, {})
     np.testing.assert_array_equal(arrays_of(again, "CellData")["label"], [4, 7])
 
 
 def test_what_is_replaced_is_said() -> None:
     with pytest.warns(MeshmatchWarning, match="a.vtp has an array thickness already, which is replaced"):
-        after = vtp_edit.with_arrays("a.vtp", example(), {"thickness": np.ones(5)}, {})
+        after = VtpFile.parsed("a.vtp", example()).with_arrays({"thickness": np.ones(5)}, {})
     np.testing.assert_array_equal(arrays_of(after, "PointData")["thickness"], 1.0)
 
 
@@ -96,12 +99,12 @@ def test_files_that_cannot_be_edited_are_told_apart(tmp_path: Path) -> None:
     path.write_bytes(example())
     shape = load_shape(path)
     path.write_bytes(example().replace(b'NumberOfPolys="2"', b'NumberOfPolys="2" NumberOfLines="1"'))
-    assert vtp_edit.data_of(path, shape, faces=True) is None
-    assert vtp_edit.data_of(path, shape) is not None
+    assert VtpFile.of(path, shape, faces=True) is None
+    assert VtpFile.of(path, shape) is not None
     pieces = example().replace(b"</Piece>", b"</Piece><Piece></Piece>")
     path.write_bytes(pieces)
-    assert vtp_edit.data_of(path, shape) is None
-    assert vtp_edit.data_of(tmp_path / "a.ply", shape) is None
+    assert VtpFile.of(path, shape) is None
+    assert VtpFile.of(tmp_path / "a.ply", shape) is None
 
 
 def test_what_the_package_wrote_can_be_edited(tmp_path: Path) -> None:
@@ -109,9 +112,9 @@ def test_what_the_package_wrote_can_be_edited(tmp_path: Path) -> None:
     path.write_bytes(example())
     shape = load_shape(path)
     vtk.write_vtp(path, shape, {"height": shape.verts[:, 1]})
-    data = vtp_edit.data_of(path, shape)
-    assert data is not None
-    found = arrays_of(vtp_edit.with_arrays("a.vtp", data, {"label": np.arange(5)}, {}), "PointData")
+    file = VtpFile.of(path, shape)
+    assert file is not None
+    found = arrays_of(file.with_arrays({"label": np.arange(5)}, {}), "PointData")
     np.testing.assert_array_equal(found["height"], PLACES[:, 1])
     np.testing.assert_array_equal(found["label"], np.arange(5))
 
@@ -129,10 +132,10 @@ TRAPS = {
 def test_what_only_looks_like_a_tag_is_none(trap: str, tmp_path: Path) -> None:
     path = tmp_path / "a.vtp"
     path.write_bytes(example().replace(*TRAPS[trap]))
-    data = vtp_edit.data_of(path, load_shape(path), faces=True)
-    assert data is not None
-    after = vtp_edit.with_arrays("a.vtp", data, {"é": np.arange(5.0)}, {}, ["label 0 a---x\x01"])
-    after = vtp_edit.with_arrays("a.vtp", after, {}, {"label": np.array([4, 4, 7], np.int32)}, ["label 0 b"])
+    file = VtpFile.of(path, load_shape(path), faces=True)
+    assert file is not None
+    after = file.with_arrays({"é": np.arange(5.0)}, {}, ["label 0 a---x\x01"])
+    after = VtpFile.parsed("a.vtp", after).with_arrays({}, {"label": np.array([4, 4, 7], np.int32)}, ["label 0 b"])
     np.testing.assert_array_equal(arrays_of(after, "PointData")["é"], np.arange(5.0))
     np.testing.assert_array_equal(arrays_of(after, "PointData")["thickness"], np.arange(5) / 3)
     np.testing.assert_array_equal(arrays_of(after, "CellData")["label"], [4, 7])
@@ -142,7 +145,7 @@ def test_what_only_looks_like_a_tag_is_none(trap: str, tmp_path: Path) -> None:
 def test_an_array_is_replaced_however_its_name_is_written(tmp_path: Path) -> None:
     old = "<PointData>{}<DataArray type='Int32' Name = 'a&amp;b' format='ascii'>1 2 3 4 5</DataArray ></PointData>"
     with pytest.warns(MeshmatchWarning, match="a.vtp has an array a&b already"):
-        after = vtp_edit.with_arrays("a.vtp", example(old), {"a&b": np.full(5, 9)}, {})
+        after = VtpFile.parsed("a.vtp", example(old)).with_arrays({"a&b": np.full(5, 9)}, {})
     assert list(arrays_of(after, "PointData")) == ["thickness", "a&b"]
     np.testing.assert_array_equal(arrays_of(after, "PointData")["a&b"], 9)
 
@@ -158,7 +161,7 @@ def test_arrays_are_written_as_those_of_the_file(order: str, header: str, packed
         "</Points></Piece></PolyData></VTKFile>"
     ).encode()
     values = np.array([1.5, np.nan, np.inf, -2.0, 0.0])
-    after = vtp_edit.with_arrays("a.vtp", data, {"v": values, "n": np.arange(10).reshape(5, 2)}, {})
+    after = VtpFile.parsed("a.vtp", data).with_arrays({"v": values, "n": np.arange(10).reshape(5, 2)}, {})
     np.testing.assert_array_equal(arrays_of(after, "PointData")["v"], values)
     np.testing.assert_array_equal(arrays_of(after, "PointData")["n"], np.arange(10))
 
@@ -167,7 +170,7 @@ def test_a_file_that_has_changed_is_not_edited(tmp_path: Path) -> None:
     path = tmp_path / "a.vtp"
     path.write_bytes(example())
     shape = load_shape(path)
-    assert vtp_edit.data_of(path, Shape(shape.verts + 1, shape.faces)) is None
-    assert vtp_edit.data_of(path, Shape(shape.verts, shape.faces[:1]), faces=True) is None
+    assert VtpFile.of(path, Shape(shape.verts + 1, shape.faces)) is None
+    assert VtpFile.of(path, Shape(shape.verts, shape.faces[:1]), faces=True) is None
     path.unlink()
-    assert vtp_edit.data_of(path, shape) is None
+    assert VtpFile.of(path, shape) is None

@@ -5,17 +5,20 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import warn
 from meshmatch.shapes.formats import damaged, runs
 from meshmatch.shapes.formats.ply import CHANNELS, END, KINDS, Columns, Content, color_properties, corners_of, parsed
 from meshmatch.shapes.formats.ply_rows import TYPES, Element, Property
+from meshmatch.shapes.formats.polygons import of_most_triangles
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
@@ -24,109 +27,138 @@ _OF_SURFACES = {*"xyzstuv", "nx", "ny", "nz", "texture_u", "texture_v", "texnumb
 _NAMED = re.compile(rb"comment label -?\d+(?: |$)")
 
 
-def with_positions(name: str, data: bytes, verts: Float[Floats, "V 3"], turns: Float[Floats, "V 3 3"]) -> bytes:
-    """The bytes of a ply whose vertices have moved; normals turn by the rotation around each vertex."""
-    normals = [f"n{axis}" for axis in "xyz"]
-    vertices = parsed(name, data).vertices
-    columns = dict(zip("xyz", verts.T, strict=True))
-    if set(normals) <= set(vertices.table):
-        before = np.stack([vertices.table[each].astype(np.float64) for each in normals], axis=1)
-        columns |= zip(normals, np.einsum("vij,vj->iv", turns, before), strict=True)
-    return _edited(name, data, columns, {}, ())
+@dataclass(frozen=True, eq=False)
+class PlyFile:
+    """A ply to be written with other numbers.
 
-
-def with_columns(name: str, data: bytes, vertex: Columns, face: Columns, comments: Sequence[str] = ()) -> bytes:
-    """The bytes of a ply with further properties.
-
-    Parameters
+    Attributes
     ----------
-    name
-        Of the file, for words.
-    data
-        What `ply.read` can read.
-    vertex
-        Arrays (V,) by the name of a property; what has that name already is replaced, which is said but of colors.
-    face
-        Arrays (F,) for its triangles as `ply.read` makes them: a polygon has what most of its triangles have, by the first
-        of the arrays. None of a file with strips, whose triangles have no rows.
-    comments
-        Go into its header, where comments on labels make room for them.
+    name : of the file, for words
+    data : its bytes
+    content : what `ply.parsed` makes of them
     """
-    content = parsed(name, data)
-    if face:
-        _, sizes = corners_of(name, content.faces[0])
-        chosen = most_frequent(next(iter(face.values())), np.maximum(sizes - 2, 0))
-        face = {name: np.append(values, none_of(values))[chosen] for name, values in face.items()}
-    for element, columns in ((content.vertices, vertex), *((each, face) for each in content.faces)):
-        colored = {p.name for p in color_properties(element)} | set(CHANNELS)
-        again = [p.name for p in element.properties if p.name in columns and p.name not in colored]
-        if again:
-            warn(f"{name} has {', '.join(again)} of each {element.name} already, which is replaced")
-    return _edited(name, data, vertex, face, comments)
 
+    name: str
+    data: bytes
+    content: Content
 
-def data_of(file: Path | None, shape: Shape, faces: bool = False, moved: bool = False) -> bytes | None:
-    """The bytes of the ply that a shape was read from, perhaps to be ``moved``.
+    @classmethod
+    def parsed(cls, name: str, data: bytes) -> PlyFile:
+        """From its bytes."""
+        return cls(name, data, parsed(name, data))
 
-    None where it came from elsewhere, where the file is another one by now, or its text does not have a row on each line,
-    and where ``faces`` need rows and the file has strips or several kinds of faces.
-    """
-    if file is None or file.suffix.lower() != ".ply" or not file.is_file():
-        return None
-    data = read_bytes(file)
-    content = parsed(file.name, data)
-    places = np.stack([content.vertices.table[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    same = len(places) == shape.V and (moved or np.array_equal(places, shape.verts_or_nan, equal_nan=True))
-    if faces:
-        rows = len(content.faces) == 1 and not content.strips
-        same &= rows and int(np.maximum(corners_of(file.name, content.faces[0])[1] - 2, 0).sum()) == shape.F
-    return data if same and (content.order or _has_a_row_on_each_line(content, data)) else None
+    @classmethod
+    def of(cls, file: Path | None, shape: Shape, faces: bool = False, moved: bool = False) -> PlyFile | None:
+        """The file that a shape was read from, perhaps to be ``moved``.
 
+        None where it came from elsewhere, where the file is another one by now, or its text does not have a row on each
+        line, and where ``faces`` need rows and the file has strips or several kinds of faces.
+        """
+        if file is None or file.suffix.lower() != ".ply" or not file.is_file():
+            return None
+        found = cls.parsed(file.name, read_bytes(file))
+        content = found.content
+        places = np.stack([content.vertices.table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        same = len(places) == shape.V and (moved or np.array_equal(places, shape.verts_or_nan, equal_nan=True))
+        if faces:
+            rows = len(content.faces) == 1 and not content.strips
+            same &= rows and int(np.maximum(corners_of(file.name, content.faces[0])[1] - 2, 0).sum()) == shape.F
+        return found if same and (content.order or found._lines is not None) else None
 
-def _has_a_row_on_each_line(content: Content, data: bytes) -> bool:
-    end = END.search(data)
-    assert end is not None
-    lines = [line for line in _lines(data[end.end() :]) if line.strip()]
-    at = 0
-    for element in content.elements:
-        rows = lines[at : at + element.count * bool(element.properties)]
-        at += len(rows)
-        if element.table and element.count:
-            words = np.full(element.count, len(element.properties))
-            for p in element.properties:
-                words += element.table[p.name][1] if p.count_kind else 0
-            if [len(row.split()) for row in rows] != words.tolist():
-                return False
-    return True
+    @property
+    def beyond_triangles(self) -> list[str]:
+        """What the file has besides triangles and their colors, in words."""
+        content = self.content
+        named, polygons = [p.name for p in content.vertices.properties], False
+        for element in content.faces:
+            named += [p.name for p in element.properties if not p.count_kind]
+            polygons |= bool((corners_of(self.name, element)[1] > 3).any())
+        colors = {p.name for element in (content.vertices, *content.faces) for p in color_properties(element)}
+        others = [each for each in dict.fromkeys(named) if each not in colors | _OF_SURFACES]
+        return ["polygons"] * polygons + [f"property {each}" for each in others]
 
+    def with_positions(self, verts: Float[Floats, "V 3"], turns: Float[Floats, "V 3 3"]) -> bytes:
+        """Its bytes when vertices have moved; normals turn by the rotation around each vertex."""
+        normals = [f"n{axis}" for axis in "xyz"]
+        table = self.content.vertices.table
+        columns = dict(zip("xyz", verts.T, strict=True))
+        if set(normals) <= set(table):
+            before = np.stack([table[each].astype(np.float64) for each in normals], axis=1)
+            columns |= zip(normals, np.einsum("vij,vj->iv", turns, before), strict=True)
+        return self._edited(columns, {}, ())
 
-def beyond_triangles(name: str, data: bytes) -> list[str]:
-    """What a file has besides triangles and their colors, in words."""
-    content = parsed(name, data)
-    named, polygons = [p.name for p in content.vertices.properties], False
-    for element in content.faces:
-        named += [p.name for p in element.properties if not p.count_kind]
-        polygons |= bool((corners_of(name, element)[1] > 3).any())
-    colors = {p.name for element in (content.vertices, *content.faces) for p in color_properties(element)}
-    others = [each for each in dict.fromkeys(named) if each not in colors | _OF_SURFACES]
-    return ["polygons"] * polygons + [f"property {each}" for each in others]
+    def with_columns(self, vertex: Columns, face: Columns, comments: Sequence[str] = ()) -> bytes:
+        """Its bytes with further properties.
 
+        Parameters
+        ----------
+        vertex
+            Arrays (V,) by the name of a property; what has that name already is replaced, which is said but of colors.
+        face
+            Arrays (F,) for its triangles as `ply.read` makes them: a polygon has what most of its triangles have, by the
+            first of the arrays. None of a file with strips, whose triangles have no rows.
+        comments
+            Go into its header, where comments on labels make room for them.
+        """
+        content = self.content
+        if face:
+            face = of_most_triangles(face, corners_of(self.name, content.faces[0])[1])
+        for element, columns in ((content.vertices, vertex), *((each, face) for each in content.faces)):
+            colored = {p.name for p in color_properties(element)} | set(CHANNELS)
+            again = [p.name for p in element.properties if p.name in columns and p.name not in colored]
+            if again:
+                warn(f"{self.name} has {', '.join(again)} of each {element.name} already, which is replaced")
+        return self._edited(vertex, face, comments)
 
-def none_of(values: NDArray[Any]) -> NDArray[Any]:
-    """(1, ...) what a polygon without triangles has: -1 of what may be negative, else 0."""
-    return np.full_like(values[:1], 0 if values.dtype.kind == "u" else -1)
+    def _edited(self, vertex: Columns, face: Columns, comments: Sequence[str]) -> bytes:
+        content = self.content
+        columns = {id(content.vertices): vertex} | {id(each): face for each in content.faces}
+        colored = CHANNELS[0] in {*vertex, *face}
+        plans = [_Plan.of(each, columns.get(id(each), {}), colored) for each in content.elements]
+        head = _head(self.data[: self._head.start()], plans, comments, "label" in {*vertex, *face})
+        rows = self._texts(plans) if content.order is None else self._bytes(plans, content.order)
+        return head + b"".join(rows)
 
+    @property
+    def _head(self) -> re.Match[bytes]:
+        """Where it ends."""
+        found = END.search(self.data)
+        assert found is not None
+        return found
 
-def most_frequent(values: NDArray[Any], triangles: Int[Ints, " P"]) -> Int[Ints, " P"]:
-    """For polygons of so many triangles one that has the value of most of them; -1 for a polygon without any."""
-    polygon = np.repeat(np.arange(len(triangles)), triangles)
-    code = np.unique(values, return_inverse=True)[1].reshape(-1)
-    _, which, counts = np.unique(polygon * (code.max(initial=0) + 1) + code, return_inverse=True, return_counts=True)
-    order = np.lexsort((np.arange(len(values)), -counts[which.reshape(-1)], polygon))
-    found = np.full(len(triangles), -1)
-    owners, first = np.unique(polygon[order], return_index=True)
-    found[owners] = order[first]
-    return found
+    @cached_property
+    def _lines(self) -> list[list[bytes]] | None:
+        """Of a text the lines of each element, and last those behind; None if they are not one row each."""
+        lines = [line for line in _split(self.data[self._head.end() :]) if line.strip()]
+        found, at = list[list[bytes]](), 0
+        for element in self.content.elements:
+            rows = lines[at : at + element.count * bool(element.properties)]
+            at += len(rows)
+            if element.table and element.count:
+                words = np.full(element.count, len(element.properties))
+                for p in element.properties:
+                    words += element.table[p.name][1] if p.count_kind else 0
+                if [len(row.split()) for row in rows] != words.tolist():
+                    return None
+            found.append(rows)
+        return [*found, lines[at:]]
+
+    def _texts(self, plans: Sequence[_Plan]) -> Iterator[bytes]:
+        """The lines of a text."""
+        if self._lines is None:
+            raise damaged(self.name, "its lines are not one row each")
+        for plan, rows in zip([*plans, None], self._lines, strict=True):
+            yield from (row + b"\n" for row in (_changed(plan, rows) if plan and plan.changes else rows))
+
+    def _bytes(self, plans: Sequence[_Plan], order: str) -> Iterator[bytes]:
+        """The rows of a binary file; what lies behind the last element that changes is not looked at."""
+        at = self._head.end()
+        last = max((k for k, plan in enumerate(plans) if plan.changes), default=-1)
+        for plan in plans[: last + 1]:
+            if plan.element.properties:
+                yield _packed(plan, order) if plan.changes else self.data[plan.element.bytes]
+                at = plan.element.bytes.stop
+        yield self.data[at:]
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,25 +201,10 @@ def _holds(p: Property, values: NDArray[Any]) -> bool:
     return bool(np.can_cast(values.dtype, p.kind, "same_kind" if p.kind[0] == "f" else "safe"))
 
 
-def _edited(name: str, data: bytes, vertex: Columns, face: Columns, comments: Sequence[str]) -> bytes:
-    content, end = parsed(name, data), END.search(data)
-    assert end is not None
-    columns = {id(content.vertices): vertex} | {id(each): face for each in content.faces}
-    colored = CHANNELS[0] in {*vertex, *face}
-    plans = [_Plan.of(each, columns.get(id(each), {}), colored) for each in content.elements]
-    head = _head(data[: end.start()], plans, comments, "label" in {*vertex, *face})
-    rows = (
-        _texts(name, data[end.end() :], plans)
-        if content.order is None
-        else _bytes(data, end.end(), plans, content.order)
-    )
-    return head + b"".join(rows)
-
-
 def _head(head: bytes, plans: Sequence[_Plan], comments: Sequence[str], labeled: bool) -> bytes:
     lines, waiting = [], iter(plans)
     plan: _Plan | None = None
-    for line in _lines(head.rstrip()):
+    for line in _split(head.rstrip()):
         words = line.split()
         if words[:1] == [b"element"] and len(words) > 2:
             lines += _declared(plan)
@@ -200,7 +217,7 @@ def _head(head: bytes, plans: Sequence[_Plan], comments: Sequence[str], labeled:
     return b"\n".join([*lines, *_declared(plan), b"end_header\n"])
 
 
-def _lines(text: bytes) -> list[bytes]:
+def _split(text: bytes) -> list[bytes]:
     return text.replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n")
 
 
@@ -208,40 +225,20 @@ def _declared(plan: _Plan | None) -> list[bytes]:
     return [f"property {p.kind} {p.name}".encode() for p in plan.added] if plan else []
 
 
-def _texts(name: str, body: bytes, plans: Sequence[_Plan]) -> Iterator[bytes]:
-    """The lines of a text, one for each row."""
-    lines = [line for line in _lines(body) if line.strip()]
-    at = 0
-    for plan in plans:
-        rows = lines[at : at + plan.element.count]
-        at += len(rows) if plan.element.properties else 0
-        if plan.element.properties:
-            yield from (_changed(name, plan, rows) if plan.changes else (row + b"\n" for row in rows))
-    yield from (line + b"\n" for line in lines[at:])
-
-
-def _changed(name: str, plan: _Plan, rows: Sequence[bytes]) -> Iterator[bytes]:
+def _changed(plan: _Plan, rows: Sequence[bytes]) -> Iterator[bytes]:
     texts = {name: values.astype(np.bytes_).tolist() for name, values in plan.columns.items()}
-    for k, row in enumerate(rows):
+    added = zip(*(texts[p.name] for p in plan.added), strict=True) if plan.added else repeat(())
+    if len(plan.added) == len(plan.columns) and not plan.gone:
+        yield from (b" ".join((row.strip(), *more)) for row, more in zip(rows, added, strict=False))
+        return
+    for k, (row, more) in enumerate(zip(rows, added, strict=False)):
         words, at, out = row.split(), 0, list[bytes]()
         for p in plan.element.properties:
-            size = 1 + int(float(words[at])) if p.count_kind and at < len(words) else 1
+            size = 1 + int(float(words[at])) if p.count_kind else 1
             if p.name not in plan.gone:
                 out += [texts[p.name][k]] if p.name in texts else words[at : at + size]
             at += size
-        if at != len(words):
-            raise damaged(name, f"a line of its {plan.element.name} is not one row")
-        yield b" ".join([*out, *(texts[p.name][k] for p in plan.added)]) + b"\n"
-
-
-def _bytes(data: bytes, at: int, plans: Sequence[_Plan], order: str) -> Iterator[bytes]:
-    """The rows of a binary file; what lies behind the last element that changes is not looked at."""
-    last = max((k for k, plan in enumerate(plans) if plan.changes), default=-1)
-    for plan in plans[: last + 1]:
-        if plan.element.properties:
-            yield _packed(plan, order) if plan.changes else data[plan.element.bytes]
-            at = plan.element.bytes.stop
-    yield data[at:]
+        yield b" ".join((*out, *more))
 
 
 def _packed(plan: _Plan, order: str) -> bytes:

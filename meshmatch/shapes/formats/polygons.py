@@ -6,9 +6,11 @@ of all corners, so that one answer serves for everything that is listed alike.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.errors import warn
@@ -68,6 +70,23 @@ def triangles_of(
         many = f"{left_out:,} polygons have" if left_out > 1 else "a polygon has"
         warn(f"{name}: {many} too many corners; what is concave there is split into triangles that overlap")
     return triangles
+
+
+def of_most_triangles(arrays: Mapping[str, NDArray[Any]], sizes: Int[Ints, " P"]) -> dict[str, NDArray[Any]]:
+    """Arrays (F, ...) for the triangles of polygons as arrays (P, ...) for polygons, of so many corners each.
+
+    A polygon has what most of its triangles have, by the first of the arrays; one without triangles has -1, or 0 of what is
+    never negative.
+    """
+    codes = np.unique(next(iter(arrays.values())), return_inverse=True)[1].reshape(-1)
+    polygon = np.repeat(np.arange(len(sizes)), np.maximum(sizes - 2, 0))
+    _, which, counts = np.unique(polygon * (codes.max(initial=0) + 1) + codes, return_inverse=True, return_counts=True)
+    order = np.lexsort((np.arange(len(codes)), -counts[which.reshape(-1)], polygon))
+    chosen = np.full(len(sizes), -1)
+    owners, first = np.unique(polygon[order], return_index=True)
+    chosen[owners] = order[first]
+    none = {label: np.full_like(each[:1], 0 if each.dtype.kind == "u" else -1) for label, each in arrays.items()}
+    return {label: np.append(each, none[label], axis=0)[chosen] for label, each in arrays.items()}
 
 
 def _alike(polygons: Ints, sizes: Ints) -> Iterator[Ints]:

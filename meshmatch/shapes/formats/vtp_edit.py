@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.errors import warn
-from meshmatch.shapes.formats.ply_edit import most_frequent, none_of
+from meshmatch.shapes.formats.polygons import of_most_triangles
 from meshmatch.shapes.formats.vtk import Arrays, comment_of, plain
-from meshmatch.shapes.formats.vtk_xml import APPENDED, arrays_of, element_like, surface_of
+from meshmatch.shapes.formats.vtk_xml import APPENDED, Surface, arrays_of, element_like, surface_of
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
@@ -30,58 +30,77 @@ _TOKEN = re.compile(
 _NAME = re.compile(rb"\sName\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
 
 
-def with_arrays(name: str, data: bytes, of_points: Arrays, of_faces: Arrays, comments: Iterable[str] = ()) -> bytes:
-    """The bytes of a file with further arrays; what has the name of one is replaced, which is said but of colors.
+@dataclass(frozen=True, eq=False)
+class VtpFile:
+    """A .vtp to be written with further arrays.
 
-    Parameters
+    Attributes
     ----------
-    name
-        Of the file, for words.
-    data
-        What `data_of` gave.
-    of_points
-        Arrays (V,) or (V, D) by name.
-    of_faces
-        Arrays (F,) or (F, D) for its triangles as `vtk_xml.read` makes them: a polygon has what most of its triangles have,
-        by the first of the arrays.
-    comments
-        Go in front of everything but the XML declaration, where those on labels make room for them.
+    name : of the file, for words
+    data : its bytes
+    surface : points and polygons; None where it has several pieces
     """
-    found = surface_of(name, data)
-    if of_faces and found is not None and found.sizes is not None:
-        chosen = most_frequent(next(iter(of_faces.values())), np.maximum(found.sizes - 2, 0))
-        of_faces = {label: np.append(each, none_of(each), axis=0)[chosen] for label, each in of_faces.items()}
-    begin = APPENDED.search(data)
-    head, rest = (data, b"") if begin is None else (data[: begin.start()], data[begin.start() :])
-    for group, arrays in zip(_GROUPS, (of_points, of_faces), strict=True):
-        if arrays:
-            head = _with(name, head, group, dict(plain(arrays)))
-    at = _Places.of(head).root
-    before = _NAMED.sub(b"", head[:at]) if "label" in {*of_points, *of_faces} else head[:at]
-    told = "".join(f"{comment_of(each)}\n" for each in comments).encode("ascii", "xmlcharrefreplace")
-    return before + told + head[at:] + rest
 
+    name: str
+    data: bytes
+    surface: Surface | None
 
-def data_of(file: Path | None, shape: Shape, faces: bool = False) -> bytes | None:
-    """The bytes of the .vtp that a shape was read from; None where it came from elsewhere, is another one by now, or is in
-    pieces, and where ``faces`` need rows of their own and the file has other cells than polygons.
-    """
-    if file is None or file.suffix.lower() != ".vtp" or not file.is_file():
-        return None
-    data = read_bytes(file)
-    found = surface_of(file.name, data)
-    if found is None or not np.array_equal(found.verts, shape.verts_or_nan, equal_nan=True):
-        return None
-    if faces and (found.sizes is None or int(np.maximum(found.sizes - 2, 0).sum()) != shape.F):
-        return None
-    return data
+    @classmethod
+    def parsed(cls, name: str, data: bytes) -> VtpFile:
+        """From its bytes."""
+        return cls(name, data, surface_of(name, data))
 
+    @classmethod
+    def of(cls, file: Path | None, shape: Shape, faces: bool = False) -> VtpFile | None:
+        """The file that a shape was read from; None where it came from elsewhere, is another one by now, or is in pieces,
+        and where ``faces`` need rows of their own and the file has other cells than polygons.
+        """
+        if file is None or file.suffix.lower() != ".vtp" or not file.is_file():
+            return None
+        found = cls.parsed(file.name, read_bytes(file))
+        surface = found.surface
+        if surface is None or not np.array_equal(surface.verts, shape.verts_or_nan, equal_nan=True):
+            return None
+        if faces and (surface.sizes is None or int(np.maximum(surface.sizes - 2, 0).sum()) != shape.F):
+            return None
+        return found
 
-def beyond_triangles(name: str, data: bytes) -> list[str]:
-    """What a file has besides triangles and their colors, in words."""
-    found = surface_of(name, data)
-    polygons = found is not None and found.sizes is not None and bool((found.sizes > 3).any())
-    return ["polygons"] * polygons + [f"array {each}" for each in arrays_of(name, data)]
+    @property
+    def arrays(self) -> list[str]:
+        """The names of arrays of points and cells that are no colors or normals."""
+        return arrays_of(self.name, self.data)
+
+    @property
+    def beyond_triangles(self) -> list[str]:
+        """What the file has besides triangles and their colors, in words."""
+        sizes = None if self.surface is None else self.surface.sizes
+        polygons = sizes is not None and bool((sizes > 3).any())
+        return ["polygons"] * polygons + [f"array {each}" for each in self.arrays]
+
+    def with_arrays(self, of_points: Arrays, of_faces: Arrays, comments: Iterable[str] = ()) -> bytes:
+        """Its bytes with further arrays; what has the name of one is replaced, which is said but of colors.
+
+        Parameters
+        ----------
+        of_points
+            Arrays (V,) or (V, D) by name.
+        of_faces
+            Arrays (F,) or (F, D) for its triangles as `vtk_xml.read` makes them: a polygon has what most of its triangles
+            have, by the first of the arrays.
+        comments
+            Go in front of everything but the XML declaration, where those on labels make room for them.
+        """
+        if of_faces and self.surface is not None and self.surface.sizes is not None:
+            of_faces = of_most_triangles(of_faces, self.surface.sizes)
+        begin = APPENDED.search(self.data)
+        head, rest = (self.data, b"") if begin is None else (self.data[: begin.start()], self.data[begin.start() :])
+        for group, arrays in zip(_GROUPS, (of_points, of_faces), strict=True):
+            if arrays:
+                head = _with(self.name, head, group, dict(plain(arrays)))
+        at = _Places.of(head).root
+        before = _NAMED.sub(b"", head[:at]) if "label" in {*of_points, *of_faces} else head[:at]
+        told = "".join(f"{comment_of(each)}\n" for each in comments).encode("ascii", "xmlcharrefreplace")
+        return before + told + head[at:] + rest
 
 
 @dataclass
@@ -108,7 +127,7 @@ class _Places:
                 open_.append((tag, token.start(), token.end(), said))
                 if len(open_) == 1 and found.root < 0:
                     found.root = token.start()
-                if len(open_) == 3 and tag == b"Piece" and found.piece < 0:
+                if len(open_) == 3 and tag == b"Piece":
                     found.piece = token.end()
             if token["ends"] or token["empty"]:
                 if not open_:
