@@ -14,7 +14,7 @@ from meshmatch.errors import OptionError, warn
 from meshmatch.outputs import replace_all_on_success
 from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
 from meshmatch.shapes.files import save_shape
-from meshmatch.shapes.formats import Textured, gltf, gltf_out, obj, obj_text, ply, vtk
+from meshmatch.shapes.formats import Textured, gltf, gltf_out, obj, obj_text, off, ply, vtk
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_dressed import colored, dressed
 from meshmatch.shapes.formats.gltf_edit import remembering
@@ -207,7 +207,8 @@ def beyond_triangles(file: Path) -> list[str]:
     suffix = file.suffix.lower()
     if suffix in gltf.SUFFIXES:
         return gltf.understood(file, read_bytes(file), "scene makes", Document.beyond_triangles)
-    if suffix == ".obj":
-        return obj_text.beyond_triangles(file.name, read_bytes(file))
     readers: dict[str, type[PlyFile | VtpFile]] = {".ply": PlyFile, ".vtp": VtpFile}
-    return readers[suffix].parsed(file.name, read_bytes(file)).beyond_triangles if suffix in readers else []
+    if suffix in readers:
+        return readers[suffix].parsed(file.name, read_bytes(file)).beyond_triangles
+    told = {".obj": obj_text.beyond_triangles, ".off": off.beyond_triangles, ".vtk": vtk.beyond_triangles}
+    return told[suffix](file.name, read_bytes(file)) if suffix in told else []

@@ -1,5 +1,6 @@
 """Transfers and moved meshes: a .ply or .vtp of the target keeps polygons and numbers of its own."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ PLY = (
     + "".join(f"{x} {y} {z} {k}.5\n" for k, (x, y, z) in enumerate(VERTICES))
     + "4 0 1 2 3\n3 1 4 2\n"
 )
+PLACES = "\n".join(" ".join(str(x) for x in v) for v in VERTICES)
 VTP = (
     '<VTKFile type="PolyData" byte_order="LittleEndian"><PolyData><Piece NumberOfPoints="5" NumberOfPolys="2"><PointData>'
     '<DataArray type="Float32" Name="thickness" format="ascii">0.5 1.5 2.5 3.5 4.5</DataArray></PointData><Points>'
@@ -70,6 +72,35 @@ def test_what_another_format_does_not_hold_is_told(target: Path) -> None:
     shape = meshmatch.load_shape(target)
     with pytest.warns(MeshmatchWarning, match=rf"^out.stl does not have .*the {word} thickness of {target.name}$"):
         save_moved(target.with_name("out.stl"), target, shape, np.tile(np.eye(3), (5, 1, 1)))
+
+
+OFF = f"OFF\n5 2 0\n{PLACES}\n4 0 1 2 3\n3 1 4 2\n"
+VTK = (
+    f"# vtk DataFile Version 4.2\na\nASCII\nDATASET POLYDATA\nPOINTS 5 float\n{PLACES}\nPOLYGONS 2 9\n4 0 1 2 3\n3 1 4 2\n"
+    "POINT_DATA 5\nSCALARS thickness float 1\nLOOKUP_TABLE default\n0 1 2 3 4\nFIELD FieldData 1\nage 1 5 int\n5 4 3 2 1\n"
+)
+NEWER = VTK.replace(
+    "POLYGONS 2 9\n4 0 1 2 3\n3 1 4 2", "POLYGONS 3 7\nOFFSETS int\n0 4 7\nCONNECTIVITY int\n0 1 2 3 1 4 2"
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("a.off", OFF, "polygons"),
+        ("a.off", OFF.replace("5 2", "5 3").replace("4 0 1 2 3", "3 0 1 2\n3 0 2 3"), ""),
+        ("a.vtk", VTK, "polygons, array thickness and array age"),
+        ("a.vtk", NEWER, "polygons, array thickness and array age"),
+        ("a.vtk", VTK.partition("POINT_DATA")[0].replace("2 9\n4 0 1 2 3", "3 12\n3 0 1 2\n3 0 2 3"), ""),
+    ],
+)
+def test_what_is_written_anew_is_told(tmp_path: Path, name: str, text: str, said: str) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        meshmatch.transfer_labels(path, path, [3, 3, 5, 5, 3]).save(tmp_path / "out.ply")
+    assert [str(each.message) for each in told] == ([f"out.ply does not have the {said} of {name}"] if said else [])
 
 
 def test_without_a_file_a_shape_is_written(target: Path) -> None:

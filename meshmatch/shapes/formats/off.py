@@ -16,6 +16,7 @@ from meshmatch.shapes.input_files import check_text
 from meshmatch.shapes.shape import Shape
 
 _HEADER = re.compile(rb"\s*((?:ST)?C?N?)OFF\b|\s*((?:ST)?C?N?)OFF(?=\d)")
+_COUNTS = re.compile(rb"\s*(\d{1,15})\s+(\d{1,15})(?!\d)(?:[ \t]+\d+)?")
 
 
 def read(path: Path, data: bytes) -> Raw:
@@ -30,7 +31,7 @@ def read(path: Path, data: bytes) -> Raw:
     body = text[header.end() :]
     if body.lstrip()[:6] == b"BINARY":
         raise InputError(f"{name} is a binary off file", "convert it to ply")
-    head = re.match(rb"\s*(\d{1,15})\s+(\d{1,15})(?!\d)(?:[ \t]+\d+)?", body)
+    head = _COUNTS.match(body)
     if not head:
         raise damaged(name, "the header does not say how many vertices and faces there are")
     V, F = int(head.group(1)), int(head.group(2))
@@ -64,6 +65,18 @@ def read(path: Path, data: bytes) -> Raw:
         warn(f"{name} has colors of faces: each vertex gets the mean of those around it")
         colors = formats.colors_of_faces(V, corner, np.repeat(found, many, axis=0))
     return Raw(verts, triangles, colors)
+
+
+def beyond_triangles(name: str, data: bytes) -> list[str]:
+    """What a file that could be read has besides triangles and their colors, in words."""
+    text = formats.without_comments(data).replace(b"\r", b"\n")
+    header = _HEADER.match(text)
+    head = None if header is None else _COUNTS.match(text, header.end())
+    if head is None:
+        return []
+    V, F = int(head[1]), int(head[2])
+    rows = [line.split(None, 1)[0] for line in text[head.end() :].split(b"\n") if line.strip()][V : V + F]
+    return ["polygons"] * any(int(float(row)) > 3 for row in rows)
 
 
 def _colors(kind: bytes, rows: Floats, widths: Ints) -> Floats | None:

@@ -33,11 +33,28 @@ _SECTION = re.compile(
     rb"\n[ \t]*(?:POINTS|POLYGONS|TRIANGLE_STRIPS|VERTICES|LINES|CELLS|CELL_TYPES|POINT_DATA|CELL_DATA)[ \t]+\d"
 )
 _COLORS = re.compile(rb"\n[ \t]*COLOR_SCALARS[ \t]+\S+[ \t]+([34])[ \t]*\r?\n")
+# Cells with how many numbers they take: since version 5 those of their points alone, and one more cell than there is.
+_LISTED = re.compile(rb"\n[ \t]*(?:POLYGONS|CELLS)[ \t]+(\d{1,12})[ \t]+(\d{1,12})[ \t]*\r?\n(OFFSETS)?")
+_NAMED = re.compile(
+    rb"\n[ \t]*(?:(?:SCALARS|VECTORS|TENSORS|GLOBAL_IDS|PEDIGREE_IDS)[ \t]+(\S+)[ \t]+[a-z_]+"
+    rb"|(\S+)[ \t]+\d+[ \t]+\d+[ \t]+[a-z_]+\d*)(?:[ \t]+\d)?[ \t]*\r?\n"
+)
 
 
 def read(path: Path, data: bytes) -> Raw:
     """The points and faces of a PolyData or an unstructured grid, and the colors of its points."""
     return _File(path.name, data).raw()
+
+
+def beyond_triangles(name: str, data: bytes) -> list[str]:
+    """What a file that could be read has besides triangles and their colors, in words."""
+    polygons = any(
+        int(size) > 3 * (int(count) - 1) if newer else int(size) > 4 * int(count)
+        for count, size, newer in _LISTED.findall(data)
+    )
+    begin = re.search(rb"\n[ \t]*(?:POINT|CELL)_DATA[ \t]+\d", data)
+    names = [] if begin is None else [a or b for a, b in _NAMED.findall(data, begin.start())]
+    return ["polygons"] * polygons + [f"array {each.decode(errors='replace')}" for each in dict.fromkeys(names)]
 
 
 class _File:
