@@ -56,7 +56,7 @@ class AtlasOptions:
         None,
         metavar="FORMULA",
         help="Explain the shapes by columns of the table: 'shape ~ log(size) + sex * age', or 'form ~ ...' with their "
-        "sizes (Procrustes analysis of variance). size is the centroid size if the table has no such column.",
+        "sizes (Procrustes analysis of variance). size is that of scores.csv if the table has no such column.",
     )
     blocks: str | None = Option(
         None,

@@ -423,7 +423,7 @@ class Atlas(Brief, Pickled):
         ----------
         formula
             ``"shape ~ log(size) + sex * age"``, or ``"form ~ ..."`` of an atlas that keeps sizes. Names are columns of the
-            table; ``size`` is the centroid size (``sizes``) unless there is such a column; ``factor()`` takes numbers for
+            table; ``size`` is ``sizes`` unless there is such a column; ``factor()`` takes numbers for
             categories; ``a * b`` is ``a + b + a:b``.
         table
             A file (.csv, .tsv, .txt) or columns by name, such as a data frame. A column ``name``, else a file's first one,

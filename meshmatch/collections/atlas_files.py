@@ -214,7 +214,7 @@ def _write_morphs(path: Path, atlas: Atlas) -> None:
 
 
 def _write_scores(path: Path, atlas: Atlas) -> None:
-    header = ["name", "centroid_size", "distance", *(f"mode_{k + 1}" for k in range(len(atlas.modes)))]
+    header = ["name", "size", "distance", *(f"mode_{k + 1}" for k in range(len(atlas.modes)))]
     table = np.column_stack([atlas.sizes, atlas.distances, atlas.scores])
     write_rows(path, header, ([name, *short(row)] for name, row in zip(atlas.names, table, strict=True)))
 

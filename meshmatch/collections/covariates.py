@@ -65,7 +65,7 @@ class DesignTerm:
 
 
 def covariates(table: str | Path | Columns | None, names: Sequence[str], sizes: Float[Floats, " S"]) -> Covariates:
-    """What a table, or a file of one, says about shapes. Their centroid sizes are the column ``size`` if it has none.
+    """What a table, or a file of one, says about shapes. Their ``sizes`` are the column ``size`` if it has none.
 
     Rows are found by the names in the column ``name``, or else the first one: those of the shapes, or of their files.
     `InputError` for shapes without a row, or with two, and for what is no table.

@@ -71,7 +71,7 @@ def test_every_file_says_what_the_atlas_knows(tmp_path: Path, atlas: Atlas) -> N
     assert np.array_equal(Atlas.load(tmp_path).modes, atlas.modes)
     assert np.allclose(load_shape(tmp_path / "mean.ply").verts, atlas.mean)
     head, rows = table(tmp_path / "scores.csv")
-    assert head[:4] == ["name", "centroid_size", "distance", "mode_1"]
+    assert head[:4] == ["name", "size", "distance", "mode_1"]
     assert tuple(row[0] for row in rows) == atlas.names
     numbers = np.array([[float(cell) for cell in row[1:]] for row in rows])
     assert np.allclose(numbers, np.column_stack([atlas.sizes, atlas.distances, atlas.scores]), rtol=1e-5, atol=1e-6)
