@@ -127,6 +127,8 @@ def test_written_to_an_obj_and_read_again(tmp_path: Path) -> None:
     assert sorted(file.name for file in tmp_path.iterdir()) == [
         *("a-emission.png", "a-metal.png", "a-normal.png", "a-roughness.png", "a.mtl", "a.obj", "a.png")
     ]
+    # without a strength Blender takes it to be 0, and `norm` alone it does not read
+    assert "\nmap_Bump -bm 1 a-normal.png\n" in (tmp_path / "a.mtl").read_text()
     found = finish_of(path)
     assert found.images == ("normal", "surface", "glow")
     np.testing.assert_array_equal(found.layers["normal"].materials[0].image, NOISE[0])

@@ -196,7 +196,8 @@ def write_materials(path: Path, names: Iterable[str], material: BakedMaterial, i
     """The mtl: materials of these names that are all the same. ``images`` has file names by what they show: "color", and
     maybe "normal", "roughness", "metal" and "emission".
 
-    Metal, roughness, light and normals as most programs read them. No options of maps: not every reader knows them.
+    Metal, roughness, light and normals as most programs read them. No options of maps, which not every reader knows, but
+    the strength of bumps: Blender takes none to be 0.
     """
     paint = ["Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 1", f"map_Kd {images['color']}"]
     if material.alpha != "opaque":
@@ -206,5 +207,5 @@ def write_materials(path: Path, names: Iterable[str], material: BakedMaterial, i
     if max(material.light) > 0:
         paint.append("Ke {:.6g} {:.6g} {:.6g}".format(*material.light))
     words = (("roughness", "map_Pr"), ("metal", "map_Pm"), ("emission", "map_Ke"), ("normal", "norm"))
-    paint += [f"{word} {images[what]}" for what, word in (*words, ("normal", "map_Bump")) if what in images]
+    paint += [f"{word} {images[what]}" for what, word in (*words, ("normal", "map_Bump -bm 1")) if what in images]
     _write(path, [line for name in names for line in (f"newmtl {name}", *paint)])
