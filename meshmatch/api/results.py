@@ -397,8 +397,8 @@ def evaluate(
     target
         As in `match`.
     truth
-        The true target vertex of every source vertex (V_source,); or N vertices of the source and those of the target,
-        ((N,), (N,)), or an array of such pairs (N, 2).
+        The true target vertex of every source vertex (V_source,), -1 where it has none; or N vertices of the source and
+        those of the target, ((N,), (N,)), or an array of such pairs (N, 2).
     backward
         A map from target to source, or its file, for ``bijectivity``; for instance ``result.backward()`` of a match.
     unit

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from meshmatch.arrays import Brief, Float, Floats, Floats32, Pickled, as_array, as_numbers, frozen, table_html
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, warn
 from meshmatch.geometry.triangles import dot, squared_lengths, triangle_vectors
 from meshmatch.maps.folds import Folds
 from meshmatch.maps.geodesics import GEODESIC, GeodesicDistances
@@ -223,6 +223,7 @@ def map_errors(
     """Errors at known points: is ``index[source_points[n]]`` the vertex ``target_points[n]``?
 
     `index` (V_source,) is the map; both kinds of points (N,) are vertices, `geodesics` those of the target.
+    Points of which one is -1 have no counterpart, and are left out with a warning.
     `InputError` if the lists are no integers, differ in length, or name a vertex that is not there.
     """
     index, a, b = (as_array(ids, "the truth", _TRUTH) for ids in (index, source_points, target_points))
@@ -231,6 +232,12 @@ def map_errors(
             raise InputError(f"the truth must be numbers of vertices, not {ids.dtype}", "integers, counted from 0")
     if a.shape != b.shape or a.ndim != 1 or not a.size:
         raise InputError(f"the truth has {a.shape} vertices of the source and {b.shape} of the target", _TRUTH)
+    known = (a != -1) & (b != -1)
+    if not known.any():
+        raise InputError("the truth has no vertex with a counterpart", _TRUTH)
+    if not known.all():
+        warn(f"{np.count_nonzero(~known)} of {len(known)} vertices have no counterpart: left out")
+        a, b = a[known], b[known]
     for ids, size, side in ((a, len(index), "source"), (b, geodesics.V, "target")):
         if (wrong := ids[(ids < 0) | (ids >= size)]).size:
             hint = "vertices are counted from 0 (subtract 1 from those of MATLAB and R), and those of the source come first"

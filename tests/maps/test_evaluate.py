@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, MeshmatchWarning
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors, coverage, distortion, evaluate_map, map_errors
 from meshmatch.maps.geodesics import GeodesicDistances
 from meshmatch.maps.vertex_map import VertexMap
@@ -37,6 +37,16 @@ def test_errors_by_hand() -> None:
     for bad in (([0, 1], [0]), ([0, 9], [0, 1]), ([0, 1], [0, 9]), ([-1], [0]), ([], [])):
         with pytest.raises(InputError):
             map_errors(index, np.array(bad[0], int), np.array(bad[1], int), geodesics)
+
+
+def test_points_without_a_counterpart_are_left_out() -> None:
+    geodesics, index = GeodesicDistances(grid(2, 2)), np.arange(9)
+    truth = np.array([0, 1, -1, 3, 4, -1, 6, 7, 2])
+    with pytest.warns(MeshmatchWarning, match="2 of 9 vertices have no counterpart: left out"):
+        found = map_errors(index, np.arange(9), truth, geodesics)
+    assert (len(found.values), np.count_nonzero(found.values)) == (7, 1)
+    with pytest.raises(InputError, match="no vertex with a counterpart"):
+        map_errors(index, np.arange(9), np.full(9, -1), geodesics)
 
 
 def test_errors_do_not_depend_on_the_unit_of_the_file() -> None:
