@@ -118,6 +118,8 @@ def _replacing(path: Path) -> Iterator[Path]:
         yield temporary
         temporary.chmod(mode)
         os.replace(temporary, final)
+    except OutputError as error:  # of a writer that takes care of its own, and knows the temporary name alone
+        raise OutputError(error.message.replace(str(temporary), str(path)), error.hint) from error
     except OSError as error:
         if error.filename in (None, str(temporary), temporary):
             raise OutputError(f"cannot write {path}: {error.strerror or error}", "is the disk full?") from error

@@ -125,6 +125,16 @@ def test_a_disk_that_is_full_for_a_library_of_rust(tmp_path: Path) -> None:
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert caught.value.hint == "is the disk full?"
+
+
+def test_a_full_disk_is_told_by_the_name_of_the_output_however_often_it_is_guarded(tmp_path: Path) -> None:
+    with (
+        pytest.raises(OutputError, match=f"^cannot write {tmp_path / 'a'}: File too large$"),
+        replace_on_success(tmp_path / "a") as outer,
+        replace_on_success(outer),
+    ):
+        raise OSError(errno.EFBIG, "File too large")
+    assert list(tmp_path.iterdir()) == []
     assert list(tmp_path.iterdir()) == []
 
 
