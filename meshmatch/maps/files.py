@@ -36,6 +36,7 @@ _WORDS = ("source", "target", "verdict", "source_hash", "target_hash", "source_u
 _COUNTS = ("source_vertices", "target_vertices")
 _KNOWN = (*_ARRAYS, *_WORDS, *_COUNTS, "reasons")
 _FORMAT = "meshmatch map 1"
+_FROM_ONE = "matlab_index"
 _VERTEX = 140  # bytes of memory for each vertex, while a map is read
 check_suffix = partial(tables.check_suffix, suffixes=MAP_SUFFIXES, what="maps")
 
@@ -194,7 +195,7 @@ def _read_json(path: Path) -> Any:
 def _write_mat(path: Path, m: VertexMap) -> None:
     from scipy.io import savemat
 
-    record = _record(m) | {"matlab_index": m.index + 1, "reasons": np.array(list(m.reasons), dtype=object)}
+    record = _record(m) | {_FROM_ONE: m.index + 1, "reasons": np.array(list(m.reasons), dtype=object)}
     with path.open("wb") as file:
         savemat(file, record, oned_as="column")  # type: ignore[arg-type]  # files serve as well
         file.seek(0)  # the first 116 bytes are free text; the time in it would make every file differ
@@ -202,7 +203,14 @@ def _write_mat(path: Path, m: VertexMap) -> None:
 
 
 def _read_mat(path: Path) -> dict[str, Any]:
-    record = _plain(read_mat(read_bytes(path), _KNOWN))
+    record = _plain(read_mat(read_bytes(path), (*_KNOWN, _FROM_ONE)))
+    from_one = record.pop(_FROM_ONE, None)
+    if isinstance(from_one, np.ndarray):
+        if "index" not in record:
+            return _bare(from_one - 1)
+        if not np.array_equal(np.ravel(from_one), np.ravel(record["index"]) + 1):
+            hint = f"save one of the two; {_FROM_ONE} alone is read as well"
+            raise InputError(f"its {_FROM_ONE} is not index + 1", hint)
     reasons = record.get("reasons", ())
     record["reasons"] = tuple(reasons) if isinstance(reasons, list) else ()
     return record | {name: np.ravel(record[name]) for name in ("index", "face", "confidence") if name in record}

@@ -97,6 +97,16 @@ def test_mat_counts_from_one_too(tmp_path: Path) -> None:
     assert np.array_equal(content["index"].ravel(), m.index)
 
 
+def test_a_map_saved_by_matlab_may_count_from_one(tmp_path: Path) -> None:
+    """`matlab_index` is what is edited there; the other array must not win without a word."""
+    path = tmp_path / "map.mat"
+    savemat(path, {"matlab_index": np.array([[3], [1], [2]], dtype=float)})
+    np.testing.assert_array_equal(load_map(path).index, [2, 0, 1])
+    savemat(path, {"matlab_index": np.array([3, 1, 2]), "index": np.array([2, 0, 0])})
+    with pytest.raises(InputError, match="its matlab_index is not index \\+ 1"):
+        load_map(path)
+
+
 def test_maps_of_other_programs(tmp_path: Path) -> None:
     expected = [2, 0, 1]
     np.save(tmp_path / "column.npy", np.array(expected, dtype=np.uint16)[:, None])
