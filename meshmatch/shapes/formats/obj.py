@@ -196,8 +196,8 @@ def write_materials(path: Path, names: Iterable[str], material: BakedMaterial, i
     """The mtl: materials of these names that are all the same. ``images`` has file names by what they show: "color", and
     maybe "normal", "roughness", "metal" and "emission".
 
-    Metal, roughness, light and normals as most programs read them. No options of maps, which not every reader knows, but
-    the strength of bumps: Blender takes none to be 0.
+    Metal, roughness, light and normals as most programs read them. Options of maps are not known to every reader, and left
+    out, all but the strength of normal maps: Blender imports them with strength 0 where it is not given.
     """
     paint = ["Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 1", f"map_Kd {images['color']}"]
     if material.alpha != "opaque":
