@@ -182,7 +182,8 @@ def agreeing_flips(
     keys = (low * count + high)[order]
     first = order[np.flatnonzero(np.diff(keys, prepend=-1))]  # a pair named twice would add up
     low, high, differ, cost = low[first], high[first], differ[first], cost[first]
-    graph = coo_array((1.0 + cost, (low, high)), (count, count)).tocsr()  # scipy takes an explicit 0 for no edge
+    ends = low.astype(np.int32), high.astype(np.int32)  # before scipy 1.17.1 spanning trees have no others
+    graph = coo_array((1.0 + cost, ends), (count, count)).tocsr()  # scipy takes an explicit 0 for no edge
     forest = minimum_spanning_tree(graph).tocoo()
     a, b = forest.row.astype(np.int64), forest.col.astype(np.int64)
     across = differ[np.searchsorted(low * count + high, a * count + b)]

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.sparse import csgraph
 
 from meshmatch.shapes import cloud
 from meshmatch.shapes.cloud import estimate_normals, local_areas, outlier_points, roughness
@@ -155,6 +156,14 @@ def test_flips_against_the_slow_way() -> None:
                 label[a] = label[b] = min(label[a], label[b])
         assert len(np.unique(part)) == len(np.unique(label))
         assert len(np.unique(np.stack([part, label]), axis=1).T) == len(np.unique(label))
+
+
+def test_the_graph_of_flips_has_indices_that_every_scipy_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before 1.17.1 `minimum_spanning_tree` takes 32-bit indices alone."""
+    seen = []
+    monkeypatch.setattr(csgraph, "minimum_spanning_tree", lambda graph: seen.append(graph.indices.dtype) or graph)
+    agreeing_flips(3, np.array([[0, 1], [1, 2]]), np.array([True, False]), np.array([0.1, 0.2]))
+    assert seen == [np.int32]
 
 
 def test_flips_trust_the_cheap_pairs() -> None:

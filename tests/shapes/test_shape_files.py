@@ -595,7 +595,7 @@ def test_npy_header_that_claims_a_billion_points(tmp_path: Path) -> None:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 5e6
-    with pytest.raises(InputError, match="could only read 299"):
+    with pytest.raises(InputError, match="299"):
         load(tmp_path, "c.npy", data[:-1])
 
 
