@@ -37,8 +37,8 @@ def find_sources(
 
     A shape of a folder is called by its path in it, without the suffix; any other by its file's name. Left out, which is
     told, are files of unknown formats, and those that Blender reads of a folder that holds other shapes. Arrays (.npy),
-    images, tables and the like beside shapes have records too, but those of the same name as a shape. What lies in the
-    folder of the fits does not count.
+    images, tables and the like beside shapes have records too, but those of the same name as a shape; so have links to
+    folders. What lies in the folder of the fits does not count.
 
     `InputError` if there is nothing, or two shapes have one name.
     """
@@ -112,6 +112,8 @@ def _find(given: str | Path, output: Store | None, found: list[Source], left_out
         projects = [file for file in shapes if file.with_name(stem_of(file)) not in known]
         _leave_out(folder.location, "files for Blender beside other shapes", projects, left_out, f"{folder.location}/")
         left_out += _beside(inside, taken, projects, f"{folder.location}/")
+        why = "a link to a folder, which is not followed"
+        left_out += [Record(link, f"{folder.location}/{link}", LEFT_OUT, reasons=why) for link in folder.folder_links()]
         found += [Source(str(file.with_name(stem_of(file))), folder, str(file)) for file in taken]
         return
     files = [path]

@@ -101,16 +101,25 @@ class Store:
         return 0 if self.remote or not path.is_file() else path.stat().st_mtime_ns
 
     def names(self, folder: str = "") -> list[str]:
-        """All files in a folder and below it, sorted, relative to the folder; those whose names begin with a dot are not
-        seen."""
+        """All files in a folder and below it, sorted, relative to the folder, and links that lead nowhere; those whose
+        names begin with a dot are not seen."""
         if self.remote:
             files, root = _filesystem(self.location)
             top = f"{root}/{folder}".rstrip("/")
             found = [path[len(top) + 1 :] for path in files.find(top)] if files.exists(top) else []
         else:
             base = Path(self.location, folder)
-            found = [path.relative_to(base).as_posix() for path in base.rglob("*") if path.is_file()]
-        return sorted(name for name in found if not any(part.startswith(".") for part in name.split("/")))
+            files = (path for path in base.rglob("*") if path.is_file() or (path.is_symlink() and not path.exists()))
+            found = [path.relative_to(base).as_posix() for path in files]
+        return _seen(found)
+
+    def folder_links(self) -> list[str]:
+        """Links to folders, which `names` does not follow, for they may lead in a circle; as `names` has files."""
+        if self.remote:
+            return []
+        base = Path(self.location)
+        links = (path for path in base.rglob("*") if path.is_symlink() and path.is_dir())
+        return _seen([path.relative_to(base).as_posix() for path in links])
 
     def remove(self, name: str) -> None:
         """Remove a file, or a folder with all that is in it."""
@@ -121,6 +130,11 @@ class Store:
         else:
             path = Path(self.location, name)
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+def _seen(names: list[str]) -> list[str]:
+    """Sorted, without those that begin with a dot or lie in such a folder."""
+    return sorted(name for name in names if not any(part.startswith(".") for part in name.split("/")))
 
 
 def _filesystem(location: str) -> tuple[Any, str]:

@@ -549,6 +549,22 @@ def test_every_file_of_a_folder_has_a_row(tmp_path: Path, capsys: pytest.Capture
     assert sorted(Path(each.file).name for each in left_out) == ["0.png", "1.png", "2.png", "stack.tif"]
 
 
+def test_links_of_a_folder_are_not_passed_over(tmp_path: Path) -> None:
+    """One that leads nowhere is a shape that fails; one to a folder, which may be a circle, has a row."""
+    (tmp_path / "more").mkdir()
+    for name, leads_to in {"a.ply": SAMPLES / "fox.ply", "gone.ply": "nowhere.ply", "self.ply": "self.ply"}.items():
+        (tmp_path / name).symlink_to(leads_to)
+    (tmp_path / "more" / "up").symlink_to("..")
+    (tmp_path / ".hidden").symlink_to("more")
+    found, left_out = find_sources(tmp_path)
+    assert [source.name for source in found] == ["a", "gone", "self"]
+    for source in found[1:]:
+        with pytest.raises(InputError, match="a link to a file that is not there"):
+            source.load((), ())
+    assert [(each.name, each.verdict) for each in left_out] == [("more/up", "left out")]
+    assert find_sources(tmp_path, Store.of(tmp_path / "fits")) == (found, left_out)
+
+
 def test_each_shape_of_a_mixed_folder_gets_the_model_of_its_kind(tmp_path: Path) -> None:
     (tmp_path / "shapes").mkdir()
     for name in ("dancer", "calf", "fox"):
