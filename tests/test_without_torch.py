@@ -61,6 +61,19 @@ def test_what_needs_torch_says_so_in_a_line(words: list[str], tmp_path: Path) ->
     assert not (tmp_path / "fitted.ply").exists()
 
 
+def test_a_search_over_codes_says_so_before_anything_is_fitted(tmp_path: Path) -> None:
+    egg = egg_model()
+    write_model(egg, tmp_path / "model")
+    save_shape(tmp_path / "egg.ply", egg.template.shape)
+    done = run(
+        f"import os\nos.chdir({str(tmp_path)!r})\nimport meshmatch\ntold = []\n"
+        "try:\n    meshmatch.register('egg.ply', model='./model', config=meshmatch.FitConfig(refine='latent'),"
+        " progress=lambda *words: told.append(words))\n"
+        "except meshmatch.MeshmatchError as error:\n    print(told, error.hint)"
+    )
+    assert done.stdout.strip() == "[] pip install 'meshmatch[train]'"
+
+
 def test_the_library_says_it_too() -> None:
     done = run(
         "import meshmatch\ntry:\n    meshmatch.train\nexcept meshmatch.MeshmatchError as error:\n    print(error.hint)"

@@ -25,7 +25,7 @@ from meshmatch.fitting.usual import Usual
 from meshmatch.geometry.oriented import quick_tree
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.card import ModelCard
-from meshmatch.models.trained import TrainedModel
+from meshmatch.models.trained import TrainedModel, torch_network
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.normalise import ALIGNS
 from meshmatch.shapes.repair import Repaired
@@ -56,6 +56,8 @@ class Fitter:
         self.model = model
         self.config = (config or FitConfig()).for_model(model)
         self.progress = progress
+        if self.config.refine == "latent":
+            torch_network(model, self.config.device)  # which needs torch: told before minutes of work
 
     def fit(self, shape: Shape, landmarks: Landmarks | None = None) -> Fit:
         """Fit the template to a repaired shape; to a cloud without its outliers.
