@@ -272,6 +272,9 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
             if verify_model(temporary) != card:
                 raise ModelError(f"{source} changed while it was copied", "try again")
             put(temporary, target)
+        except ModelError as error:  # of the copy, which is gone when it is read
+            message = error.message.replace(str(temporary), str(source)).replace(temporary.name, card.name)
+            raise ModelError(message, error.hint) from error
         except OSError as error:
             raise OutputError(f"cannot write {user_folder()}: {error.strerror}", _ELSEWHERE) from error
         finally:

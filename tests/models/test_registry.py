@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -141,6 +142,18 @@ def test_wrong_weights_are_refused_and_not_added(blob: Path) -> None:
     with pytest.raises(ModelError, match="are not those of its card"):
         add_model(blob)
     assert list(user_folder().iterdir()) == []  # no half-added copy either
+
+
+def test_what_is_wrong_with_a_copy_is_said_of_its_source(blob: Path) -> None:
+    """The copy is gone when the words are read."""
+    data = bytearray((blob / "template.safetensors").read_bytes())
+    (blob / "template.safetensors").write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    with pytest.raises(ModelError, match=r"^model blob: template"):
+        add_model(blob)
+    write_model(blob)
+    write_card(small_card(**_true(blob) | {"network": NETWORK.to_dict() | {"width": 48}}), blob / "card.json")
+    with pytest.raises(ModelError, match=re.escape(f"{blob / 'weights.safetensors'} does not fit")):
+        add_model(blob)
 
 
 def test_another_template_is_refused(blob: Path) -> None:
