@@ -31,7 +31,7 @@ def info(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="A shape, a map, a template bundle or landmarks; or the folder of a collection or an atlas.",
+            help="A shape, a map, a fit, a template or landmarks; or the folder of a collection, an atlas or a model.",
         ),
     ],
     json: options.Json = False,
@@ -47,7 +47,7 @@ def info(
     if file.is_dir():
         about = _folder
     elif suffix == ".safetensors":
-        about = _template
+        about = _tensors
     elif suffix in (".fcsv", ".pp", ".pts", ".tps"):
         about = _landmarks
     elif suffix in MAP_SUFFIXES and (suffix != ".npy" or _is_list(file)):
@@ -204,11 +204,13 @@ def _landmarks(file: Path) -> Json:
 
 
 def _folder(file: Path) -> Json:
-    """Fits of a collection, or an atlas."""
+    """Fits of a collection, an atlas, or a model."""
     import csv
 
     from meshmatch.collections.settle import read_about
     from meshmatch.collections.stores import Store
+    from meshmatch.models.card import is_implicit
+    from meshmatch.models.registry import CARD, read_any_card
 
     if (about := read_about(Store.of(file))) is not None:
         verdicts: Counter[str] = Counter()
@@ -219,7 +221,30 @@ def _folder(file: Path) -> Json:
         return {"kind": "fits of a collection", "model": about["model"], "shapes": told}
     if (file / "atlas.npz").is_file():
         return {"kind": "atlas"}
-    raise InputError(f"{file} is a folder", "give the name of a file, or a folder that `meshmatch fit` or `atlas` made")
+    if (file / CARD).is_file() or is_implicit(file):
+        card = read_any_card(file)
+        return {"kind": "model"} | {
+            name: getattr(card, name) for name in ("name", "category", "data", "licence", "created")
+        }
+    hint = "give the name of a file, of a model's folder, or of one that `meshmatch fit` or `atlas` made"
+    raise InputError(f"{file} is a folder", hint)
+
+
+def _tensors(file: Path) -> Json:
+    """A fit, or a template."""
+    from meshmatch.maps.fit_files import load_words
+    from meshmatch.models.registry import CARD, WEIGHTS
+
+    if file.name == WEIGHTS and file.with_name(CARD).is_file():
+        raise InputError(f"{file} holds the weights of a model", f"meshmatch info {file.parent}")
+    try:
+        fit, _ = load_words(file)
+    except InputError:
+        return _template(file)
+    shown = ("shape", "model", "verdict", "trust", "residual", "up", "front", "partial")
+    return (
+        {"kind": "fit"} | {name: fit.get(name) for name in shown} | {"reasons": [words for _, words in fit["reasons"]]}
+    )
 
 
 def _template(file: Path) -> Json:

@@ -57,7 +57,11 @@ def settled(wish: Setting, sources: Sequence[Source]) -> Setting:
         save_text(store, ABOUT, json.dumps(wanted, indent=2) + "\n")  # last: a folder without it is no collection
     elif differs := [name for name in wanted if about[name] != wanted[name]]:
         other = f"the fits in {store.location} were made with another {_differing(differs[0], about, wanted)}"
-        raise OptionError(other, "choose another folder, or the options of before")
+        hint = "choose another folder, or the options of before"
+        if isinstance(about["fit"], dict) and about["fit"].keys() != wanted["fit"].keys():
+            other = f"the fits in {store.location} were made by another version of meshmatch, which fits otherwise"
+            hint = "choose another folder, or go on with that version; maps and atlases can be made of them as they are"
+        raise OptionError(other, hint)
     return setting
 
 

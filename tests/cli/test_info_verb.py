@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import meshmatch
 from meshmatch.collections.settle import SCHEMA
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
@@ -14,6 +15,7 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from tests.cli.conftest import Run
+from tests.fitting.eggs import egg_model, write_model
 
 
 def record(run: Run, file: Path) -> dict[str, object]:
@@ -156,6 +158,21 @@ def test_folders_are_called_what_they_are(run: Run, tmp_path: Path) -> None:
     (tmp_path / "atlas").mkdir()
     (tmp_path / "atlas" / "atlas.npz").touch()
     assert record(run, tmp_path / "atlas")["kind"] == "atlas"
+
+
+def test_a_fit_and_a_model(run: Run, tmp_path: Path) -> None:
+    egg = egg_model()
+    write_model(egg, tmp_path / "egg")
+    fit = meshmatch.register(egg.template.shape, model=egg, config=meshmatch.FitConfig(refine="none"))
+    meshmatch.save_fit(tmp_path / "fit.safetensors", fit)
+    found = record(run, tmp_path / "fit.safetensors")
+    assert (found["kind"], found["model"], found["verdict"]) == ("fit", "egg", fit.verdict)
+    assert found["reasons"] == [str(reason) for reason in fit.reasons]
+    found = record(run, tmp_path / "egg")
+    assert (found["kind"], found["name"], found["category"]) == ("model", "egg", "eggs")
+    done = run("info", tmp_path / "egg" / "weights.safetensors")
+    assert done.status == 1 and "holds the weights of a model" in done.err
+    assert record(run, tmp_path / "egg" / "template.safetensors")["kind"] == "template"
 
 
 def test_materials_and_their_textures(run: Run, tmp_path: Path, sphere: Shape) -> None:

@@ -224,6 +224,12 @@ def test_what_is_wrong_is_said(made: tuple[Path, tuple[Record, ...]], shapes: Pa
         meshmatch.Collection(shapes).fit(shapes)
     with pytest.raises(OptionError, match="another model"):
         collection.fit(shapes, model="quadruped")
+    shutil.copytree(folder, tmp_path / "older")
+    about = json.loads((folder / "collection.json").read_text())
+    del about["fit"]["again"]  # a choice that there was not in 0.2.0
+    (tmp_path / "older" / "collection.json").write_text(json.dumps(about))
+    with pytest.raises(OptionError, match="made by another version of meshmatch"):
+        meshmatch.Collection(tmp_path / "older").fit(shapes)
     with pytest.raises(InputError, match="not a folder of fits"):
         meshmatch.Collection(tmp_path).names  # noqa: B018
     with pytest.raises(InputError, match="no shapes"):
