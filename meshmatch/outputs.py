@@ -177,6 +177,8 @@ def folder_on_success(path: str | Path, replaces: Collection[str] = ()) -> Itera
             _exchange(temporary, path)
         else:
             os.replace(temporary, path)
+    except OutputError as error:  # of a file in it, which is gone when this is read
+        raise OutputError(error.message.replace(str(temporary), str(path)), error.hint) from error
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror or error}", "is the disk full?") from error
     finally:

@@ -127,6 +127,16 @@ def test_a_disk_that_is_full_for_a_library_of_rust(tmp_path: Path) -> None:
     assert caught.value.hint == "is the disk full?"
 
 
+def test_a_full_disk_is_told_by_the_name_of_the_folder_that_is_made(tmp_path: Path) -> None:
+    with (
+        pytest.raises(OutputError, match=f"^cannot write {tmp_path / 'made' / 'a.ply'}: No space left on device$"),
+        folder_on_success(tmp_path / "made") as folder,
+        replace_on_success(folder / "a.ply"),
+    ):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_full_disk_is_told_by_the_name_of_the_output_however_often_it_is_guarded(tmp_path: Path) -> None:
     with (
         pytest.raises(OutputError, match=f"^cannot write {tmp_path / 'a'}: File too large$"),
