@@ -92,17 +92,63 @@ def leave_out_strangers(folder):
 
 
 def shown():
-    """The meshes of the scene that are not hidden."""
-    return [each for each in bpy.context.scene.objects if each.type == "MESH" and not each.hide_render]
+    """The objects with a mesh that a render draws, also those of collections that others draw copies of."""
+    found = list(bpy.context.scene.objects)
+    for each in found:  # which grows
+        if each.instance_type == "COLLECTION" and each.instance_collection is not None and not each.hide_render:
+            found += [other for other in each.instance_collection.all_objects if other not in found]
+    return [each for each in found if each.type == "MESH" and not each.hide_render]
+
+
+def hide_what_is_not_rendered():
+    """Hide the objects of collections that are left out of the scene's views, or of renders, such as the widgets of a rig:
+    exporters go by what objects say themselves. What only a view hides is told.
+    """
+    layers = [each.layer_collection for each in bpy.context.scene.view_layers if each.use]
+    kept = set()
+    for each in layers:  # which grows
+        if not each.exclude and not each.collection.hide_render:
+            kept.update(each.collection.objects)
+            layers += each.children
+    objects = list(bpy.context.scene.objects)
+    for each in objects:
+        if layers and each not in kept:
+            each.hide_render = True
+    veiled = [each.name for each in objects if each.type == "MESH" and not each.hide_render and not each.visible_get()]
+    if veiled:
+        names = ", ".join(veiled[:4]) + (", ..." if len(veiled) > 4 else "")
+        note(f"read as well, because renders show what only the view hides: {names} (--without leaves it out)")
 
 
 def prepare():
-    """Make ready for the exporters what they would lose."""
+    """Make ready for the exporters what they would lose: with shape keys anywhere they apply no modifiers."""
     with_shapes = [each for each in shown() if each.data.shape_keys]
     modified = [each.name for each in with_shapes if any(one.type != "ARMATURE" for one in each.modifiers)]
     if modified:
         note(f"modifiers are left out of meshes with shape keys: {', '.join(modified[:4])}")
+    if with_shapes:
+        for each in shown():
+            if not each.data.shape_keys and not each.library:
+                apply_modifiers(each)
     return not with_shapes
+
+
+def apply_modifiers(thing):
+    """Put what the modifiers of an object make in place of its mesh, but for a skeleton's."""
+    skeletons = [each for each in thing.modifiers if each.type == "ARMATURE" and each.show_viewport]
+    others = [each for each in thing.modifiers if each.type != "ARMATURE"]
+    if not others:
+        return
+    for each in skeletons:
+        each.show_viewport = False
+    graph = bpy.context.evaluated_depsgraph_get()
+    made = bpy.data.meshes.new_from_object(thing.evaluated_get(graph), preserve_all_data_layers=True, depsgraph=graph)
+    made.name = thing.data.name
+    thing.data = made
+    for each in others:
+        thing.modifiers.remove(each)
+    for each in skeletons:
+        each.show_viewport = True
 
 
 def tell_polygons():
@@ -290,6 +336,7 @@ def main(source, output):
     bound()
     start()
     read(source)
+    hide_what_is_not_rendered()
     if not shown():
         raise SystemExit("there is no mesh in it")
     leave_out_strangers(os.path.dirname(source))

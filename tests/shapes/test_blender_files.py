@@ -54,6 +54,41 @@ for name in ("cube", "ico_sphere"):
 sys.stdout.flush()
 os._exit(0)
 """
+HIDDEN = """
+import bpy, os, sys
+def cube(name, collection):
+    bpy.ops.mesh.primitive_cube_add()
+    thing = bpy.context.object
+    thing.name = name
+    bpy.context.scene.collection.objects.unlink(thing)
+    collection.objects.link(thing)
+    return thing
+bpy.ops.wm.read_factory_settings(use_empty=True)
+scene = bpy.context.scene
+made = {name: bpy.data.collections.new(name) for name in ("shown", "left out", "not rendered", "character")}
+for name in ("shown", "left out", "not rendered"):
+    scene.collection.children.link(made[name])
+    cube(name, made[name])
+cube("character", made["character"])
+cube("veiled", made["shown"]).hide_set(True)
+bpy.context.view_layer.layer_collection.children["left out"].exclude = True
+made["not rendered"].hide_render = True
+copy = bpy.data.objects.new("copy", None)
+copy.instance_type, copy.instance_collection = "COLLECTION", made["character"]
+scene.collection.objects.link(copy)
+bpy.ops.wm.save_as_mainfile(filepath=os.path.join(sys.argv[-1], "hidden.blend"))
+scene.collection.children.unlink(made["shown"])
+bpy.ops.wm.save_as_mainfile(filepath=os.path.join(sys.argv[-1], "copy.blend"))
+bpy.ops.wm.read_factory_settings(use_empty=True)
+scene = bpy.context.scene
+talking, smooth = cube("talking", scene.collection), cube("smooth", scene.collection)
+talking.shape_key_add(name="Basis")
+for thing in (talking, smooth):
+    thing.modifiers.new("Subdivision", "SUBSURF")
+bpy.ops.wm.save_as_mainfile(filepath=os.path.join(sys.argv[-1], "smooth.blend"))
+sys.stdout.flush()
+os._exit(0)
+"""
 TRUSTING = """
 import bpy, os, sys
 bpy.context.preferences.filepaths.use_scripts_auto_execute = True
@@ -214,6 +249,18 @@ def test_blender_says_whether_there_are_polygons(tmp_path: Path) -> None:
     run_inside(tmp_path / "make.py", tmp_path)
     for name in ("cube", "ico_sphere"):
         assert blender.has_polygons(tmp_path / f"{name}.blend") == (name == "cube")
+
+
+@needs_blender
+def test_a_blend_file_has_what_its_renders_show(tmp_path: Path) -> None:
+    (tmp_path / "make.py").write_text(HIDDEN)
+    run_inside(tmp_path / "make.py", tmp_path)
+    with pytest.warns(MeshmatchWarning, match="only the view hides: veiled "):
+        shape = meshmatch.load_shape(tmp_path / "hidden.blend")
+    assert {name for name, _ in shape.meshes} == {"shown", "veiled", "character"}
+    assert meshmatch.load_shape(tmp_path / "copy.blend").F == 12
+    with pytest.warns(MeshmatchWarning, match="modifiers are left out of meshes with shape keys: talking$"):
+        assert meshmatch.load_shape(tmp_path / "smooth.blend").F == 12 + 48
 
 
 def test_works_of_an_artist_beside_shapes_of_a_folder_are_left_alone(tmp_path: Path) -> None:
