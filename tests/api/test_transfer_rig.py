@@ -340,6 +340,27 @@ def test_a_skeleton_of_its_own_is_replaced(source: Path, stands: float) -> None:
     assert np.linalg.norm(played(out, "bend", 0.0) - tube().verts, axis=1).mean() < 0.03
 
 
+@pytest.mark.parametrize("skinned", [True, False])
+def test_a_mirror_above_a_target_turns_nothing_inside_out(source: Path, skinned: bool) -> None:
+    """Programs differ in what mirrored joints do to triangles, so that none are left."""
+    target = source.with_name("target.glb")
+    write_tube(target)
+    nodes = Document(target, target.read_bytes()).json["nodes"]
+    nodes[6] = nodes[6] if skinned else {"mesh": 0}
+    write_tube(
+        target, nodes=[*nodes, {"scale": [-1, 1, 1], "children": [0, 6]}], scenes=[{"nodes": [7]}], animations=[]
+    )
+    shape = load_shape(target)
+    out, _ = rigged(source, target)
+    found = Document(out, out.read_bytes())
+    ((number, part, place),) = found.primitives()
+    stored = found.accessor(part["attributes"]["POSITION"])
+    assert not found.mirrors(number, part, place) and np.linalg.det(place[:3, :3]) > 0
+    assert volume(stored, found.triangles(part)) > 0
+    assert np.abs(load_shape(out).verts - shape.verts).max() < 1e-5
+    assert np.array_equal(load_shape(out).faces, shape.faces)
+
+
 def test_nodes_that_something_else_needs_stay(source: Path) -> None:
     """A lamp in the hand, a node with somebody's data, and bones that an extension may name."""
     target = source.with_name("target.glb")

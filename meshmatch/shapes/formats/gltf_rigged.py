@@ -69,8 +69,8 @@ def rigged(document: Document, binding: Binding) -> tuple[bytes, Replaced]:
     """The scene as a glb, moved by a skeleton, which hangs from its first node; and what of its own moves it no more:
     joints and their clips are taken out, but for nodes that something else needs.
 
-    Vertices are stored as they are, unless a skin of their own bends them: then as they stand. Those of the binding are in
-    the order of the scene.
+    Vertices are stored as they are, unless a skin of their own bends them, or they are drawn as in a mirror: then as they
+    stand. Those of the binding are in the order of the scene.
     """
     editor = Editor(document)
     rig, turn = binding.rig, binding.turn
@@ -150,8 +150,12 @@ def _add_nodes(editor: Editor, document: Document, rig: Rig) -> list[int]:
 
 
 def frame_of(document: Document, number: int, parts: dict[int, dict[str, Any]]) -> Float[Floats, "4 4"] | None:
-    """What puts the vertices of a node where they stand in the scene; None where a skin bends them."""
+    """What puts the vertices of a node where they stand in the scene; None where a skin bends them, or they are mirrored:
+    programs differ in which side of a triangle is outside if joints mirror it.
+    """
     place = document.world[number]
+    if any(document.mirrors(number, part, place) for part in parts.values()):
+        return None
     if "skin" not in document.nodes[number]:
         return place
     bones = document.bones(document.nodes[number]["skin"])
@@ -170,7 +174,7 @@ def frame_of(document: Document, number: int, parts: dict[int, dict[str, Any]]) 
 
 
 def straighten(editor: Editor, document: Document, number: int, part: dict[str, Any], own: dict[str, Any]) -> None:
-    """Store the vertices of a primitive where a skin puts them, and turn what belongs to them."""
+    """Store the vertices of a primitive where a skin or a mirror puts them, and turn what belongs to them."""
     place = document.world[number]
 
     def turned(accessor: int, unit: bool) -> Floats:
@@ -189,6 +193,10 @@ def straighten(editor: Editor, document: Document, number: int, part: dict[str, 
     for target in own.get("targets", []):
         for key in [key for key in ("POSITION", *_DIRECTIONS) if key in target]:
             target[key] = editor.add_array(turned(target[key], False).astype("<f4"), bounds=key == "POSITION")
+    faces = document.drawn_triangles(number, part, place)
+    if len(faces) and document.mirrors(number, part, place):
+        own["indices"] = editor.add_indices(faces, len(standing))
+        own.pop("mode", None)
 
 
 def _drop_skins(editor: Editor, before: set[int]) -> tuple[set[int], tuple[str, ...]]:
@@ -244,7 +252,8 @@ def _lift(editor: Editor, document: Document) -> None:
         if number in skinned:
             trees.setdefault(root[number], []).append(number)
     new = {number for number in skinned if "skin" not in document.nodes[number]}
-    trees = {top: some for top, some in trees.items() if not new.isdisjoint(some)}  # others lay there with their skins
+    turned = new | {number for number in skinned if np.linalg.det(document.world[number][:3, :3]) < 0}
+    trees = {top: some for top, some in trees.items() if not turned.isdisjoint(some)}  # others lay there with their skins
     lifted = {number for some in trees.values() for number in some}
     whole: set[int] = set()
     for number in reversed(document.world):  # children before parents
