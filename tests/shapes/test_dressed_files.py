@@ -144,7 +144,15 @@ def scene(path: Path, **more: Any) -> None:
         np.frombuffer(encoded(quarters()), "u1"),
         np.tile(np.array([[1.0, 0, 0, 1]], "f4"), (4, 1)),
     ]
-    attributes = {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2, "TEXCOORD_1": 3, "COLOR_0": 5, "TANGENT": 8}
+    attributes = {
+        "POSITION": 0,
+        "NORMAL": 1,
+        "TEXCOORD_0": 2,
+        "TEXCOORD_1": 3,
+        "COLOR_0": 5,
+        "COLOR_1": 5,
+        "TANGENT": 8,
+    }
     parts = [
         {"attributes": attributes, "indices": 4, "material": 0, "targets": [{"POSITION": 6}]},
         {"attributes": {"POSITION": 0, "TEXCOORD_0": 2}, "indices": 4, "material": 1, "targets": [{"POSITION": 6}]},
@@ -190,6 +198,7 @@ def test_everything_else_of_a_scene_stays(tmp_path: Path) -> None:
     for key, values in {"TEXCOORD_2": UV, "TEXCOORD_1": 0.5 * UV, "_COLOR_0": np.tile([1.0, 0, 0, 1], (4, 1))}.items():
         np.testing.assert_allclose(document.accessor(attributes[key]), values[vertex])
     assert "COLOR_0" not in attributes  # it would tint the image
+    assert "_COLOR_1" in attributes and "COLOR_1" not in attributes  # sets are counted from 0
     target = document.accessor(first["primitives"][1]["targets"][0]["POSITION"])
     np.testing.assert_allclose(target, 0.1 * CORNERS[vertex], atol=1e-7)
     np.testing.assert_allclose(load_coordinates(out, load_shape(out)), apart(load_shape(path)), atol=1e-6)

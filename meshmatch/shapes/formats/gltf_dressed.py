@@ -152,10 +152,13 @@ def _lay(editor: Editor, document: Document, V: int, primitive: dict[str, Any], 
 
 
 def _untint(document: Document, part: dict[str, Any], primitive: dict[str, Any]) -> None:
-    """Keep colors of vertices, which would be multiplied with the image, under a name that no program draws."""
-    colors = document.colors(part)
+    """Keep colors of vertices, which would be multiplied with the image, under names that no program draws: all sets of
+    them, for those of a primitive are counted from 0.
+    """
+    colors, attributes = document.colors(part), primitive["attributes"]
     if colors is not None and (colors != 1.0).any():
-        primitive["attributes"]["_COLOR_0"] = primitive["attributes"].pop("COLOR_0")
+        for key in [key for key in attributes if key.startswith("COLOR_")]:
+            attributes[f"_{key}"] = attributes.pop(key)
 
 
 def _normals(document: Document, parts: dict[int, dict[str, Any]]) -> dict[int, Floats]:
