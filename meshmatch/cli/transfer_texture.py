@@ -79,7 +79,8 @@ def transfer_texture(
         hint = f"leave out --uv {uv}" if b.is_cloud else "end the output in .glb or .obj for a texture"
         raise OptionError(f"{b.name} gets vertex colors, which need no texture coordinates", hint)
     look = textured_files.load_appearance(source, a, image)
-    layers = () if look.finish is None else look.finish.images
+    finish = look.finish
+    layers = () if finish is None else [each for each in finish.images if each != "surface" or not finish.even]
     tiles: list[int] = []
     if not painted and uv in ("auto", "keep"):
         tiles = tiles_of_file(target, b, size)

@@ -82,11 +82,16 @@ class Finish:
         return "occlusion" in self.layers and self.layers["occlusion"].textured
 
     @property
+    def even(self) -> bool:
+        """Whether roughness and metal are the same all over."""
+        return "surface" in self.layers and self.layers["surface"].plain
+
+    @property
     def images(self) -> tuple[Layer, ...]:
         """The layers that need an image when they are baked; occlusion goes with the surface."""
         needed: dict[Layer, bool] = {
             "normal": "normal" in self.layers and self.layers["normal"].textured,
-            "surface": "surface" in self.layers and (self.occluded or not self.layers["surface"].plain),
+            "surface": "surface" in self.layers and (self.occluded or not self.even),
             "glow": "glow" in self.layers and not self.layers["glow"].plain,
         }
         return tuple(layer for layer, some in needed.items() if some)
@@ -110,8 +115,10 @@ class BakedMaterial:
         (H, W, 4) directions in the frame of the surface, as glTF has them: red along u, green against v, blue outwards.
     surface
         (H, W, 4): red is occlusion if it is ``occluded``, green roughness, blue metal.
+    even
+        Roughness and metal are the same all over: the image shows occlusion alone.
     roughness
-        In 0..1; multiplies the image, if there is one.
+        In 0..1; multiplies the image, if there is one that shows it.
     metal
         The same.
     glow
@@ -129,6 +136,7 @@ class BakedMaterial:
     normal: Pixels | None = None
     surface: Pixels | None = None
     occluded: bool = False
+    even: bool = False
     roughness: float = 1.0
     metal: float = 0.0
     glow: Pixels | None = None
@@ -136,8 +144,9 @@ class BakedMaterial:
 
     @property
     def layers(self) -> tuple[Layer, ...]:
-        """Those that there is an image of."""
-        shown: dict[Layer, Pixels | None] = {"normal": self.normal, "surface": self.surface, "glow": self.glow}
+        """Those that an obj has images of, which holds no occlusion."""
+        surface = None if self.even else self.surface
+        shown: dict[Layer, Pixels | None] = {"normal": self.normal, "surface": surface, "glow": self.glow}
         return tuple(layer for layer, image in shown.items() if image is not None)
 
 

@@ -119,7 +119,7 @@ def _images_of(material: BakedMaterial) -> dict[str, Pixels]:
     images = {"color": material.color}
     if material.normal is not None:
         images["normal"] = material.normal
-    if material.surface is not None:
+    if material.surface is not None and not material.even:
         for k, word in ((1, "roughness"), (2, "metal")):
             images[word] = np.dstack([*[material.surface[..., k]] * 3, material.surface[..., 3]])
     if material.glow is not None:

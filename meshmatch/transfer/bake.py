@@ -239,9 +239,9 @@ def _finished(plain: BakedMaterial, look: Appearance, images: dict[Layer, Pixels
     made = replace(plain, double_sided=finish.double_sided, unlit=finish.unlit, normal=images.get("normal"))
     if "surface" in images:
         made = replace(made, surface=images["surface"], occluded=finish.occluded, roughness=1.0, metal=1.0)
-    elif "surface" in finish.layers:
+    if finish.even:
         _, roughness, metal, _ = _factor(finish.layers["surface"])
-        made = replace(made, roughness=roughness, metal=metal)
+        made = replace(made, even="surface" in images, roughness=roughness, metal=metal)
     if "glow" in images:
         return replace(made, glow=images["glow"], light=(finish.light,) * 3)
     if "glow" in finish.layers:

@@ -120,6 +120,17 @@ def test_written_to_a_glb_and_read_again(tmp_path: Path) -> None:
     np.testing.assert_allclose(tangents, np.tile([1.0, 0, 0, 1], (4, 1)), atol=1e-6)
 
 
+@pytest.mark.filterwarnings("ignore:.*does not have an occlusion map")
+def test_an_image_of_occlusion_alone_is_none_of_metal(tmp_path: Path) -> None:
+    made = BakedMaterial(quarters(8), surface=NOISE[1], occluded=True, even=True, roughness=0.75)
+    for suffix in (".glb", ".obj"):
+        Dressed(Shape(CORNERS, FACES, "square"), None, UV[FACES], False, made).save(tmp_path / f"a{suffix}")
+    found = finish_of(tmp_path / "a.glb")
+    assert found.occluded and found.layers["surface"].plain
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.glb", "a.mtl", "a.obj", "a.png"]
+    assert "\nPr 0.75\nPm 0\n" in (tmp_path / "a.mtl").read_text()
+
+
 def test_written_to_an_obj_and_read_again(tmp_path: Path) -> None:
     path = tmp_path / "a.obj"
     with pytest.warns(MeshmatchWarning, match=r"a\.obj does not have an occlusion map"):

@@ -119,6 +119,17 @@ def test_surface_and_occlusion_share_an_image() -> None:
     assert (made.roughness, made.metal, made.normal, made.glow) == (1.0, 1.0, None, None)
 
 
+def test_occlusion_leaves_roughness_and_metal_numbers() -> None:
+    uv = UV[FACES]
+    layers: dict[Layer, Appearance] = {
+        "surface": layer(None, uv, factor=(1.0, 0.75, 0.25, 1.0)),
+        "occlusion": layer(flat((0.2, 0, 0)), uv),
+    }
+    made = baked(SQUARE, finished(uv, layers), uv)
+    assert made.surface is not None and made.occluded and made.even
+    assert (made.roughness, made.metal, made.surface[16, 16, 0]) == (0.75, 0.25, 51)
+
+
 def test_numbers_stay_numbers() -> None:
     uv = UV[FACES]
     layers: dict[Layer, Appearance] = {

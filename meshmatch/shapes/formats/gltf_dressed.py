@@ -210,7 +210,7 @@ class _Wardrobe:
             None if image is None else self._texture(image, f" {what}")
             for image, what in (
                 (material.normal, "normal"),
-                (material.surface, "occlusion, roughness, metal"),
+                (material.surface, "occlusion" if material.even else "occlusion, roughness, metal"),
                 (material.glow, "emission"),
             )
         )
@@ -266,7 +266,7 @@ class _Wardrobe:
         paint |= {"metallicFactor": baked.metal, "roughnessFactor": baked.roughness}
         for where, key, texture in (
             (paint, "baseColorTexture", self.color),
-            (paint, "metallicRoughnessTexture", self.surface),
+            (paint, "metallicRoughnessTexture", None if baked.even else self.surface),
             (entry, "occlusionTexture", self.surface if baked.occluded else None),
             (entry, "normalTexture", self.normal),
             (entry, "emissiveTexture", self.glow),

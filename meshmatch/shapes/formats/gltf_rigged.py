@@ -253,7 +253,9 @@ def _lift(editor: Editor, document: Document) -> None:
             trees.setdefault(root[number], []).append(number)
     new = {number for number in skinned if "skin" not in document.nodes[number]}
     turned = new | {number for number in skinned if np.linalg.det(document.world[number][:3, :3]) < 0}
-    trees = {top: some for top, some in trees.items() if not turned.isdisjoint(some)}  # others lay there with their skins
+    trees = {
+        top: some for top, some in trees.items() if not turned.isdisjoint(some)
+    }  # others lay there with their skins
     lifted = {number for some in trees.values() for number in some}
     whole: set[int] = set()
     for number in reversed(document.world):  # children before parents
