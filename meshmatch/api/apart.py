@@ -102,9 +102,11 @@ def find_alone(
                 break
         else:
             return None
-    others = _rivals(parts, sets, chosen, known)
+    copied = clean[chosen].copied  # the same figure again, at another place of the scene: either is meant
+    copies = [k for k in range(len(sets)) if copied is not None and copied[np.isin(parts.number, list(sets[k]))].all()]
+    others = _rivals(parts, sets, chosen, [k for k in known if k not in copies])
     if not others:  # another one may be in a pose that reads strangely
-        promising = [k for k in range(len(sets)) if FAMILIAR < value[k] <= _PROMISING]
+        promising = [k for k in range(len(sets)) if FAMILIAR < value[k] <= _PROMISING and k not in copies]
         others = [k for k in _rivals(parts, sets, chosen, promising, beside=True)[:1] if trusted(k) is not None]
     if others:
         _refuse_to_choose(whole, parts, [sets[k] for k in (chosen, *others)])

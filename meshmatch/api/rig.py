@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -15,6 +16,7 @@ from meshmatch.api.transfer import MapLike, find_maps
 from meshmatch.api.upright import trust
 from meshmatch.arrays import Brief
 from meshmatch.errors import InputError, OptionError, warn
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.shapes import tables
 from meshmatch.shapes.files import ShapeLike, as_scene, as_shape, load_shape
@@ -25,6 +27,7 @@ from meshmatch.shapes.formats.gltf_rig import Rig, read_rig
 from meshmatch.shapes.formats.gltf_rigged import Binding, hanging_groups, rigged
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.moved_files import tell_left, with_look
+from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.attributes import joint_table, most_votes, pull_weights
 from meshmatch.transfer.carry_rig import UP, carry, upright
@@ -157,6 +160,19 @@ def _tell_stretched(name: str, rig: Rig) -> None:
         warn(f"{which} have a scale that differs by axis, and clips will look different: apply it before the export")
 
 
+def _refuse_copies(target: Shape, backward: VertexMap) -> None:
+    """Refuse a figure that stands in its scene several times: all its copies would follow the joints in one of them."""
+    seen: set[tuple[int, bytes]] = set()
+    starts = np.cumsum([0, *(count for _, count in target.meshes)])
+    for start, end in pairwise(starts.tolist()) if starts[-1] == target.V else ():
+        places = np.column_stack([backward.index, backward.barycentric])[start:end]
+        key = end - start, places.tobytes()
+        if key in seen and 2 * len(np.unique(places, axis=0)) > len(places):  # not what was left out and lies near by
+            hint = "export it once; copies of what comes out move alike"
+            raise InputError(f"{target.name} draws one figure several times, which one skeleton cannot move", hint)
+        seen.add(key)
+
+
 def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *, pose: Pose = "rest") -> RiggedResult:
     """The target as it came, with the skeleton, skin weights and animation clips of the source.
 
@@ -207,6 +223,7 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     path, data, in_gltf = as_scene(target, b)
     hanging = gltf.understood(path, data, "scene makes", hanging_groups)
     maps = find_maps(a, b, match)
+    _refuse_copies(b, maps.backward)
     with thread_limit(1):
         points, share = maps.forward.points(b), trust(a, maps)
         turn = np.eye(3) if in_gltf else upright(a, points, share)

@@ -324,12 +324,16 @@ class SurfaceBinding:
         foot, _ = template_footpoints(part.shape, fit, workers)
         rows = part.original_to_repaired  # all vertices of the original are bound
         self._corners, self._weights = fit.faces[foot.face[rows]], foot.barycentric[rows]
-        offset = fit.frame.apply(part.original.verts) - self._on(fit.points)
+        here = fit.frame.apply(part.original.verts)
+        self._apart = np.zeros_like(here)
+        if part.copied is not None:  # a copy moves as what stands for it, at the place where it is
+            self._apart[part.copied] = (here - here[part.kept_vertex[rows]])[part.copied]
+        offset = here - self._apart - self._on(fit.points)
         self._offsets = [np.einsum("nji,nj->ni", turns[self._corners[:, k]], offset) for k in range(3)]
 
     def at(self, points: Float[Floats, "V 3"], turns: Float[Floats, "V 3 3"]) -> Float[Floats, "N 3"]:
         """Vertices (N, 3) of the shape for points (V, 3) and rotations (V, 3, 3) of the template; core frame."""
-        verts = self._on(points)
+        verts = self._on(points) + self._apart
         for k, offset in enumerate(self._offsets):
             turned = np.einsum("nij,nj->ni", turns[self._corners[:, k]], offset)
             verts += self._weights[:, k, None] * turned

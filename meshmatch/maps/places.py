@@ -98,6 +98,8 @@ class Places(Brief):
         stands = part.kept_vertex[part.original_to_repaired]
         # What was left out is as near to the template as the vertex that stands for it, and the way there.
         away = np.linalg.norm(original.verts - original.verts[stands], axis=1) * original.valid / fit.frame.scale
+        if part.copied is not None:  # but a copy is where it is for another reason
+            away[part.copied] = 0.0
         fitted = np.zeros(original.F, bool)
         fitted[part.kept_face] = True
         return cls(

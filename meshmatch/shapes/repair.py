@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Bools, Brief, Int, Ints
+from meshmatch.arrays import Bool, Bools, Brief, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
+from meshmatch.shapes.copies import counterparts
 from meshmatch.shapes.denoise import without_noise
 from meshmatch.shapes.faces import collapsed, duplicate_faces, find_parts, flat_faces, seams, turn_faces
 from meshmatch.shapes.shape import Shape
@@ -35,7 +36,9 @@ class Repaired(Brief):
     the original vertex (increasing) or face that each repaired one is; corners may be turned, or stand for twins. `notes`
     say what was found and done, a line each; none for a shape that was fine. `far_parts` counts big parts that lie far from
     the largest one: perhaps two objects in one file. They are kept. `left_out` are numbers of parts
-    (`meshmatch.shapes.parts`) that were tried apart and are no part of what is fitted.
+    (`meshmatch.shapes.parts`) that were tried apart and are no part of what is fitted. `copied` are original vertices that
+    were dropped with a copy of all that is kept, such as the same figure at another node of a scene: their counterparts
+    stand for them.
     """
 
     shape: Shape
@@ -46,6 +49,7 @@ class Repaired(Brief):
     kept_face: Int[Ints, " F"]
     far_parts: int = 0
     left_out: tuple[int, ...] = ()
+    copied: Bool[Bools, " V_original"] | None = None
 
 
 def repair(shape: Shape) -> Repaired:
@@ -210,7 +214,15 @@ def _result(
         from meshmatch.geometry.trees import cKDTree
 
         tree = cKDTree(repaired.verts, compact_nodes=False, balanced_tree=False)
+        own = counterparts(shape, answer < 0)
+        copied = (own >= 0) & (answer[own] >= 0)
         answer[lost] = tree.query(shape.verts[stands[lost]])[1]
+        answer[copied] = answer[own[copied]]
+        if copied.any():
+            _note(
+                notes, int(copied.sum()), "vertex", "of copies of the rest, elsewhere in the scene, matched as that is"
+            )
+            return Repaired(repaired, answer, chosen, tuple(notes), shape, which, far_parts, copied=copied)
     return Repaired(repaired, answer, chosen, tuple(notes), shape, which, far_parts)
 
 

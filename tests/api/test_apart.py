@@ -1,6 +1,7 @@
 """Where a whole file cannot be fitted its parts are tried apart: by readings, and at the end with the models that ship."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,6 +27,7 @@ from tests.shapes.scenes import (
     eyes,
     floor,
     fused_with_floor,
+    moved,
     pack,
     pedestal,
     sample,
@@ -102,6 +104,14 @@ def test_two_bodies_are_for_the_user_to_choose_from(reads: Reads) -> None:
     with pytest.raises(InputError, match=r"two\.ply holds several shapes of one kind: part 1 .* and part 2 ") as caught:
         find_alone(loaders(), scene, CONFIG)
     assert "--only 1 or --only 2" in caught.value.hint
+
+
+def test_of_copies_in_a_scene_any_is_meant(reads: Reads) -> None:
+    reads({BODY.V: 3.7})
+    scene = together("two.glb", BODY, moved(BODY, [1.0, 0, 0]))
+    alone = find_alone(loaders(), replace(scene, meshes=(("a", BODY.V), ("b", BODY.V))), CONFIG)
+    assert alone is not None and alone.clean.shape.V == BODY.V
+    assert alone.clean.copied is not None and alone.clean.copied.sum() == BODY.V
 
 
 def test_two_bodies_that_run_into_each_other_are_not_one_in_clothes(reads: Reads) -> None:

@@ -502,5 +502,10 @@ def test_what_cannot_be_rigged_is_told(source: Path) -> None:
     )
     with pytest.raises(InputError, match="draws copies of one mesh"):
         meshmatch.transfer_rig(source, copies)
+    two = load_shape(plain)
+    back = VertexMap.between(two, load_shape(source), np.arange(two.V) % tube().V)
+    pair = meshmatch.MapPair(load_shape(source), two, same_order(source, plain), opposite=back)
+    with pytest.raises(InputError, match=r"plain\.glb draws one figure several times"):
+        meshmatch.transfer_rig(source, plain, pair)
     with pytest.raises(OptionError, match="not a format for rigs"):
         rigged(source, target)[1].save("out.obj")

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps.footpoints import SurfaceBinding
+from meshmatch.maps.places import Places
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere, some_fit
@@ -74,3 +75,20 @@ def test_twins_stay_together(bumpy: Shape) -> None:
     rider = SurfaceBinding(repair(bumpy), fit, turns(len(fit.points), np.eye(3)))
     found = rider.at(fit.points + 0.2 * own[:, 0], own)
     assert np.allclose(found[0], found[642])
+
+
+def test_a_copy_goes_beside_what_it_is_a_copy_of(bumpy: Shape) -> None:
+    """It belongs to the same places, and is as sure of them."""
+    one = repair(bumpy).shape
+    V, meshes = one.V, (("one", one.V), ("again", one.V))
+    verts, faces = np.vstack([one.verts, one.verts + np.array([9.0, 0, 0])]), np.vstack([one.faces, one.faces + one.V])
+    part = repair(Shape(verts, faces, weights=np.repeat([1.0, 0], V), meshes=meshes))
+    fit = ball_fit(bumpy)
+    places = Places.of(part, fit)
+    np.testing.assert_array_equal(places.distance[V:], places.distance[:V])
+    np.testing.assert_array_equal(places.stands[V:], places.stands[:V])
+    rider = SurfaceBinding(part, fit, turns(len(fit.points), np.eye(3)))
+    R = Rotation.from_euler("y", 80, degrees=True).as_matrix()
+    found, before = rider.at(fit.points @ R.T, turns(len(fit.points), R)), fit.frame.apply(verts)
+    np.testing.assert_allclose(found[:V], before[:V] @ R.T, atol=1e-12)
+    np.testing.assert_allclose(found[V:] - found[:V], before[V:] - before[:V], atol=1e-12)
