@@ -91,13 +91,20 @@ def _converted(path: Path) -> tuple[bytes, bool]:
                 glb = Path(folder, "converted.glb")
                 said = _run(path, glb)
                 if isinstance(said, _Trouble):
-                    hint = said.hint or "is it damaged? export it as .glb"
+                    hint = said.hint or _other_export(path)
                     raise InputError(f"{path.name} cannot be read: {said.why}", hint)
                 _done[key] = glb.read_bytes(), _POLYGONS in said
         _done.move_to_end(key)
         while len(_done) > _KEPT:
             _done.popitem(last=False)
         return _done[key]
+
+
+def _other_export(path: Path) -> str:
+    """What to do about a file that Blender does not read."""
+    with path.open("rb") as file:
+        written_out = path.suffix.lower() == ".fbx" and file.read(1) == b";"
+    return "export it as a binary .fbx, or as .glb" if written_out else "is it damaged? export it as .glb"
 
 
 def check_written(path: Path) -> None:

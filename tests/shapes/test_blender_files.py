@@ -153,6 +153,15 @@ def test_without_blender_the_line_says_how_to_get_it(tmp_path: Path, monkeypatch
     assert sorted(each.name for each in tmp_path.iterdir()) == ["a.fbx"]
 
 
+def test_an_fbx_of_text_is_to_be_exported_as_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(tmp_path, monkeypatch, "sys.exit('Error: ASCII FBX files are not supported')")
+    for head, hint in ((b"; FBX 7.4.0 project file", "binary .fbx, or as .glb"), (b"Kaydara", "is it damaged?")):
+        (tmp_path / "a.fbx").write_bytes(head + b"\n" * len(hint))
+        with pytest.raises(InputError, match="ASCII FBX") as error:
+            meshmatch.load_shape(tmp_path / "a.fbx")
+        assert hint in error.value.hint
+
+
 @pytest.mark.parametrize(
     ("does", "words"),
     [
