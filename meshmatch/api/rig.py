@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -37,6 +36,7 @@ from meshmatch.transfer.weight_files import SkinWeights, load_weights
 
 Pose = Literal["rest", "source"]
 """How a rigged target stands: as it came, or as the source does."""
+_ALIKE = 0.8  # share of vertices that copies have in common places on the source; set by hand
 _EVEN = 1.05  # a joint's longest side over its shortest; set by hand
 check_rig_suffix = partial(tables.check_suffix, suffixes=(".glb", gltf_vrm.SUFFIX), what="rigs")
 
@@ -162,15 +162,14 @@ def _tell_stretched(name: str, rig: Rig) -> None:
 
 def _refuse_copies(target: Shape, backward: VertexMap) -> None:
     """Refuse a figure that stands in its scene several times: all its copies would follow the joints in one of them."""
-    seen: set[tuple[int, bytes]] = set()
-    starts = np.cumsum([0, *(count for _, count in target.meshes)])
-    for start, end in pairwise(starts.tolist()) if starts[-1] == target.V else ():
-        places = np.column_stack([backward.index, backward.barycentric])[start:end]
-        key = end - start, places.tobytes()
-        if key in seen and 2 * len(np.unique(places, axis=0)) > len(places):  # not what was left out and lies near by
+    counts = [count for _, count in target.meshes]
+    blocks = np.split(backward.index, np.cumsum(counts)[:-1]) if sum(counts) == target.V and len(counts) > 1 else []
+    for k, own in enumerate(blocks):
+        if 4 * len(np.unique(own)) < len(own):  # it was left out, and lies near few places
+            continue
+        if any(len(own) == len(other) and (own == other).mean() > _ALIKE for other in blocks[:k]):
             hint = "export it once; copies of what comes out move alike"
             raise InputError(f"{target.name} draws one figure several times, which one skeleton cannot move", hint)
-        seen.add(key)
 
 
 def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *, pose: Pose = "rest") -> RiggedResult:
