@@ -27,9 +27,11 @@ def counterparts(shape: Shape, lost: Bool[Bools, " V"]) -> Int[Ints, " V"]:
     ends = np.cumsum(counts)
     starts = ends - counts
     of_face = np.searchsorted(ends, shape.faces[:, 0], side="right")
+    by_mesh = shape.faces[np.argsort(of_face, kind="stable")]
+    own_faces = np.split(by_mesh, np.cumsum(np.bincount(of_face, minlength=len(counts)))[:-1])
     alike: dict[tuple[int, bytes], tuple[list[int], list[int]]] = {}
     for k, (start, end) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
-        faces = np.sort(shape.faces[of_face == k] - start, axis=1)  # a mirror turns them over
+        faces = np.sort(own_faces[k] - start, axis=1)  # a mirror turns them over
         if len(faces):
             alike.setdefault((end - start, faces.tobytes()), ([], []))[int(lost[start:end].all())].append(k)
     for kept, copies in alike.values():
