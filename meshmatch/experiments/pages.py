@@ -31,7 +31,6 @@ DOCS = Path(__file__).parents[2] / "docs"
 PAGES = ("results.md", "method.md", "paper.md", "rigs.md", "collections.md", "categories.md")
 _BLOCK = re.compile(r"(<!-- (results|summary)([^>]*?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 _COLUMNS = ("mean", "median", "lost", "flips", "pairs")
-_SHOWN_AS = {"not testable at this length": "not testable here"}  # as earlier files word it
 
 
 class Row(NamedTuple):
@@ -103,7 +102,7 @@ def table_of(words: str, docs: Path) -> str:
     table = found["tables"][int(number) - 1]
     wanted = [each.strip() for each in names.split(",") if each.strip()] or table["columns"]
     places = [table["columns"].index(each) for each in wanted]
-    rows = [[_SHOWN_AS.get(row[place], row[place]) for place in places] for row in table["rows"]]
+    rows = [[row[place] for place in places] for row in table["rows"]]
     told = f"[{name}.json](results/{name}.json): {found['date']}, commit {found['commit']}, {found['machine']}"
     if last := found.get("last_commit"):
         told += f"; to repeat it, check out {last}"
