@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -36,7 +37,9 @@ from meshmatch.transfer.weight_files import SkinWeights, load_weights
 
 Pose = Literal["rest", "source"]
 """How a rigged target stands: as it came, or as the source does."""
-_ALIKE = 0.8  # share of vertices that copies have in common places on the source; set by hand
+# What copies of a figure are, set by hand: share of vertices that have common places on the source, and how far apart they
+# stand, in units of a copy's diagonal; looked for among so many meshes, the largest.
+_ALIKE, _BESIDE, _MOST_MESHES = 0.8, 0.1, 64
 _EVEN = 1.05  # a joint's longest side over its shortest; set by hand
 check_rig_suffix = partial(tables.check_suffix, suffixes=(".glb", gltf_vrm.SUFFIX), what="rigs")
 
@@ -161,13 +164,20 @@ def _tell_stretched(name: str, rig: Rig) -> None:
 
 
 def _refuse_copies(target: Shape, backward: VertexMap) -> None:
-    """Refuse a figure that stands in its scene several times: all its copies would follow the joints in one of them."""
-    counts = [count for _, count in target.meshes]
-    blocks = np.split(backward.index, np.cumsum(counts)[:-1]) if sum(counts) == target.V and len(counts) > 1 else []
-    for k, own in enumerate(blocks):
-        if 4 * len(np.unique(own)) < len(own):  # it was left out, and lies near few places
-            continue
-        if any(len(own) == len(other) and (own == other).mean() > _ALIKE for other in blocks[:k]):
+    """Refuse a figure that stands in its scene several times: all its copies would follow the joints in one of them. Two
+    meshes in one place, such as a body and the outline that is drawn around it, are no copies.
+    """
+    ends = np.cumsum([count for _, count in target.meshes], dtype=np.int64).tolist()
+    if len(ends) < 2 or ends[-1] != target.V:
+        return
+    blocks = [slice(*each) for each in pairwise([0, *ends])]
+    largest = sorted(blocks, key=lambda block: block.start - block.stop)[:_MOST_MESHES]
+    for one, other in combinations(largest, 2):
+        here, there = backward.index[one], backward.index[other]
+        if len(here) != len(there) or (here == there).mean() <= _ALIKE or 4 * len(np.unique(here)) < len(here):
+            continue  # the last: it was left out, and lies near few places
+        own = target.verts[one]
+        if np.linalg.norm(own - target.verts[other], axis=1).mean() > _BESIDE * np.linalg.norm(np.ptp(own, axis=0)):
             hint = "export it once; copies of what comes out move alike"
             raise InputError(f"{target.name} draws one figure several times, which one skeleton cannot move", hint)
 

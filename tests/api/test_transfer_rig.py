@@ -480,6 +480,22 @@ def test_joints_without_a_vertex_are_named(source: Path) -> None:
     assert [result.rig.names[joint] for joint in result.rig.joints] == list(JOINTS)
 
 
+def test_an_outline_around_a_target_is_no_copy_of_it(source: Path) -> None:
+    """Toon shading draws a mesh again, a little larger: one skeleton moves both."""
+    target, shape = source.with_name("target.glb"), tube()
+    document = {
+        "scene": 0,
+        "scenes": [{"nodes": [0, 1]}],
+        "nodes": [{"mesh": 0}, {"mesh": 0, "scale": [1.02, 1.02, 1.02]}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+    }
+    write_document(target, document, shape.verts.astype("f4"), shape.faces.ravel().astype("u2"))
+    a, b = load_shape(source), load_shape(target)
+    back = VertexMap.between(b, a, np.arange(b.V) % a.V)
+    result = meshmatch.transfer_rig(source, target, meshmatch.MapPair(a, b, same_order(source, target), opposite=back))
+    assert set(result.rig.names) >= set(JOINTS)
+
+
 def test_what_cannot_be_rigged_is_told(source: Path) -> None:
     target = source.with_name("target.ply")
     save_shape(target, tube())
