@@ -19,6 +19,7 @@ from meshmatch.fitting.judge.verdict import LIMITS, judge_registration
 from meshmatch.fitting.search.predictor import mirror_of
 from meshmatch.fitting.search.refinement import REFINEMENTS, fit_part, fit_whole
 from meshmatch.fitting.search.task import FitTask, Registration
+from meshmatch.fitting.search.thick_parts import with_thick_part_smaller
 from meshmatch.fitting.search.untangling import untangled
 from meshmatch.fitting.solve.terms import Landmarks
 from meshmatch.fitting.usual import Usual
@@ -97,7 +98,8 @@ class Fitter:
             doubts.append(Reason("side", SIDE_IN_DOUBT))
         fit = as_fit(found, partial, began)
         if _spoken_against(fit) and not partial and config.variants and config.moves_nodes:
-            better = untangled(found)
+            better = with_thick_part_smaller(found) if fit.verdict == "poor" else None
+            better = better or untangled(found)
             fit = fit if better is None else as_fit(better, partial, began)
         fit = replace(fit, notes=notes)
         return cap_verdict(fit if card.correspondence else judged_of_kind(card, fit), doubts)
