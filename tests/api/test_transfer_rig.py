@@ -480,18 +480,24 @@ def test_joints_without_a_vertex_are_named(source: Path) -> None:
     assert [result.rig.names[joint] for joint in result.rig.joints] == list(JOINTS)
 
 
-def test_an_outline_around_a_target_is_no_copy_of_it(source: Path) -> None:
-    """Toon shading draws a mesh again, a little larger: one skeleton moves both."""
+@pytest.mark.parametrize(
+    ("again", "places"),
+    [
+        pytest.param({"scale": [1.02, 1.02, 1.02]}, None, id="an outline, which toon shading draws around a mesh"),
+        pytest.param({"translation": [3.0, 0, 0]}, 4, id="props, which lie near few places of the source"),
+    ],
+)
+def test_what_moves_with_a_target_is_no_copy_of_it(source: Path, again: dict[str, Any], places: int | None) -> None:
     target, shape = source.with_name("target.glb"), tube()
     document = {
         "scene": 0,
         "scenes": [{"nodes": [0, 1]}],
-        "nodes": [{"mesh": 0}, {"mesh": 0, "scale": [1.02, 1.02, 1.02]}],
+        "nodes": [{"mesh": 0}, {"mesh": 0, **again}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
     }
     write_document(target, document, shape.verts.astype("f4"), shape.faces.ravel().astype("u2"))
     a, b = load_shape(source), load_shape(target)
-    back = VertexMap.between(b, a, np.arange(b.V) % a.V)
+    back = VertexMap.between(b, a, np.tile(np.arange(a.V) % (places or a.V), 2))
     result = meshmatch.transfer_rig(source, target, meshmatch.MapPair(a, b, same_order(source, target), opposite=back))
     assert set(result.rig.names) >= set(JOINTS)
 
