@@ -48,7 +48,7 @@ def info(
         about = _folder
     elif suffix == ".safetensors":
         about = _tensors
-    elif suffix in (".fcsv", ".pp", ".pts", ".tps"):
+    elif suffix in (".fcsv", ".pp", ".pts", ".tps", ".landmarkascii"):
         about = _landmarks
     elif suffix in MAP_SUFFIXES and (suffix != ".npy" or _is_list(file)):
         about = _map

@@ -231,7 +231,7 @@ def transfer_landmarks(
         "--landmarks",
         metavar="FILE",
         help="Landmarks of SRC, as vertices or positions: .csv, .txt, .npy or .json, MeshLab's .pp, 3D Slicer's .fcsv and "
-        ".mrk.json, .pts, .tps, or Morphologika's .txt.",
+        ".mrk.json, Amira's .landmarkAscii, .pts, .tps, or Morphologika's .txt.",
     ),
     maps: MapOptionsWithPairs,
     run: RunOptions,

@@ -21,7 +21,7 @@ _COMPANIONS = {
     *(".mtl", ".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff", ".gif", ".exr", ".hdr", ".psd"),
     *(".mp4", ".mov", ".bin", ".raw", ".zraw", ".safetensors"),
     *(".csv", ".tsv", ".xls", ".xlsx", ".ods", ".json", ".npz", ".mat", ".xml", ".yaml", ".yml", ".rds", ".rda"),
-    *(".fcsv", ".tps", ".pts", ".pp"),
+    *(".fcsv", ".tps", ".pts", ".pp", ".landmarkascii"),
     *(".txt", ".md", ".rst", ".html", ".pdf", ".svg", ".doc", ".docx", ".odt", ".rtf", ".log", ".ini", ".db"),
     *(".py", ".r", ".rdata", ".ipynb", ".sh"),
 }  # what lies beside shapes and is none

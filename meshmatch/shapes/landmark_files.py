@@ -1,6 +1,6 @@
 """Landmarks in files: tables of vertices or positions, JSON, MeshLab's picked points, 3D Slicer's markups, the .pts and
-.tps of landmark editors, Morphologika's text. What a file says of each point is read here; `meshmatch.transfer.landmarks`
-puts it on a shape.
+.tps of landmark editors, the text of Amira and of Morphologika. What a file says of each point is read here;
+`meshmatch.transfer.landmarks` puts it on a shape.
 
 3D Slicer writes points and meshes in one of two frames, which differ in the signs of x and y, and says which: LPS or RAS.
 """
@@ -382,6 +382,22 @@ def _chosen(ids: Sequence[Collection[str]], shape: str) -> int:
     return own[0]
 
 
+def _read_amira(path: Path) -> list[Record]:
+    """The points of Amira and Avizo: a header declares how many, and which section of the data they are in."""
+    text = read_text(path, _RECORD)
+    header, *sections = re.split(r"^@(\d+)[ \t]*$", text, flags=re.MULTILINE)
+    count = re.search(r"\bdefine\s+Markers\s+(\d+)", header)
+    declared = re.findall(r"\bMarkers\s*\{\s*(?:float|double)\[3\][^}]*\}[ =]*@(\d+)", header)
+    if count is None or not declared:
+        raise InputError("it is not the text of a set of landmarks", "save it in Amira as LandmarkSet Ascii")
+    if len(declared) > 1:
+        raise InputError(f"it holds {len(declared)} sets of landmarks", "save each set in a file of its own")
+    points = dict(zip(sections[::2], sections[1::2], strict=True)).get(declared[0], "").strip().splitlines()
+    if len(points) != int(count[1]):
+        raise InputError(f"it has {len(points)} landmarks, but declares {count[1][:20]}")
+    return [{"position": _three(line.split(), str(k))} for k, line in enumerate(points)]
+
+
 def _read_pp(path: Path) -> list[Record]:
     data = read_bytes(path)
     if len(data) > _LARGEST_PP:
@@ -409,6 +425,7 @@ LANDMARK_READERS: Mapping[str, Callable[..., list[Record]]] = {
     ".fcsv": _read_fcsv,
     ".pts": _read_pts,
     ".tps": _read_tps,
+    ".landmarkascii": _read_amira,
     ".txt": _read_table,
     ".npy": _read_npy,
 }

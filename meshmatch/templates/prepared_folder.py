@@ -249,7 +249,7 @@ def find_landmarks(where: str | Path | None, folder: Path, files: Sequence[Path]
         return [None] * len(files)
     place, suffixes = folder, [str(where)]
     if Path(where).is_dir():
-        kinds = (".npy", ".txt", ".csv", ".mrk.json", ".json", ".fcsv", ".pp", ".pts", ".tps")
+        kinds = (".npy", ".txt", ".csv", ".mrk.json", ".json", ".fcsv", ".pp", ".pts", ".tps", ".landmarkAscii")
         place, suffixes = Path(where), [stem + kind for kind in kinds for stem in (".landmarks", "")]
     found = []
     for file in files:

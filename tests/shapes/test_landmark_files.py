@@ -43,6 +43,7 @@ FCSV = (
     "# Markups fiducial file version = 4.11\n# CoordinateSystem = {}\n"
     "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n"
 )
+AMIRA = "# Avizo 3D ASCII 2.0\ndefine Markers {}\nMarkers {{ float[3] Coordinates }} @1\n{}"
 FILES = {
     "Slicer's markups": ("a.mrk.json", markups()),
     "Slicer's fiducials": ("a.fcsv", FCSV.format("LPS") + rows('{0},{2},{3},{4},0,0,0,1,1,1,0,"{1}",,')),
@@ -71,6 +72,11 @@ FILES = {
         + "9 9 9\n" * 3
         + "\n'#2\n"
         + rows("{2} {3} {4}"),
+    ),
+    "Amira": (
+        "a.landmarkAscii",
+        AMIRA.format(3, 'Parameters { NumSets 1, ContentType "LandmarkSet" }\n# Data section follows\n@1\n')
+        + rows("{2} {3} {4} "),
     ),
     "a table of specimens": ("a.csv", "specimen,landmark,x,y,z\nother,a,9,9,9\n" + rows('sphere1,"{1}",{2},{3},{4}')),
     "picked with commas": (
@@ -200,6 +206,9 @@ def test_curves_of_slicer_stay_curves(tmp_path: Path) -> None:
         ("a.pts", "0 0 1 255 255 255 255\n", "is not a point"),
         ("a.fcsv", "# CoordinateSystem = IJK\n1,0,0,1\n", "not LPS or RAS"),
         ("a.fcsv", "# columns = id,x,y,z,label\n1,0,46,1,2,3,4,L\n", "8 cells, but there are 5 columns"),
+        ("a.landmarkAscii", "# AmiraMesh 3D ASCII 2.0\ndefine Lattice 2\n", "not the text of a set of landmarks"),
+        ("a.landmarkAscii", AMIRA.format(2, "@1\n0 0 1\n"), "has 1 landmarks, but declares 2"),
+        ("a.landmarkAscii", AMIRA.format(1, "Markers { float[3] Other } @2\n@1\n0 0 1\n@2\n0 0 1\n"), "2 sets of"),
         ("a.json", '{"markups": [{"controlPoints": 7}]}', "no list of control points"),
         ("a.json", '{"nose": [0,46, 1,2, 3,4]}', "three numbers are needed"),
         ("a.csv", "name,x,y,z\nnose,0,46,1,2,3,4\n", "line 2 has 7 cells, the first 4"),
