@@ -130,12 +130,15 @@ def _nearest_for_empty(weights: csr_array, target: Shape) -> csr_array:
     return csr_array(weights[rows])
 
 
-def rigid(weights: csr_array, groups: list[Int[Ints, " N"]]) -> csr_array:
-    """The same, but each group of vertices moves as one: with the joint that has most of their weight."""
+def rigid(weights: csr_array, groups: list[tuple[Int[Ints, " N"], Int[Ints, " M"]]]) -> csr_array:
+    """The same, but each group of vertices moves as one: with the joint that has most of the weight of those that it goes
+    with, or of its own where there are none.
+    """
     rows = np.arange(weights.shape[0])
     chosen = np.full(len(rows), -1)
-    for group in groups:
-        chosen[group] = int(np.asarray(weights[group].sum(axis=0)).ravel().argmax())
+    for group, beside in groups:
+        asked = beside if len(beside) else group
+        chosen[group] = int(np.asarray(weights[asked].sum(axis=0)).ravel().argmax())
     stiff = chosen >= 0
     others = csr_array(diags_array((~stiff).astype(np.float64)) @ weights)
     one = csr_array((np.ones(int(stiff.sum())), (rows[stiff], chosen[stiff])), weights.shape)

@@ -19,10 +19,11 @@ from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.formats.gltf import Document, digest
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_rig import read_rig
+from meshmatch.shapes.formats.gltf_rigged import hanging_groups
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance, load_coordinates
 from tests.shapes.painted import encoded, quarters, write_document
-from tests.transfer.rigs import AROUND, BEND, KNEE, NODES, played, tube, volume, write_tube
+from tests.transfer.rigs import AROUND, BEND, KNEE, NODES, played, tube, volume, weights_of, write_tube
 
 UPRIGHT = np.array([[0, 0, 0, 1]] * 2, "f4")
 JOINTS = ("root", "hip", "knee", "foot")
@@ -300,13 +301,38 @@ def test_a_gltf_becomes_a_glb_that_needs_no_other_file(source: Path) -> None:
 
 
 def test_what_hangs_from_a_joint_stays_rigid(source: Path) -> None:
+    """It lies where weights vary, below a node that is no joint, as a sword in a socket."""
     target = source.with_name("target.glb")
     two_parts(target, hanging=True)
+    document = Document(target, target.read_bytes())
+    editor = Editor(document)
+    editor.json["nodes"][3]["children"] = [editor.add("nodes", {"name": "socket", "children": [2]})]
+    editor.json["nodes"][2] |= {"translation": [0, 0.5, 0], "scale": [2.01, 2.01, 2.01]}
+    target.write_bytes(editor.to_bytes())
     V = tube().V
     _, result = rigged(source, target)
     matrix = result.weights.matrix.toarray()
     assert len(np.unique(matrix[V:], axis=0)) == 1 and sorted(matrix[V]) == [0, 0, 0, 1]
     assert len(np.unique(matrix[:V], axis=0)) > 10
+
+
+def test_what_hangs_from_a_joint_goes_with_what_that_moves(tmp_path: Path) -> None:
+    """A pole at the tip, a joint that moves nothing, below the knee; and one at the root, which stands above all joints."""
+    target = tmp_path / "target.glb"
+    write_tube(target)
+    json = Document(target, target.read_bytes()).json
+    poles = [{"attributes": {"POSITION": 0}, "indices": 1}]
+    nodes = [*json["nodes"], {"mesh": 1}, {"mesh": 1}]
+    nodes[4]["children"], nodes[1]["children"] = [7], [8, 2, 5]
+    write_tube(
+        target, nodes=nodes, meshes=[*json["meshes"], {"primitives": poles}], skins=[{"joints": [1, 2, 3, 5, 4]}]
+    )
+    V, main = tube().V, weights_of(tube().verts[:, 1]).astype("f4").argmax(axis=1)
+    at_root, at_tip = hanging_groups(Document(target, target.read_bytes()))
+    assert np.array_equal(at_root[0], np.arange(V)) and not len(at_root[1])
+    assert np.array_equal(at_tip[0], np.arange(V, 2 * V)) and np.array_equal(
+        at_tip[1] - 2 * V, np.flatnonzero(main == 1)
+    )
 
 
 @pytest.mark.parametrize("stands", [0.0, 40.0])

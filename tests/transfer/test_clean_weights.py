@@ -96,9 +96,12 @@ def test_tears_are_smoothed_and_seams_stay_closed() -> None:
 
 
 def test_what_is_rigid_goes_with_one_joint(good: np.ndarray) -> None:
-    group = np.arange(100, 400)
-    found = rigid(csr_array(good), [group]).toarray()
+    group, nothing = np.arange(100, 400), np.zeros(0, np.int64)
+    found = rigid(csr_array(good), [(group, nothing)]).toarray()
     assert np.array_equal(found[group], np.tile(np.eye(3)[good[group].sum(axis=0).argmax()], (300, 1)))
+    beside = np.flatnonzero(good[:, 2] == 1)
+    assert not np.isin(beside, group).any()
+    assert np.array_equal(rigid(csr_array(good), [(group, beside)]).toarray()[group], np.tile([0, 0, 1], (300, 1)))
     assert np.array_equal(np.delete(found, group, 0), np.delete(good, group, 0))
 
 

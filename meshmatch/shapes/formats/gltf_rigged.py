@@ -118,22 +118,45 @@ def rigged(document: Document, binding: Binding) -> tuple[bytes, Replaced]:
     return editor.to_bytes(), Replaced(len(gone), clips)
 
 
-def hanging_groups(document: Document) -> list[Ints]:
-    """Vertices, in the order of the scene, of each node that hangs from a joint and is not bent by a skin: they are to
-    stay rigid.
+def hanging_groups(document: Document) -> list[tuple[Ints, Ints]]:
+    """Vertices, in the order of the scene, of each node that hangs from a joint and is not bent by a skin, which are to stay
+    rigid; and those to go with: what the joint, or else the next above it, moves most.
     """
     joints = {int(joint) for skin in document.json.get("skins", []) for joint in skin["joints"]}
-    below = set(joints)
-    for node in document.world:
-        if node in below:
-            below.update(document.nodes[node].get("children", []))
-    found, seen = [], 0
-    for number, parts in drawn(document).items():
-        V = sum(document.count(part["attributes"]["POSITION"]) for part in parts.values())
-        if number in below and "skin" not in document.nodes[number]:
-            found.append(np.arange(seen, seen + V))
-        seen += V
-    return found
+    scene = drawn(document)
+    above: dict[int, int] = {}  # of each node, the next joint above it
+    for node in document.world:  # parents before children
+        if node in joints or node in above:
+            next_one = node if node in joints else above[node]
+            above |= {int(child): next_one for child in document.nodes[node].get("children", [])}
+    hanging: list[tuple[Ints, int]] = []  # with their joints
+    movers = [np.zeros(0, np.int64)]  # of each vertex, the joint that moves it most
+    seen = 0
+    for number, parts in scene.items():
+        mover = np.concatenate([_movers(document, number, part) for part in parts.values()])
+        if "skin" not in document.nodes[number] and (number in joints or number in above):
+            hanging.append((np.arange(seen, seen + len(mover)), number if number in joints else above[number]))
+        movers.append(mover)
+        seen += len(mover)
+    moved_by = np.concatenate(movers)
+
+    def beside(joint: int) -> Ints:
+        while not (moved_by == joint).any() and joint in above:
+            joint = above[joint]
+        return np.flatnonzero(moved_by == joint)
+
+    return [(group, beside(joint)) for group, joint in hanging]
+
+
+def _movers(document: Document, number: int, part: dict[str, Any]) -> Ints:
+    """Of each vertex of a primitive the joint that its skin moves it most by; -1 where there is none."""
+    V = document.count(part["attributes"]["POSITION"])
+    sets = list(document.influences(part)) if "skin" in document.nodes[number] else []
+    if not sets:
+        return np.full(V, -1)
+    numbers, weights = (np.concatenate(each, axis=1) for each in zip(*sets, strict=True))
+    listed = np.array(document.json["skins"][document.nodes[number]["skin"]]["joints"], np.int64)
+    return np.asarray(listed[numbers[np.arange(V), weights.argmax(axis=1)].astype(np.int64)])
 
 
 def _add_nodes(editor: Editor, document: Document, rig: Rig) -> list[int]:
