@@ -29,7 +29,7 @@ from meshmatch.collections.workers import hired
 from meshmatch.errors import InputError, warn
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.maps.build import build_map
+from meshmatch.maps.build import map_of_placed
 from meshmatch.maps.files import check_suffix
 from meshmatch.maps.places import Places
 from meshmatch.maps.unfold_pair import both_unfolded
@@ -227,7 +227,7 @@ class Collection(FitsFolder):
         VertexMap
             From source to target.
         """
-        return build_map(self.places_of(source), self.places_of(target))
+        return map_of_placed(self._read(source), self._read(target))
 
     def maps_between(self, source: ShapeLike, target: ShapeLike) -> MapPair:
         """The maps between two shapes themselves, in both directions, for transfers and `evaluate`.

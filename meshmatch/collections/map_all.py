@@ -11,7 +11,7 @@ from meshmatch.collections.setting import FITS, SUFFIX, finished_fit
 from meshmatch.collections.stores import Store
 from meshmatch.collections.workers import Died, Workers
 from meshmatch.errors import InputError
-from meshmatch.maps.build import build_map
+from meshmatch.maps.build import map_of_placed
 from meshmatch.maps.files import save_map
 from meshmatch.outputs import as_path
 from meshmatch.progress import ProgressCallback
@@ -67,8 +67,7 @@ def map_some(task: MapTask) -> int:
     """Write maps to one shape; how many there are. Those that are as new as the fits are kept."""
     for source in task.sources:
         if not _is_new(task, source):
-            places, target = (finished_fit(task.fits, name).places for name in (source, task.target))
-            found = build_map(places, target)
+            found = map_of_placed(finished_fit(task.fits, source), finished_fit(task.fits, task.target))
             with task.output.writing(task.file(source)) as path:
                 save_map(path, found)
     return len(task.sources)

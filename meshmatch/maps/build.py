@@ -9,7 +9,7 @@ import numpy as np
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import OptionError
 from meshmatch.maps.parts import kept_together
-from meshmatch.maps.places import Places
+from meshmatch.maps.places import PlacedFit, Places
 from meshmatch.maps.vertex_map import VERDICTS, VertexMap
 from meshmatch.shapes.shape import Shape
 
@@ -60,6 +60,11 @@ def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
         target_hash=target.hash,
         target_faces=target.faces.astype(np.int64),
     )
+
+
+def map_of_placed(source: PlacedFit, target: PlacedFit) -> VertexMap:
+    """The same of two fits of a folder, which also know which axis of their files is up."""
+    return replace(build_map(source.places, target.places), source_up=source.up, target_up=target.up)
 
 
 def judged_by_pairs(

@@ -85,6 +85,7 @@ def test_a_bad_shape_is_told_and_stops_nobody(made: tuple[Path, tuple[Record, ..
 def test_a_body_on_its_side_is_the_same_body(made: tuple[Path, tuple[Record, ...]]) -> None:
     collection = meshmatch.Collection(made[0])
     found = collection.map("dancer", "turned")
+    assert (found.source_up, found.target_up) == ("+y", "+x")  # by which transfers turn a glb upright
     dancer = load_shape(SAMPLES / "dancer.ply")
     off = np.linalg.norm(dancer.verts[found.index] - dancer.verts, axis=1) / np.sqrt(dancer.area)
     assert off.mean() < 0.01
@@ -186,7 +187,7 @@ def test_maps_are_written_once(made: tuple[Path, tuple[Record, ...]], tmp_path: 
     written = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.npz"))
     assert written == [f"{a}/{b}.npz" for a in NAMES for b in NAMES if a != b]
     read = meshmatch.load_map(folder / "dancer" / "turned.npz", SAMPLES / "dancer.ply")
-    assert np.array_equal(read.index, collection.map("dancer", "turned").index)
+    assert np.array_equal(read.index, collection.map("dancer", "turned").index) and read.target_up == "+x"
     times = [path.stat().st_mtime_ns for path in sorted(folder.rglob("*.npz"))]
     assert collection.save_maps(folder, [("dancer", "turned")]) == 1
     assert collection.save_maps(folder, [("dancer", "turned")], suffix="npy") == 1
