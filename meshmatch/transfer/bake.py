@@ -399,7 +399,8 @@ def _fill_and_blank(image: Pixels, painted: Bools, low: Bools, options: BakeOpti
             pixels[low, :3] = (red, green, blue)
         if share < 255 and low.any() and alpha == "opaque":
             return "blend" if share else "mask"
-    return alpha
+    # Where nothing of it is transparent, such as hair that was left out, a body is no glass: viewers would sort it.
+    return "opaque" if (pixels[painted, 3] == 255).all() else alpha
 
 
 def _weights(known: Bools) -> UInts8:

@@ -341,6 +341,10 @@ def test_thresholds_of_alpha() -> None:
     solid = Material("d", image)
     four = worn(SQUARE, Appearance((glass, solid), np.array([0, 1]), OWN), SQUARE, uv=OWN)
     assert four.image[25, 25, 3] == 90 and four.image[5, 5, 3] == 255
+    five = worn(SQUARE, Appearance((glass, solid), np.array([1, 1]), OWN), SQUARE, uv=OWN)
+    assert (four.material.alpha, five.material.alpha) == ("blend", "opaque")
+    clear = np.full((32, 32, 4), 255, np.uint8)
+    assert worn(SQUARE, wearing(clear, alpha="mask"), SQUARE, uv=OWN).material.alpha == "opaque"
 
 
 # LowConfidence
