@@ -56,8 +56,8 @@ def transfer_rig(
         console.say(f"note: the skeleton that {transfer.names[1]} had ({result.replaced} joints) is replaced")
     if result.replaced_clips:
         many, names = len(result.replaced_clips), _listed(result.replaced_clips)
-        have = "clip that moved that skeleton is" if many == 1 else "clips that moved that skeleton are"
-        console.warn(f"{many} {have} left out: {names}")
+        moved = "clip moved that skeleton, and does" if many == 1 else "clips moved that skeleton, and do"
+        console.warn(f"{many} {moved} so no more: {names}")
     played = f", {len(clips)} clip{'s' if len(clips) != 1 else ''}" if clips else ""
     console.say(f"wrote {output}: {transfer.names[1]} with {joints} joints{played}")
     if picture is not None:

@@ -366,6 +366,32 @@ def test_a_skeleton_of_its_own_is_replaced(source: Path, stands: float) -> None:
     assert np.linalg.norm(played(out, "bend", 0.0) - tube().verts, axis=1).mean() < 0.03
 
 
+def test_a_clip_of_the_target_takes_in_that_of_its_name(source: Path) -> None:
+    """Each does so once, with what it has and still moves."""
+    document = Document(source, source.read_bytes())
+    editor = Editor(document)
+    editor.json["animations"] *= 2
+    source.write_bytes(editor.to_bytes())
+    target = source.with_name("target.glb")
+    write_tube(target)
+    before = Document(target, target.read_bytes()).json
+    clip = before["animations"][0] | {"extras": {"loop": True}}
+    clip["channels"] = [*clip["channels"], {"sampler": 0, "target": {"node": 7, "path": "rotation"}}]
+    write_tube(target, nodes=[*before["nodes"], {"name": "lamp"}], scenes=[{"nodes": [0, 6, 7]}], animations=[clip])
+    out, result = rigged(source, target)
+    found = Document(out, out.read_bytes()).json
+    names = [each["name"] for each in found["nodes"]]
+    assert result.replaced_clips == ("bend",)
+    assert [(each["name"], each.get("extras")) for each in found["animations"]] == [
+        ("bend", {"loop": True}),
+        ("bend", None),
+    ]
+    moved = [[names[each["target"]["node"]] for each in clip["channels"]] for clip in found["animations"]]
+    assert moved[0] == ["lamp", *moved[1]] and "knee" in moved[1]
+    expected = played(source, "bend", 1.0)
+    assert np.abs(played(out, "bend", 1.0) - expected).max() < 1e-4
+
+
 @pytest.mark.parametrize("skinned", [True, False])
 def test_a_mirror_above_a_target_turns_nothing_inside_out(source: Path, skinned: bool) -> None:
     """Programs differ in what mirrored joints do to triangles, so that none are left."""
@@ -397,7 +423,10 @@ def test_nodes_that_something_else_needs_stay(source: Path) -> None:
     lights = {"KHR_lights_punctual": {"lights": [{"type": "point"}]}}
     more: dict[str, Any] = {"nodes": nodes, "extensionsUsed": [*lights], "extensions": lights}
     write_tube(target, **more)
-    out, _ = rigged(source, target)
+    with pytest.warns(
+        MeshmatchWarning, match="^tip of target.glb hung from the skeleton that is replaced, and stays where"
+    ):
+        out, _ = rigged(source, target)
     kept = Document(out, out.read_bytes()).json["nodes"]
     assert [node["name"] for node in kept[:7]] == list(NODES)
     nodes[4].pop("extensions")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Brief, Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import warn
+from meshmatch.outputs import plain_text
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor, drawn
 from meshmatch.shapes.formats.gltf_prune import drop_nodes, nodes_are_ours
@@ -21,6 +22,7 @@ from meshmatch.shapes.formats.gltf_rig import Clip, Rig, nodes_of_skeleton
 
 _SAME = 1e-6  # of the size of a mesh: vertices that a skin moves by less than this are not moved
 _DIRECTIONS = ("NORMAL", "TANGENT")
+_LIGHT, _TOLD = "KHR_lights_punctual", 5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -110,9 +112,11 @@ def rigged(document: Document, binding: Binding) -> tuple[bytes, Replaced]:
     gone, clips = _drop_skins(editor, before)
     _lift(editor, document)
     arrays: dict[bytes, int] = {}
+    theirs = editor.json.get("animations", []).copy()
     for clip in rig.clips:
-        _add_clip(editor, clip, names, arrays)
+        _add_clip(editor, clip, names, arrays, theirs)
     if gone:
+        _tell_left(document, gone)
         drop_nodes(editor.json, nodes_of_skeleton(document, sorted(gone)))
         editor.prune(document)
     return editor.to_bytes(), Replaced(len(gone), clips)
@@ -312,9 +316,30 @@ def _lift(editor: Editor, document: Document) -> None:
     drop_channels(editor, lambda target: target.get("node") in whole and target["path"] != "weights")
 
 
-def _add_clip(editor: Editor, clip: Clip, names: list[int], arrays: dict[bytes, int]) -> None:
-    """Add an animation; ``arrays`` are accessors of those that were added before, for many share their times."""
-    entry: dict[str, Any] = {"name": clip.name, "samplers": [], "channels": []}
+def _tell_left(document: Document, joints: set[int]) -> None:
+    """Warn of cameras and lights that hang from joints which move nothing any more."""
+    below, held = set(joints), []
+    for number in document.world:  # parents before children
+        node = document.nodes[number]
+        if number in below:
+            below.update(node.get("children", []))
+            if "camera" in node or _LIGHT in node.get("extensions", {}):
+                held.append(plain_text(str(node.get("name") or f"node {number}")))
+    if held:
+        what = f"{', '.join(held[:_TOLD])}{', ...' if len(held) > _TOLD else ''} of {document.name}"
+        stay = "stays where it" if len(held) == 1 else "stay where they"
+        warn(f"{what} hung from the skeleton that is replaced, and {stay} stood")
+
+
+def _add_clip(
+    editor: Editor, clip: Clip, names: list[int], arrays: dict[bytes, int], theirs: list[dict[str, Any]]
+) -> None:
+    """Add an animation; ``arrays`` are accessors of those that were added before, for many share their times. One of its
+    name among ``theirs``, which the scene had and which may move a lamp, takes it in; each does so once.
+    """
+    of_name = [k for k, each in enumerate(theirs) if each.get("name") == clip.name]
+    joined = theirs.pop(of_name[0]) if of_name else None
+    entry: dict[str, Any] = joined or {"name": clip.name, "samplers": [], "channels": []}
 
     def once(values: Floats, bounds: bool) -> int:
         short = values.astype("<f4")
@@ -329,4 +354,5 @@ def _add_clip(editor: Editor, clip: Clip, names: list[int], arrays: dict[bytes, 
         target = {"node": names[track.node], "path": track.moves}
         entry["channels"].append({"sampler": len(entry["samplers"]), "target": target})
         entry["samplers"].append(sampler)
-    editor.add("animations", entry)
+    if joined is None:
+        editor.add("animations", entry)
