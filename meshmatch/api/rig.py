@@ -16,6 +16,7 @@ from meshmatch.api.transfer import MapLike, find_maps
 from meshmatch.api.upright import trust
 from meshmatch.arrays import Brief
 from meshmatch.errors import InputError, OptionError, warn
+from meshmatch.fitting.search.frames import axis_vector
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.shapes import tables
@@ -32,7 +33,7 @@ from meshmatch.threads import thread_limit
 from meshmatch.transfer.attributes import joint_table, most_votes, pull_weights
 from meshmatch.transfer.carry_rig import UP, carry, upright
 from meshmatch.transfer.clean_weights import beyond, clean_weights, rigid
-from meshmatch.transfer.retarget_clips import standing_clips
+from meshmatch.transfer.retarget_clips import points_at_start, standing_clips
 from meshmatch.transfer.weight_files import SkinWeights, load_weights
 
 Pose = Literal["rest", "source"]
@@ -40,6 +41,7 @@ Pose = Literal["rest", "source"]
 # What copies of a figure are, set by hand: share of vertices that have common places on the source, and how far apart they
 # stand, in units of a copy's diagonal; looked for among so many meshes, the largest.
 _ALIKE, _BESIDE, _MOST_MESHES = 0.8, 0.1, 64
+_LIES, _TOLD = 0.5, 5  # the cosine between up and what was up in the file; names in a warning
 _EVEN = 1.05  # a joint's longest side over its shortest; set by hand
 check_rig_suffix = partial(tables.check_suffix, suffixes=(".glb", gltf_vrm.SUFFIX), what="rigs")
 
@@ -163,6 +165,17 @@ def _tell_stretched(name: str, rig: Rig) -> None:
         warn(f"{which} have a scale that differs by axis, and clips will look different: apply it before the export")
 
 
+def _tell_lying(a: Shape, rig: Rig, weights: SkinWeights, up: str, target: str) -> None:
+    """Say that a target will lie in clips, if the source lies in its file, as far as the map knows, and in these."""
+    if up in ("", "+y"):
+        return
+    top = int(rig.joints[np.asarray(weights.matrix.sum(axis=0)).ravel() > 0].min(initial=len(rig.names) - 1))
+    lie = [clip.name for clip in rig.clips if points_at_start(clip, rig, top, axis_vector(up))[UP] < _LIES]
+    if lie:
+        named = "its clips" if len(lie) == len(rig.clips) else ", ".join(lie[:_TOLD]) + ", ..." * (len(lie) > _TOLD)
+        warn(f"{a.name} lies in its file, where {up} is up, and {target} will lie in {named}: export it with y up")
+
+
 def _refuse_copies(target: Shape, backward: VertexMap) -> None:
     """Refuse a figure that stands in its scene several times: all its copies would follow the joints in one of them. Two
     meshes in one place, such as a body and the outline that is drawn around it, are no copies.
@@ -233,6 +246,7 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     hanging = gltf.understood(path, data, "scene makes", hanging_groups)
     maps = find_maps(a, b, match)
     _refuse_copies(b, maps.backward)
+    _tell_lying(a, rig, weights, maps.forward.source_up, b.name or "the target")
     with thread_limit(1):
         points, share = maps.forward.points(b), trust(a, maps)
         turn = np.eye(3) if in_gltf else upright(a, points, share)

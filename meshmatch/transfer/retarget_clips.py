@@ -133,6 +133,15 @@ def _sampled(track: Track | None, rest: Float[Floats, " D"], times: Float[Floats
     return np.stack([np.interp(times, track.times, column) for column in values.T], axis=1)
 
 
+def points_at_start(clip: Clip, rig: Rig, node: int, along: Float[Floats, " 3"]) -> Float[Floats, " 3"]:
+    """Where what goes with a node points as a clip begins, if it points ``along`` a direction as the file stands."""
+    tracks = {(track.node, track.moves): track for track in clip.tracks}
+    begins = min((float(track.times[0]) for track in clip.tracks), default=0.0)
+    there, here = _worlds(rig, tracks, node, np.array([begins]))[0], rig.worlds()[node]
+    found = there[:3, :3] @ np.linalg.pinv(here[:3, :3]) @ along
+    return np.asarray(found / max(float(np.linalg.norm(found)), 1e-300))
+
+
 def standing_clips(bind: Rig, posed: Rig) -> tuple[Clip, ...]:
     """The clips of a skeleton in the source's pose, for one that stands as `bind` does: what they leave alone is held as the
     source has it.

@@ -3,6 +3,7 @@
 import json
 import re
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -172,6 +173,32 @@ def test_joints_that_are_stretched_are_told(source: Path, clips: bool) -> None:
         rigged(source, target)
     told = "1 of 4 joints of source.glb, such as knee, have a scale that differs by axis"
     assert [str(each.message).startswith(told) for each in said] == [True] * clips
+
+
+@pytest.mark.parametrize("clip", ["lies", "stands", "is not there"])
+def test_a_source_that_lies_in_its_file_and_in_clips_is_told(source: Path, clip: str) -> None:
+    """A node above the armature lays it down along z, out of which one clip turns it."""
+    quarter = Rotation.from_euler("x", 90, degrees=True)
+    up = [{"sampler": 0, "target": {"node": 7, "path": "rotation"}}]
+    editor = Editor(Document(source, source.read_bytes()))
+    editor.json["scenes"][0]["nodes"] = [
+        editor.add("nodes", {"rotation": quarter.as_quat().tolist(), "children": [0]}),
+        6,
+    ]
+    if clip == "stands":
+        times, values = editor.add_array(np.zeros(1, "f4"), bounds=True), editor.add_array(UPRIGHT[:1])
+        editor.json["animations"][0] = {"name": "up", "samplers": [{"input": times, "output": values}], "channels": up}
+    elif clip != "lies":
+        del editor.json["animations"]
+    source.write_bytes(editor.to_bytes())
+    target = source.with_name("target.ply")
+    save_shape(target, tube())
+    maps = replace(same_order(source, target), source_up="+z", target_up="+y")
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        meshmatch.transfer_rig(source, target, maps)
+    told = "source.glb lies in its file, where +z is up, and target.ply will lie in its clips: export it with y up"
+    assert [str(each.message) for each in said] == [told] * (clip == "lies")
 
 
 def two_parts(path: Path, hanging: bool = False) -> dict[str, Any]:
