@@ -193,7 +193,7 @@ def transfer_texture(
             check_layout(shape, look)
             atlas = None
         else:
-            atlas = atlas_of(mesh, own, options.size, options.padding, uv, polygons)
+            atlas = atlas_of(mesh, own, options.size, options.padding, uv, polygons, options.tiles)
     unwrapped = time.monotonic() - began
     maps = find_maps(shape, mesh, match)
     began = time.monotonic() - unwrapped

@@ -62,16 +62,12 @@ def transfer_texture(
     """
     from meshmatch.api.texture import tiles_of_file
     from meshmatch.shapes import textured_files
-    from meshmatch.shapes.dressed_files import check_tiles
     from meshmatch.transfer.value_files import parse_color
 
     transfer = Transfer(source, target, output, maps, run, picture)
     size, uv, image = texture.size, texture.uv, texture.image
     blank = parse_color(rules.blank)
     rule = rules.rule(blank)
-    baking = meshmatch.BakeOptions(
-        size, texture.samples, texture.padding, rules.min_confidence, rules.fill, blank, run.threads
-    )
     textured_files.check_textured(output, _COLORS)
     a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
     painted = b.is_cloud or output.suffix.lower() in _COLORS
@@ -84,11 +80,12 @@ def transfer_texture(
     tiles: list[int] = []
     if not painted and uv in ("auto", "keep"):
         tiles = tiles_of_file(target, b, size)
-    if tiles and output.suffix.lower() != ".obj":
-        if uv == "keep":
-            check_tiles(output)
-        transfer.console.say(f"note: {output.suffix} has no tiles (UDIM), so {b.name} gets new texture coordinates")
-        uv, tiles = "new", []
+    tiled = output.suffix.lower() == ".obj"
+    if tiles and not tiled:
+        transfer.console.say(f"note: {output.suffix} has no tiles (UDIM): those of {b.name} are brought into one image")
+        tiles = []
+    rules_of_texels = rules.min_confidence, rules.fill, blank
+    baking = meshmatch.BakeOptions(size, texture.samples, texture.padding, *rules_of_texels, run.threads, tiled)
     files = [output] if painted else textured_files.files_of(output, layers, tiles)
     turn = None
     with transfer.outputs(image, files=files) as temporary:

@@ -131,7 +131,7 @@ def check_tiles(path: Path) -> None:
     """Refuse to write tiles (UDIM) in a format that has none (`OptionError`)."""
     if path.suffix.lower() != ".obj":
         problem = f"{path.name}: {path.suffix} has no tiles (UDIM), in which the texture coordinates of the target lie"
-        raise OptionError(problem, "end the name in .obj, or ask for new coordinates with --uv new (uv='new')")
+        raise OptionError(problem, "end the name in .obj, or bring them into one (BakeOptions.tiles=False)")
 
 
 def save_textured(path: str | Path, mesh: Textured, image: Pixels) -> None:

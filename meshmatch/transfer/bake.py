@@ -62,6 +62,8 @@ class BakeOptions:
         Or one color: sRGB and alpha, in 0..1.
     workers
         Threads.
+    tiles
+        Whether coordinates in several tiles (UDIM) get an image each, as an obj can have; else they are brought into one.
 
     Raises
     ------
@@ -82,6 +84,7 @@ class BakeOptions:
     fill: bool = False
     blank: tuple[float, float, float, float] | None = None
     workers: int = 2
+    tiles: bool = True
 
     def __post_init__(self) -> None:
         for name, low, high, hint in (

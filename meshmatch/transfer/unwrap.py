@@ -62,18 +62,24 @@ class Atlas(Brief):
 
 
 def atlas_of(
-    shape: Shape, own: Floats | None, size: int, padding: int, keep: Keep = "auto", polygons: Ints | None = None
+    shape: Shape,
+    own: Floats | None,
+    size: int,
+    padding: int,
+    keep: Keep = "auto",
+    polygons: Ints | None = None,
+    tiled: bool = True,
 ) -> Atlas:
     """The coordinates to bake an image of `size` with: the file's own (F, 3, 2) where they are valid ("auto"), these or
     an error ("keep"), or new ones, with at least `padding` texels between charts, and no seam across one of the
-    `polygons` that triangles (F,) are parts of.
+    `polygons` that triangles (F,) are parts of. If ``tiled``, own ones in several tiles stay in these.
 
     `OptionError` for a cloud, or coordinates to keep that are not valid; `InputError` without area, or for threads.
     """
     name = shape.name or "the target"
     check_surface(shape)
     if own is not None and keep != "new":
-        tiles = tiles_of(shape, own, size)
+        tiles = tiles_of(shape, own, size) if tiled else None
         if tiles is not None:
             words = f"{name}: its own texture coordinates lie in the tiles {', '.join(map(str, np.unique(tiles)))}"
             return Atlas(np.clip(_within(own, shape), 0.0, 1.0), True, f"{words}: an image for each", tiles=tiles)
