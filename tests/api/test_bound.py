@@ -89,7 +89,10 @@ def test_images_of_both_are_kept(body: Path) -> None:
     paint = [{"name": "skin", "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
     body.with_name("own.png").write_bytes(encoded(quarters()))
     garment, plain = body.with_name("stocking.glb"), body.with_name("plain.glb")
-    write_tube(garment, materials=paint, **pictures)
+    write_tube(garment)
+    nodes = Document(garment, garment.read_bytes()).json["nodes"]
+    nodes[6]["extras"] = {"layer": 2}
+    write_tube(garment, materials=paint, nodes=nodes, **pictures)
     save_shape(plain, tube())
     a, b = load_shape(body), load_shape(plain)
     result = meshmatch.transfer_garment(garment, body, plain, same_numbers(a, b))
@@ -97,7 +100,7 @@ def test_images_of_both_are_kept(body: Path) -> None:
     result.save(out, join=True)
     found = Document(out, out.read_bytes())
     assert len(found.json["images"]) == 1 and found.view_bytes(found.json["images"][0]["bufferView"])[:4] == b"\x89PNG"
-    assert "skins" not in found.json
+    assert "skins" not in found.json and found.json["nodes"][-1]["extras"] == {"layer": 2}
     assert np.allclose(load_shape(out).verts[b.V :], result.shape.verts, atol=1e-5)
     with pytest.raises(OptionError, match="nothing can be put into the target"):
         replace(result, body=None).save(out, join=True)

@@ -45,6 +45,7 @@ def joined(document: Document, added: Document, binding: Binding | None) -> byte
         entry: dict[str, Any] = {"mesh": mesh}
         if name := added.nodes[number].get("name") or held.get("name"):
             entry["name"] = name
+        entry |= {key: added.nodes[number][key] for key in ("weights", "extras") if key in added.nodes[number]}
         for k, part in own.items():
             some = slice(seen, seen + added.count(part["attributes"]["POSITION"]))
             seen = some.stop
