@@ -441,23 +441,37 @@ def test_a_mirror_above_a_target_turns_nothing_inside_out(source: Path, skinned:
 
 
 def test_nodes_that_something_else_needs_stay(source: Path) -> None:
-    """A lamp in the hand, a node with somebody's data, and bones that an extension may name."""
+    """A lamp and a socket go with the skin around them; a camera where there is none, somebody's data, and bones that an
+    extension may name stay.
+    """
     target = source.with_name("target.glb")
     write_tube(target)
     nodes = Document(target, target.read_bytes()).json["nodes"]
     nodes[4]["extensions"] = {"KHR_lights_punctual": {"light": 0}}
     nodes[5]["extras"] = {"mine": 1}
+    nodes[1]["children"], nodes[3]["children"] = [*nodes[1]["children"], 7], [4, 8]
+    nodes += [{"name": "eye", "camera": 0}, {"name": "socket", "translation": [0, 0, 0.1]}]
     lights = {"KHR_lights_punctual": {"lights": [{"type": "point"}]}}
-    more: dict[str, Any] = {"nodes": nodes, "extensionsUsed": [*lights], "extensions": lights}
+    eye = {"type": "perspective", "perspective": {"yfov": 1, "znear": 0.1}}
+    more: dict[str, Any] = {"nodes": nodes, "extensionsUsed": [*lights], "extensions": lights, "cameras": [eye]}
     write_tube(target, **more)
+    before = Document(target, target.read_bytes())
+    before.scene()
     with pytest.warns(
-        MeshmatchWarning, match="^tip of target.glb hung from the skeleton that is replaced, and stays where"
+        MeshmatchWarning, match="^eye of target.glb hung from the skeleton that is replaced, and stays where"
     ):
         out, _ = rigged(source, target)
-    kept = Document(out, out.read_bytes()).json["nodes"]
-    assert [node["name"] for node in kept[:7]] == list(NODES)
+    found = Document(out, out.read_bytes())
+    found.scene()
+    names = [node["name"] for node in found.nodes]
+    assert names[:7] == ["armature", "root", "tip", "foot", "tube", "eye", "socket"]
+    above = {child: names[number] for number, node in enumerate(found.nodes) for child in node.get("children", [])}
+    assert [above[k] for k in (2, 5, 6)] == ["knee", "root", "knee"]
+    for name, number in (("tip", 4), ("eye", 7), ("socket", 8)):
+        assert np.allclose(found.world[names.index(name)], before.world[number], atol=1e-6)
+    nodes[1]["children"], nodes[3]["children"] = [2, 5], [4]
     nodes[4].pop("extensions")
-    write_tube(target, nodes=nodes, extensionsUsed=["VRMC_vrm"], extensions={"VRMC_vrm": {"hips": {"node": 2}}})
+    write_tube(target, nodes=nodes[:7], extensionsUsed=["VRMC_vrm"], extensions={"VRMC_vrm": {"hips": {"node": 2}}})
     out, _ = rigged(source, target)
     assert Document(out, out.read_bytes()).json["nodes"][2]["name"] == "hip"
 

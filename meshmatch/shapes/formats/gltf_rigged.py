@@ -116,8 +116,9 @@ def rigged(document: Document, binding: Binding) -> tuple[bytes, Replaced]:
     for clip in rig.clips:
         _add_clip(editor, clip, names, arrays, theirs)
     if gone:
-        _tell_left(document, gone)
-        drop_nodes(editor.json, nodes_of_skeleton(document, sorted(gone)))
+        hang = _hang_over(editor, document, gone, binding, names)
+        _tell_left(document, gone, hang)
+        drop_nodes(editor.json, [node for node in nodes_of_skeleton(document, sorted(gone)) if node not in hang])
         editor.prune(document)
     return editor.to_bytes(), Replaced(len(gone), clips)
 
@@ -126,30 +127,34 @@ def hanging_groups(document: Document) -> list[tuple[Ints, Ints]]:
     """Vertices, in the order of the scene, of each node that hangs from a joint and is not bent by a skin, which are to stay
     rigid; and those to go with: what the joint, or else the next above it, moves most.
     """
-    joints = {int(joint) for skin in document.json.get("skins", []) for joint in skin["joints"]}
-    scene = drawn(document)
-    above: dict[int, int] = {}  # of each node, the next joint above it
-    for node in document.world:  # parents before children
-        if node in joints or node in above:
-            next_one = node if node in joints else above[node]
-            above |= {int(child): next_one for child in document.nodes[node].get("children", [])}
-    hanging: list[tuple[Ints, int]] = []  # with their joints
-    movers = [np.zeros(0, np.int64)]  # of each vertex, the joint that moves it most
-    seen = 0
-    for number, parts in scene.items():
-        mover = np.concatenate([_movers(document, number, part) for part in parts.values()])
-        if "skin" not in document.nodes[number] and (number in joints or number in above):
-            hanging.append((np.arange(seen, seen + len(mover)), number if number in joints else above[number]))
-        movers.append(mover)
-        seen += len(mover)
-    moved_by = np.concatenate(movers)
+    skin, found, seen = _OldSkin(document), [], 0
+    for number, parts in drawn(document).items():
+        V = sum(document.count(part["attributes"]["POSITION"]) for part in parts.values())
+        joint = number if number in skin.joints else skin.above.get(number)
+        if joint is not None and "skin" not in document.nodes[number]:
+            found.append((np.arange(seen, seen + V), skin.around(joint)))
+        seen += V
+    return found
 
-    def beside(joint: int) -> Ints:
-        while not (moved_by == joint).any() and joint in above:
-            joint = above[joint]
-        return np.flatnonzero(moved_by == joint)
 
-    return [(group, beside(joint)) for group, joint in hanging]
+class _OldSkin:
+    """The joints of a scene: which of them is next above each node, and which moves each vertex most."""
+
+    def __init__(self, document: Document) -> None:
+        self.joints = {int(joint) for skin in document.json.get("skins", []) for joint in skin["joints"]}
+        parts = [(number, part) for number, own in drawn(document).items() for part in own.values()]
+        self._moved_by = np.concatenate([np.zeros(0, np.int64), *(_movers(document, *each) for each in parts)])
+        self.above: dict[int, int] = {}
+        for node in document.world:  # parents before children
+            joint = node if node in self.joints else self.above.get(node)
+            if joint is not None:
+                self.above |= {int(child): joint for child in document.nodes[node].get("children", [])}
+
+    def around(self, joint: int) -> Ints:
+        """The vertices that a joint moves most; of one that moves none, those of the next above it."""
+        while not (self._moved_by == joint).any() and joint in self.above:
+            joint = self.above[joint]
+        return np.flatnonzero(self._moved_by == joint)
 
 
 def _movers(document: Document, number: int, part: dict[str, Any]) -> Ints:
@@ -316,14 +321,57 @@ def _lift(editor: Editor, document: Document) -> None:
     drop_channels(editor, lambda target: target.get("node") in whole and target["path"] != "weights")
 
 
-def _tell_left(document: Document, joints: set[int]) -> None:
-    """Warn of cameras and lights that hang from joints which move nothing any more."""
+def _hang_over(editor: Editor, document: Document, gone: set[int], binding: Binding, names: list[int]) -> set[int]:
+    """Let what hangs from joints that are replaced, such as a lamp or a socket, hang where it stood from those that move the
+    skin there now; returns these nodes and all below them. Ends of bones hang from nothing new.
+    """
+    found: set[int] = set()
+    if not nodes_are_ours(editor.json):
+        return found
+    nodes, skin = editor.json["nodes"], _OldSkin(document)
+    moved = {
+        channel["target"].get("node") for clip in editor.json.get("animations", []) for channel in clip["channels"]
+    }
+    for joint in sorted(gone):
+        rows, children = skin.around(joint), document.nodes[joint].get("children", [])
+        for child in children if len(rows) else ():
+            tree = _below(document, child)
+            plain = len(tree) == 1 and not nodes[child].keys() & {"camera", "extensions", "extras"}
+            if plain and (len(children) == 1 or nodes[child].get("name") in binding.rig.names):
+                continue
+            if "skin" in nodes[child] or child in moved or not tree.isdisjoint(skin.joints):
+                continue  # meshes hang from nothing, clips and joints need what is above them
+            votes = np.bincount(binding.joints[rows].ravel(), binding.weights[rows].ravel())
+            new = int(binding.rig.joints[votes.argmax()])
+            place = np.linalg.inv(binding.bind[new]) @ document.world[child]
+            for key in ("translation", "rotation", "scale", "matrix"):
+                nodes[child].pop(key, None)
+            nodes[child]["matrix"] = place.T.ravel().tolist()
+            nodes[joint]["children"].remove(child)
+            if not nodes[joint]["children"]:
+                del nodes[joint]["children"]
+            nodes[names[new]].setdefault("children", []).append(child)
+            found |= tree
+    return found
+
+
+def _below(document: Document, number: int) -> set[int]:
+    """A node and all below it."""
+    found, stack = set(), [number]
+    while stack:
+        found.add(node := stack.pop())
+        stack += document.nodes[node].get("children", [])
+    return found
+
+
+def _tell_left(document: Document, joints: set[int], hang: set[int]) -> None:
+    """Warn of cameras and lights below joints which move nothing any more, but for those that ``hang`` from new ones."""
     below, held = set(joints), []
     for number in document.world:  # parents before children
         node = document.nodes[number]
         if number in below:
             below.update(node.get("children", []))
-            if "camera" in node or _LIGHT in node.get("extensions", {}):
+            if number not in hang and ("camera" in node or _LIGHT in node.get("extensions", {})):
                 held.append(plain_text(str(node.get("name") or f"node {number}")))
     if held:
         what = f"{', '.join(held[:_TOLD])}{', ...' if len(held) > _TOLD else ''} of {document.name}"
