@@ -25,7 +25,7 @@ from meshmatch.shapes.formats import gltf, gltf_vrm
 from meshmatch.shapes.formats.gltf_edit import remembering
 from meshmatch.shapes.formats.gltf_humanoid import Person, person_of, with_bones
 from meshmatch.shapes.formats.gltf_rig import Rig, read_rig
-from meshmatch.shapes.formats.gltf_rigged import Binding, hanging_groups, rigged
+from meshmatch.shapes.formats.gltf_rigged import Binding, figures_apart, hanging_groups, rigged
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.moved_files import tell_left, with_look
 from meshmatch.shapes.shape import Shape
@@ -245,6 +245,12 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     path, data, in_gltf = as_scene(target, b)
     hanging = gltf.understood(path, data, "scene makes", hanging_groups)
     maps = find_maps(a, b, match)
+    apart = gltf.understood(path, data, "scene makes", lambda document: figures_apart(document, maps.forward.index))
+    if apart:
+        keep = "keeps its" if len(apart) == 1 else "keep their"
+        warn(
+            f"{', '.join(apart.values())} of {b.name or 'the target'} {keep} own skeleton, apart from what was matched"
+        )
     _refuse_copies(b, maps.backward)
     _tell_lying(a, rig, weights, maps.forward.source_up, b.name or "the target")
     with thread_limit(1):
@@ -258,7 +264,7 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
         standing, posed = carried.bind, carried.source_pose
         standing = posed if pose == "source" else replace(standing, clips=standing_clips(standing, posed))
         binding = Binding(standing, carried.bind.worlds(), *joint_table(found), turn)
-        glb, replaced = gltf.understood(path, data, "scene makes", lambda document: rigged(document, binding))
+        glb, replaced = gltf.understood(path, data, "scene makes", lambda document: rigged(document, binding, apart))
     before, after = (np.asarray(each.sum(axis=0)).ravel() > 0 for each in (weights.matrix, found))
     unused = tuple(weights.names[joint] for joint in np.flatnonzero(before & ~after))
     moving = SkinWeights(found, weights.names)

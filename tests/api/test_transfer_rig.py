@@ -419,6 +419,36 @@ def test_a_clip_of_the_target_takes_in_that_of_its_name(source: Path) -> None:
     assert np.abs(played(out, "bend", 1.0) - expected).max() < 1e-4
 
 
+@pytest.mark.parametrize("alike", [False, True])
+def test_a_thing_apart_keeps_its_skeleton(source: Path, alike: bool) -> None:
+    """A flag with joints at a root of their own, which a clip moves; but joints of the same names copy a skeleton."""
+    target = source.with_name("target.glb")
+    write_tube(target)
+    before = Document(target, target.read_bytes()).json
+    nodes, meshes = [*before["nodes"], {"name": "flag", "mesh": 1, "skin": 1}], [before["meshes"][0]] * 2
+    names = ("root", "hip", "knee", "foot") if alike else ("root", "pole", "cloth", "end")
+    nodes += [{"name": name, "translation": [5, 0, 0]} for name in names]
+    skins = [before["skins"][0], {"joints": [8, 9, 10, 11]}]
+    channels = [{"sampler": 0, "target": {"node": 9, "path": "rotation"}}]
+    clips = [{"name": "wave", "samplers": before["animations"][0]["samplers"], "channels": channels}]
+    scenes = [{"nodes": [0, 6, *range(7, 12)]}]
+    write_tube(target, nodes=nodes, meshes=meshes, skins=skins, animations=clips, scenes=scenes)
+    stood = load_shape(target).verts
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        out, result = rigged(source, target)
+    found = Document(out, out.read_bytes())
+    told = "flag of target.glb keeps its own skeleton, apart from what was matched"
+    assert [str(each.message) for each in said] == [told] * (not alike)
+    assert result.replaced == 4 + 4 * alike
+    assert [each["name"] for each in found.json["animations"]] == (["bend"] if alike else ["wave", "bend"])
+    flag = next(node for node in found.nodes if node["name"] == "flag")
+    bones = [found.nodes[joint]["name"] for joint in found.json["skins"][flag["skin"]]["joints"]]
+    assert bones == [*(JOINTS if alike else names)]
+    assert np.abs(load_shape(out).verts - stood).max() < 1e-5
+    assert np.abs(played(out, "bend", 1.0)[: tube().V] - played(source, "bend", 1.0)).max() < 1e-4
+
+
 @pytest.mark.parametrize("skinned", [True, False])
 def test_a_mirror_above_a_target_turns_nothing_inside_out(source: Path, skinned: bool) -> None:
     """Programs differ in what mirrored joints do to triangles, so that none are left."""

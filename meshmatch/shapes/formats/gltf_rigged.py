@@ -5,7 +5,7 @@ Specification: Khronos glTF 2.0, sections 3.7.3 and 3.11.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -67,9 +67,9 @@ class Replaced:
     clips: tuple[str, ...] = ()
 
 
-def rigged(document: Document, binding: Binding) -> tuple[bytes, Replaced]:
+def rigged(document: Document, binding: Binding, apart: Container[int] = ()) -> tuple[bytes, Replaced]:
     """The scene as a glb, moved by a skeleton, which hangs from its first node; and what of its own moves it no more:
-    joints and their clips are taken out, but for nodes that something else needs.
+    joints and their clips are taken out, but for nodes that something else needs. Nodes `apart` are left alone.
 
     Vertices are stored as they are, unless a skin of their own bends them, or they are drawn as in a mirror: then as they
     stand. Those of the binding are in the order of the scene.
@@ -83,6 +83,9 @@ def rigged(document: Document, binding: Binding) -> tuple[bytes, Replaced]:
     before: set[int] = set()
     seen = 0
     for number, parts in drawn(document).items():
+        if number in apart:
+            seen += _count(document, parts)
+            continue
         node = editor.json["nodes"][number]
         frame = frame_of(document, number, parts)
         mesh = editor.own_mesh(number)  # other weights for each node
@@ -110,7 +113,7 @@ def rigged(document: Document, binding: Binding) -> tuple[bytes, Replaced]:
             before.add(node["skin"])
         node["skin"] = skins[standing.tobytes()]
     gone, clips = _drop_skins(editor, before)
-    _lift(editor, document)
+    _lift(editor, document, {number for number in drawn(document) if number not in apart})
     arrays: dict[bytes, int] = {}
     theirs = editor.json.get("animations", []).copy()
     for clip in rig.clips:
@@ -129,12 +132,43 @@ def hanging_groups(document: Document) -> list[tuple[Ints, Ints]]:
     """
     skin, found, seen = _OldSkin(document), [], 0
     for number, parts in drawn(document).items():
-        V = sum(document.count(part["attributes"]["POSITION"]) for part in parts.values())
+        V = _count(document, parts)
         joint = number if number in skin.joints else skin.above.get(number)
         if joint is not None and "skin" not in document.nodes[number]:
             found.append((np.arange(seen, seen + V), skin.around(joint)))
         seen += V
     return found
+
+
+def figures_apart(document: Document, hit: Ints) -> dict[int, str]:
+    """Nodes that draw a thing of its own beside what a map leads to, such as a flag, with their names: no vertex of it is
+    ``hit``, and its joints hang from another root of the scene, with names that the others, for the most part, do not have.
+    """
+    root: dict[int, int] = {}
+    for node in document.roots():
+        root |= dict.fromkeys(_below(document, node), node)
+    hits, joints, seen = np.bincount(hit), {}, 0
+    fitted: set[int] = set()  # joints
+    taken: set[int] = set()  # roots
+    for number, parts in drawn(document).items():
+        rows = slice(seen, seen := seen + _count(document, parts))
+        skin = document.nodes[number].get("skin")
+        joints[number] = set() if skin is None else {int(joint) for joint in document.json["skins"][skin]["joints"]}
+        if hits[rows].any():
+            fitted |= joints[number]
+            taken |= {root[node] for node in joints[number] | {number}}
+    names = {document.nodes[joint].get("name") for joint in fitted}
+
+    def is_apart(own: set[int]) -> bool:
+        copied = sum(document.nodes[joint].get("name") in names for joint in own)
+        return taken.isdisjoint(root[joint] for joint in own) and 2 * copied <= len(own)
+
+    found = [number for number, own in joints.items() if fitted and own and is_apart(own)]
+    return {number: plain_text(str(document.nodes[number].get("name") or f"node {number}")) for number in found}
+
+
+def _count(document: Document, parts: dict[int, dict[str, Any]]) -> int:
+    return sum(document.count(part["attributes"]["POSITION"]) for part in parts.values())
 
 
 class _OldSkin:
@@ -266,7 +300,7 @@ def drop_channels(editor: Editor, gone: Callable[[dict[str, Any]], bool]) -> tup
     return tuple(names)
 
 
-def _lift(editor: Editor, document: Document) -> None:
+def _lift(editor: Editor, document: Document, skinned: set[int]) -> None:
     """Let what a skin moves now hang from nothing, without a transform, in the order of the scene: glTF ignores transforms
     above a skinned mesh, and not all viewers do. A node that holds something else as well stays, without its mesh.
     """
@@ -276,7 +310,6 @@ def _lift(editor: Editor, document: Document) -> None:
     joints = {joint for skin in editor.json["skins"] for joint in skin["joints"]}
     clips = [channel["target"] for clip in editor.json.get("animations", []) for channel in clip["channels"]]
     parents = {child: number for number, node in enumerate(document.nodes) for child in node.get("children", [])}
-    skinned = drawn(document)
     trees: dict[int, list[int]] = {}  # meshes that a skin moves, in the order of the scene
     root: dict[int, int] = {}
     for number in document.world:  # parents before children
