@@ -156,6 +156,7 @@ def _below_a_root(rig: Rig, name: str) -> Rig:
         np.concatenate([np.zeros((1, 3)), rig.translations]),
         np.concatenate([np.ones((1, 3)), rig.scales]),
         tuple(replace(clip, tracks=own) for clip, own in zip(rig.clips, tracks, strict=True)),
+        (None, *rig.extras),
     )
 
 

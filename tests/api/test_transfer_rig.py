@@ -131,6 +131,19 @@ def test_a_foot_that_hangs_from_the_root_stays_on_a_shorter_leg(source: Path) ->
         assert np.linalg.norm(played(out, "bend", time)[-1] - KNEE - turn.apply([0, 0.5, 0])) < 0.04
 
 
+def test_what_somebody_noted_at_bones_and_clips_arrives(source: Path) -> None:
+    editor = Editor(Document(source, source.read_bytes()))
+    editor.json["nodes"][NODES.index("knee")]["extras"] = {"twist": 0}
+    editor.json["animations"][0]["extras"] = {"loop": True}
+    source.write_bytes(editor.to_bytes())
+    target = source.with_name("target.ply")
+    save_shape(target, tube())
+    out, _ = rigged(source, target)
+    found = Document(out, out.read_bytes()).json
+    assert [node["name"] for node in found["nodes"] if node.get("extras") == {"twist": 0}] == ["knee"]
+    assert [clip.get("extras") for clip in found["animations"]] == [{"loop": True}]
+
+
 @pytest.mark.parametrize("interpolation", ["STEP", "CUBICSPLINE"])
 def test_other_interpolations_are_kept(source: Path, interpolation: str) -> None:
     """The foot, which follows the knee, gets keys of its own."""

@@ -48,6 +48,7 @@ class Clip(Brief):
 
     name: str
     tracks: tuple[Track, ...]
+    extras: Any = None  # what somebody noted in the file
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -64,6 +65,7 @@ class Rig(Brief):
     translations: Float[Floats, "N 3"]
     scales: Float[Floats, "N 3"]
     clips: tuple[Clip, ...]
+    extras: tuple[Any, ...] = ()  # N, or none: what somebody noted at the nodes
 
     def worlds(self) -> Float[Floats, "N 4 4"]:
         """Where every node stands in the scene."""
@@ -105,6 +107,7 @@ def _rig(document: Document) -> Rig:
         np.array([place[node] for node in joints], np.int64),
         *(rotations, translations, scales),
         _clips(document, place),
+        tuple(document.nodes[node].get("extras") for node in chosen),
     )
     worlds = rig.worlds()
     if not (np.isfinite(worlds).all() and np.abs(worlds).max() < _LARGEST):
@@ -175,5 +178,6 @@ def _clips(document: Document, place: dict[int, int]) -> tuple[Clip, ...]:
                 raise InputError(many_keys, "export fewer clips, or sample them less often")
             tracks.append(Track(node, moves, times, values, interpolation))
         if tracks:
-            clips.append(Clip(plain_text(str(animation.get("name", f"clip {number}"))), tuple(tracks)))
+            name = plain_text(str(animation.get("name", f"clip {number}")))
+            clips.append(Clip(name, tuple(tracks), animation.get("extras")))
     return tuple(clips)

@@ -205,6 +205,8 @@ def _movers(document: Document, number: int, part: dict[str, Any]) -> Ints:
 def _add_nodes(editor: Editor, document: Document, rig: Rig) -> list[int]:
     """The numbers of the skeleton's nodes in the document."""
     names = [editor.add_node(*each) for each in zip(rig.names, rig.rotations, rig.translations, strict=True)]
+    for number, extras in zip(names, rig.extras, strict=False):
+        editor.json["nodes"][number] |= {} if extras is None else {"extras": extras}
     for node, parent in enumerate(rig.parents.tolist()):
         if np.any(rig.scales[node] != 1.0):
             editor.json["nodes"][names[node]]["scale"] = rig.scales[node].tolist()
@@ -436,4 +438,4 @@ def _add_clip(
         entry["channels"].append({"sampler": len(entry["samplers"]), "target": target})
         entry["samplers"].append(sampler)
     if joined is None:
-        editor.add("animations", entry)
+        editor.add("animations", entry | ({} if clip.extras is None else {"extras": clip.extras}))
