@@ -96,8 +96,10 @@ class Places(Brief):
 
         original = part.original
         stands = part.kept_vertex[part.original_to_repaired]
-        # What was left out is as near to the template as the vertex that stands for it, and the way there.
-        away = np.linalg.norm(original.verts - original.verts[stands], axis=1) * original.valid / fit.frame.scale
+        # What was left out is as near to the template as the vertex that stands for it, and the way there; what has no
+        # position may be anywhere on the shape.
+        away = np.linalg.norm(original.verts - original.verts[stands], axis=1)
+        away = np.where(original.valid, away, original.diagonal) / fit.frame.scale
         if part.copied is not None:  # but a copy is where it is for another reason
             away[part.copied] = 0.0
         fitted = np.zeros(original.F, bool)

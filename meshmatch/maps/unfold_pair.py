@@ -1,7 +1,8 @@
 """The two maps of a pair without folds, between what nobody left out of the two shapes.
 
-What was left out, such as the floor under a scan, is matched like the nearest vertex that was fitted. Those images would
-count as folds, and the inverse would look for each such vertex on all of the other shape.
+What was left out, such as the floor under a scan, is matched like the nearest vertex that was fitted, and so is a vertex
+without a position or a face like the one that stands for it. Those images would count as folds, and the inverse would look
+for each such vertex on all of the other shape.
 """
 
 from __future__ import annotations
@@ -51,7 +52,9 @@ def both_unfolded(
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    """What is left of a mesh of which vertices have weight 0: ``shape``, of which vertices and faces of the file."""
+    """What is left of a mesh of which vertices have weight 0, no position or no face: ``shape``, of which vertices and faces
+    of the file.
+    """
 
     shape: Shape
     verts: Int[Ints, " N"]
@@ -60,13 +63,15 @@ class _Kept:
 
     @classmethod
     def of(cls, shape: Shape) -> _Kept:
-        if shape.weights is None or (shape.weights > 0).all():
-            return cls(shape, np.arange(shape.V), np.arange(shape.F), True)
-        faces = np.flatnonzero((shape.weights > 0)[shape.faces].any(axis=1))  # as repair keeps them
+        chosen = shape.valid_faces
+        if shape.weights is not None:
+            chosen = chosen & (shape.weights > 0)[shape.faces].any(axis=1)  # as repair keeps them
+        faces = np.flatnonzero(chosen)
         verts = np.flatnonzero(np.bincount(shape.faces[faces].ravel(), minlength=shape.V))
-        invalid = None if shape.invalid is None else shape.invalid[verts]
+        if len(verts) == shape.V and len(faces) == shape.F:
+            return cls(shape, verts, faces, True)
         corners = np.searchsorted(verts, shape.faces[faces])
-        return cls(Shape(shape.verts[verts], corners, shape.name, invalid=invalid), verts, faces, False)
+        return cls(Shape(shape.verts[verts], corners, shape.name), verts, faces, False)
 
     def between(self, found: VertexMap, target: _Kept) -> VertexMap | None:
         """A map between two files as one between what is left of them; None where one has images on what is not."""

@@ -130,3 +130,14 @@ def test_what_was_left_out_is_as_far_away_as_it_lies() -> None:
     away = np.linalg.norm(verts[dropped] - verts[places.stands[dropped]], axis=1)
     assert np.allclose(places.distance[dropped], away, atol=1e-6) and away.max() > 0.05
     assert np.allclose(places.distance[part.kept_vertex], 0, atol=1e-6)
+
+
+def test_what_has_no_position_is_a_guess() -> None:
+    """It has the answer of a neighbour, and may be anywhere."""
+    unit = unit_ball()
+    invalid = np.isin(np.arange(unit.V + 1), [7, unit.V])
+    verts = np.where(invalid[:, None], 0.0, np.append(unit.verts, [[0, 0, 0]], axis=0))
+    part, fit = repair(Shape(verts, unit.faces, "part", invalid=invalid)), lying_on(unit)
+    found = mapped(part, fit, repair(unit), fit)
+    assert found.confidence[invalid].max() < 1e-6 and found.confidence[~invalid].min() > 0.9
+    assert np.linalg.norm(unit.verts[found.index[7]] - unit.verts[7]) < 0.2

@@ -56,3 +56,21 @@ def test_a_map_onto_what_was_left_out_stays_as_it_is() -> None:
     onto_floor = VertexMap.between(source, target, np.zeros(source.V, int), verdict="good")
     found, opposite = unfolded_pair(onto_floor, lambda: onto_floor, source, target, False)
     assert found is onto_floor and opposite is None
+
+
+def test_vertices_without_a_position_or_a_face_keep_the_images_of_those_that_stand_for_them() -> None:
+    """They lie somewhere else than on the surface, where an inverse would look for what is nearest."""
+    whole, target = ball(3), ball(3, 0.0)
+    lost = np.array([7, 300, whole.V, whole.V + 1])
+    invalid = np.isin(np.arange(whole.V + 2), lost[:3])
+    verts = np.concatenate([whole.verts, [[0, 0, 0], [0.1, 0, 0]]])
+    verts[invalid] = 0.0
+    source = Shape(verts, whole.faces, invalid=invalid)
+    alone, rows = put(whole, target, whole.verts), np.append(np.arange(whole.V), [9, 9])
+    rows[lost[:2]] = [8, 301]  # which stand for them
+    rest = {"face": alone.face[rows], "barycentric": alone.barycentric[rows], "verdict": "good"}
+    there = VertexMap.between(source, target, alone.index[rows], **rest)
+    back = replace(put(target, source, target.verts), verdict="good")
+    found, opposite = unfolded_pair(there, lambda: back, source, target, False)
+    assert opposite is not None
+    np.testing.assert_allclose(found.points(target)[lost], there.points(target)[lost])
