@@ -449,7 +449,8 @@ def _summary(
     if isinstance(card, ModelCard) and (distance := card.metrics.get("validation", {}).get("distance")):
         before = [now.validation for now in reports if now.validation is not None and now.step <= _APART * card.steps]
         falls = f", {'still falling' if distance < _FALLS * before[-1] else 'no longer falling'}" if before else ""
-        console.say(f"off by {100 * distance:.2g} % of sqrt(area) on shapes that were not learned{falls}")
+        on = card.recipe.get("validation") or "shapes that were not learned"
+        console.say(f"off by {100 * distance:.2g} % of sqrt(area) on {on}{falls}")
     own = shlex.quote(str(output))
     console.say(
         f"wrote model {card.name}, learned from {card.data}, to {output} after step {card.steps}; use it with "

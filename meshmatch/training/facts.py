@@ -26,6 +26,7 @@ class CardFacts:
     start: TrainedModel | str | Path | None = None
     mirror: str = ""  # "auto" for what comes in two sides, or "no"
     frame: dict[str, str] | None = None  # as the training's shapes and network say
+    measured: str = ""  # what the validation error is of, unless it is of more of what is generated
 
 
 def inherited(facts: CardFacts, card: ModelCard) -> CardFacts:

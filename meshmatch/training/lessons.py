@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.generators.bodies import Bodies
 from meshmatch.generators.characters import people_source
 from meshmatch.generators.generator import Source, shipped_template
@@ -32,6 +33,8 @@ from meshmatch.templates.template import Template, read_template
 from meshmatch.training.datasets import deformed_source, drawn_once, registered_source
 from meshmatch.training.recipes import Recipe
 
+_AGAIN = "the learned shapes, drawn anew"
+
 
 @dataclass(frozen=True, eq=False)
 class Lessons:
@@ -45,6 +48,8 @@ class Lessons:
     mirror: Mirroring = "no"  # "auto" where shapes come in two sides
     unseen: Source | None = None  # draws shapes to be measured on, where the source draws but few again and again
     digest: str = ""  # the same for the same shapes, wherever they lie: a checkpoint goes on with no others
+    each: frozenset[str] = frozenset()  # the same of each registered shape
+    measured: str = ""  # what is measured on, in a few words, unless it is more of what is generated
 
 
 def generated(kind: Kind | Bodies, recipe: Recipe, progress: Progress) -> Lessons:
@@ -74,12 +79,13 @@ def prepared(shapes: Path, recipe: Recipe) -> Lessons:
     if recipe.train.loss.needs_correspondence:
         verts = read_registered(shapes, template)
         source = (deformed_source if recipe.deform else registered_source)(torch.from_numpy(verts))
-        data = f"{len(verts)} registered shapes of {name}"
-        return Lessons(template, source, "", data, frame, mirror, digest=_digest(verts))
+        data, each = f"{len(verts)} registered shapes of {name}", _each(verts)
+        return Lessons(template, source, "", data, frame, mirror, None, _digest(verts), each, _AGAIN)
     samples = read_samples(shapes, template)
     known = f" and {len(samples.template_landmarks)} known points" if len(samples.template_landmarks) else ""
     data = f"{len(samples.points)} shapes of {name}, without correspondence{known}"
-    return Lessons(template, samples, "", data, frame, mirror, digest=_digest(samples.points, samples.landmarks))
+    digest = _digest(samples.points, samples.landmarks)
+    return Lessons(template, samples, "", data, frame, mirror, digest=digest, measured=_AGAIN)
 
 
 def _digest(*parts: np.ndarray | str) -> str:
@@ -88,6 +94,11 @@ def _digest(*parts: np.ndarray | str) -> str:
     for part in parts:
         found.update(part.encode() if isinstance(part, str) else np.ascontiguousarray(part).tobytes())
     return found.hexdigest()[:16]
+
+
+def _each(verts: np.ndarray) -> frozenset[str]:
+    """Of each of N registered shapes."""
+    return frozenset(_digest(each) for each in verts)
 
 
 def template_of(
@@ -118,7 +129,7 @@ def check_start(start: TrainedModel, template: Template | None, recipe: Recipe) 
 
 
 def measured_on(shapes: str | Path | RegisteredShapes | None, learned: Lessons) -> Lessons:
-    """The same lessons, measured on other registered shapes if there are some.
+    """The same lessons, measured on other registered shapes if there are some; warns of those that are learned, too.
 
     `InputError` for a folder that is not prepared, or for another template; `OptionError` where learning needs no
     correspondence, and is measured without.
@@ -128,12 +139,16 @@ def measured_on(shapes: str | Path | RegisteredShapes | None, learned: Lessons) 
     if isinstance(learned.source, ShapeSamples):
         raise OptionError("learning without correspondence is not measured on registered shapes", "leave them out")
     if isinstance(shapes, RegisteredShapes):
-        verts = np.asarray(shapes.verts, np.float32)
+        verts, name = np.asarray(shapes.verts, np.float32), shapes.name
         if shapes.template.hash != learned.template.hash:
-            raise InputError(f"{shapes.name}: these are fits of another template", "fit them with the same model")
+            raise InputError(f"{name}: these are fits of another template", "fit them with the same model")
+        words = f"{len(verts)} fits of {name}"
     else:
-        verts = read_registered(shapes, learned.template)
-    return replace(learned, unseen=registered_source(torch.from_numpy(verts)))
+        verts, name = read_registered(shapes, learned.template), as_path(shapes).resolve().name
+        words = f"{len(verts)} registered shapes of {name}"
+    if same := len(_each(verts) & learned.each):
+        warn(f"{name}: {same} of {len(verts)} shapes to be measured on are learned as well")
+    return replace(learned, unseen=registered_source(torch.from_numpy(verts)), measured=words)
 
 
 def kind_named(name: str) -> Kind | Bodies:
@@ -151,11 +166,12 @@ def lessons(
         raise OptionError("generated shapes do not go with a folder of shapes", "leave out one of the two")
     if isinstance(shapes, RegisteredShapes):
         verts = np.asarray(shapes.verts, np.float32)
-        source, digest = deformed_source(torch.from_numpy(verts)), _digest(verts)
+        source = deformed_source(torch.from_numpy(verts))
+        rest: dict[str, Any] = {"digest": _digest(verts), "each": _each(verts), "measured": _AGAIN}
         known = f"{len(verts)} fits of {shapes.name}"
         if shapes.orientation is None:
-            return Lessons(shapes.template, source, shapes.name, known, digest=digest)
+            return Lessons(shapes.template, source, shapes.name, known, **rest)
         frame = {"orientation": shapes.orientation, "scale": "area"}
         sides: Mirroring = "auto" if shapes.mirror else "no"
-        return Lessons(shapes.template, source, "", f"{known}, without a model", frame, sides, digest=digest)
+        return Lessons(shapes.template, source, "", f"{known}, without a model", frame, sides, **rest)
     return prepared(as_path(shapes), recipe)

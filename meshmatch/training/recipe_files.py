@@ -26,7 +26,7 @@ _LOSSES: dict[str, type[Objective]] = {
     f"{each.__module__}.{each.__qualname__}": each for each in (CorrespondenceLoss, ChamferLoss)
 }
 _PARTS = {"network", "field", "recipe"}
-_HISTORY = ("start", "earlier")
+_HISTORY = ("start", "earlier", "validation")
 _OWN = ("deform", "storage", "template", "characters", "bodies", "stylised")
 _HINT = "give the card.json of a model, or a part of one: network, field.kernel, recipe.train, recipe.scan"
 

@@ -164,6 +164,7 @@ def _learn(
     learned = make()
     facts = replace(facts, category=facts.category or learned.category or facts.name, data=facts.data or learned.data)
     facts = replace(facts, frame=facts.frame or learned.frame, mirror=facts.mirror or learned.mirror)
+    facts = replace(facts, measured=facts.measured or learned.measured)
     return train_model(
         learned.template, learned.source, output, recipe, facts, resume, report, learned.unseen, tensorboard, progress,
         learned.digest,
@@ -280,7 +281,8 @@ def export(trainer: Trainer, template: Template, output: Path, recipe: Recipe, f
     (output / CARD).unlink(missing_ok=True)
     save_template(template, output / TEMPLATE)
     digest = save_weights(trainer.averaged_state(), output / WEIGHTS, storage=recipe.storage)
-    settings = recipe_record(recipe) | ({"earlier": trainer.earlier} if trainer.earlier else {})
+    history = {"earlier": trainer.earlier, "validation": facts.measured}
+    settings = recipe_record(recipe) | {name: value for name, value in history.items() if value}
     if isinstance(facts.start, TrainedModel):
         begun = facts.start.card
         settings["start"] = {"model": begun.name, "weights_sha256": begun.weights_sha256, "steps": begun.steps}

@@ -37,6 +37,7 @@ from meshmatch.training.datasets import registered_source
 from meshmatch.training.lessons import template_of
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.losses import CorrespondenceLoss
+from meshmatch.training.recipe_files import read_recipe
 from meshmatch.training.recipes import Recipe, default, going_on, paper, people, recipe_for
 from meshmatch.training.records import curves
 from meshmatch.training.scans import ScanConfig
@@ -170,9 +171,12 @@ def test_another_folder_can_be_measured_on(prepared: Path, tmp_path: Path) -> No
     there = trained(prepared, tmp_path / "there", validation=flat)
     card, other = load_model(usual).card, load_model(there).card
     assert card.weights_sha256 == other.weights_sha256 and card.metrics != other.metrics
-    assert (
-        load_model(trained(prepared, tmp_path / "same", validation=prepared)).card.weights_sha256 == card.weights_sha256
-    )
+    told = [each.recipe["validation"] for each in (card, other)]
+    assert told == ["the learned shapes, drawn anew", "1 fits of flat"]
+    with pytest.warns(MeshmatchWarning, match="5 of 5 shapes to be measured on are learned as well"):
+        same = load_model(trained(prepared, tmp_path / "same", validation=prepared)).card
+    assert same.weights_sha256 == card.weights_sha256
+    assert read_recipe(tmp_path / "same" / "card.json", SMALL) == SMALL
     other_template = replace(flat, template=replace(template, core=template.core[:-1]))
     for wrong, error in ((tmp_path / "usual", "not a prepared folder"), (other_template, "another template")):
         with pytest.raises(InputError, match=error):
