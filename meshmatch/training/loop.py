@@ -131,6 +131,11 @@ def learning_rate(step: int, config: TrainConfig) -> float:
     return config.rate * min(1.0, (step + 1) / max(config.warm_up, 1)) * fade
 
 
+def processes() -> int:
+    """How many learn together, each from batches of its own, as torchrun says."""
+    return int(os.environ.get("WORLD_SIZE", 1))
+
+
 class Trainer:
     """State of a run: weights, their average, the optimiser and the next step. All of it is in a checkpoint."""
 
@@ -138,10 +143,10 @@ class Trainer:
         self, model: Any, points: Any, config: TrainConfig, digest: str = "", recipe: Mapping[str, Any] | None = None
     ) -> None:
         self.config, self.digest = config, digest  # of the shapes, see `Lessons`; empty where it is not known
-        self.settings: dict[str, Any] = settings_of(recipe or asdict(config))
+        self.settings: dict[str, Any] = settings_of(recipe or asdict(config)) | {"processes": processes()}
         self.earlier: list[dict[str, Any]] = []  # until which step other settings held, and which
         self.rank = int(os.environ.get("RANK", 0))
-        self.world = int(os.environ.get("WORLD_SIZE", 1))
+        self.world = processes()
         self.device = training_device(int(os.environ.get("LOCAL_RANK", 0)), config.device)
         if self.world > 1 and not dist.is_initialized():
             dist.init_process_group("gloo" if self.device.type == "cpu" else "nccl")

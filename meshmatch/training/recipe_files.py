@@ -18,7 +18,7 @@ from meshmatch.models.checkpoint import Storage
 from meshmatch.models.network import NetworkConfig
 from meshmatch.shapes.input_files import read_json
 from meshmatch.training.limits import filled
-from meshmatch.training.loop import OF_THE_MACHINE
+from meshmatch.training.loop import OF_THE_MACHINE, processes
 from meshmatch.training.losses import ChamferLoss, CorrespondenceLoss, Objective
 from meshmatch.training.recipes import Recipe
 
@@ -26,7 +26,7 @@ _LOSSES: dict[str, type[Objective]] = {
     f"{each.__module__}.{each.__qualname__}": each for each in (CorrespondenceLoss, ChamferLoss)
 }
 _PARTS = {"network", "field", "recipe"}
-_HISTORY = ("start", "earlier", "validation")
+_HISTORY = ("start", "earlier", "validation", "processes")
 _OWN = ("deform", "storage", "template", "characters", "bodies", "stylised")
 _HINT = "give the card.json of a model, or a part of one: network, field.kernel, recipe.train, recipe.scan"
 
@@ -51,8 +51,8 @@ def read_recipe(path: str | Path, usual: Recipe, started: bool = False) -> Recip
     """The recipe of a card, or of a file that has parts of one; what it does not say is as in the usual one.
 
     What belongs to the machine (minutes, threads, device, where batches are drawn, compiling) is not taken from a file.
-    Warns where a training by it is another: one that is not ``started`` from the model that it names, or one of several
-    stages.
+    Warns where a training by it is another: one that is not ``started`` from the model that it names, one by more or fewer
+    processes, or one of several stages.
     `InputError` if it is none, names something unknown, or was learned by a loss that is not meshmatch's own.
     """
     path = Path(path)
@@ -79,7 +79,7 @@ def read_recipe(path: str | Path, usual: Recipe, started: bool = False) -> Recip
             raise InputError("its kernel or storage is unknown")
         if Path(found.template).name != found.template:
             raise InputError("recipe.template must be the name of an included template")
-        _tell_history(path.name, own, started)
+        _tell_history(path.name, {"processes": 1} | own if "weights_sha256" in record else own, started)
         return replace(
             found,
             network=NetworkConfig.from_dict(usual.network.to_dict() | network),
@@ -98,6 +98,11 @@ def _tell_history(name: str, own: Mapping[str, Any], started: bool) -> None:
     if own.get("start") and not started:
         known = own["start"].get("model", "another") if isinstance(own["start"], dict) else "another"
         warn(f"{name} is of a training that started from the model {str(known)[:64]}; this one starts anew (--start)")
+    if own.get("processes", now := processes()) != now:
+        before = str(own["processes"])[:9]
+        warn(
+            f"{name}: processes, each with batches of its own, were {before} in that training, and are {now} in this one"
+        )
     if own.get("earlier"):
         warn(f"{name} is of a training whose settings changed on the way; this one has the last of them throughout")
 

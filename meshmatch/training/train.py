@@ -281,7 +281,8 @@ def export(trainer: Trainer, template: Template, output: Path, recipe: Recipe, f
     (output / CARD).unlink(missing_ok=True)
     save_template(template, output / TEMPLATE)
     digest = save_weights(trainer.averaged_state(), output / WEIGHTS, storage=recipe.storage)
-    history = {"earlier": trainer.earlier, "validation": facts.measured}
+    history: dict[str, Any] = {"earlier": trainer.earlier, "validation": facts.measured}
+    history |= {"processes": trainer.world} if trainer.world > 1 else {}
     settings = recipe_record(recipe) | {name: value for name, value in history.items() if value}
     if isinstance(facts.start, TrainedModel):
         begun = facts.start.card

@@ -134,6 +134,20 @@ def test_other_settings_of_a_checkpoint_are_told_and_kept(egg: Template, tmp_pat
     assert last.earlier == other.earlier
 
 
+def test_another_number_of_processes_is_told_and_kept(
+    egg: Template, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, alone = tmp_path / "last.safetensors", trainer(egg, CONFIG)
+    alone.step = 4
+    alone.save(path)
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setattr("torch.distributed.is_initialized", lambda: True)
+    both = trainer(egg, CONFIG)
+    with pytest.warns(MeshmatchWarning, match="processes 1 is 2 now"):
+        both.load(path)
+    assert both.earlier == [{"until_step": 4, "processes": 1}]
+
+
 def test_a_seed_fixes_the_training(egg: Template) -> None:
     def trained(seed: int) -> dict[str, torch.Tensor]:
         run = trainer(egg, replace(CONFIG, steps=2, seed=seed))

@@ -73,6 +73,19 @@ def test_what_a_recipe_has_behind_it_is_told(tmp_path: Path) -> None:
         read_recipe(written(tmp_path, {"recipe": {"earlier": [{"until_step": 3, "train.steps": 3}]}}), people())
 
 
+def test_another_number_of_processes_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    by_two = written(tmp_path, {"recipe": {"processes": 2}})
+    with pytest.warns(MeshmatchWarning, match="were 2 in that training, and are 1 in this one"):
+        read_recipe(by_two, people())
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_recipe(by_two, people())
+        read_recipe(written(tmp_path, {"recipe": {"train": {"steps": 5}}}), people())
+    with pytest.warns(MeshmatchWarning, match="were 1 in that training, and are 2 in this one"):
+        read_recipe(bundled_folder() / "models" / "hand" / "card.json", recipe_for(kind="hand"), started=True)
+
+
 def test_a_part_changes_a_part(tmp_path: Path) -> None:
     part = {"recipe": {"train": {"steps": 5, "loss": {"arap": 1}}}}
     usual = people()

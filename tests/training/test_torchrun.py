@@ -72,7 +72,8 @@ def test_two_processes_train_one_model(prepared: Path, tmp_path: Path) -> None:
         assert file.metadata()["step"] == "3"
         held = [name for name in file.keys() if name.startswith("model.")]  # noqa: SIM118 (it is no dictionary)
         kept = {name.removeprefix("model."): file.get_tensor(name) for name in held}
-    assert verify_model(output).steps == 3
+    card = verify_model(output)
+    assert (card.steps, card.recipe["processes"]) == (3, 2)
     # both ended with the same weights, which are the checkpoint's
     ranks = []
     for rank in (0, 1):
