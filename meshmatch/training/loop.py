@@ -158,6 +158,8 @@ class Trainer:
         self.loss: Any = torch.compile(config.loss) if config.compile else config.loss
         self.step, self.seconds = 0, 0.0
         self._unchecked: tuple[dict[str, Tensor], int] | None = None  # terms of a step, which a GPU still computes
+        self._came: list[int] = []  # signals that are to end one of several processes
+        self._ends = False  # whether one came to any of them
 
     def save(self, path: Path) -> None:
         """Write everything that the next step depends on (rank 0 only)."""
@@ -247,7 +249,7 @@ class Trainer:
         progress: Progress | None = None,
     ) -> None:
         """Train until ``steps`` or ``minutes`` are over, of which so many seconds are ``spent``; writes ``checkpoint`` now
-        and then, at the end, and where Ctrl-C ends it."""
+        and then, at the end, and where Ctrl-C ends it; several processes end after the same step."""
         config = self.config
         torch.set_num_threads(config.threads)
         _keep_memory()
@@ -261,33 +263,34 @@ class Trainer:
             for held in (*self.model.state_dict().values(), *self.average.values()):
                 dist.broadcast(held.detach(), 0)
         try:
-            for batch in batches(data, ours, self.device, config.workers, config.draw):
-                with _whole():
-                    between = False
-                    terms = self.iterate(batch)
-                    between = True
-                for name, value in terms.items():
-                    sums[name] = (
-                        sums.get(name, 0.0) + value.detach().float()
-                    )  # there: no step waits for a GPU's numbers
-                summed += 1
-                now = time.monotonic()
-                self.seconds = before + now - began
-                if report is not None and (self.step % every == 0 or self.step == config.steps):
-                    asked = self.step % (10 * every) == 0 or self.step == config.steps
-                    score = validate(self.model) if validate and asked else None
-                    means = {name: float(value) / summed for name, value in sums.items()}
-                    rate = learning_rate(self.step, config)
-                    reported = StepReport(self.step, config.steps, rate, now - began, means, score)
-                    report(reported)
-                    sums, summed, lately = {}, 0, reported.losses
-                if progress is not None:  # at every step, for one may take seconds
-                    progress.named(f"step {self.step:,} of {config.steps:,}{lately}")(self.step / config.steps)
-                if checkpoint is not None and now - saved > 60 * config.checkpoint_minutes:
-                    self.save(checkpoint)
-                    saved = now
-                if config.minutes is not None and self.any_says(now - began > 60 * config.minutes):
-                    break
+            with _noted(self.world > 1) as self._came:
+                for batch in batches(data, ours, self.device, config.workers, config.draw):
+                    with _whole() if self.world == 1 else nullcontext():
+                        between = False
+                        terms = self.iterate(batch)
+                        between = True
+                    for name, value in terms.items():
+                        sums[name] = (
+                            sums.get(name, 0.0) + value.detach().float()
+                        )  # there: no step waits for a GPU's numbers
+                    summed += 1
+                    now = time.monotonic()
+                    self.seconds = before + now - began
+                    if report is not None and (self.step % every == 0 or self.step == config.steps):
+                        asked = self.step % (10 * every) == 0 or self.step == config.steps
+                        score = validate(self.model) if validate and asked else None
+                        means = {name: float(value) / summed for name, value in sums.items()}
+                        rate = learning_rate(self.step, config)
+                        reported = StepReport(self.step, config.steps, rate, now - began, means, score)
+                        report(reported)
+                        sums, summed, lately = {}, 0, reported.losses
+                    if progress is not None:  # at every step, for one may take seconds
+                        progress.named(f"step {self.step:,} of {config.steps:,}{lately}")(self.step / config.steps)
+                    if checkpoint is not None and now - saved > 60 * config.checkpoint_minutes:
+                        self.save(checkpoint)
+                        saved = now
+                    if self._ends or (config.minutes is not None and self.any_says(now - began > 60 * config.minutes)):
+                        break
         except KeyboardInterrupt:
             if checkpoint is not None and self.world == 1 and between and self.step > first:
                 self.save(checkpoint)
@@ -295,6 +298,9 @@ class Trainer:
         if checkpoint is not None:
             self.save(checkpoint)
         self.model.eval()
+        if self._ends:
+            _obey(self._came)
+            raise KeyboardInterrupt  # another process was told to
 
     def iterate(self, batch: Any) -> dict[str, Tensor]:
         """One step of training on a batch; returns its losses. The model must be in training mode."""
@@ -334,10 +340,14 @@ class Trainer:
             self._unchecked = None
 
     def _exchange(self) -> None:
-        """Gradients become the means over all processes: all at once, for each exchange takes time of its own."""
+        """Gradients become the means over all processes, and all know whether one is to end: all at once, for each exchange
+        takes time of its own.
+        """
         held = [each.grad for each in self.model.parameters() if each.grad is not None]
-        flat = torch.cat([each.flatten() for each in held])
+        ends = held[0].new_tensor([float(bool(self._came))])
+        flat = torch.cat([*(each.flatten() for each in held), ends])
         dist.all_reduce(flat)
+        flat, self._ends = flat[:-1], bool(flat[-1])
         for each, mean in zip(held, (flat / self.world).split([each.numel() for each in held]), strict=True):
             each.copy_(mean.view_as(each))
 
@@ -388,15 +398,15 @@ def _products(precision: str) -> Iterator[None]:
 
 
 @contextmanager
-def _whole() -> Iterator[None]:
-    """Signals that end the program wait until the block is done; where one comes again, a second later, they do not."""
+def _noted(wanted: bool = True) -> Iterator[list[int]]:
+    """Signals that end the program are noted alone within the block; one that comes again, a second later, ends it."""
     came: list[int] = []
     began = 0.0
     named = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    ours = threading.current_thread() is threading.main_thread()
+    ours = wanted and threading.current_thread() is threading.main_thread()
     handlers: dict[int, Any] = {each: found for each in named if ours and callable(found := signal.getsignal(each))}
 
-    def wait(number: int, frame: Any) -> None:
+    def note(number: int, frame: Any) -> None:
         nonlocal began
         if came and time.monotonic() - began > 1:
             handlers[number](number, frame)
@@ -404,14 +414,27 @@ def _whole() -> Iterator[None]:
         came.append(number)
 
     for number in handlers:
-        signal.signal(number, wait)
+        signal.signal(number, note)
     try:
-        yield
+        yield came
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
-    if came:
-        handlers[came[0]](came[0], None)
+
+
+@contextmanager
+def _whole() -> Iterator[None]:
+    """Signals that end the program wait until the block is done, unless they come again."""
+    with _noted() as came:
+        yield
+    _obey(came)
+
+
+def _obey(came: list[int]) -> None:
+    """Let the first of some signals do what it does."""
+    handler: Any = signal.getsignal(came[0]) if came else None
+    if callable(handler):
+        handler(came[0], None)
 
 
 def _check_terms(terms: Any) -> None:

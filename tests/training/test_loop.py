@@ -87,8 +87,10 @@ def test_a_stopped_run_ends_where_an_unbroken_one_does(
 class Interrupting(CorrespondenceLoss):
     """Ctrl-C in the middle of the third step."""
 
+    own: bool = True
+
     def __call__(self, *inputs: Any) -> dict[str, torch.Tensor]:
-        if (step := CALLS.pop() + 1) == 3:
+        if (step := CALLS.pop() + 1) == 3 and self.own:
             signal.raise_signal(signal.SIGINT)
         CALLS.append(step)
         return super().__call__(*inputs)
@@ -115,6 +117,31 @@ def test_ctrl_c_ends_a_training_after_its_step_with_a_checkpoint(egg: Template, 
     assert second.step == 3
     second.run(small_data(egg, second.model, length=5))
     assert same(state(second), state(whole))
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["first", "second"])
+def test_ctrl_c_of_one_process_ends_both_after_a_step_with_a_checkpoint(
+    egg: Template, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: bool
+) -> None:
+    def meet(sums: torch.Tensor) -> None:
+        """The second process has the same gradients, and is told to end in the third step."""
+        sums.mul_(2)
+        sums[-1] += len(sums) > 1 and not own and CALLS == [3]
+
+    monkeypatch.setattr("torch.distributed.broadcast", lambda *_: None)
+    monkeypatch.setattr("torch.distributed.all_reduce", meet)
+    path, stopped = tmp_path / "last.safetensors", trainer(egg, replace(CONFIG, steps=5, loss=Interrupting(own=own)))
+    stopped.world, CALLS[:] = 2, [0]
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            stopped.run(small_data(egg, stopped.model, length=10), path)
+        assert CALLS == [3] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    second = trainer(egg, replace(CONFIG, steps=5, loss=Interrupting(own=own)))
+    second.load(path)
+    assert second.step == 3 and same(state(second), state(stopped))
 
 
 def test_other_settings_of_a_checkpoint_are_told_and_kept(egg: Template, tmp_path: Path) -> None:
