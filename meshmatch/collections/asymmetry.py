@@ -77,6 +77,9 @@ def measure_asymmetry(
 ) -> Asymmetry:
     """Compare the shapes of an atlas with their mirror images, or left ones with right ones.
 
+    What lies across from a vertex is the nearest place of the mean's mirror image: what all shapes have in common along the
+    surface is no directional asymmetry. Left and right ones are compared vertex by vertex.
+
     Parameters
     ----------
     atlas
