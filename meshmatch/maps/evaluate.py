@@ -260,10 +260,11 @@ def distortion(
     """Mean change of the distance between two points under a map, in units of sqrt(area).
 
     Compares ``samples`` random source vertices pairwise; both shapes in units of their own sqrt(area). 0 for an
-    isometry; a random map between two bodies has about 0.45. It needs no truth, and sees no left-right flip.
+    isometry; a random map between two bodies has about 0.45. It needs no truth, and sees no left-right flip. Vertices
+    that no face uses are on no surface, and left out.
     """
     index = np.asarray(index)
-    chosen = rng.choice(source.V, size=min(samples, source.V), replace=False)
+    chosen = rng.choice(source.on_surface, size=min(samples, len(source.on_surface)), replace=False)
     images, column = np.unique(index[chosen], return_inverse=True)
     before = np.concatenate([rows[:, chosen] for _, rows in source.chunks(chosen)])
     after = np.concatenate([rows[:, images] for _, rows in target.chunks(images)])[np.ix_(column, column)]
@@ -286,9 +287,11 @@ def dirichlet_energy(found: VertexMap, source: Shape, target: Shape) -> float:
 
 
 def round_trip(found: VertexMap, backward: VertexMap, source: GeodesicDistances) -> float:
-    """How far from itself a vertex of the source arrives by a map and the one back, on average, in units of sqrt(area)."""
-    there_and_back = found.compose(backward).index
-    return float(source.between(np.arange(source.V), there_and_back).mean())
+    """How far from itself a vertex of the source's faces arrives by a map and the one back, on average, in units of
+    sqrt(area).
+    """
+    there_and_back, rows = found.compose(backward).index, source.on_surface
+    return float(source.between(rows, there_and_back[rows]).mean())
 
 
 @dataclass(frozen=True)

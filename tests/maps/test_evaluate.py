@@ -109,3 +109,15 @@ def test_distortion_is_a_mean_over_pairs() -> None:
     distances = geodesics.rows(np.arange(shape.V))
     found = distortion(np.zeros(shape.V, int), geodesics, geodesics, np.random.default_rng(0), samples=shape.V)
     assert found == pytest.approx(distances.sum() / (shape.V * (shape.V - 1)))
+
+
+def test_vertices_on_no_surface_do_not_count() -> None:
+    """Those that no face uses, and those without a position, which the map sends with the vertex that stands for them."""
+    shape = bumpy_sphere(6, 7)
+    strays = np.concatenate([50.0 + np.arange(60).reshape(20, 3), np.zeros((20, 3))])
+    invalid = np.arange(shape.V + 40) >= shape.V + 20
+    scene = Shape(np.concatenate([shape.verts, strays]), shape.faces, invalid=invalid)
+    there = VertexMap.between(scene, shape, np.concatenate([np.arange(shape.V), np.zeros(40, int)]))
+    back = VertexMap.between(shape, scene, np.arange(shape.V))
+    for found in (evaluate_map(there, scene, shape, backward=back), evaluate_map(back, shape, scene, backward=there)):
+        assert (found.distortion, found.bijectivity) == (pytest.approx(0, abs=1e-9), 0)
