@@ -116,9 +116,8 @@ class GeodesicDistances:
         if not self.unit > 0:
             raise InputError(f"{shape.name or 'the shape'} has no surface area")
         # An invalid vertex has a stand-in for a position: a path over it would cut through the body.
-        faces = shape.faces[shape.valid_faces]
-        self.graph = surface_graph(shape.verts, faces)
-        self.on_surface = np.flatnonzero(np.bincount(faces.ravel(), minlength=shape.V))
+        self.graph = surface_graph(shape.verts, shape.faces[shape.valid_faces])
+        self.on_surface = np.flatnonzero(shape.on_surface)
         self._verts = shape.verts
         self._edge = float(np.median(self.graph.data)) if self.graph.nnz else 0.0
 

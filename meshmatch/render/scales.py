@@ -40,7 +40,7 @@ def position_colors(shape: Shape, rotation: Float[Floats, "3 3"] | None = None) 
     ``rotation`` leads into a frame with x to the shape's left, y up and z to its front; by default the file's own axes.
     """
     points = shape.verts if rotation is None else shape.verts @ np.asarray(rotation, dtype=np.float64).T
-    used = points[shape.valid]
+    used = points[shape.on_surface]
     low, high = used.min(axis=0), used.max(axis=0)
     extent = np.where(high > low, high - low, 1.0)
     left, up, front = (2 * np.clip((points - low) / extent, 0.0, 1.0) - 1).T

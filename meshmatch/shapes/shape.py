@@ -185,6 +185,14 @@ class Shape(Pickled):
         return np.asarray(self.valid[self.faces].all(axis=1))
 
     @cached_property
+    def on_surface(self) -> Bool[Bools, " V"]:
+        """True for a vertex of a face whose corners all have a position; where there is no such face, as in a cloud, for one
+        with a position.
+        """
+        used = np.bincount(self.faces[self.valid_faces].ravel(), minlength=self.V) > 0
+        return frozen(used if used.any() else self.valid)
+
+    @cached_property
     def face_vectors(self) -> Floats:
         """(F, 3) normal of each face, twice its area long; 0 where a corner is invalid."""
         vectors = triangle_vectors(self.verts, self.faces)
@@ -256,8 +264,8 @@ class Shape(Pickled):
 
     @cached_property
     def bounds(self) -> Floats:
-        """(2, 3) lowest and highest corner of the box around the valid vertices."""
-        verts = self._valid if len(self._valid) else self.verts
+        """(2, 3) lowest and highest corner of the box around the surface, or the points of a cloud."""
+        verts = self.verts[self.on_surface] if self.on_surface.any() else self.verts
         return frozen(np.stack([verts.min(axis=0), verts.max(axis=0)]))
 
     @property

@@ -401,6 +401,8 @@ def test_position_colors_follow_a_rotation_and_tell_places_apart() -> None:
     assert np.linalg.norm(colors[left] - colors[~left], axis=1).min() > 0.25  # a flip is seen at once
     flat = Shape(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]))
     assert np.isfinite(position_colors(flat)).all()
+    scene = Shape(np.append(shape.verts, [[900, 900, 900]], axis=0), shape.faces)  # a vertex that no face uses
+    assert position_colors(scene)[:-1] == pytest.approx(colors)
 
 
 def test_pictures_of_shapes_apart_have_one_scale() -> None:

@@ -19,6 +19,19 @@ def test_cube_by_hand(cube: Shape) -> None:
     assert (np.einsum("fi,fi->f", unit(cube.face_vectors), centers - 0.5) > 0.4).all()  # outward
 
 
+def test_the_box_is_around_the_surface(cube: Shape) -> None:
+    """And not around vertices that no face uses, or that have no position."""
+    verts, invalid = np.concatenate([cube.verts, [[50, 50, 50], [0, 0, 0]]]), np.arange(10) > 8
+    scene = Shape(verts, cube.faces, invalid=invalid)
+    np.testing.assert_array_equal(scene.on_surface, np.arange(10) < 8)
+    np.testing.assert_array_equal(scene.bounds, cube.bounds)
+    lost = Shape(verts, [[0, 1, 9]], invalid=invalid)  # no face has three places
+    cloud = Shape(verts, np.zeros((0, 3), int), invalid=invalid)
+    for each in (lost, cloud):
+        np.testing.assert_array_equal(each.on_surface, ~invalid)
+        np.testing.assert_array_equal(each.bounds, [[0, 0, 0], [50, 50, 50]])
+
+
 def test_sphere_normals_point_outward(sphere: Shape) -> None:
     np.testing.assert_allclose(np.linalg.norm(sphere.vertex_normals, axis=1), 1.0)
     assert np.einsum("vi,vi->v", sphere.vertex_normals, sphere.verts).min() > 0.999
