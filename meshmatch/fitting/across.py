@@ -65,7 +65,7 @@ def match_across(
 
 def image_in(plane: MirrorPlane, shape: Shape) -> Shape:
     """The mirror image of a shape, facing out."""
-    return replace(shape, verts=plane.reflect(shape.verts_or_nan), faces=shape.faces[:, ::-1])
+    return replace(shape, verts=plane.reflect(shape.verts), faces=shape.faces[:, ::-1])
 
 
 def _in_file(plane: MirrorPlane, frame: Frame) -> MirrorPlane:

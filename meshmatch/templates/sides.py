@@ -33,7 +33,7 @@ _CONSISTENT = 0.9  # share of the evidence that agrees with the sides: posed ani
 
 def mirrored(shape: Shape) -> Shape:
     """The mirror image of a shape in the plane x = 0, facing out."""
-    return replace(shape, verts=shape.verts_or_nan * _MIRROR, faces=shape.faces[:, ::-1])
+    return replace(shape, verts=shape.verts * _MIRROR, faces=shape.faces[:, ::-1])
 
 
 def other_side(shapes: Sequence[Repaired], scale: Scale, seed: int, progress: Progress) -> Bool[Bools, " N"]:
