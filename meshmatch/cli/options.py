@@ -130,13 +130,16 @@ def load_truth(
     shapes: tuple[meshmatch.Shape, meshmatch.Shape],
     files: tuple[Path, Path] | None = None,
 ) -> tuple[Ints, Ints] | None:
-    """True points on source and target, where they are known; the shapes' files may say the frame of landmarks."""
+    """True points on source and target, where they are known and have a position; the shapes' files may say the frame of
+    landmarks.
+    """
     import numpy as np
 
+    from meshmatch.maps.evaluate import placed_pairs
     from meshmatch.shapes import vertex_lists
 
     if points is not None:
-        return _load_points(points, shapes, files)
+        return placed_pairs(*_load_points(points, shapes, files), *shapes)
     if truth is None:
         return None
     rows, source = vertex_lists.load_truth(truth), shapes[0]
@@ -148,7 +151,7 @@ def load_truth(
     known = rows[(rows >= 0).all(axis=1)]
     if len(known) < len(rows):
         warn(f"{truth.name}: {len(rows) - len(known)} of {len(rows)} vertices have no counterpart: left out")
-    return known[:, 0], known[:, 1]
+    return placed_pairs(known[:, 0], known[:, 1], *shapes)
 
 
 def _load_points(

@@ -302,6 +302,8 @@ def landmark_places(clean: Sequence[Repaired], landmarks: Sequence[ArrayLike]) -
                 f"landmark vertex {chosen.max()} is not on {part.shape.name}, which has {V} vertices",
                 "numbers start at 0; the source comes first",
             )
+        if (lost := chosen[~part.original.valid[chosen]]).size:
+            raise OptionError(f"landmark vertex {lost[0]} of {part.shape.name} has no position", "leave its pair out")
         places.append(part.shape.verts[part.original_to_repaired[chosen]])
     if len(places[0]) != len(places[1]):
         raise OptionError("landmarks must come in pairs", _HINT)

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from meshmatch.arrays import Brief, Float, Floats, Floats32, Pickled, as_array, as_numbers, frozen, table_html
 from meshmatch.errors import InputError, warn
@@ -245,6 +245,23 @@ def map_errors(
     return Errors(geodesics.between(index[a], b, progress).astype(np.float32))
 
 
+def placed_pairs(
+    source_points: ArrayLike, target_points: ArrayLike, source: Shape, target: Shape
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """The known points of which both vertices have a position; warns of others. What `map_errors` refuses stays."""
+    a, b = (as_array(ids, "the truth", _TRUTH) for ids in (source_points, target_points))
+    known = (source.invalid is not None or target.invalid is not None) and a.shape == b.shape and a.ndim == 1
+    if not known or not all(ids.dtype.kind in "iu" for ids in (a, b)):
+        return a, b
+    lost = np.zeros(len(a), bool)
+    for ids, shape in ((a, source), (b, target)):
+        there = (ids >= 0) & (ids < shape.V)
+        lost[there] |= ~shape.valid[ids[there]]
+    if lost.any():
+        warn(f"{np.count_nonzero(lost)} of {len(lost)} known points have a vertex without a position: left out")
+    return a[~lost], b[~lost]
+
+
 def coverage(index: ArrayLike, target: Shape) -> Coverage:
     """Share of the target's vertices, and of its area, that ``index`` ``(V_source,)`` hits."""
     hit = np.zeros(target.V, dtype=bool)
@@ -422,8 +439,8 @@ def evaluate_map(
     report = Progress(progress, target.name).stage("measuring errors")
     if target_points is not None:
         source_points = np.arange(source.V) if source_points is None else source_points
-        over = GeodesicDistances(target)
-        errors = map_errors(vertex_map.index, source_points, target_points, over, report)
+        over, pairs = GeodesicDistances(target), placed_pairs(source_points, target_points, source, target)
+        errors = map_errors(vertex_map.index, *pairs, over, report)
     if not source.is_cloud and not target.is_cloud:
         both = GeodesicDistances(source), over or GeodesicDistances(target)
         stretched = distortion(vertex_map.index, *both, rng or np.random.default_rng(0))

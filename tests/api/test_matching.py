@@ -223,6 +223,13 @@ def test_landmarks_are_checked_before_the_shapes_are_fitted(
         matcher.match(sphere, sphere, landmarks=landmarks)
 
 
+def test_a_landmark_needs_a_position(matcher: Matcher, sphere: Shape, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Matcher, "_fit_all", lambda *_: pytest.fail("fitted"))
+    torn = Shape(sphere.verts, sphere.faces, invalid=np.arange(sphere.V) == 7)
+    with pytest.raises(OptionError, match="has no position"):
+        matcher.match(torn, sphere, landmarks=([3, 7], [3, 7]))
+
+
 @pytest.mark.parametrize(
     "wrong",
     [{"up": "w"}, {"front": ""}, {"up": 3}, {"up": "y", "front": "-y"}, {"seed": -1}, {"seed": 1.5}, {"samples": 0}],

@@ -1,5 +1,7 @@
 """Errors, coverage and distortion by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -121,3 +123,16 @@ def test_vertices_on_no_surface_do_not_count() -> None:
     back = VertexMap.between(shape, scene, np.arange(shape.V))
     for found in (evaluate_map(there, scene, shape, backward=back), evaluate_map(back, shape, scene, backward=there)):
         assert (found.distortion, found.bijectivity) == (pytest.approx(0, abs=1e-9), 0)
+
+
+def test_known_points_without_a_position_do_not_count() -> None:
+    shape = bumpy_sphere(6, 7)
+    torn = Shape(shape.verts, shape.faces, invalid=np.arange(shape.V) < 4)
+    there, truth = VertexMap.between(shape, torn, np.arange(shape.V)), np.arange(shape.V)
+    for one, other, n in ((shape, torn, 4), (torn, shape, 4), (torn, torn, 7)):
+        found = replace(there, source_hash="", target_hash="")
+        with pytest.warns(MeshmatchWarning, match=f"{n} of {shape.V} known points have a vertex without a position"):
+            measured = evaluate_map(found, one, other, np.roll(truth, 3) if n == 7 else None, truth)
+        assert measured.errors is not None and measured.errors.values.size == shape.V - n
+    with pytest.raises(InputError, match="has 37"), pytest.warns(MeshmatchWarning):
+        evaluate_map(found, torn, torn, target_points=truth + 1)
