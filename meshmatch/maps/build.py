@@ -45,6 +45,7 @@ def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
         doubt += np.square(source.moved - target.moved[found.vertex]).sum(1) / _AGREEMENT_SCALE**2
     confidence = _confidence(doubt, source.trust * target.trust)
     verdict = max(source.verdict, target.verdict, key=VERDICTS.index)
+    sides = {"source": source, "target": target}
     return VertexMap(
         source.name,
         target.name,
@@ -53,7 +54,7 @@ def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
         barycentric=found.barycentric,
         confidence=confidence.astype(np.float32),
         verdict=verdict,
-        reasons=tuple(f"{side.name}: {reason}" for side in (source, target) for reason in side.reasons),
+        reasons=tuple(f"{side.name or what}: {reason}" for what, side in sides.items() for reason in side.reasons),
         source_vertices=len(source.resting),
         target_vertices=len(target.resting),
         source_hash=source.hash,

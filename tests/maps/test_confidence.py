@@ -132,6 +132,14 @@ def test_what_was_left_out_is_as_far_away_as_it_lies() -> None:
     assert np.allclose(places.distance[part.kept_vertex], 0, atol=1e-6)
 
 
+def test_reasons_say_which_shape_they_are_of() -> None:
+    """By its name, or without one by its side."""
+    places = Places.of(repair(unit_ball()), lying_on(unit_ball()))
+    here, there = (replace(places, name=name, verdict="fair", reasons=("cut",)) for name in ("ball", ""))
+    assert build_map(here, there).reasons == ("ball: cut", "target: cut")
+    assert build_map(there, here).reasons == ("source: cut", "ball: cut")
+
+
 def test_what_has_no_position_is_a_guess() -> None:
     """It has the answer of a neighbour, and may be anywhere."""
     unit = unit_ball()
