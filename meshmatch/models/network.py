@@ -17,6 +17,7 @@ _MAX = {
     "code": 4096, "width": 8192, "depth": 64, "basis": 8192,
     "align_basis": 8192, "align_width": 8192, "corrections": 64, "correct_width": 8192,
 }  # fmt: skip
+_NEEDED = ("code", "width")  # nothing could pass through none
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,9 @@ class NetworkConfig:
             raise ModelError(f"unknown field {self.field!r}, only {', '.join(FIELDS)}", "update meshmatch")
         for name, limit in _MAX.items():
             value = getattr(self, name)
-            if type(value) is not int or not 0 <= value <= limit:
-                raise ModelError(f"network option {name} must be an integer from 0 to {limit}, not {value!r}")
+            least = 1 if name in _NEEDED else 0
+            if type(value) is not int or not least <= value <= limit:
+                raise ModelError(f"network option {name} must be an integer from {least} to {limit}, not {value!r}")
 
     @property
     def in_torch(self) -> bool:

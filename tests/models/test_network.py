@@ -348,6 +348,9 @@ def test_configs_survive_their_card_and_unknown_options_do_not() -> None:
     with pytest.raises(ModelError, match="unknown network options: wings") as caught:
         NetworkConfig.from_dict(NETWORK.to_dict() | {"wings": 2})
     assert "update" in caught.value.hint
+    for name in ("code", "width"):  # through which nothing would pass
+        with pytest.raises(ModelError, match=f"{name} must be an integer from 1 to"):
+            NetworkConfig.from_dict(NETWORK.to_dict() | {name: 0})
 
 
 # the model that ships
