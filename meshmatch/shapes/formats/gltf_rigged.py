@@ -115,7 +115,9 @@ def rigged(document: Document, binding: Binding, apart: Container[int] = ()) -> 
     gone, clips = _drop_skins(editor, before)
     _lift(editor, document, {number for number in drawn(document) if number not in apart})
     arrays: dict[bytes, int] = {}
-    theirs = editor.json.get("animations", []).copy()
+    theirs: dict[str, list[dict[str, Any]]] = {}
+    for animation in reversed(editor.json.get("animations", [])):
+        theirs.setdefault(str(animation.get("name")), []).append(animation)
     for clip in rig.clips:
         _add_clip(editor, clip, names, arrays, theirs)
     if gone:
@@ -147,23 +149,28 @@ def figures_apart(document: Document, hit: Ints) -> dict[int, str]:
     root: dict[int, int] = {}
     for node in document.roots():
         root |= dict.fromkeys(_below(document, node), node)
-    hits, joints, seen = np.bincount(hit), {}, 0
-    fitted: set[int] = set()  # joints
+    hits, seen = np.bincount(hit), 0
+    skin_of: dict[int, int] = {}
+    fitted: set[int] = set()  # skins
     taken: set[int] = set()  # roots
     for number, parts in drawn(document).items():
         rows = slice(seen, seen := seen + _count(document, parts))
         skin = document.nodes[number].get("skin")
-        joints[number] = set() if skin is None else {int(joint) for joint in document.json["skins"][skin]["joints"]}
+        if skin is not None:
+            skin_of[number] = skin
         if hits[rows].any():
-            fitted |= joints[number]
-            taken |= {root[node] for node in joints[number] | {number}}
-    names = {document.nodes[joint].get("name") for joint in fitted}
+            fitted |= set() if skin is None else {skin}
+            taken.add(root[number])
+    joints = [{int(joint) for joint in skin["joints"]} for skin in document.json.get("skins", [])]
+    names = {document.nodes[joint].get("name") for skin in fitted for joint in joints[skin]}
+    taken |= {root.get(joint, joint) for skin in fitted for joint in joints[skin]}
 
     def is_apart(own: set[int]) -> bool:
         copied = sum(document.nodes[joint].get("name") in names for joint in own)
-        return taken.isdisjoint(root[joint] for joint in own) and 2 * copied <= len(own)
+        return taken.isdisjoint(root.get(joint, joint) for joint in own) and 2 * copied <= len(own)
 
-    found = [number for number, own in joints.items() if fitted and own and is_apart(own)]
+    apart = {skin for skin in set(skin_of.values()) if fitted and joints[skin] and is_apart(joints[skin])}
+    found = [number for number, skin in skin_of.items() if skin in apart]
     return {number: plain_text(str(document.nodes[number].get("name") or f"node {number}")) for number in found}
 
 
@@ -177,18 +184,24 @@ class _OldSkin:
     def __init__(self, document: Document) -> None:
         self.joints = {int(joint) for skin in document.json.get("skins", []) for joint in skin["joints"]}
         parts = [(number, part) for number, own in drawn(document).items() for part in own.values()]
-        self._moved_by = np.concatenate([np.zeros(0, np.int64), *(_movers(document, *each) for each in parts)])
+        moved_by = np.concatenate([np.zeros(0, np.int64), *(_movers(document, *each) for each in parts)])
+        self._order = np.argsort(moved_by, kind="stable")
+        self._sorted = moved_by[self._order]
+        moving = set(np.unique(moved_by).tolist())
         self.above: dict[int, int] = {}
+        self._mover: dict[int, int] = {}  # of each joint: itself, or the next above it that moves something
         for node in document.world:  # parents before children
             joint = node if node in self.joints else self.above.get(node)
-            if joint is not None:
-                self.above |= {int(child): joint for child in document.nodes[node].get("children", [])}
+            if joint is None:
+                continue
+            if joint == node:
+                self._mover[node] = node if node in moving else self._mover.get(self.above.get(node, node), node)
+            self.above |= {int(child): joint for child in document.nodes[node].get("children", [])}
 
     def around(self, joint: int) -> Ints:
         """The vertices that a joint moves most; of one that moves none, those of the next above it."""
-        while not (self._moved_by == joint).any() and joint in self.above:
-            joint = self.above[joint]
-        return np.flatnonzero(self._moved_by == joint)
+        low, high = np.searchsorted(self._sorted, self._mover.get(joint, joint) + np.array([0, 1]))
+        return self._order[low:high]
 
 
 def _movers(document: Document, number: int, part: dict[str, Any]) -> Ints:
@@ -320,9 +333,8 @@ def _lift(editor: Editor, document: Document, skinned: set[int]) -> None:
             trees.setdefault(root[number], []).append(number)
     new = {number for number in skinned if "skin" not in document.nodes[number]}
     turned = new | {number for number in skinned if np.linalg.det(document.world[number][:3, :3]) < 0}
-    trees = {
-        top: some for top, some in trees.items() if not turned.isdisjoint(some)
-    }  # others lay there with their skins
+    # others lay there with their skins
+    trees = {top: some for top, some in trees.items() if not turned.isdisjoint(some)}
     lifted = {number for some in trees.values() for number in some}
     whole: set[int] = set()
     for number in reversed(document.world):  # children before parents
@@ -367,26 +379,36 @@ def _hang_over(editor: Editor, document: Document, gone: set[int], binding: Bind
     moved = {
         channel["target"].get("node") for clip in editor.json.get("animations", []) for channel in clip["channels"]
     }
+    holding = set(skin.joints)  # nodes that are joints, or have some below them
+    for node in reversed(document.world):  # children before parents
+        if not holding.isdisjoint(document.nodes[node].get("children", [])):
+            holding.add(node)
     for joint in sorted(gone):
         rows, children = skin.around(joint), document.nodes[joint].get("children", [])
+        hung = []
         for child in children if len(rows) else ():
+            # meshes hang from nothing, clips and joints need what is above them
+            if child in holding or child in moved or "skin" in nodes[child] or child not in document.world:
+                continue
             tree = _below(document, child)
             plain = len(tree) == 1 and not nodes[child].keys() & {"camera", "extensions", "extras"}
-            if plain and (len(children) == 1 or nodes[child].get("name") in binding.rig.names):
-                continue
-            if "skin" in nodes[child] or child in moved or not tree.isdisjoint(skin.joints):
-                continue  # meshes hang from nothing, clips and joints need what is above them
-            votes = np.bincount(binding.joints[rows].ravel(), binding.weights[rows].ravel())
-            new = int(binding.rig.joints[votes.argmax()])
+            if not (plain and (len(children) == 1 or nodes[child].get("name") in binding.rig.names)):
+                hung.append(child)
+                found |= tree
+        if not hung:
+            continue
+        votes = np.bincount(binding.joints[rows].ravel(), binding.weights[rows].ravel())
+        new = int(binding.rig.joints[votes.argmax()])
+        for child in hung:
             place = np.linalg.inv(binding.bind[new]) @ document.world[child]
             for key in ("translation", "rotation", "scale", "matrix"):
                 nodes[child].pop(key, None)
             nodes[child]["matrix"] = place.T.ravel().tolist()
-            nodes[joint]["children"].remove(child)
-            if not nodes[joint]["children"]:
-                del nodes[joint]["children"]
-            nodes[names[new]].setdefault("children", []).append(child)
-            found |= tree
+        left = set(nodes[joint]["children"]).difference(hung)
+        nodes[joint]["children"] = [child for child in nodes[joint]["children"] if child in left]
+        if not left:
+            del nodes[joint]["children"]
+        nodes[names[new]].setdefault("children", []).extend(hung)
     return found
 
 
@@ -415,13 +437,12 @@ def _tell_left(document: Document, joints: set[int], hang: set[int]) -> None:
 
 
 def _add_clip(
-    editor: Editor, clip: Clip, names: list[int], arrays: dict[bytes, int], theirs: list[dict[str, Any]]
+    editor: Editor, clip: Clip, names: list[int], arrays: dict[bytes, int], theirs: dict[str, list[dict[str, Any]]]
 ) -> None:
     """Add an animation; ``arrays`` are accessors of those that were added before, for many share their times. One of its
     name among ``theirs``, which the scene had and which may move a lamp, takes it in; each does so once.
     """
-    of_name = [k for k, each in enumerate(theirs) if each.get("name") == clip.name]
-    joined = theirs.pop(of_name[0]) if of_name else None
+    joined = theirs[clip.name].pop() if theirs.get(clip.name) else None
     entry: dict[str, Any] = joined or {"name": clip.name, "samplers": [], "channels": []}
 
     def once(values: Floats, bounds: bool) -> int:
