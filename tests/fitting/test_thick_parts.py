@@ -1,6 +1,7 @@
 """A part thicker than any of an ordinary body is read as if it were smaller."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -110,3 +111,20 @@ def test_ordinary_bodies_and_clouds_are_not_asked(human: TrainedModel, monkeypat
     for shape in (body, Shape(cartoon(human).verts, np.zeros((0, 3), np.int64))):
         task = FitTask.of(human, FitConfig(), shape)
         assert with_thick_part_smaller(Registration(task, Candidate(RigidPose.identity(), still(human), 0.05))) is None
+
+
+def test_the_smaller_shape_keeps_landmarks_and_side(human: TrainedModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    shape = cartoon(human)
+    task = FitTask.of(human, FitConfig(), shape, (np.array([7]), shape.verts[[7]]), mirrored=True)
+    asked: list[tuple[Shape, np.ndarray, bool]] = []
+
+    def of(model: TrainedModel, config: FitConfig, other: Shape, landmarks: Any, mirrored: bool) -> FitTask:
+        asked.append((other, landmarks[1], mirrored))
+        raise InterruptedError
+
+    monkeypatch.setattr(FitTask, "of", of)
+    with pytest.raises(InterruptedError):
+        thick_parts._read_through(task, Contraction(np.zeros(3), 0.3, 0.5))
+    ((other, places, mirrored),) = asked
+    assert mirrored is task.frame.mirrored
+    assert np.allclose(places, other.verts[[7]]) and not np.allclose(places, shape.verts[[7]])

@@ -129,17 +129,22 @@ def rigged(document: Document, binding: Binding, apart: Container[int] = ()) -> 
 
 
 def hanging_groups(document: Document) -> list[tuple[Ints, Ints]]:
-    """Vertices, in the order of the scene, of each node that hangs from a joint and is not bent by a skin, which are to stay
-    rigid; and those to go with: what the joint, or else the next above it, moves most.
+    """Vertices, in the order of the scene, of nodes that hang from a joint and are not bent by a skin, which are to stay
+    rigid; and those to go with: what the joint, or else the next above it, moves most. Nodes that go with the same are one.
     """
-    skin, found, seen = _OldSkin(document), [], 0
+    skin, alone, seen = _OldSkin(document), [], 0
+    beside: dict[int, list[Ints]] = {}
     for number, parts in drawn(document).items():
         V = _count(document, parts)
         joint = number if number in skin.joints else skin.above.get(number)
         if joint is not None and "skin" not in document.nodes[number]:
-            found.append((np.arange(seen, seen + V), skin.around(joint)))
+            own, mover = np.arange(seen, seen + V), skin.mover(joint)
+            if len(skin.around(mover)):
+                beside.setdefault(mover, []).append(own)
+            else:
+                alone.append((own, skin.around(mover)))
         seen += V
-    return found
+    return [*alone, *((np.concatenate(groups), skin.around(mover)) for mover, groups in beside.items())]
 
 
 def figures_apart(document: Document, hit: Ints) -> dict[int, str]:
@@ -198,9 +203,13 @@ class _OldSkin:
                 self._mover[node] = node if node in moving else self._mover.get(self.above.get(node, node), node)
             self.above |= {int(child): joint for child in document.nodes[node].get("children", [])}
 
+    def mover(self, joint: int) -> int:
+        """A joint; of one that moves nothing, the next above it that moves something, if there is one."""
+        return self._mover.get(joint, joint)
+
     def around(self, joint: int) -> Ints:
-        """The vertices that a joint moves most; of one that moves none, those of the next above it."""
-        low, high = np.searchsorted(self._sorted, self._mover.get(joint, joint) + np.array([0, 1]))
+        """The vertices that a joint, or the one that moves in its place, moves most."""
+        low, high = np.searchsorted(self._sorted, self.mover(joint) + np.array([0, 1]))
         return self._order[low:high]
 
 
