@@ -8,8 +8,9 @@ which command it ran, and its tables. A page asks for a table between two commen
     <!-- results NAME 1: set, mean, median -->
     <!-- end -->
 
-the number of the table in the file, from 1, and which columns (all of them where none is named). A page begins the table
-of all sets (`SUMMARY`) with ``<!-- summary -->``. Whatever stands between the comments is replaced.
+the number of the table in the file, from 1, and which columns (all of them where none is named). Below its first table of a
+file a page says when and how that was made. A page begins the table of all sets (`SUMMARY`) with ``<!-- summary -->``.
+Whatever stands between the comments is replaced.
 
 A file that the commands of today cannot make again says in ``last_commit`` which commit was the last that could.
 """
@@ -94,8 +95,8 @@ def markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], "|---" * len(columns) + "|", *lines[1:], ""])
 
 
-def table_of(words: str, docs: Path) -> str:
-    """The table that a comment asks for, and when, on which commit and machine it was made."""
+def table_of(words: str, docs: Path, above: bool = False) -> str:
+    """The table that a comment asks for, and when, on which commit and machine it was made, unless that stands ``above``."""
     head, _, names = words.partition(":")
     name, number = head.split()
     found = results_file(name, docs)
@@ -103,9 +104,13 @@ def table_of(words: str, docs: Path) -> str:
     wanted = [each.strip() for each in names.split(",") if each.strip()] or table["columns"]
     places = [table["columns"].index(each) for each in wanted]
     rows = [[row[place] for place in places] for row in table["rows"]]
-    told = f"[{name}.json](results/{name}.json): {found['date']}, commit {found['commit']}, {found['machine']}"
-    if last := found.get("last_commit"):
-        told += f"; to repeat it, check out {last}"
+    told = f"[{name}.json](results/{name}.json)"
+    if above:
+        told += ", as above"
+    else:
+        told += f": {found['date']}, commit {found['commit']}, {found['machine']}"
+        if last := found.get("last_commit"):
+            told += f"; to repeat it, check out {last}"
     return f"\n{markdown(wanted, rows)}\n{told}.\n\n"
 
 
@@ -122,9 +127,14 @@ def summary(docs: Path) -> str:
 
 def refreshed(text: str, docs: Path) -> str:
     """A page with its tables as the files have them now."""
+    files: set[str] = set()
 
     def block(match: re.Match[str]) -> str:
-        made = summary(docs) if match[2] == "summary" else table_of(match[3].strip(), docs)
+        if match[2] == "summary":
+            return f"{match[1]}{summary(docs)}{match[5]}"
+        name = match[3].split()[0]
+        made = table_of(match[3].strip(), docs, above=name in files)
+        files.add(name)
         return f"{match[1]}{made}{match[5]}"
 
     return _BLOCK.sub(block, text)

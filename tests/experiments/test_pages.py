@@ -77,6 +77,9 @@ def test_a_page_that_differs_from_its_files_is_told_and_then_made(tmp_path: Path
     text = (tmp_path / pages.PAGES[0]).read_text()
     assert "| b |\n|---|\n| 2 |\n" in text and "old" not in text and text.endswith("after\n")
     assert pages.main(["--check", "--docs", str(tmp_path)]) == 0
+    twice = "<!-- results few 1: a -->\n<!-- end -->\n<!-- results few 1: b -->\n<!-- end -->\n"
+    first, second = pages.refreshed(twice, tmp_path).split("<!-- end -->\n")[:2]
+    assert "d, commit c, m." in first and second.endswith("(results/few.json), as above.\n\n") and "| 2 |" in second
     (tmp_path / "results" / "few.json").write_text("{}")
     with pytest.raises(InputError, match="few"):
         pages.results_file("few", tmp_path)
