@@ -25,8 +25,8 @@ class PrepareOptions:
     align: Literal["none", "near", "rigid"] | None = Option(
         None,
         help="How shapes are aligned with the template, now and whenever the model is used: not at all, by a small "
-        "rotation, or from any orientation. Default: near for registered shapes that share an orientation, "
-        "otherwise rigid.",
+        "rotation, or from any orientation. Default: near for registered shapes that share an orientation, none for a "
+        "hundred registered ones or more, otherwise rigid.",
     )
     scale: Literal["area", "sphere"] = Option(
         "area", help="What is scaled to the template's: surface area, or the radius around the centroid."
