@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from meshmatch.api.matcher import Matcher as Matcher
     from meshmatch.api.matching import match as match
     from meshmatch.api.matching import register as register
+    from meshmatch.api.measure import measure as measure
     from meshmatch.api.pictures import picture as picture
     from meshmatch.api.pictures import view as view
     from meshmatch.api.prepare import prepare as prepare
@@ -81,6 +82,8 @@ if TYPE_CHECKING:
     from meshmatch.training.recipes import recipe_for as recipe_for
     from meshmatch.training.train import train as train
     from meshmatch.transfer.bake import BakeOptions as BakeOptions
+    from meshmatch.transfer.measurements import Measurement as Measurement
+    from meshmatch.transfer.measurements import Measurements as Measurements
 
 _NAMES = {
     "api.blend_shapes": "BlendShapesResult transfer_shapes",
@@ -90,6 +93,7 @@ _NAMES = {
     "api.interpolation": "Interpolation InterpolationOptions interpolate",
     "api.matcher": "Matcher",
     "api.matching": "match register",
+    "api.measure": "measure",
     "api.pictures": "picture view",
     "api.prepare": "prepare",
     "api.results": "ConfidenceRule MapPair MatchResult Transferred evaluate measure_distance",
@@ -123,6 +127,7 @@ _NAMES = {
     "training.recipes": "Recipe recipe_for",
     "training.train": "train",
     "transfer.bake": "BakeOptions",
+    "transfer.measurements": "Measurement Measurements",
 }
 _HOMES = {name: f"meshmatch.{module}" for module, names in _NAMES.items() for name in names.split()}
 

@@ -446,7 +446,7 @@ def transfer_landmarks(
     """
     space = mesh_space(source) if isinstance(source, str | Path) else ""
     source = as_shape(source, "source")
-    given = _landmarks(landmarks, source, space)
+    given = given_landmarks(landmarks, source, space)
     maps = find_maps(source, target, match)
     with thread_limit(1):
         found = push_landmarks(maps.forward, maps.source, maps.target, given)
@@ -462,7 +462,7 @@ def _write_landmarks(landmarks: Landmarks, target: Shape, file: Path | None, pat
     save_landmarks(path, landmarks, space or "LPS", final.name, stem_of(file or Path(target.name)))
 
 
-def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape, space: Space) -> Landmarks:
+def given_landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape, space: Space) -> Landmarks:
     if isinstance(landmarks, Landmarks):
         return landmarks
     if isinstance(landmarks, str | Path):

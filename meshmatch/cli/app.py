@@ -15,6 +15,7 @@ from meshmatch.cli.export import export
 from meshmatch.cli.info import info
 from meshmatch.cli.interpolate import interpolate
 from meshmatch.cli.match import evaluate, match, register
+from meshmatch.cli.measure import measure
 from meshmatch.cli.models import models
 from meshmatch.cli.picture import picture, view
 from meshmatch.cli.prepare import prepare
@@ -73,7 +74,7 @@ def root(
 for verb in (
     *(match, register, wrap, evaluate),
     *(transfer_texture, transfer_color, transfer_labels, transfer_weights),
-    *(transfer_rig, transfer_shapes, transfer_landmarks, transfer_garment),
+    *(transfer_rig, transfer_shapes, transfer_landmarks, transfer_garment, measure),
     *(fit, map, export, atlas, symmetry),
     *(interpolate, picture, view, info, prepare, train, blender_addon),
 ):

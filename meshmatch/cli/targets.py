@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
 
 from typer import Argument, Option
 
@@ -22,24 +22,30 @@ if TYPE_CHECKING:
     from meshmatch.collections.transfer_table import TransferRecord
 
 Verb = Callable[..., Json]
-Gather = Callable[[Path, Mapping[str, Any], str, Mapping[str, Path]], str]
-"""Writes one table of all, from its path, the verb's arguments, the source's name and the outputs by name; what to say."""
+
+
+class Gather(NamedTuple):
+    """How one table of all targets is written."""
+
+    check: Callable[[Path], object]
+    """Refuses a path that cannot be such a table (`OptionError`)."""
+    write: Callable[[Path, Mapping[str, Any], str, Mapping[str, Path]], str]
+    """From its path, the verb's arguments, the source's name and the outputs by name; says what was written."""
+
+
 _ROW = "{:<28} {:<8} {:>10} {:>8}"
 _NAMED = 5  # targets that the last line lists
-_Targets = Annotated[
-    list[Path],
-    Argument(
-        metavar="TGT",
-        help="Shape to transfer to. Or several: files, patterns in quotes, a folder of shapes, or a folder of fits, whose "
-        "maps are used; the output is a folder then.",
-    ),
-]
+_SEVERAL = (
+    "Or several: files, patterns in quotes, a folder of shapes, or a folder of fits, whose maps are used; the output is a "
+    "folder then."
+)
 
 
 def to_targets(transfer: str, gather: Gather | None = None) -> Callable[[Verb], Callable[..., None]]:
     """Let a verb of one target, which returns its record for --json, take several.
 
-    ``transfer`` is the function of `meshmatch` that it calls; ``gather`` writes what its option ``table`` asks for.
+    ``transfer`` is the function of `meshmatch` that it calls; ``gather`` is how the table is written that its option
+    ``table`` names.
     """
 
     def wrapped(verb: Verb) -> Callable[..., None]:
@@ -61,11 +67,13 @@ def to_targets(transfer: str, gather: Gather | None = None) -> Callable[[Verb], 
         words = f"With several targets, the suffix of each output. Default: {usual}."
         format_ = Option(None, "--format", metavar="SUFFIX", help=words)
         parameters = dict(inspect.signature(verb).parameters)
-        parameters["target"] = parameters["target"].replace(annotation=_Targets)
+        hints = get_type_hints(verb, include_extras=True)
+        one = hints["target"].__metadata__[0]
+        targets = Annotated[list[Path], Argument(metavar=one.metavar, help=f"{one.help} {_SEVERAL}")]
+        parameters["target"] = parameters["target"].replace(annotation=targets)
         parameters["ending"] = inspect.Parameter("ending", inspect.Parameter.KEYWORD_ONLY, default=format_)
         called.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
-        hints = get_type_hints(verb, include_extras=True)
-        called.__annotations__ = hints | {"target": _Targets, "ending": str | None, "return": None}
+        called.__annotations__ = hints | {"target": targets, "ending": str | None, "return": None}
         return called
 
     return wrapped
@@ -95,6 +103,8 @@ def _transfer_all(
         maps = _changed(maps, map=found.fits)
     if table is not None:
         rest["table"] = None
+        if gather is not None:
+            gather.check(table)
         _check_table(table, found.source, found.files, rest)
     if rest.get("values") is not None:
         transfer = "transfer_values"
@@ -133,7 +143,7 @@ def _transfer_all(
     rows = transfer_each(found.files, output, endings, (verb.__name__, how, run.strict), made, tell, drawn)
     written = {row.name: Path(row.output) for row in rows if row.verdict != FAILED}
     if gather is not None and table is not None and written:
-        console.say(gather(table, rest, found.source, written))
+        console.say(gather.write(table, rest, found.source, written))
     told = [{"name": row.name, "file": row.file} | records.get(row.name, _record(row)) for row in rows]
     _tell(console, output, rows, told, run.json)
 
@@ -166,13 +176,10 @@ def _tell(console: Console, output: Path, rows: Sequence[TransferRecord], record
 
 def _check_table(table: Path, source: str, files: Mapping[str, Path], rest: Mapping[str, Any]) -> None:
     """Refuse a table of all that could not be written afterwards (`OptionError`, `OutputError`)."""
-    from meshmatch.transfer.landmarks import check_table_suffix
-
-    check_table_suffix(table)
     if source in files:
         problem = f"the source and a target are both called {source}"
         raise OptionError(problem, "rename one: a table has specimens by name")
-    check_outputs([*files.values(), rest["source"], rest["landmarks"]], table)
+    check_outputs([*files.values(), rest["source"], rest["landmarks"], rest.get("measurements")], table)
     check_writable(table)
 
 

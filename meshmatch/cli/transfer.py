@@ -8,7 +8,7 @@ from typer import Option
 
 import meshmatch
 from meshmatch.cli.options import RuleOptions, RunOptions, grouped, optional, output_option
-from meshmatch.cli.targets import to_targets
+from meshmatch.cli.targets import Gather, to_targets
 from meshmatch.cli.transfer_options import MapOptions, MapOptionsWithPairs, Picture, Source, Target, Transfer
 from meshmatch.cli.words import Json
 from meshmatch.errors import InputError, OptionError, warn
@@ -195,6 +195,12 @@ def transfer_weights(
     return transfer.record(counts | low, result.maps, float(result.confidence.mean()))
 
 
+def _check_landmark_table(table: Path) -> None:
+    from meshmatch.transfer.landmarks import check_table_suffix
+
+    check_table_suffix(table)
+
+
 def _landmark_table(table: Path, given: Mapping[str, Any], source: str, written: Mapping[str, Path]) -> str:
     """Write the landmarks of SRC and all targets as one table."""
     import numpy as np
@@ -220,7 +226,7 @@ def _landmark_table(table: Path, given: Mapping[str, Any], source: str, written:
 
 
 @grouped
-@to_targets("transfer_landmarks", gather=_landmark_table)
+@to_targets("transfer_landmarks", Gather(_check_landmark_table, _landmark_table))
 def transfer_landmarks(
     *,
     source: Source,

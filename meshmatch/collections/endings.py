@@ -27,6 +27,7 @@ USUAL = {
     "transfer_labels": Ending(".npy"),
     "transfer_weights": Ending(".npz"),
     "transfer_landmarks": Ending(".csv"),
+    "measure": Ending(".csv"),
     "transfer_rig": Ending(".glb"),
     "transfer_shapes": Ending(".glb", (".vrm",)),
     "transfer_texture": Ending(".glb", (".obj", ".vrm")),
@@ -59,7 +60,7 @@ def ending_of(
 def _check(transfer: str, name: str) -> None:
     from meshmatch.api import blend_shapes, rig
     from meshmatch.shapes import files, tables, textured_files
-    from meshmatch.transfer import label_files, landmarks, value_files, weight_files
+    from meshmatch.transfer import label_files, landmarks, measurements, value_files, weight_files
 
     if Path(name).name != name:
         raise OptionError(f"{name}: --format is a suffix", "such as .glb")
@@ -69,6 +70,7 @@ def _check(transfer: str, name: str) -> None:
         "transfer_labels": label_files.check_labels_suffix,
         "transfer_weights": weight_files.check_weights_suffix,
         "transfer_landmarks": landmarks.check_landmarks_suffix,
+        "measure": measurements.check_measurements_suffix,
         "transfer_rig": rig.check_rig_suffix,
         "transfer_shapes": blend_shapes.check_suffix,
         "transfer_texture": textured_files.check_textured,

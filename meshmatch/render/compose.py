@@ -33,6 +33,7 @@ from meshmatch.transfer.label_files import Labels
 _MATCHED = 0.05
 # Known points closer than this (units of sqrt(area)) are interpolated over the surface between them.
 _CLOSE = 0.06
+_MOST_DOTS = 5000  # that a line is drawn by
 PALE = (0.88, 0.88, 0.89)
 """Color of a shape that only shows points."""
 
@@ -234,6 +235,27 @@ def compose_points(shapes: Sequence[Shape], points: Sequence[Float[Floats, "N 3"
     colors = [label_colors(np.arange(len(own))) for own in points]
     radii = [0.02 * float(np.sqrt(shape.area)) or None for shape in shapes]
     return Composition(tuple(map(_with_points, shapes, points, colors, radii)))
+
+
+def compose_lines(shapes: Sequence[Shape], lines: Sequence[Sequence[Float[Floats, "M 3"]]]) -> Composition:
+    """Lines on each shape, in the frame of its file; those of one index have one color."""
+    panels = []
+    for shape, own in zip(shapes, lines, strict=True):
+        radius = 0.006 * float(np.sqrt(shape.area) or shape.diagonal)
+        dots = [_along(line, radius) for line in own]
+        colors = label_colors(np.repeat(np.arange(len(dots)), [len(each) for each in dots]))
+        panels.append(_with_points(shape, np.concatenate([np.empty((0, 3)), *dots]), colors, radius))
+    return Composition(tuple(panels))
+
+
+def _along(line: Float[Floats, "M 3"], step: float) -> Float[Floats, "N 3"]:
+    """Points along a line, at most a step apart."""
+    if len(line) < 2:
+        return line
+    lengths = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    at = np.concatenate([[0.0], np.cumsum(lengths)])
+    wanted = np.linspace(0.0, at[-1], min(int(at[-1] / step) + 2, _MOST_DOTS))
+    return np.column_stack([np.interp(wanted, at, line[:, axis]) for axis in range(3)])
 
 
 def compose_worn(bodies: Sequence[Shape], worn: Sequence[Shape]) -> Composition:

@@ -8,8 +8,8 @@ from meshmatch.errors import TemplateError
 def bundled_folder() -> Path:
     """The folder of bundled data: ``meshmatch/_templates`` of an installed wheel, ``templates/`` beside a checkout.
 
-    It holds ``human/`` (template bundles), ``models/NAME/`` (trained models), ``rigs/`` (what animals are made from) and
-    ``samples/`` (shapes to try).
+    It holds ``human/`` (template bundles), ``models/NAME/`` (trained models), ``rigs/`` (what animals are made from),
+    ``measurements/`` (a body to measure by) and ``samples/`` (shapes to try).
     The wheel's own copy wins, and of a checkout only one with its ``pyproject.toml``, so that an installed package
     never reads a stranger's ``templates/``. `TemplateError` if there is neither.
     """

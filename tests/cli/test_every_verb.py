@@ -23,6 +23,7 @@ PAIR = {
     "transfer-labels": ("out.txt", "--labels", "labels.txt"),
     "transfer-weights": ("out.npz", "--weights", "weights.json"),
     "transfer-landmarks": ("out.csv", "--landmarks", "points.txt"),
+    "measure": ("out.csv", "--landmarks", "points.txt", "--measurements", "what.csv"),
     "transfer-texture": ("out.glb", "--size", "32", "--samples", "1"),
     "transfer-garment": ("out.obj",),
     "transfer-shapes": ("out.npz", "--shapes", "moved.ply"),
@@ -63,6 +64,7 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sphere: Shape, torus:
     Path("labels.txt").write_text("1\n" * sphere.V)
     Path("weights.json").write_text(json.dumps({"weights": [[1.0]] * sphere.V}))
     Path("points.txt").write_text("0\n5\n")
+    Path("what.csv").write_text("far,distance,0,1\n")
     Path("pairs.txt").write_text("0 10\n5 11\n")
     return tmp_path
 
@@ -75,7 +77,7 @@ def test_shared_options_reach_the_matching(run: Run, files: Path, stub: FakeMatc
         assert answer.status == 0, answer.err
         assert stub.called["config"] == (FitConfig(**source), FitConfig(**target)), words
         assert (stub.called["landmarks"], stub.called["threads"]) == (None, 2)
-    pairs = "--pairs" if verb == "transfer-landmarks" else "--landmarks"
+    pairs = "--pairs" if verb in ("transfer-landmarks", "measure") else "--landmarks"
     more = (pairs, "pairs.txt", "--threads", "3", "--model", "./model")
     (files / "model").mkdir()
     assert run(verb, *FIRST.get(verb, ()), "a.ply", "b.ply", "-o", output, *rest, *more).status == 0

@@ -25,6 +25,7 @@ VERBS = {
     "transfer-labels": ("b.npy", "sub/c.npy"),
     "transfer-weights": ("b.npz", "sub/c.npz"),
     "transfer-landmarks": ("b.csv", "sub/c.csv"),
+    "measure": ("b.csv", "sub/c.csv"),
     "transfer-shapes": ("b.glb", "sub/c.glb"),
     "transfer-garment": ("b.obj", "sub/c.obj"),
 }
@@ -33,6 +34,7 @@ MORE = {
     "transfer-labels": ("--labels", "labels.txt"),
     "transfer-weights": ("--weights", "weights.json"),
     "transfer-landmarks": ("--landmarks", "points.txt"),
+    "measure": ("--landmarks", "points.txt", "--measurements", "what.csv"),
     "transfer-shapes": ("--shapes", "moved.ply"),
 }
 
@@ -50,6 +52,7 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sphere: Shape, torus:
     Path("labels.txt").write_text("1\n" * sphere.V)
     Path("weights.json").write_text(json.dumps({"weights": [[1.0]] * sphere.V}))
     Path("points.txt").write_text("0\n5\n")
+    Path("what.csv").write_text("far,distance,0,1\n")
     return tmp_path
 
 

@@ -58,6 +58,10 @@ WRITTEN = {
     meshmatch.transfer_labels: ({"labels": "labels.txt"}, ["b.npy", "sub/c.npy"]),
     meshmatch.transfer_weights: ({"weights": np.ones((642, 1))}, ["b.npz", "sub/c.npz"]),
     meshmatch.transfer_landmarks: ({"landmarks": np.array([0, 5])}, ["b.csv", "sub/c.csv"]),
+    meshmatch.measure: (
+        {"landmarks": np.array([0, 5]), "measurements": [meshmatch.Measurement("far", "distance", ("0", "1"))]},
+        ["b.csv", "sub/c.csv"],
+    ),
     meshmatch.transfer_garment: ({"garment": "worn.obj"}, ["b.obj", "sub/c.obj"]),
     meshmatch.transfer_texture: ({"options": meshmatch.BakeOptions(size=64)}, ["b.glb", "sub/c.mtl", "sub/c.obj"]),
 }

@@ -1,0 +1,118 @@
+"""`measure`: girths, lengths and angles of a shape that are defined by landmarks of another, or of the body that comes with
+the package.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from meshmatch.api.results import ConfidenceRule, Transferred
+from meshmatch.api.transfer import MapLike, find_maps, given_landmarks
+from meshmatch.errors import OptionError
+from meshmatch.shapes.files import ShapeLike, as_shape
+from meshmatch.shapes.landmark_files import mesh_space
+from meshmatch.templates.location import bundled_folder
+from meshmatch.threads import thread_limit
+from meshmatch.transfer.landmarks import Landmarks, push_landmarks
+from meshmatch.transfer.low_confidence import LowConfidence
+from meshmatch.transfer.measurements import (
+    Measurement,
+    Measurements,
+    MeasuringPoints,
+    each_once,
+    load_measurements,
+    save_measurements,
+)
+
+BODY = "body"
+"""As the source: a person in meshmatch's own files, with landmarks and measurements."""
+
+
+def measure(
+    source: ShapeLike,
+    target: ShapeLike,
+    measurements: Sequence[Measurement] | str | Path | None = None,
+    landmarks: Landmarks | ArrayLike | str | Path | None = None,
+    match: MapLike = None,
+    *,
+    rule: ConfidenceRule = ConfidenceRule(),
+) -> Transferred[Measurements]:
+    """Measure a shape: girths, lengths and angles that are defined by landmarks of another.
+
+    Parameters
+    ----------
+    source
+        The shape that has the landmarks, as in `find_maps`; or ``"body"``: a person with 39 landmarks and 30 measurements,
+        which comes with meshmatch.
+    target
+        The shape that is measured, a mesh or a cloud of points.
+    measurements
+        What is measured, or the path of a table of it. Needed of any source but ``"body"``.
+    landmarks
+        As in `transfer_landmarks`. Needed of any source but ``"body"``.
+    match
+        As in `find_maps`.
+    rule
+        A length or an angle is nan where one of its landmarks is less confident than the minimum; a girth where a quarter of
+        it is.
+
+    Returns
+    -------
+    Transferred
+        ``data.values`` (N,) in the unit of the target's file, angles in degrees, and the lines that were measured.
+
+    Raises
+    ------
+    MeshmatchError
+        A measurement names a landmark that the source does not have, or cannot be taken on it; or as for `find_maps`.
+
+    Examples
+    --------
+    >>> found = meshmatch.measure("body", "templates/samples/dancer.ply").data
+    >>> dict(zip(found.names, found.values))  # unit of the dancer's file
+    """
+    points = own_points(source, measurements, landmarks)
+    maps = find_maps(points.shape, target, match)
+    with thread_limit(1):
+        found = points.taken(push_landmarks(maps.forward, maps.source, maps.target, points.points), rule.minimum)
+    lost = int(np.isnan(found.values).sum())
+    write = partial(_write_measurements, found)
+    return Transferred(found, found.confidence, LowConfidence(len(found.names), lost, lost), maps, write)
+
+
+def own_points(
+    source: ShapeLike,
+    measurements: Sequence[Measurement] | str | Path | None = None,
+    landmarks: Landmarks | ArrayLike | str | Path | None = None,
+) -> MeasuringPoints:
+    """The points of a source, as of `measure`, by which measurements are taken."""
+    source, measurements, landmarks = measured_by(source, measurements, landmarks)
+    space = mesh_space(source) if isinstance(source, str | Path) else ""
+    shape = as_shape(source, "source")
+    given = load_measurements(measurements) if isinstance(measurements, str | Path) else each_once(measurements)
+    return MeasuringPoints.of(shape, given_landmarks(landmarks, shape, space), given)
+
+
+def measured_by(
+    source: ShapeLike,
+    measurements: Sequence[Measurement] | str | Path | None,
+    landmarks: Landmarks | ArrayLike | str | Path | None,
+) -> tuple[ShapeLike, Sequence[Measurement] | str | Path, Landmarks | ArrayLike | str | Path]:
+    """The shape, measurements and landmarks that are meant; `OptionError` if something is missing."""
+    if isinstance(source, str | Path) and str(source) == BODY:
+        folder = bundled_folder() / "measurements"
+        source, own = folder / "body.ply", (folder / "body-measurements.csv", folder / "body-landmarks.csv")
+        return source, own[0] if measurements is None else measurements, own[1] if landmarks is None else landmarks
+    if measurements is None or landmarks is None:
+        what = "measurements" if measurements is None else "landmarks"
+        raise OptionError(f"of a source of your own the {what} are needed", f"{BODY} is a person that has its own")
+    return source, measurements, landmarks
+
+
+def _write_measurements(found: Measurements, path: Path, final: Path) -> None:
+    save_measurements(path, found)

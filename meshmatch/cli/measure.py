@@ -1,0 +1,132 @@
+"""``meshmatch measure``."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from typer import Argument, Option
+
+import meshmatch
+from meshmatch.cli.options import RunOptions, grouped, optional, output_option
+from meshmatch.cli.targets import Gather, to_targets
+from meshmatch.cli.transfer_options import MapOptionsWithPairs, Picture, Transfer
+from meshmatch.cli.words import Json
+from meshmatch.errors import warn
+from meshmatch.outputs import replace_on_success
+
+_ROW = "{:<28} {:>10} {:>10}"
+_Source = Annotated[
+    Path,
+    Argument(
+        metavar="SRC",
+        help="Shape with the landmarks that measurements are defined by; or the word body: a person that comes with "
+        "landmarks and measurements.",
+    ),
+]
+
+
+_Target = Annotated[Path, Argument(metavar="TGT", help="Shape to measure.")]
+
+
+def _check_table(table: Path) -> None:
+    from meshmatch.shapes.tables import check_suffix
+
+    check_suffix(table, (".csv",), "a table of measurements")
+
+
+def _table(table: Path, given: Mapping[str, Any], source: str, written: Mapping[str, Path]) -> str:
+    """Write the measurements of SRC, unless it is the body, and all targets as one table."""
+    import numpy as np
+
+    from meshmatch.api.measure import BODY, own_points
+    from meshmatch.collections.registered import mixed_units
+    from meshmatch.shapes.tables import write_rows
+    from meshmatch.transfer.measurements import measured_values
+
+    points = own_points(given["source"], given["measurements"], given["landmarks"])
+    own = points.taken(points.points)
+    values = {source: dict(zip(own.names, own.values.tolist(), strict=True))} if str(given["source"]) != BODY else {}
+    values |= {name: measured_values(file) for name, file in written.items()}
+    numbers = np.array([[row.get(name, np.nan) for name in own.names] for row in values.values()])
+    with replace_on_success(table) as temporary:
+        cells = zip(values, numbers.tolist(), strict=True)
+        write_rows(temporary, ["name", *own.names], [[name, *map(_cell, row)] for name, row in cells])
+    lengths = numbers[:, [kind != "angle" for kind in own.kinds]]
+    known = np.isfinite(lengths).any(axis=1)
+    if known.any():
+        sizes = np.nanmedian(lengths[known] / own.values[[kind != "angle" for kind in own.kinds]], axis=1)
+        if units := mixed_units([name for name, there in zip(values, known, strict=True) if there], sizes):
+            warn(units)
+    return f"wrote {table}: {len(own.names)} measurements of {len(values)} shapes"
+
+
+def _cell(value: float) -> float | str:
+    return value if value == value else ""
+
+
+@grouped
+@to_targets("measure", Gather(_check_table, _table))
+def measure(
+    *,
+    source: _Source,
+    target: _Target,
+    output: Path = output_option("FILE", "The measurements of TGT: .csv, or .json, which also has the lines measured."),
+    measurements: Path | None = optional(
+        "FILE",
+        "What is measured: a .csv with a row each, name,kind,landmark,landmark,... The kinds are distance (along straight "
+        "lines from landmark to landmark), girth (around what the first lies on, perpendicular to the line from the second "
+        "to the third) and angle (at the second of three, in degrees). Default of body: its own.",
+    ),
+    landmarks: Path | None = optional(
+        "FILE", "Landmarks of SRC, in any format of `transfer-landmarks`. Default of body: its own."
+    ),
+    maps: MapOptionsWithPairs,
+    run: RunOptions,
+    min_confidence: float = Option(
+        0.3, min=0.0, max=1.0, help="Of landmarks below this confidence nothing is measured on TGT."
+    ),
+    table: Path | None = optional("FILE", "With several targets, also one table of them all: .csv."),
+    picture: Picture = None,
+) -> Json:
+    """Measure a shape: girths, lengths, angles.
+
+    Each measurement is defined by landmarks of SRC, and taken where these lie on TGT, in the unit of its file. A girth is
+    as long as a tape around it: it does not follow hollows. `meshmatch measure body scan.ply -o scan.csv` takes 30 of a
+    person in any pose.
+    """
+    import numpy as np
+
+    from meshmatch.api.measure import measured_by, own_points
+    from meshmatch.transfer.measurements import check_measurements_suffix
+
+    path, defined, marks = measured_by(source, measurements, landmarks)
+    assert isinstance(path, Path)
+    transfer = Transfer(path, target, output, maps, run, picture)
+    console = transfer.console
+    check_measurements_suffix(output)
+    with transfer.outputs(measurements, landmarks) as (temporary,):
+        rule = meshmatch.ConfidenceRule(min_confidence)
+        result = meshmatch.measure(path, target, defined, marks, transfer, rule=rule)
+        found = result.data
+        result.writer(temporary, output)
+    console.say(_ROW.format("measurement", "value", "confidence"))
+    for name, value, sure in zip(found.names, found.values, found.confidence, strict=True):
+        told = "missing" if np.isnan(value) else f"{value:.4g}"
+        console.say(_ROW.format(name, told, "unknown" if np.isnan(sure) else f"{sure:.2f}"))
+    lost = int(np.isnan(found.values).sum())
+    if lost:
+        console.warn(f"{transfer.names[1]}: {lost} measurements are missing, for their landmarks are not trusted there")
+    told = "in the unit of its file; angles in degrees" if "angle" in found.kinds else "in the unit of its file"
+    console.say(f"wrote {output}: {len(found.names) - lost} measurements of {transfer.names[1]}, {told}")
+    if picture is not None:
+        from meshmatch.render.compose import compose_lines
+
+        points = own_points(source, measurements, landmarks)
+        there = np.flatnonzero(~np.isnan(found.values)).tolist()
+        lines = [[each.lines[k] for k in there] for each in (points.taken(points.points), found)]
+        transfer.draw(result.maps, compose_lines((result.maps.source, result.maps.target), lines))
+    values = {
+        name: None if np.isnan(value) else float(value) for name, value in zip(found.names, found.values, strict=True)
+    }
+    counts = {"measurements": values, "min_confidence": min_confidence, "missing": lost}
+    return transfer.record({"picture": picture} | counts, result.maps, float(result.maps.forward.confidence.mean()))

@@ -1,0 +1,115 @@
+"""How well measurements of a person repeat over poses: `meshmatch measure body` of scans of the same people.
+
+A tape around a thigh says the same in every pose, but for muscles and skin; so the spread over the poses of one person
+bounds the errors of maps. What poses do themselves is seen beside it: the same lines, carried from the first pose of each
+person to the others by the true correspondences, which are rounded to vertices. Shoulders and bent hands do differ.
+
+In centimeters, on bodies scaled to 1.9 square meters of skin. A spread is the standard deviation within a person, over
+poses, pooled over people; left and right are pooled too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, Any
+
+import numpy as np
+from typer import Option
+
+import meshmatch
+from meshmatch.api.measure import BODY, own_points
+from meshmatch.arrays import Float, Floats
+from meshmatch.experiments import runner
+from meshmatch.experiments.bench.sets import BenchSet, load_set
+from meshmatch.geometry.trees import cKDTree
+from meshmatch.maps.evaluate import CM_PER_UNIT
+from meshmatch.transfer.landmarks import push_landmarks
+
+COLUMNS = {
+    "measurement": "measurement", "people": "people", "scans": "scans", "missing": "missing", "mean cm": "mean:.1f",
+    "spread cm": "spread:.2f", "%": "percent:.1f", "worst cm": "worst:.1f", "true correspondences cm": "true:.2f",
+}  # fmt: skip
+
+
+def people_of(name: str, shapes: Iterable[str]) -> dict[str, list[str]]:
+    """The shapes of each person: SCAPE has one, FAUST ten consecutive numbers of each."""
+    found: dict[str, list[str]] = {}
+    for shape in shapes:
+        found.setdefault(name if name == "scape" else f"{name} {int(shape.removeprefix('tr_reg_')) // 10}", []).append(
+            shape
+        )
+    return found
+
+
+def measured(bench: BenchSet, shapes: list[str], matcher: meshmatch.Matcher, body: meshmatch.Fit) -> list[list[Floats]]:
+    """(2, N) for each shape: measurements by `measure`, and by the true correspondences from the first shape."""
+    points, found = own_points(BODY), []
+    first = bench.shape(shapes[0])
+    places = None
+    for name in runner.track(shapes, f"people of {bench.name}"):
+        shape = bench.shape(name)
+        forward = matcher.map(body, matcher.fit(shape))
+        here = push_landmarks(forward, points.shape, shape, points.points)
+        places = here if places is None else places
+        rows = cKDTree(first.verts[bench.landmarks(shapes[0])]).query(first.verts)[1]
+        true = meshmatch.VertexMap.between(first, shape, bench.landmarks(name)[rows])
+        scale = CM_PER_UNIT / np.sqrt(shape.area)
+        there = push_landmarks(true, first, shape, places)
+        found.append([scale * points.taken(each, least).values for each, least in ((here, 0.3), (there, 0.0))])
+    return found
+
+
+def _name(measurement: str) -> str:
+    return measurement.removeprefix("left ").removeprefix("right ")
+
+
+def _spread(people: list[Float[Floats, "S M"]]) -> float:
+    """The standard deviation within people, of S scans with M measurements each."""
+    apart = [values - np.nanmean(values, axis=0) for values in people]
+    free = sum(int((np.isfinite(each).sum(axis=0) - 1).sum()) for each in apart)
+    return float(np.sqrt(sum(float(np.nansum(each**2)) for each in apart) / free))
+
+
+def _row(name: str, people: list[Float[Floats, "S 2 M"]]) -> dict[str, Any]:
+    """Of S scans of each person, and M measurements, on both sides of the body."""
+    ours, true = ([values[:, k] for values in people] for k in range(2))
+    mean = float(np.nanmean(np.concatenate([each.ravel() for each in ours])))
+    spread = _spread(ours)
+    return {
+        "measurement": name,
+        "people": len(people),
+        "scans": sum(map(len, people)),
+        "missing": int(sum(np.isnan(each).sum() for each in ours)),
+        "mean": mean,
+        "spread": spread,
+        "percent": 100 * spread / mean,
+        "worst": float(max(np.nanmax(np.abs(each - np.nanmedian(each, axis=0))) for each in ours)),
+        "true": _spread(true),
+    }
+
+
+@runner.command
+def main(
+    data: runner.Data = runner.DATA,
+    sets: Annotated[str, Option(help="of faust, scape")] = "faust,scape",
+    limit_shapes: Annotated[int | None, Option(min=2, help="scans of each person, evenly spread")] = None,
+    threads: runner.Threads = 1,
+) -> runner.Report:
+    matcher, points = meshmatch.Matcher("human"), own_points(BODY)
+    body = matcher.fit(points.shape)
+    names = [each.name for each in points.measurements]
+    rows: list[dict[str, Any]] = []
+    for name in runner.names_of(sets, ("faust", "scape"), "set"):
+        bench = load_set(name, data)
+        people = [
+            np.array(measured(bench, runner.spread(own, limit_shapes), matcher, body))
+            for own in people_of(name, bench.shapes).values()
+        ]
+        for each in dict.fromkeys(map(_name, names)):
+            own = [k for k, full in enumerate(names) if _name(full) == each]
+            rows.append({"set": name} | _row(each, [values[:, :, own] for values in people]))
+    tables = [
+        runner.table(f"Measurements of the people of {name}", [row for row in rows if row["set"] == name], COLUMNS)
+        for name in dict.fromkeys(row["set"] for row in rows)
+    ]
+    return runner.Report({"rows": rows}, tables)
