@@ -29,7 +29,7 @@ from meshmatch.errors import InputError
 from meshmatch.experiments import runner
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGES = ("results.md", "method.md", "paper.md", "rigs.md", "collections.md", "categories.md")
+PAGES = ("results.md", "method.md", "paper.md", "rigs.md", "collections.md", "categories.md", "measurements.md")
 _BLOCK = re.compile(r"(<!-- (results|summary)([^>]*?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 _COLUMNS = ("mean", "median", "lost", "flips", "pairs")
 
