@@ -16,6 +16,8 @@ OUTLIER_SHARE = 0.02
 _FAR = 0.25  # gap between two big parts, in diagonals of the largest, from which they count as apart
 _SHEET = 0.8  # a sheet's mean normal is so long: 0.5 of half a sphere, 0.64 of half a cylinder, 0.9 of leaves
 _SHORT = 1e-9  # of the median edge: an edge without length
+_FEWEST, _USUAL = 100, 0.99  # vertices that tell how far most lie from their middle, and what share of them does
+_SPIKE, _NEEDLE = 1.5, 0.1  # a spike is so many times as long, and its foot that much narrower
 _NEAR = 0.05  # gap up to which a small part belongs to a shape that is made of small parts
 
 
@@ -36,6 +38,33 @@ def seams(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, " V
     own = np.arange(len(verts))
     own[place] = place[same_rows(verts[place])]
     return own
+
+
+def spikes(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Bool[Bools, " V"]:
+    """Single vertices far from all others, each the tip of a needle of faces, as errors of scanners leave them."""
+    found = np.zeros(len(verts), bool)
+    used = np.flatnonzero(np.bincount(faces.ravel(), minlength=len(verts)))
+    if len(used) < _FEWEST:
+        return found
+    away = np.linalg.norm(verts - np.median(verts[used], axis=0), axis=1)
+    usual = float(np.quantile(away[used], _USUAL))
+    far = away > _SPIKE * usual
+    corners = faces[far[faces].any(axis=1)]
+    alone = far[corners].sum(axis=1) == 1
+    far[corners[~alone]] = False  # a thin part has more vertices than one at its end
+    corners = corners[alone & far[corners].any(axis=1)]
+    if not len(corners):
+        return found
+    at = far[corners].argmax(axis=1)[:, None]
+    tips, tip = np.unique(np.take_along_axis(corners, at, axis=1)[:, 0], return_inverse=True)
+    ring = verts[np.take_along_axis(corners, (at + np.array([1, 2])) % 3, axis=1)]
+    low, high, length = np.full((len(tips), 3), np.inf), np.full((len(tips), 3), -np.inf), np.full(len(tips), np.inf)
+    for side in range(2):
+        np.minimum.at(low, tip, ring[:, side])
+        np.maximum.at(high, tip, ring[:, side])
+        np.minimum.at(length, tip, np.linalg.norm(verts[tips[tip]] - ring[:, side], axis=1))
+    found[tips] = (length > _SPIKE * usual) & (np.linalg.norm(high - low, axis=1) < _NEEDLE * length)
+    return found
 
 
 def collapsed(

@@ -17,7 +17,7 @@ from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
 from meshmatch.shapes.copies import counterparts
 from meshmatch.shapes.denoise import without_noise
-from meshmatch.shapes.faces import collapsed, duplicate_faces, find_parts, flat_faces, seams, turn_faces
+from meshmatch.shapes.faces import collapsed, duplicate_faces, find_parts, flat_faces, seams, spikes, turn_faces
 from meshmatch.shapes.shape import Shape
 
 _NAMED = 5  # meshes that a note lists
@@ -55,14 +55,15 @@ class Repaired(Brief):
 def repair(shape: Shape) -> Repaired:
     """Drop what is broken, merge what is double, and say so.
 
-    In this order: vertices without a position and the faces that touch them; faces, or points, of weight 0; vertices
-    at exactly the same position are merged if they lie on an open edge (texture seams of obj and glTF files, every
-    corner of an stl; two layers that merely touch stay apart); edges without length, which are collapsed; faces without
-    area; faces that occur twice (both of them, where they are a flap of no volume on a closed surface); outlier parts (see
+    In this order: vertices without a position, or single ones far away from all others
+    (`meshmatch.shapes.faces.spikes`), and the faces that touch them; faces, or points, of weight 0; vertices at
+    exactly the same position are merged if they lie on an open edge (texture seams of obj and glTF files, every corner
+    of an stl; two layers that merely touch stay apart); edges without length, which are collapsed; faces without area;
+    faces that occur twice (both of them, where they are a flap of no volume on a closed surface); outlier parts (see
     `meshmatch.shapes.faces.OUTLIER_SHARE`; unless together they are more than a tenth of the surface: then the shape
-    is made of small parts, and only those far from the rest are outliers; never what joints move, such as the shells of
-    a robot's fingers); vertices that no face uses. Then faces are turned so that neighbours agree and the shape is not
-    inside out. Open and non-manifold edges are counted, not mended. Where noise is as large as the triangles, the
+    is made of small parts, and only those far from the rest are outliers; never what joints move, such as the shells
+    of a robot's fingers); vertices that no face uses. Then faces are turned so that neighbours agree and the shape is
+    not inside out. Open and non-manifold edges are counted, not mended. Where noise is as large as the triangles, the
     surface is smoothed (`meshmatch.shapes.denoise`).
     Of a cloud: points without a position, double ones, and outliers far from all others.
 
@@ -74,6 +75,10 @@ def repair(shape: Shape) -> Repaired:
         hint = "all are NaN, infinite or huge: export it again"
         raise InputError(f"{shape.name or 'the shape'}: no vertex has a usable position", hint)
     _note(notes, shape.V - int(valid.sum()), "vertex", "without a usable position dropped")
+    far = spikes(shape.verts, shape.faces[shape.valid_faces])
+    if far.any():
+        _note(notes, int(far.sum()), "vertex", "far from all others dropped, as a spike is")
+        valid = valid & ~far
     _note_rigid(notes, shape)
     return (_repair_cloud if shape.is_cloud else _repair_mesh)(shape, valid, notes)
 

@@ -85,7 +85,7 @@ def faults() -> dict[str, Fault]:
         ),
         "one corner in common": (join(cube, move(cube, [1, 1, 1])), (16, 24), ("2 separate parts kept",)),
         "a flap": (
-            Shape(np.vstack([ball.verts, [[2, 2, 2]]]), np.vstack([ball.faces, flap])),
+            Shape(np.vstack([ball.verts, [[1.2, 1.2, 1.2]]]), np.vstack([ball.faces, flap])),
             (ball.V, ball.F),
             ("2 duplicate faces dropped",),
         ),
@@ -223,6 +223,52 @@ def test_a_vertex_far_away_does_not_make_all_edges_short() -> None:
     ball = icosphere(2)
     given = Shape(np.vstack([ball.verts, [[1e12, 0, 0]]]), np.vstack([ball.faces, [[0, 1, ball.V]]]))
     assert repair(given).shape.V >= ball.V
+
+
+def with_a_cone(shape: Shape, length: float, wide: float) -> Shape:
+    """A sphere of radius 1 whose vertex nearest to the pole is drawn out, and those around it moved nearer or apart."""
+    tip = int(shape.verts[:, 2].argmax())
+    around = np.setdiff1d(shape.faces[(shape.faces == tip).any(axis=1)], tip)
+    verts = shape.verts.copy()
+    verts[around, :2] = wide * unit(verts[around, :2])
+    verts[tip] = [0, 0, 1 + length]
+    return Shape(verts, shape.faces, "cone")
+
+
+@pytest.mark.parametrize("length", [3.0, 30.0, 1e30])
+def test_a_spike_is_dropped_and_answered_by_a_neighbour(sphere: Shape, length: float) -> None:
+    """Which would make a body the speck at the end of a needle."""
+    spiked = with_a_cone(sphere, length, 0.1)
+    tip = int(spiked.verts[:, 2].argmax())
+    done = repair(spiked)
+    assert done.notes[:2] == (
+        "1 vertex far from all others dropped, as a spike is",
+        f"{(spiked.faces == tip).any(axis=1).sum()} faces at such vertices dropped",
+    )
+    assert done.shape.V == sphere.V - 1 and done.shape.diagonal < 4
+    answer = done.kept_vertex[done.original_to_repaired[tip]]
+    assert answer in spiked.faces[(spiked.faces == tip).any(axis=1)]
+
+
+@pytest.mark.parametrize(("length", "wide"), [(1.2, 0.1), (3.0, 0.9)])
+def test_a_horn_or_a_hat_is_no_spike(sphere: Shape, length: float, wide: float) -> None:
+    assert not repair(with_a_cone(sphere, length, wide)).notes
+
+
+def test_a_thin_stick_with_an_end_is_no_spike(sphere: Shape) -> None:
+    """As of a lollipop: few vertices, but more than one at its end."""
+    top = int(sphere.verts[:, 2].argmax())
+    near = np.setdiff1d(sphere.faces[(sphere.faces == top).any(axis=1)], top)
+    corners = np.argsort(np.arctan2(*sphere.verts[near, :2].T))
+    ring = sphere.verts[near[corners]] * [0.1, 0.1, 1]
+    N, verts = len(ring), np.concatenate([sphere.verts, ring + np.array([0, 0, 9])])
+    verts[near[corners]] = ring
+    first, k = near[corners], np.arange(N)
+    sides = np.concatenate(
+        [np.stack([first, first[k - 1], sphere.V + k], 1), np.stack([first[k - 1], sphere.V + k - 1, sphere.V + k], 1)]
+    )
+    stick = Shape(verts, np.concatenate([sphere.faces, sides]), "lollipop")
+    assert not any("spike" in note for note in repair(stick).notes)
 
 
 def test_seams_are_merged_and_every_copy_answered(tmp_path: Path, torus: Shape) -> None:
