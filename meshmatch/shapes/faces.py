@@ -9,7 +9,7 @@ import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry import triangles
-from meshmatch.geometry.triangles import Edges, edge_keys, same_rows, squared_lengths, together
+from meshmatch.geometry.triangles import Edges, edge_keys, same_rows, squared_lengths, together, unit
 
 OUTLIER_SHARE = 0.02
 """A part with less than this share of the largest part's area is an outlier. This and the next two are set by hand."""
@@ -18,6 +18,10 @@ _SHEET = 0.8  # a sheet's mean normal is so long: 0.5 of half a sphere, 0.64 of 
 _SHORT = 1e-9  # of the median edge: an edge without length
 _FEWEST, _USUAL = 100, 0.99  # vertices that tell how far most lie from their middle, and what share of them does
 _SPIKE, _NEEDLE = 1.5, 0.1  # a spike is so many times as long, and its foot that much narrower
+_HULL_FACES, _TOUCHING = (
+    64,
+    1e-3,
+)  # that a plain hull has at most; how far what it holds may reach out of it, of its length
 _NEAR = 0.05  # gap up to which a small part belongs to a shape that is made of small parts
 
 
@@ -139,7 +143,8 @@ def find_parts(
     cross: Float[Floats, "F 3"],
     spared: Bool[Bools, " V"] | None = None,
 ) -> tuple[Bool[Bools, " F"], int, int, int, float]:
-    """Judge the connected parts of a mesh; `cross` as in `flat_faces`. A part with a `spared` vertex is no outlier.
+    """Judge the connected parts of a mesh; `cross` as in `flat_faces`. A part with a `spared` vertex is no outlier; a plain
+    hull of all others is one.
 
     Returns the faces of outlier parts; how many parts are outliers, and how many are not; how many of the latter are
     big but lie far from the rest; and the share of the surface that these have, in 0..1.
@@ -147,6 +152,12 @@ def find_parts(
     part = triangles.face_parts(faces, len(verts))
     if part.max() == 0:
         return np.zeros(len(faces), bool), 0, 1, 0, 0.0
+    around = None if spared is not None else _container(verts, faces, part)
+    if around is not None:
+        inside = part != around
+        dropped = np.ones(len(faces), bool)
+        dropped[inside], *counts, share = find_parts(verts, faces[inside], cross[inside])
+        return dropped, counts[0] + 1, counts[1], counts[2], share
     face_areas = 0.5 * np.sqrt(squared_lengths(cross))
     areas = np.bincount(part, weights=face_areas)
     largest = int(areas.argmax())
@@ -169,6 +180,30 @@ def find_parts(
         outlier[part[spared[faces].any(axis=1)]] = False
     many = int(outlier.sum())
     return outlier[part], many, len(areas) - many, len(far), float(areas[far].sum() / areas.sum())
+
+
+def _container(verts: Floats, faces: Ints, part: Ints) -> int | None:
+    """The part that is a plain convex hull of all others, if one is: a bounding box, or the collision shape of a game."""
+    few = np.bincount(part) <= _HULL_FACES
+    chosen = few[part]
+    if not chosen.any() or np.count_nonzero(~chosen) < _FEWEST:
+        return None
+    used = verts[np.flatnonzero(np.bincount(faces.ravel(), minlength=len(verts)))]
+    low, high = used.min(axis=0), used.max(axis=0)
+    slack = _TOUCHING * float((high - low).max())
+    least, most = (np.full((len(few), 3), end) for end in (np.inf, -np.inf))
+    corners = verts[faces[chosen]]
+    np.minimum.at(least, part[chosen], corners.min(axis=1))
+    np.maximum.at(most, part[chosen], corners.max(axis=1))
+    outermost = np.flatnonzero(((least <= low + slack) & (most >= high - slack)).all(axis=1))
+    for each in outermost[:1].tolist():
+        a, b, c = np.swapaxes(verts[faces[part == each]], 0, 1)
+        normals = unit(triangles.cross_product(b - a, c - a))
+        heights = [(used - corner) @ normal for corner, normal in zip(a, normals, strict=True)]
+        held = all(height.max() <= slack or height.min() >= -slack for height in heights)
+        if held and np.linalg.matrix_rank(normals, 1e-3) == 3:
+            return int(each)
+    return None
 
 
 def _gaps(verts: Floats, faces: Ints, face_areas: Floats, part: Ints, body: Ints, others: Ints) -> tuple[Floats, float]:

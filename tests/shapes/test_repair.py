@@ -292,6 +292,31 @@ def test_shape_made_of_small_parts_is_not_taken_apart(make_sphere: Callable[[int
     assert done.notes == ("1 outlier part dropped (80 faces)", "61 separate parts kept")
 
 
+@pytest.mark.parametrize("kind", ["box", "turned box", "hull"])
+def test_a_plain_hull_of_all_the_rest_is_left_out(kind: str, torus: Shape) -> None:
+    """A bounding box or collision shape, which is larger than what it holds."""
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    hull = trimesh.creation.box(extents=np.ptp(torus.verts, axis=0))
+    if kind == "hull":
+        hull = trimesh.creation.icosphere(0, radius=1.3 * np.linalg.norm(torus.verts, axis=1).max())
+    around = Shape(np.asarray(hull.vertices), np.asarray(hull.faces))
+    turn = turn if kind == "turned box" else np.eye(3)
+    done = repair(Shape(join(torus, around).verts @ turn, join(torus, around).faces))
+    assert (done.shape.V, done.notes[0]) == (torus.V, f"1 outlier part dropped ({around.F} faces)")
+
+
+def test_what_holds_something_else_is_kept(sphere: Shape) -> None:
+    """A box beside a body, one that it sticks out of, a round hull, and a box around nothing much."""
+    wide = Shape(10 * (box().verts - 0.5), box().faces)
+    for shape in (
+        join(sphere, move(wide, [6, 0, 0], 0.2)),
+        join(sphere, Shape(wide.verts * [0.5, 0.1, 0.5], wide.faces)),
+        join(sphere, Shape(3 * sphere.verts, sphere.faces)),
+        join(Shape(0.5 * wide.verts, wide.faces), wide),
+    ):
+        assert not any("12 faces" in note or "outlier" in note for note in repair(shape).notes)
+
+
 def test_moebius_band_is_survived() -> None:
     n = 40
     t = np.arange(n) * 2 * np.pi / n
