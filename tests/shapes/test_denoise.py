@@ -51,3 +51,14 @@ def test_plain_solids_keep_their_corners() -> None:
     joined = trimesh.util.concatenate(many)
     done = repair(Shape(joined.vertices, np.asarray(joined.faces)))
     assert np.array_equal(done.shape.verts, joined.vertices)
+
+
+def test_a_large_plain_part_does_not_make_a_body_noisy() -> None:
+    """Whose few corners have most of the area: a floor of a scan, a crate that somebody sits on."""
+    body, crate = ball(0.0), trimesh.creation.box(extents=(9, 3, 9))
+    verts = np.concatenate([body.verts, np.asarray(crate.vertices) - [0, 2.4, 0]])
+    both = Shape(verts, np.concatenate([body.faces, np.asarray(crate.faces) + body.V]), "seated")
+    assert repair(both).shape.V == both.V and not any("smoothed" in note for note in repair(both).notes)
+    noisy = ball(0.12)
+    both = Shape(np.concatenate([noisy.verts, verts[body.V :]]), both.faces, "noisy and seated")
+    assert any("smoothed" in note for note in repair(both).notes)
