@@ -156,12 +156,17 @@ def find_parts(
     if around is not None:
         inside = part != around
         dropped = np.ones(len(faces), bool)
-        dropped[inside], *counts, share = find_parts(verts, faces[inside], cross[inside])
-        return dropped, counts[0] + 1, counts[1], counts[2], share
+        dropped[inside], many, kept, apart, share = find_parts(verts, faces[inside], cross[inside])
+        return dropped, many + 1, kept, apart, share
     face_areas = 0.5 * np.sqrt(squared_lengths(cross))
     areas = np.bincount(part, weights=face_areas)
     largest = int(areas.argmax())
     small = areas < OUTLIER_SHARE * areas[largest]
+    counts = np.bincount(part)
+    finest = counts[small].max(initial=0)
+    if counts[~small].max() <= _HULL_FACES < finest and ((~small).sum() == 1 or 2 * finest > len(faces)):
+        # beside something plain and huge, such as the ground of a scene, a body is no dirt
+        small = areas < OUTLIER_SHARE * areas[counts > _HULL_FACES].max(initial=0.0)
     big = np.flatnonzero(~small)
     # the body grows from the largest part by all big parts that are near
     body = np.array([largest])

@@ -197,7 +197,7 @@ def _bases(shape: Shape, corners: Int[Ints, "F 3"], area: Float[Floats, " F"], p
         centers = shape.verts[corners[own]].mean(axis=1)
         low = plane.below(centers)
         base, rest = own[low], own[~low]
-        if len(rest) and _plain(shape.verts[np.unique(corners[base])], centers[low], area[base]):
+        if len(base) and len(rest) and _plain(shape.verts[np.unique(corners[base])], centers[low], area[base]):
             pieces = np.bincount(triangles.face_parts(corners[rest], shape.V), area[rest])
             if pieces.max() >= _OF_STANDING * pieces.sum():
                 found.append(base)

@@ -13,6 +13,7 @@ from meshmatch.shapes.files import load_shape, load_shapes, save_shape
 from meshmatch.shapes.parts import Parts, apart, leave_out, tries
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
+from tests.conftest import icosphere
 from tests.shapes.scenes import beside, box, chair, coat, eyes, floor, moved, pack, pedestal, sample, second, together
 
 
@@ -185,3 +186,15 @@ def test_wrong_numbers_are_told(three: Shape, tmp_path: Path, make_sphere: Calla
     # of two files, one that lacks the number is not asked for it
     first, second = load_shapes([tmp_path / "three.ply", tmp_path / "ball.ply"], only=2)
     assert first.weights is not None and second.weights is None
+
+
+def test_the_ground_of_two_triangles_has_no_base_of_its_own() -> None:
+    """Rounding may put all of it above the plane through its own samples."""
+    ball = icosphere(2)
+    for seed in (127, 132, 170):
+        rng = np.random.default_rng(seed)
+        k = rng.uniform(1, 50)
+        corners = np.array([[-k, -1, -k], [k, -1, -k], [k, -1, k], [-k, -1, k]])
+        verts = np.concatenate([ball.verts, corners]) + k * rng.normal(size=3)
+        faces = np.concatenate([ball.faces, ball.V + np.array([[0, 1, 2], [0, 2, 3]])])
+        assert len(Parts.of(Shape(verts, faces), bases=True)) == 2

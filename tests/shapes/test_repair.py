@@ -305,6 +305,21 @@ def test_a_plain_hull_of_all_the_rest_is_left_out(kind: str, torus: Shape) -> No
     assert (done.shape.V, done.notes[0]) == (torus.V, f"1 outlier part dropped ({around.F} faces)")
 
 
+def test_a_body_on_a_huge_ground_is_no_dirt(sphere: Shape) -> None:
+    """Also beside a crate, and of several parts; but a bolt is none of a table."""
+    ground = Shape(
+        np.array([[-99.0, -1, -99], [99, -1, -99], [99, -1, 99], [-99, -1, 99]]), np.array([[0, 1, 2], [0, 2, 3]])
+    )
+    crate = Shape(9 * (box().verts - 0.5) + [9, 0, 0], box().faces)
+    hat = move(sphere, [0, 1.2, 0], 0.5)
+    for bodies, parts in ((join(sphere, ground), 2), (join(sphere, hat, ground), 3), (join(sphere, crate, ground), 3)):
+        done = repair(bodies)
+        assert done.shape.V == bodies.V and f"{parts} separate parts kept" in done.notes
+    panels = [Shape(9 * (box().verts - 0.5) * [1, 1, 0.1] + [0, 0, 9 * k], box().faces) for k in range(3)]
+    bolts = [move(sphere, [k, 5, 0], 0.1) for k in range(4)]
+    assert "4 outlier parts dropped (5,120 faces)" in repair(join(*panels, *bolts)).notes
+
+
 def test_what_holds_something_else_is_kept(sphere: Shape) -> None:
     """A box beside a body, one that it sticks out of, a round hull, and a box around nothing much."""
     wide = Shape(10 * (box().verts - 0.5), box().faces)
