@@ -15,8 +15,7 @@ from meshmatch.maps.mapped_mesh import MappedMesh
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.formats import gltf
-from meshmatch.shapes.formats.gltf_rig import read_rig
-from meshmatch.shapes.formats.gltf_rigged import Binding
+from meshmatch.shapes.formats.gltf_rig import Binding, read_rig
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import joint_table, largest_weights, pull_weights

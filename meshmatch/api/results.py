@@ -28,7 +28,7 @@ from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
-from meshmatch.shapes.formats.gltf_rigged import Binding
+from meshmatch.shapes.formats.gltf_rig import Binding
 from meshmatch.shapes.moved_files import save_moved
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape

@@ -23,9 +23,10 @@ from meshmatch.shapes import tables
 from meshmatch.shapes.files import ShapeLike, as_scene, as_shape, load_shape
 from meshmatch.shapes.formats import gltf, gltf_vrm
 from meshmatch.shapes.formats.gltf_edit import remembering
+from meshmatch.shapes.formats.gltf_former import figures_apart, hanging_groups
 from meshmatch.shapes.formats.gltf_humanoid import Person, person_of, with_bones
-from meshmatch.shapes.formats.gltf_rig import Rig, read_rig
-from meshmatch.shapes.formats.gltf_rigged import Binding, figures_apart, hanging_groups, rigged
+from meshmatch.shapes.formats.gltf_rig import Binding, Rig, read_rig
+from meshmatch.shapes.formats.gltf_rigged import rigged
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.moved_files import tell_left, with_look
 from meshmatch.shapes.shape import Shape

@@ -26,7 +26,8 @@ from meshmatch.shapes.formats.gltf_dressed import dressed, laid
 from meshmatch.shapes.formats.gltf_edit import Editor, remembering
 from meshmatch.shapes.formats.gltf_join import joined
 from meshmatch.shapes.formats.gltf_moved import moved
-from meshmatch.shapes.formats.gltf_rigged import Binding, rigged
+from meshmatch.shapes.formats.gltf_rig import Binding
+from meshmatch.shapes.formats.gltf_rigged import rigged
 from meshmatch.shapes.formats.gltf_vrm import SUFFIX, check_character
 from meshmatch.shapes.formats.ply_edit import PlyFile
 from meshmatch.shapes.input_files import read_bytes

@@ -19,8 +19,8 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.formats.gltf import Document, digest
 from meshmatch.shapes.formats.gltf_edit import Editor
+from meshmatch.shapes.formats.gltf_former import hanging_groups
 from meshmatch.shapes.formats.gltf_rig import read_rig
-from meshmatch.shapes.formats.gltf_rigged import hanging_groups
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance, load_coordinates
 from tests.shapes.painted import encoded, quarters, write_document

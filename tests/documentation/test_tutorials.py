@@ -33,8 +33,8 @@ from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.formats.gltf import Document
-from meshmatch.shapes.formats.gltf_rig import Clip, Rig, Track
-from meshmatch.shapes.formats.gltf_rigged import Binding, rigged
+from meshmatch.shapes.formats.gltf_rig import Binding, Clip, Rig, Track
+from meshmatch.shapes.formats.gltf_rigged import rigged
 from meshmatch.shapes.landmark_files import read_landmark_file
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance

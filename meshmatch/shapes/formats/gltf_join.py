@@ -16,7 +16,8 @@ from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_attributes import joint_nodes
 from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor, drawn
 from meshmatch.shapes.formats.gltf_prune import references
-from meshmatch.shapes.formats.gltf_rigged import Binding, frame_of, straighten
+from meshmatch.shapes.formats.gltf_rig import Binding
+from meshmatch.shapes.formats.gltf_rigged import frame_of, straighten
 
 _KINDS = ("bufferViews", "accessors", "images", "samplers", "textures", "materials", "meshes")
 _VARIANTS = "KHR_materials_variants"

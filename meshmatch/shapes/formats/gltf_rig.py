@@ -5,14 +5,15 @@ Specification: Khronos glTF 2.0, sections 3.7.3 and 3.11.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from meshmatch.arrays import Brief, Float, Floats, Int, Ints
+from meshmatch.arrays import Brief, Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.formats.gltf import Document, local_matrix, understood
@@ -76,6 +77,40 @@ class Rig(Brief):
             if parent >= 0:
                 found[node] = found[parent] @ found[node]
         return found
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Binding(Brief):
+    """A skeleton, and how it moves the vertices of a scene.
+
+    Attributes
+    ----------
+    rig
+        The skeleton as it is to stand, with its clips.
+    bind
+        Where its nodes stand when every vertex is where it was, but for the turn.
+    joints
+        Numbers in ``rig.joints`` of up to four joints for each vertex.
+    weights
+        How much each of them moves the vertex.
+    turn
+        What turns the scene upright.
+    """
+
+    rig: Rig
+    bind: Float[Floats, "N 4 4"]
+    joints: Int[NDArray[np.int32], "V K"]
+    weights: Float[Floats32, "V K"]
+    turn: Float[Floats, "3 3"] = field(default_factory=lambda: np.eye(3))
+
+    def of(self, rows: Int[Ints, " N"]) -> Binding:
+        """That of other vertices, which move as some of these do."""
+        return replace(self, joints=self.joints[rows], weights=self.weights[rows])
+
+    def table(self) -> tuple[NDArray[Any], Floats32]:
+        """Joints and weights, four for each vertex, as a file holds them."""
+        joints, weights = (np.pad(each, ((0, 0), (0, 4 - each.shape[1]))) for each in (self.joints, self.weights))
+        return joints.astype("<u1" if len(self.rig.joints) <= 256 else "<u2"), weights.astype(np.float32)
 
 
 def read_rig(path: Path, data: bytes) -> Rig:
