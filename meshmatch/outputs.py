@@ -3,8 +3,9 @@
 import os
 import re
 import shutil
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +20,22 @@ def plain_text(text: str) -> str:
     U+FFFD.
     """
     return text.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
+
+
+def numbered_apart(words: Iterable[str], between: str, alike: Callable[[str], str] = str) -> list[str]:
+    """The same words, but 2, 3, ... behind those that are as an earlier one, by what ``alike`` makes of them."""
+    forms: dict[str, Iterator[str]] = {}  # those of a word that were not tried yet
+    found: dict[str, str] = {}
+    for word in words:
+        left = forms.setdefault(word, _numbered(word, between))
+        own = next(form for form in left if alike(form) not in found)
+        found[alike(own)] = own
+    return list(found.values())
+
+
+def _numbered(word: str, between: str) -> Iterator[str]:
+    yield word
+    yield from (f"{word}{between}{k}" for k in count(2))
 
 
 def as_path(path: str | Path) -> Path:

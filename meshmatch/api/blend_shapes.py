@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from meshmatch.api.upright import turn_upright
 from meshmatch.arrays import Brief
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import shortest_turns
-from meshmatch.outputs import as_path, check_new_folder, folder_on_success, replace_on_success
+from meshmatch.outputs import as_path, check_new_folder, folder_on_success, numbered_apart, replace_on_success
 from meshmatch.shapes import tables
 from meshmatch.shapes.blend_shape_files import load_blend_shapes, save_blend_shapes
 from meshmatch.shapes.blend_shapes import BlendShapes, shape_normals
@@ -111,13 +110,8 @@ class BlendShapesResult(Brief):
 
     def _plans(self, folder: Path) -> list[MovedFile]:
         """The files of a folder of meshes: an .obj for each shape, and what an .obj takes along, once."""
-        taken: set[str] = set()
-        files: list[Path] = []
-        for name in self.shapes.names:
-            plain = _PLAIN.sub("_", name)[:_LONGEST].strip(". ") or "shape"
-            stem = next(word for word in _numbered(plain) if word.lower() not in taken)
-            taken.add(stem.lower())
-            files.append(folder / f"{stem}.obj")
+        plain = (_PLAIN.sub("_", name)[:_LONGEST].strip(". ") or "shape" for name in self.shapes.names)
+        files = [folder / f"{stem}.obj" for stem in numbered_apart(plain, "-", str.lower)]
         return MovedFile.planned_all(files, self.original)
 
     def _write_meshes(self, plans: Sequence[MovedFile]) -> None:
@@ -151,12 +145,6 @@ def check_shapes_output(path: Path) -> str:
         return check_suffix(path)
     check_new_folder(path)
     return ""
-
-
-def _numbered(word: str) -> Iterator[str]:
-    yield word
-    for number in count(2):
-        yield f"{word}-{number}"
 
 
 def transfer_shapes(

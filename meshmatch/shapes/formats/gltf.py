@@ -113,6 +113,7 @@ class Document:
         self.world: dict[int, Floats] = {}
         self.hidden: set[int] = set()
         self._bones: dict[int, Floats] = {}  # a thousand meshes may hang from one skin of a thousand joints
+        self._mirrors: dict[int, bool] = {}
         self._bound: int | None = None
         if compressed := {each for each in required if each in COMPRESSED}:
             self.buffers |= decompress(self.name, self.size, self.json, self.buffer, compressed)
@@ -319,10 +320,12 @@ class Document:
 
     def mirrors(self, number: int, primitive: dict[str, Any], place: Floats) -> bool:
         """Whether a node, or most joints of its skin, draws a primitive as in a mirror: its triangles turn over (3.7.4)."""
-        node = self.nodes[number]
-        skinned = "skin" in node and "JOINTS_0" in primitive["attributes"]
-        moves = self.bones(node["skin"]) if skinned else place[None]
-        return bool((np.linalg.det(moves[:, :3, :3]) < 0).mean() > 0.5)
+        skin = self.nodes[number].get("skin")
+        if skin is None or "JOINTS_0" not in primitive["attributes"]:
+            return bool(np.linalg.det(place[:3, :3]) < 0)
+        if skin not in self._mirrors:
+            self._mirrors[skin] = bool((np.linalg.det(self.bones(skin)[:, :3, :3]) < 0).mean() > 0.5)
+        return self._mirrors[skin]
 
     def drawn_triangles(self, number: int, primitive: dict[str, Any], place: Floats) -> Int[Ints, "F 3"]:
         """The triangles of a primitive, counterclockwise from outside in the scene."""

@@ -8,9 +8,7 @@ same order.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ from scipy.sparse import csr_array
 
 from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import InputError
-from meshmatch.outputs import plain_text
+from meshmatch.outputs import numbered_apart, plain_text
 from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap, no_coordinates
 from meshmatch.shapes.formats import damaged, joined_colors
 from meshmatch.shapes.formats.gltf import Document, embedded, understood
@@ -217,15 +215,5 @@ def _skin(document: Document) -> tuple[csr_array, tuple[str, ...]]:
         raise InputError(f"{document.name} has a skin that moves no vertex", "was it exported with its weights?")
     vertices, joints, weights = (np.concatenate(each) for each in zip(*found, strict=True))
     labels = [document.nodes[node].get("name") or f"joint {node}" for node in nodes]
-    names: dict[str, None] = {}
-    others: dict[str, Iterator[str]] = {}  # of each label, the names that are left for joints called so
-    for label in (plain_text(str(label)) for label in labels):
-        left = others.setdefault(label, _numbered(label))
-        names[next(word for word in left if word not in names)] = None
+    names = numbered_apart((plain_text(str(label)) for label in labels), " ")
     return csr_array((weights, (vertices, joints)), (seen, len(nodes))), tuple(names)
-
-
-def _numbered(label: str) -> Iterator[str]:
-    """A label, then the same with 2, 3, ... behind it, without end."""
-    yield label
-    yield from (f"{label} {k}" for k in count(2))

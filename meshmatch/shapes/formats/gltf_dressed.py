@@ -199,7 +199,8 @@ class _Wardrobe:
         parts = [part for parts in drawn(document).values() for part in parts.values()]
         seen = {id(part) for part in parts}
         others = (part for mesh in document.json["meshes"] for part in mesh["primitives"] if id(part) not in seen)
-        self.worn_elsewhere = {number for part in others for number in _materials_of(part)}
+        # What others wear keeps its number, and so does what is made already.
+        self.kept = {number for part in others for number in _materials_of(part)}
         self.made: dict[tuple[int | None, int | None], int] = {}
         leaves = len(uv) > 0 and (uv.min() < -_SLACK or uv.max() > 1.0 + _SLACK)
         wrap = _REPEAT if leaves else _CLAMP
@@ -239,10 +240,9 @@ class _Wardrobe:
             self._lay_on(entry, moved_to, self.toon.keeps(number, entry))
             if number is not None:
                 self.toon.lay_on(entry, self.before[number], moved_to)
-            first = number is not None and number not in self.worn_elsewhere
-            first &= all(each != number for each, _ in self.made)
-            if number is not None and first:
+            if number is not None and number not in self.kept:
                 self.editor.json["materials"][number], self.made[key] = entry, number
+                self.kept.add(number)
             else:
                 self.made[key] = self.editor.add("materials", entry)
         return self.made[key]

@@ -131,6 +131,7 @@ def hang_over(editor: Editor, document: Document, gone: set[int], binding: Bindi
     for node in reversed(document.world):  # children before parents
         if not holding.isdisjoint(document.nodes[node].get("children", [])):
             holding.add(node)
+    movers: dict[int, int] = {}  # the new joints, by what moved the skin there
     for joint in sorted(gone):
         rows, children = skin.around(joint), document.nodes[joint].get("children", [])
         hung = []
@@ -145,8 +146,10 @@ def hang_over(editor: Editor, document: Document, gone: set[int], binding: Bindi
                 found |= tree
         if not hung:
             continue
-        votes = np.bincount(binding.joints[rows].ravel(), binding.weights[rows].ravel())
-        new = int(binding.rig.joints[votes.argmax()])
+        if (mover := skin.mover(joint)) not in movers:
+            votes = np.bincount(binding.joints[rows].ravel(), binding.weights[rows].ravel())
+            movers[mover] = int(binding.rig.joints[votes.argmax()])
+        new = movers[mover]
         for child in hung:
             place = np.linalg.inv(binding.bind[new]) @ document.world[child]
             for key in ("translation", "rotation", "scale", "matrix"):

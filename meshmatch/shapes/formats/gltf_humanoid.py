@@ -5,6 +5,7 @@ Specification: VRM Consortium, VRM 0.0; VRMC_vrm 1.0.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -47,13 +48,15 @@ def person_of(source: Document, target: Document) -> Person | None:
     nodes = nodes_of_skeleton(source, joint_nodes(source))
     own, wanted = _bones(source), _bones(target)
     if own:
-        bones = {bone: nodes.index(node) for bone, node in own.items() if node in nodes}
+        places = {node: k for k, node in enumerate(nodes)}
+        bones = {bone: places[node] for bone, node in own.items() if node in places}
     else:
         names = [source.nodes[node].get("name") for node in nodes]
-        called = {bone: target.nodes[node].get("name") for bone, node in wanted.items()}
-        if any(name is None or names.count(name) != 1 for name in called.values()):
+        called, times = {bone: target.nodes[node].get("name") for bone, node in wanted.items()}, Counter(names)
+        if any(name is None or times[name] != 1 for name in called.values()):
             return None
-        bones = {bone: names.index(name) for bone, name in called.items()}
+        named = {name: k for k, name in enumerate(names)}
+        bones = {bone: named[name] for bone, name in called.items()}
     if not {"hips", "head"} <= bones.keys():
         return None
     return Person(bones, tuple(nodes_of_skeleton(target, joint_nodes(target))), len(target.nodes))
@@ -137,7 +140,7 @@ def _untwisted(editor: Editor, document: Document, nodes: range) -> dict[int, Fl
         worlds[number] = np.eye(4)
         worlds[number][:3, 3] = place
     for skin, own in enumerate(editor.json["skins"]):
-        if set(own["joints"]) <= set(nodes):
+        if all(joint in nodes for joint in own["joints"]):
             stand = document.bones(skin)
             back = np.linalg.inv(np.stack([worlds[joint] for joint in own["joints"]])) @ stand
             own["inverseBindMatrices"] = editor.add_array(back.swapaxes(1, 2).reshape(-1, 16).astype("<f4"))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Floats32
+from meshmatch.derived import derived
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import shortest_turns, unit
 from meshmatch.outputs import plain_text
@@ -40,15 +41,17 @@ def with_morphs(document: Document, shape: Shape, added: BlendShapes, turn: Floa
     editor = Editor(document)
     normals = shape_normals(shape, added.moves) if added.normals else None
     moving: dict[int, Floats] = {}
+    animated, taken = _animated(document), set(added.names)
     seen = 0
     for number, parts in drawn(document).items():
         start, seen = seen, seen + sum(document.count(part["attributes"]["POSITION"]) for part in parts.values())
         if not added.moves[:, start:seen].any():
             continue
         node, mesh = editor.json["nodes"][number], editor.own_mesh(number)
-        before, weights = _names(mesh), _rest(node, mesh)
+        before, weights = _names(document, document.nodes[number]["mesh"]), _rest(node, mesh)
         node.pop("weights", None)
-        kept = [k for k, name in enumerate(before) if name not in added.names]
+        place = {name: k for k, name in enumerate(before)}
+        kept = [k for k, name in enumerate(before) if name not in taken]
         for k, own in enumerate(mesh["primitives"]):
             rows = slice(start, start + document.count(own["attributes"]["POSITION"]) if k in parts else start)
             start = rows.stop
@@ -62,12 +65,17 @@ def with_morphs(document: Document, shape: Shape, added: BlendShapes, turn: Floa
         for own in mesh["primitives"]:
             if isinstance(own.get("extras"), dict) and "targetNames" in own["extras"]:
                 own["extras"] |= names
-        columns = [*kept, *(before.index(name) if name in before else -1 for name in added.names)]
-        _follow(editor, document, number, columns, mesh["weights"])
+        columns = [*kept, *(place.get(name, -1) for name in added.names)]
+        for animation, channel in animated.get(number, ()):
+            _follow(editor, document, animation, channel, columns, mesh["weights"])
         gltf_vrm.reorder_targets(editor.json, number, node["mesh"], columns)
         moving[number] = np.array([weights[k] for k in kept])
+    quiet: dict[str, list[dict[str, Any]]] = {}  # clips that animate no weights, such as those of a skeleton, by name
+    for each in reversed(editor.json.get("animations", [])):
+        if all(channel["target"]["path"] != "weights" for channel in each["channels"]):
+            quiet.setdefault(str(each.get("name")), []).append(each)
     for clip in added.clips:
-        _add_clip(editor, clip, moving)
+        _add_clip(editor, clip, moving, quiet)
     if not np.array_equal(turn, np.eye(3)):
         editor.turn(turn)
     return editor.to_bytes()
@@ -77,9 +85,10 @@ def _morphs(document: Document) -> BlendShapes:
     parts = list(document.primitives())
     names: dict[str, int] = {}
     weights: list[float] = []
-    for number, _, _ in parts:
-        mesh = document.json["meshes"][document.nodes[number]["mesh"]]
-        for name, weight in zip(_names(mesh), _rest(document.nodes[number], mesh), strict=True):
+    for number in dict.fromkeys(number for number, _, _ in parts):
+        node = document.nodes[number]
+        rest = _rest(node, document.json["meshes"][node["mesh"]])
+        for name, weight in zip(_names(document, node["mesh"]), rest, strict=True):
             if name not in names:
                 names[name] = len(names)
                 weights.append(weight)
@@ -91,8 +100,8 @@ def _morphs(document: Document) -> BlendShapes:
     moves = np.zeros((len(names), sum(counts), 3), np.float32)
     seen, normals = 0, True
     for (number, part, place), count in zip(parts, counts, strict=True):
-        mesh = document.json["meshes"][document.nodes[number]["mesh"]]
-        for name, target in zip(_names(mesh), part.get("targets", []), strict=True):
+        own_names = _names(document, document.nodes[number]["mesh"])
+        for name, target in zip(own_names, part.get("targets", []), strict=True):
             normals &= "NORMAL" in target
             if "POSITION" in target:
                 own = document.accessor(target["POSITION"])
@@ -104,16 +113,19 @@ def _morphs(document: Document) -> BlendShapes:
     return BlendShapes(tuple(names), moves, np.array(weights), normals, _clips(document, names, np.array(weights)))
 
 
-def _names(mesh: dict[str, Any]) -> list[str]:
+@derived
+def _names(document: Document, number: int) -> tuple[str, ...]:
     """What the targets of a mesh are called, none alike."""
+    mesh = document.json["meshes"][number]
     held = [each.get("extras") for each in (mesh, *mesh["primitives"])]  # those of VRM 0.x have them in primitives
     told = [extras.get("targetNames") for extras in held if isinstance(extras, dict)]
     given = next((names for names in told if isinstance(names, list)), [])
-    names: list[str] = []
+    names, taken = list[str](), set[str]()
     for k in range(len(mesh["primitives"][0].get("targets", []))):
         name = plain_text(given[k]) if k < len(given) and isinstance(given[k], str) and given[k] else f"shape {k}"
-        names.append(name if name not in names else f"{name} ({k})")
-    return names
+        names.append(name if name not in taken else f"{name} ({k})")
+        taken.add(names[-1])
+    return tuple(names)
 
 
 def _rest(node: dict[str, Any], mesh: dict[str, Any]) -> list[float]:
@@ -153,7 +165,7 @@ def _clips(document: Document, names: dict[str, int], rest: Float[Floats, " K"])
     for number, animation in enumerate(document.json.get("animations", [])):
         tracks: dict[int, tuple[Floats, Floats, str]] = {}
         for node, _, sampler in _channels(document, animation):
-            own = _names(document.json["meshes"][document.nodes[node]["mesh"]])
+            own = _names(document, document.nodes[node]["mesh"])
             times, values, interpolation = _track(document, sampler, len(own))
             keys += len(times) * len(names)
             if keys > _FEW_WEIGHTS + document.size // 4:
@@ -210,32 +222,41 @@ def _targets(
         yield target
 
 
-def _follow(editor: Editor, document: Document, number: int, columns: list[int], weights: list[float]) -> None:
-    """Let the clips of a node's weights hold those of its new targets: ``columns`` are their old places, or -1."""
-    many = len(_names(document.json["meshes"][document.nodes[number]["mesh"]]))
-    for before, animation in zip(document.json.get("animations", []), editor.json.get("animations", []), strict=True):
-        for k, channel in enumerate(before["channels"]):
-            if channel["target"].get("node") != number or channel["target"]["path"] != "weights":
-                continue
-            sampler = before["samplers"][channel["sampler"]]
-            _, values, interpolation = _track(document, sampler, many)
-            rows = np.tile(weights, (len(values), 1))
-            if interpolation == "CUBICSPLINE":
-                rows[0::3] = rows[2::3] = 0.0
-            for new, old in enumerate(columns):
-                rows[:, new] = rows[:, new] if old < 0 else values[:, old]
-            animation["channels"][k]["sampler"] = len(animation["samplers"])
-            animation["samplers"].append(sampler | {"output": editor.add_array(rows.reshape(-1, 1).astype("<f4"))})
+def _animated(document: Document) -> dict[int, list[tuple[int, int]]]:
+    """Of each node the clips, and channels of these, that animate its weights, by number."""
+    found: dict[int, list[tuple[int, int]]] = {}
+    for number, animation in enumerate(document.json.get("animations", [])):
+        for k, channel in enumerate(animation["channels"]):
+            if channel["target"].get("path") == "weights":
+                found.setdefault(channel["target"].get("node", -1), []).append((number, k))
+    return found
 
 
-def _add_clip(editor: Editor, clip: WeightClip, moving: dict[int, Float[Floats, " N"]]) -> None:
+def _follow(editor: Editor, document: Document, number: int, k: int, columns: list[int], weights: list[float]) -> None:
+    """Let a channel of a clip hold the weights of a node's new targets: ``columns`` are their old places, or -1."""
+    before, animation = document.json["animations"][number], editor.json["animations"][number]
+    channel = before["channels"][k]
+    sampler = before["samplers"][channel["sampler"]]
+    many = len(_names(document, document.nodes[channel["target"]["node"]]["mesh"]))
+    _, values, interpolation = _track(document, sampler, many)
+    rows = np.tile(weights, (len(values), 1))
+    if interpolation == "CUBICSPLINE":
+        rows[0::3] = rows[2::3] = 0.0
+    for new, old in enumerate(columns):
+        rows[:, new] = rows[:, new] if old < 0 else values[:, old]
+    animation["channels"][k]["sampler"] = len(animation["samplers"])
+    animation["samplers"].append(sampler | {"output": editor.add_array(rows.reshape(-1, 1).astype("<f4"))})
+
+
+def _add_clip(
+    editor: Editor, clip: WeightClip, moving: dict[int, Float[Floats, " N"]], quiet: dict[str, list[dict[str, Any]]]
+) -> None:
     """Animate the weights of nodes; ``moving`` are those of the targets that a node has before the new ones.
 
-    A clip of that name that animates no weights, such as that of a skeleton, takes them in.
+    A ``quiet`` clip of that name, which animates no weights, takes them in; each does so once.
     """
-    of_name = [each for each in editor.json.get("animations", []) if each.get("name") == clip.name]
-    quiet = [each for each in of_name if all(ch["target"]["path"] != "weights" for ch in each["channels"])]
-    entry: dict[str, Any] = quiet[0] if quiet else {"name": clip.name, "samplers": [], "channels": []}
+    joined = quiet[clip.name].pop() if quiet.get(clip.name) else None
+    entry: dict[str, Any] = joined or {"name": clip.name, "samplers": [], "channels": []}
     times = editor.add_array(clip.times.astype("<f4"), bounds=True)
     samplers: dict[bytes, int] = {}
     for number, kept in moving.items():
@@ -249,5 +270,5 @@ def _add_clip(editor: Editor, clip: WeightClip, moving: dict[int, Float[Floats, 
             entry["samplers"].append(sampler | {"interpolation": clip.interpolation})
         target = {"node": number, "path": "weights"}
         entry["channels"].append({"sampler": samplers[kept.tobytes()], "target": target})
-    if not quiet and moving:
+    if joined is None and moving:
         editor.add("animations", entry)

@@ -74,10 +74,15 @@ def drop_nodes(json: Json, candidates: Iterable[int], character: bool = False) -
     needed = {target.get("node") for target in channels} | {skin.get("skeleton") for skin in skins}
     needed |= {joint for skin in skins for joint in skin["joints"]} | {holder[key] for _, holder, key in named}
     left = {number for number in left - needed if not nodes[number].keys() & {"mesh", "camera", "extensions", "extras"}}
-    kept: set[int] = set()
-    while left != kept:
-        kept = left
-        left = {number for number in kept if set(nodes[number].get("children", [])) <= kept}
+    above: dict[int, list[int]] = {}
+    for parent in left:
+        for child in nodes[parent].get("children", []):
+            above.setdefault(child, []).append(parent)
+    staying = [child for child in above if child not in left]
+    while staying:  # what is above it stays too
+        for parent in left.intersection(above[staying.pop()]):
+            left.remove(parent)
+            staying += [parent] if parent in above else []
     number = {old: new for new, old in enumerate(k for k in range(len(nodes)) if k not in left)}
     holders = [*((node, "children") for node in nodes), *((scene, "nodes") for scene in json.get("scenes", []))]
     for holder, key in [each for each in holders if each[1] in each[0]]:

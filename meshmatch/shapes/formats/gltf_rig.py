@@ -165,7 +165,8 @@ def nodes_of_skeleton(document: Document, joints: list[int]) -> list[int]:
     for node in document.world:
         if parent.get(node) in below and not {"mesh", "camera", "extensions"} & document.nodes[node].keys():
             below.add(node)
-    return [node for node in document.world if node in wanted | below]
+    wanted |= below
+    return [node for node in document.world if node in wanted]
 
 
 def _parts(name: str, node: dict[str, Any]) -> tuple[Floats, Floats, Floats]:
