@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from io import BytesIO
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -23,6 +24,7 @@ from PIL import Image, UnidentifiedImageError
 from meshmatch.arrays import Brief, Float, Floats, Int, Ints, UInts8
 from meshmatch.errors import InputError, warn
 from meshmatch.shapes.colors import INVISIBLE, light
+from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
 Pixels = UInts8
@@ -243,6 +245,13 @@ class ImageReader:
 
     def __init__(self) -> None:
         self.left = MAX_ALL_PIXELS
+        self._known: dict[Path, Pixels] = {}
+
+    def read(self, file: Path) -> Pixels:
+        """`decode` of a file: once, for many materials may name one image."""
+        if file not in self._known:
+            self._known[file] = self.decode(read_bytes(file), file.name)
+        return self._known[file]
 
     def decode(self, data: bytes, label: str) -> Pixels:
         """(H, W, 4) red, green, blue, alpha of a png, jpeg, webp, bmp, tga or tiff, top row first; or `InputError`."""

@@ -263,7 +263,7 @@ def _laid(name: Path, glb: bytes, shape: Shape, uv: Floats) -> bytes:
 
 def _turned(document: gltf.Document, turn: Float[Floats, "3 3"]) -> bytes:
     editor = Editor(document)
-    editor.turn(turn)
+    editor.turn(document, turn)
     return editor.to_bytes()
 
 

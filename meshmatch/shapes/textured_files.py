@@ -54,7 +54,7 @@ def find_appearance(
     """
     path = Path(path)
     suffix, reader = path.suffix.lower(), ImageReader()
-    picture = None if image is None else reader.decode(read_bytes(Path(image)), Path(image).name)
+    picture = None if image is None else reader.read(Path(image))
     if suffix in _READERS:
         with np.errstate(invalid="ignore", over="ignore"):  # coordinates are judged by the appearance
             found = _READERS[suffix][0](path, read_bytes(path), shape, reader, picture)

@@ -366,6 +366,14 @@ def test_large_images_are_refused_before_they_are_unpacked(tmp_path: Path, monke
         ImageReader().decode(LARGE, "b.png")
 
 
+def test_an_image_that_several_materials_name_counts_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(appearance, "MAX_ALL_PIXELS", 64 * 64)
+    (tmp_path / "p.png").write_bytes(LARGE)
+    lines = ("map_Kd p.png", "newmtl other", "map_Kd ./p.png")
+    first, second = look(obj(tmp_path, *lines, corners="usemtl other\nf 1/1 2/2 3/3\n")).materials
+    assert first.image is second.image is not None
+
+
 def test_a_damaged_tiff_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
     """The library that reads it is of C, and would."""
     out = BytesIO()

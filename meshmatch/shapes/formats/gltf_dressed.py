@@ -76,7 +76,7 @@ def dressed(
                 _add_tangents(editor, document, part, primitive, normals[k], laid)
             wardrobe.dress(primitive, moved_to)
     if not np.array_equal(turn, np.eye(3)):
-        editor.turn(turn)
+        editor.turn(document, turn)
     wardrobe.list_extensions()
     wardrobe.toon.finish(wardrobe.made)
     editor.prune(document)
@@ -115,7 +115,7 @@ def colored(document: Document, colors: Float[Floats, "V 4"], turn: Float[Floats
             mesh["primitives"][k]["attributes"]["COLOR_0"] = editor.add_array(amounts, target=VERTICES)
             seen += V
     if not np.array_equal(turn, np.eye(3)):
-        editor.turn(turn)
+        editor.turn(document, turn)
     editor.prune(document)
     return editor.to_bytes()
 

@@ -81,10 +81,14 @@ class Editor:
 
     def draw(self, document: Document, node: int) -> None:
         """Let a new node hang from nothing in the scene."""
-        if self.json.get("scenes"):
-            self.json["scenes"][self.json.get("scene", 0)].setdefault("nodes", []).append(node)
-        else:
-            self.json |= {"scenes": [{"nodes": [*document.roots(), node]}], "scene": 0}
+        self._scene(document).setdefault("nodes", []).append(node)
+
+    def _scene(self, document: Document) -> dict[str, Any]:
+        """The scene that is drawn; a document need not have one."""
+        if not self.json.get("scenes"):
+            self.json |= {"scenes": [{"nodes": document.roots()}], "scene": 0}
+        found: dict[str, Any] = self.json["scenes"][self.json.get("scene", 0)]
+        return found
 
     def add_view(self, data: bytes, target: int | None = None) -> int:
         """The number of a new buffer view."""
@@ -129,9 +133,9 @@ class Editor:
         """The number of a new accessor for triangles among V vertices."""
         return self.add_array(faces.astype("<u2" if V < 65_535 else "<u4").reshape(-1), target=INDICES)
 
-    def turn(self, rotation: Float[Floats, "3 3"]) -> None:
+    def turn(self, document: Document, rotation: Float[Floats, "3 3"]) -> None:
         """Turn the scene, by a node above all others."""
-        scene = self.json["scenes"][self.json.get("scene", 0)]
+        scene = self._scene(document)
         node = self.add_node("upright", Rotation.from_matrix(rotation).as_quat(), np.zeros(3))
         self.json["nodes"][node]["children"], scene["nodes"] = scene["nodes"], [node]
 

@@ -77,7 +77,7 @@ def with_morphs(document: Document, shape: Shape, added: BlendShapes, turn: Floa
     for clip in added.clips:
         _add_clip(editor, clip, moving, quiet)
     if not np.array_equal(turn, np.eye(3)):
-        editor.turn(turn)
+        editor.turn(document, turn)
     return editor.to_bytes()
 
 

@@ -431,4 +431,4 @@ def _decoded(path: Path, name: str, entry: _Entry, wanted: _Map, reader: ImageRe
     if file is None:
         what = f"{path.name} needs the image {wanted.file[:200]} of its material {name}, which is not there"
         raise InputError(what, f"copy it to {entry.folder}, or name another with --image")
-    return reader.decode(read_bytes(file), file.name)
+    return reader.read(file)

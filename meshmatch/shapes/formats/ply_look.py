@@ -21,7 +21,6 @@ from meshmatch.shapes.formats import damaged
 from meshmatch.shapes.formats.ply import Content, corners_of, faces_of, parsed
 from meshmatch.shapes.formats.ply_rows import Element
 from meshmatch.shapes.formats.polygons import triangles_of
-from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
 _TEXTURE = re.compile(r"texture[ _]?file\b\s*[:=]?\s*(.+)|texture\b\s*[:=]?\s*(.+\.\w{3,4})", re.IGNORECASE)
@@ -70,7 +69,7 @@ def _image(path: Path, name: str, reader: ImageReader, shape: Shape) -> Pixels |
     """The image of a name; None if it is not there, and the vertices have colors to show instead."""
     file = beside(path.parent, name)
     if file is not None:
-        return reader.decode(read_bytes(file), file.name)
+        return reader.read(file)
     missing = f"{path.name} needs the image {name[:200]}, which is not there"
     if shape.colors is None:
         raise InputError(missing, f"copy it to {path.parent}, or name another with --image")
