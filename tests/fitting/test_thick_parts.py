@@ -82,6 +82,14 @@ def test_a_sheet_holds_no_ball() -> None:
     assert largest_ball(scan_of(Shape(np.stack([x, y, 0.1 * x * y], 1), faces), 2000), 200) is None
 
 
+def test_the_gap_between_a_body_and_its_coat_holds_no_ball() -> None:
+    """Both sheets face outwards: a ball between them would touch the upper one from within, the lower one from out."""
+    skin = np.array([[0, 0, -0.3], [1, 0, -0.3], [1, 1, -0.3], [0, 1, -0.3]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    worn = Shape(np.concatenate([skin, skin + np.array([0, 0, 0.3])]), np.concatenate([faces, faces + 4]))
+    assert largest_ball(scan_of(worn, 4000), 200) is None
+
+
 def test_a_head_larger_than_all_the_rest_is_no_trunk(human: TrainedModel, monkeypatch: pytest.MonkeyPatch) -> None:
     """A cartoon on short legs."""
     monkeypatch.setattr(thick_parts, "SETTINGS", replace(thick_parts.SETTINGS, factors=(0.36,)))  # one is quicker
