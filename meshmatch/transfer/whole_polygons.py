@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from heapq import heappop, heappush
+
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
@@ -14,11 +16,17 @@ def unfolded_polygon(
     places: list[Floats] = []
     out = np.empty((len(faces), 3), np.int64)
     at: dict[int, int] = {}
-    left = list(range(len(faces)))
-    while left:  # one that hangs together with what is laid
-        face = max(left, key=lambda each: sum(vertex in at for vertex in faces[each].tolist()))
-        left.remove(face)
-        own = faces[face].tolist()
+    corners = faces.tolist()
+    around: dict[int, list[int]] = {}  # the faces at each corner
+    for face, own in enumerate(corners):
+        for vertex in own:
+            around.setdefault(vertex, []).append(face)
+    shared, waiting = [0] * len(corners), [(0, face) for face in range(len(corners))]
+    while waiting:  # the first of those that hang together best with what is laid
+        less, face = heappop(waiting)
+        if less != -shared[face]:  # it waits elsewhere, or is laid
+            continue
+        own, shared[face] = corners[face], -1
         for k in [k for k in range(3) if own[k] not in at]:
             a, b = (own[(k + step) % 3] for step in (1, 2))
             known = [at[vertex] for vertex in (a, b) if vertex in at]
@@ -29,6 +37,10 @@ def unfolded_polygon(
                 place = places[known[0]] + [float(np.linalg.norm(verts[own[k]] - verts[other])), 0.0]
             else:
                 place = np.array([max((float(each[0]) for each in places), default=0.0), 0.0])
+            for other in around[own[k]] if own[k] not in at else ():
+                if shared[other] >= 0:
+                    shared[other] += 1
+                    heappush(waiting, (-shared[other], other))
             at[own[k]] = len(places)
             places.append(np.asarray(place))
         out[face] = [at[vertex] for vertex in own]

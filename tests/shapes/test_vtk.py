@@ -2,6 +2,7 @@
 
 import base64
 import lzma
+import time
 import zlib
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from meshmatch.collections.sources import find_sources
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchWarning
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats import vtk
+from meshmatch.shapes.formats import vtk, vtk_xml
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
 
@@ -270,6 +271,21 @@ def test_nothing_is_read_again_and_again(tmp_path: Path) -> None:
     (tmp_path / "b.vtp").write_bytes(many)
     with pytest.raises(InputError, match="vertices and faces"):
         load_shape(tmp_path / "b.vtp")
+
+
+def test_many_arrays_in_a_long_tail(tmp_path: Path) -> None:
+    """None takes a copy of all that lies behind where it begins."""
+    array = '<DataArray type="Float32" Name="{}" format="appended" offset="4"/>'
+    arrays = "".join(array.format(k) for k in range(3000))
+    head = '<VTKFile type="PolyData" byte_order="LittleEndian"><PolyData>'
+    piece = f'<Piece NumberOfPoints="1"><PointData>{arrays}</PointData></Piece></PolyData>'
+    held = b"AAAA" + packed(np.array([2.5], "<f4").tobytes(), "apart", "<u4", "") + b"A" * 8_000_000
+    tail = b'<AppendedData encoding="base64">_' + held + b"</AppendedData></VTKFile>"
+    (tmp_path / "a.vtp").write_bytes((head + piece).encode() + tail)
+    begin = time.process_time()
+    found = vtk_xml.point_arrays(tmp_path / "a.vtp")
+    assert time.process_time() - begin < 1
+    assert len(found) == 3000 and all(values.tolist() == [2.5] for values in found.values())
 
 
 def test_a_piece_does_not_take_the_vertices_of_another(tmp_path: Path) -> None:

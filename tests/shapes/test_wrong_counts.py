@@ -1,6 +1,7 @@
 """STL, PCD and NumPy files that hold more or less than they promise: all that is whole is read, and it is said."""
 
 import struct
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -152,3 +153,15 @@ def test_numpy_arrays_with_more_behind_them_or_with_fields(tmp_path: Path) -> No
         rows[axis] = column
     np.save(tmp_path / "b.npy", rows)
     np.testing.assert_array_equal(load_shape(tmp_path / "b.npy").verts, POINTS)
+
+
+def test_a_pcd_with_millions_of_numbers_for_each_point(tmp_path: Path) -> None:
+    """The memory that a header asks for is no more than its bytes can mean, field by field and together."""
+    fields = 20
+    head = f"FIELDS {'x ' * fields}\nSIZE {'4 ' * fields}\nTYPE {'F ' * fields}\nCOUNT {'9000000 ' * fields}\n"
+    (tmp_path / "a.pcd").write_bytes(f"{head}POINTS 1\nDATA binary\n".encode() + bytes(200_000))
+    tracemalloc.start()
+    with pytest.raises(InputError, match="over 4096 numbers for each point"):
+        load_shape(tmp_path / "a.pcd")
+    assert tracemalloc.get_traced_memory()[1] < 4_000_000
+    tracemalloc.stop()

@@ -1,5 +1,7 @@
 """New charts: they lie flat and apart, hold together, and do not cover themselves."""
 
+import time
+
 import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter
@@ -13,6 +15,7 @@ from meshmatch.transfer.new_charts import flat_areas, new_charts
 from meshmatch.transfer.pack_charts import Chart, packed, tightest
 from meshmatch.transfer.texels import faces_on
 from meshmatch.transfer.tighten_charts import tightened
+from meshmatch.transfer.whole_polygons import unfolded_polygon
 from tests.conftest import icosphere
 
 
@@ -138,6 +141,20 @@ def test_small_closed_pieces_are_unfolded() -> None:
         assert (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0] > 0).all()
         image = (laid - laid.min(axis=(0, 1))) / np.ptp(laid, axis=(0, 1)).max()
         assert faces_on(image * 512, 512)[1] == 0
+
+
+def test_a_polygon_of_thousands_of_corners_is_unfolded() -> None:
+    """A disc, cut in triangles between its rim's ends from both sides, which all lie in one plane."""
+    count = 6000
+    angle = 2 * np.pi * np.arange(count) / count
+    disc = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
+    low, high = np.arange(count // 2 - 1), count - 1 - np.arange(count // 2 - 1)
+    faces = np.concatenate([np.stack([low, low + 1, high], 1), np.stack([low + 1, high - 1, high], 1)])
+    begin = time.process_time()
+    laid, corners = unfolded_polygon(disc, faces)
+    assert time.process_time() - begin < 2
+    sides = [np.linalg.norm(each[:, [1, 2, 0]] - each, axis=2) for each in (laid[corners], disc[faces])]
+    assert np.allclose(*sides, atol=1e-9)
 
 
 def strand(bend: float, count: int = 12, around: int = 6) -> tuple[np.ndarray, np.ndarray]:

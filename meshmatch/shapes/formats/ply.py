@@ -151,7 +151,9 @@ def read_pcd(path: Path, data: bytes) -> Raw:
         points = Element("vertex", 0)
         for label, kind, size, count in zip(head["FIELDS"], head["TYPE"], head["SIZE"], counts, strict=True):
             known = TYPES[{"F": "float", "I": "int", "U": "uint"}[kind] + str(8 * int(size))]
-            points.properties += [Property(label.lower(), known)] * min(int(count), len(data))
+            points.properties += [Property(label.lower(), known)] * min(int(count), _MOST_LINES)
+            if len(points.properties) > _MOST_LINES:
+                raise damaged(name, f"its header declares over {_MOST_LINES} numbers for each point")
         grid = int(head["WIDTH"][0]) * int(head["HEIGHT"][0]) if "WIDTH" in head and "HEIGHT" in head else 0
         promised = int(head["POINTS"][0]) if "POINTS" in head else grid
         body = Body(name, data, start.end(), None if start[1] == b"ascii" else "<")

@@ -231,7 +231,7 @@ class _File:
                 at = int(str(element.get("offset")))
                 if not 0 <= at < len(self.appended):
                     raise ValueError("an offset beyond the end")
-                data = self._raw(at) if b"raw" in self.encoding else self._base64(self.appended[at:])
+                data = self._raw(at) if b"raw" in self.encoding else self._base64(memoryview(self.appended)[at:])
             else:
                 data = self._base64(text)
             return np.frombuffer(data, np.dtype(self.order + kind))
@@ -249,7 +249,7 @@ class _File:
         at += len(head) * width
         return self._unpacked(head, self.appended[at : at + int(head[3:].sum())])
 
-    def _base64(self, text: bytes) -> bytes:
+    def _base64(self, text: bytes | memoryview) -> bytes:
         """The data behind a header of base64, which may be a text of its own."""
         width = self.header.itemsize
         first = base64.b64decode(text[: _letters(width)])
