@@ -8,6 +8,7 @@ become a cloud without a word.
 from __future__ import annotations
 
 import re
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -150,11 +151,16 @@ def _ragged(values: Any) -> bool:
 
 def _polygons(values: Any, label: str) -> _Polygons:
     """Polygons of lists of corners, or of rows with the same number of corners."""
-    sizes = np.array([len(each) for each in values], np.int64)
-    corners = [_whole(_array(each, label), label) for each in values if len(each)]
-    if any(each.ndim != 1 for each in corners):
-        raise InputError(f"{label}: each face must be a list of vertices", HINT)
-    return _Polygons(np.concatenate(corners).astype(np.int64), sizes)
+    if isinstance(values, np.ndarray) and values.ndim == 2:
+        sizes, corners = np.full(len(values), values.shape[1]), values.reshape(-1)
+    else:
+        sizes = np.array([len(each) for each in values], np.int64)
+        rows = (each if isinstance(each, list | tuple) else np.atleast_1d(_array(each, label)) for each in values)
+        flat = list(chain.from_iterable(rows))
+        if any(isinstance(each, list | tuple | np.ndarray) for each in flat):
+            raise InputError(f"{label}: each face must be a list of vertices", HINT)
+        corners = _array(flat, label)
+    return _Polygons(_whole(corners, label).astype(np.int64), sizes)
 
 
 def _counted(values: np.ndarray, label: str) -> tuple[Ints, Ints]:
