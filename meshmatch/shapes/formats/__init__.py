@@ -107,6 +107,14 @@ def fan(corners: Int[Ints, " N"], sizes: Int[Ints, " P"]) -> Int[Ints, "F 3"]:
     return np.stack([corners[np.repeat(starts, triangles)], corners[second], corners[second + 1]], axis=1)
 
 
+def strips(corners: Int[Ints, " N"], sizes: Int[Ints, " P"]) -> Int[Ints, "F 3"]:
+    """Triangles of strips, given as to `fan`: a b c d ... becomes a b c, c b d, ..., every other one turned over."""
+    counts = np.maximum(sizes - 2, 0)
+    first = runs(np.cumsum(sizes) - sizes, counts)
+    odd = runs(np.zeros(len(counts), np.int64), counts) % 2
+    return np.stack([corners[first + odd], corners[first + 1 - odd], corners[first + 2]], axis=1)
+
+
 def indices(name: str, values: NDArray[Any]) -> Ints:
     """Numbers of vertices, or `InputError`: floats are what text files are read as."""
     if values.dtype.kind == "f" and not (np.abs(values) < 2**53).all():

@@ -25,7 +25,7 @@ from meshmatch.errors import InputError, warn
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import to_srgb
 from meshmatch.shapes.companions import beside
-from meshmatch.shapes.formats import NO_FACES, WRONG_SUFFIX, Raw, check_places, damaged, joined_colors
+from meshmatch.shapes.formats import NO_FACES, WRONG_SUFFIX, Raw, check_places, damaged, fan, joined_colors, strips
 from meshmatch.shapes.formats.gltf_compressed import COMPONENTS, DRACO, MESHOPT, WIDTHS, decompress
 from meshmatch.shapes.input_files import check_text, json_of, read_bytes
 
@@ -343,13 +343,7 @@ class Document:
             corners = np.arange(self.count(primitive["attributes"]["POSITION"]))
         if mode == _TRIANGLES:
             return corners[: len(corners) // 3 * 3].reshape(-1, 3)
-        if len(corners) < 3:
-            return NO_FACES
-        a, b, c = corners[:-2], corners[1:-1], corners[2:]
-        if mode == _FAN:
-            return np.stack([np.full_like(b, corners[0]), b, c], axis=1)
-        odd = np.arange(len(a)) % 2 == 1
-        return np.stack([np.where(odd, b, a), np.where(odd, a, b), c], axis=1)
+        return (fan if mode == _FAN else strips)(corners, np.array([len(corners)]))
 
     def colors(self, primitive: dict[str, Any]) -> Float[Floats, "V 4"] | None:
         """(V, 4) light and alpha of a primitive's vertices: `COLOR_0` is linear (section 3.9.2)."""

@@ -74,6 +74,7 @@ def label_surfaces(
             label = int(labels[code + 1]) if box is not None else 0
             if label == 0:
                 continue
+            at_edge = any(side.start == 0 or side.stop == codes.shape[axis] for axis, side in enumerate(box))
             box = tuple(slice(max(side.start - 1, 0), side.stop + 1) for side in box)
             voxels = math.prod(side.stop - side.start for side in box)
             work += voxels
@@ -88,7 +89,7 @@ def label_surfaces(
             points, own = _net(inside)
             if len(points) == 0:
                 continue
-            if _reaches(codes, code + 1):
+            if at_edge:
                 cut.append(str(label))
             points = (points + [side.start for side in box]) @ steps + origin
             faces.append((own if np.linalg.det(steps) > 0 else own[:, ::-1]) + count)
@@ -139,11 +140,6 @@ def _slabs(voxels: NDArray[Any]) -> Iterator[tuple[slice, slice, slice]]:
     step = max(1, _SLAB // (voxels.shape[0] * voxels.shape[1]))
     for low in range(0, voxels.shape[2], step):
         yield slice(None), slice(None), slice(low, low + step)
-
-
-def _reaches(codes: NDArray[np.uint16], code: int) -> bool:
-    ends = (np.take(codes, [0, -1], axis) for axis in range(3))
-    return any(bool((end == code).any()) for end in ends)
 
 
 def _net(inside: Bool[Bools, "X Y Z"]) -> tuple[Float[Floats, "V 3"], Int[Ints, "F 3"]]:

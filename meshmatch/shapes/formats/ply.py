@@ -23,6 +23,7 @@ from meshmatch.shapes.formats import (
     colors_of_faces,
     damaged,
     indices,
+    strips,
     tell_lost_faces,
 )
 from meshmatch.shapes.formats.ply_rows import TYPES, Body, Element, Property
@@ -270,14 +271,10 @@ def _check_kinds(name: str, element: Element) -> None:
 
 
 def faces_of(corners: Ints, sizes: Ints) -> Ints:
-    """Triangles of strips, which are a row each, or split by -1; every second triangle of a strip is turned round."""
-    a, b, c = corners[:-2], corners[1:-1], corners[2:]
-    place, row = np.arange(len(corners)), np.repeat(np.arange(len(sizes)), sizes)
-    begins = np.where(corners < 0, place + 1, np.repeat(np.cumsum(sizes) - sizes, sizes))
-    begin = np.maximum.accumulate(begins)[: len(a)]
-    odd = (place[: len(a)] - begin) % 2 == 1
-    faces = np.stack([np.where(odd, b, a), np.where(odd, a, b), c], axis=1)
-    return np.asarray(faces[(a >= 0) & (b >= 0) & (c >= 0) & (row[: len(a)] == row[2:])])
+    """Triangles of strips, which are a row each, or split by -1."""
+    ends = corners < 0
+    strip = np.repeat(np.arange(len(sizes)), sizes) + np.cumsum(ends)
+    return strips(corners[~ends], np.unique(strip[~ends], return_counts=True)[1])
 
 
 def _colors(element: Element) -> Floats | None:

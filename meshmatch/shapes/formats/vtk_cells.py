@@ -10,7 +10,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, warn
-from meshmatch.shapes.formats import Raw, check_places, damaged, runs, tell_lost_faces
+from meshmatch.shapes.formats import Raw, check_places, damaged, runs, strips, tell_lost_faces
 from meshmatch.shapes.formats.polygons import triangles_of
 
 _POINTS, _LINES = (0, 1, 2), (3, 4, 21)
@@ -60,7 +60,7 @@ def raw_of(
             listed += len(some)
             corners, sizes = each.corners[runs(starts[some], each.sizes[some])], each.sizes[some]
             if kinds == (_STRIP,):
-                triangles.append(_of_strips(corners, sizes))
+                triangles.append(strips(corners, sizes))
                 continue
             if kinds == (_PIXEL,):
                 if (sizes != 4).any():
@@ -70,14 +70,3 @@ def raw_of(
     found = np.concatenate(triangles)
     tell_lost_faces(name, listed, found)
     return Raw(verts, found, colors)
-
-
-def _of_strips(corners: Ints, sizes: Ints) -> Ints:
-    """Triangles of strips, every other one turned over."""
-    counts = np.maximum(sizes - 2, 0)
-    starts = np.cumsum(sizes) - sizes
-    first = runs(starts, counts)
-    odd = (runs(np.zeros(len(counts), np.int64), counts) % 2).astype(bool)
-    found = np.stack([corners[first], corners[first + 1], corners[first + 2]], axis=1)
-    found[odd] = found[odd][:, [1, 0, 2]]
-    return found
