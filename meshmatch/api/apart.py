@@ -15,18 +15,17 @@ import numpy as np
 
 from meshmatch.api.inputs import usable
 from meshmatch.arrays import Float, Floats
-from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.errors import InputError
 from meshmatch.fitting.classify import classify
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter, may_show_part
-from meshmatch.fitting.judge.category import BELONGS, FAMILIAR, STRANGE, SURE, category_residual, category_samples
+from meshmatch.fitting.judge.category import BELONGS, FAMILIAR, STRANGE, SURE, Readings
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.parts import Parts, apart, tries, without_parts
 from meshmatch.shapes.repair import NOT_TRUSTED, Repaired
 from meshmatch.shapes.shape import Shape
-from meshmatch.threads import parallel_map
 
 Loader = Callable[[], TrainedModel]
 _AS_WELL = 0.003  # what also reads so much worse (units of sqrt(area)) keeps what touches it, such as clothes
@@ -83,7 +82,12 @@ def find_alone(
                 clean.append(rest)
     if not sets:
         return None
-    found = _readings(models, [each.shape for each in clean], config, order or [range(len(models))])
+    readings = Readings(models, [each.shape for each in clean], [config] * len(clean))
+    found = readings.found
+    for rows in order or [range(len(models))]:
+        readings.ask(rows, range(len(clean)))
+        if found.min() <= FAMILIAR:
+            break
     value = found.min(axis=0)
 
     def trusted(k: int) -> Fit | None:
@@ -146,29 +150,6 @@ def left_out_words(parts: Parts, numbers: Sequence[int]) -> str:
 def _listed(numbers: Sequence[int]) -> str:
     more = f" and {len(numbers) - _TOLD} more" if len(numbers) > _TOLD else ""
     return f"{'part' if len(numbers) == 1 else 'parts'} {', '.join(map(str, numbers[:_TOLD]))}{more}"
-
-
-def _readings(
-    models: Sequence[Loader], shapes: Sequence[Shape], config: FitConfig, order: Iterable[Sequence[int]]
-) -> Float[Floats, "M S"]:
-    samples = parallel_map(category_samples, shapes, [config.seed] * len(shapes))
-    found = np.full((len(models), len(shapes)), np.inf)
-
-    def reading(row: int, number: int) -> float:
-        try:
-            return category_residual(models[row](), shapes[number], samples[number], config)
-        except OptionError:
-            raise
-        except MeshmatchError:  # a damaged model, or a shape that it cannot see
-            return np.inf
-
-    for rows in order:
-        at = [(row, number) for row in rows for number in range(len(shapes))]
-        for place, value in zip(at, parallel_map(lambda at: reading(*at), at), strict=True):
-            found[place] = value
-        if found.min() <= FAMILIAR:
-            break
-    return found
 
 
 def _fullest(parts: Parts, sets: Sequence[frozenset[int]], value: Floats, known: Sequence[int]) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,12 +14,12 @@ import numpy as np
 from meshmatch.api.apart import find_alone
 from meshmatch.api.inputs import UnknownKindsError, as_model, refuse_far_parts
 from meshmatch.arrays import Float, Floats
-from meshmatch.errors import InputError, MeshmatchError, ModelError, OptionError
+from meshmatch.errors import InputError, ModelError, OptionError
 from meshmatch.fitting.classify import classify
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import boundary_length, may_show_part
-from meshmatch.fitting.judge.category import FAMILIAR, KNOWN, SURE, category_residual, category_samples
+from meshmatch.fitting.judge.category import FAMILIAR, KNOWN, SURE, Readings
 from meshmatch.maps.evaluate import CM, X100, ErrorUnit
 from meshmatch.models.card import ModelCard
 from meshmatch.models.registry import list_models
@@ -81,23 +81,8 @@ def category_residuals(
     is. Models of its kind are then asked about the other shapes, and the rest where they do not know them: but not about a
     part of something whose kind is known.
     """
-    samples = parallel_map(category_samples, shapes, [config.seed for config in configs])
-
-    def reading(model: Installed, number: int) -> float:
-        try:
-            return category_residual(model.load(), shapes[number], samples[number], configs[number])
-        except OptionError:  # a device that is not there: true of all models
-            raise
-        except MeshmatchError:  # also of a damaged model: `meshmatch models list` tells what is wrong with it
-            return np.inf
-
-    found = np.full((len(models), len(shapes)), np.inf)
-
-    def ask(rows: Iterable[int], numbers: Iterable[int]) -> None:
-        at = [(row, number) for row in rows for number in numbers]
-        for place, value in zip(at, parallel_map(lambda at: reading(models[at[0]], at[1]), at), strict=True):
-            found[place] = value
-
+    readings = Readings([model.load for model in models], shapes, configs)
+    found = readings.found
     parts = [_is_part(shape, config) for shape, config in zip(shapes, configs, strict=True)]
     lacking = [
         np.inf if shape.is_cloud else part * boundary_length(shape) / np.sqrt(shape.area)
@@ -105,15 +90,15 @@ def category_residuals(
     ]
     first, *others = np.argsort(lacking, kind="stable").tolist()
     for rows in _order(models):
-        ask(rows, [first])
+        readings.ask(rows, [first])
         if found[:, first].min() <= sure:
             break
     known = found[:, first].min() <= KNOWN
     kind = models[int(found[:, first].argmin())].card.category
     same = [row for row, model in enumerate(models) if model.card.category == kind and known]
-    ask(same, others)
+    readings.ask(same, others)
     unknown = [number for number in others if found[:, number].min() > KNOWN and not (known and parts[number])]
-    ask([row for row in range(len(models)) if row not in same], unknown)
+    readings.ask([row for row in range(len(models)) if row not in same], unknown)
     return found
 
 

@@ -16,6 +16,7 @@ from meshmatch.api.inputs import as_model, usable
 from meshmatch.api.matcher import Matcher
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.judge import category
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.parts import Parts, leave_out
 from meshmatch.shapes.parts import apart as parts_apart
@@ -50,7 +51,7 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[int, float]], list[
             asked.append(shape.V)
             return known.get(shape.V, 8.0) / 100
 
-        monkeypatch.setattr(apart, "category_residual", read)
+        monkeypatch.setattr(category, "category_residual", read)
         return asked
 
     return install

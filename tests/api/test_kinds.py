@@ -17,6 +17,7 @@ from meshmatch.api.matcher import Matcher
 from meshmatch.errors import InputError, ModelError, OptionError
 from meshmatch.fitting import classify
 from meshmatch.fitting.fit_config import FitConfig, Partial
+from meshmatch.fitting.judge import category
 from meshmatch.fitting.judge.category import has_limbs
 from meshmatch.models import registry
 from meshmatch.models.trained import TrainedModel
@@ -215,7 +216,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, shapes: list[Shape], partial: Partial
         calls.append(f"{model} {name}")
         return float(words[["human", "quadruped", "own"].index(model)]) / 100
 
-    monkeypatch.setattr(kinds, "category_residual", read)
+    monkeypatch.setattr(category, "category_residual", read)
     cards = {name: as_model(name).card for name in ("human", "quadruped")}
     cards["own"] = replace(cards["quadruped"], name="own", category="ape")
     models = [Installed(card, lambda name=name: name, name != "own") for name, card in cards.items()]
@@ -260,11 +261,11 @@ def test_samples_are_told_apart() -> None:
 
 def test_hands_and_heads_are_told_apart() -> None:
     models = kinds.installed_models()
-    for name, category in (("waving", "hand"), ("pointing", "hand"), ("laughing", "head"), ("child", "head")):
+    for name, kind in (("waving", "hand"), ("pointing", "hand"), ("laughing", "head"), ("child", "head")):
         shape = validated(meshmatch.load_shape(SAMPLES / f"{name}.ply")).shape
         readings = kinds.category_residuals(models, [shape], [CONFIG])
-        assert kinds.classify_shapes(models, readings, [shape], [CONFIG])[0].kind == category, name
-        own = [model.card.category for model in models].index(category)
+        assert kinds.classify_shapes(models, readings, [shape], [CONFIG])[0].kind == kind, name
+        own = [model.card.category for model in models].index(kind)
         assert np.delete(readings[:, 0], own).min() > readings[own, 0] + 0.005, name
 
 
@@ -317,7 +318,7 @@ def test_animals_are_told_before_the_rarer_kinds_are_asked(monkeypatch: pytest.M
     def asked(name: str, known: str) -> list[str]:
         calls.clear()
         monkeypatch.setattr(
-            kinds, "category_residual", lambda model, *_: calls.append(model) or (0.03 if model == known else 0.07)
+            category, "category_residual", lambda model, *_: calls.append(model) or (0.03 if model == known else 0.07)
         )
         found = kinds.category_residuals(models, [ball(name)], [CONFIG])
         assert [*cards][int(found.argmin())] == known

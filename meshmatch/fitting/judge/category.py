@@ -6,12 +6,14 @@ complete shape: of a part a high one says little.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
 from meshmatch.derived import derived
+from meshmatch.errors import MeshmatchError, OptionError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.reasons import Verdict
 from meshmatch.fitting.search.frames import frames_to_try, scan_frame
@@ -21,6 +23,7 @@ from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import parallel_map
 
 KNOWN = 0.0485
 """Residuals up to this (units of sqrt(area)) are of a shape that the model knows. The benchmark's bodies, scans and animals
@@ -57,6 +60,35 @@ def category_residual(model: TrainedModel, shape: Shape, samples: OrientedPoints
     starts = [(thin, pose) for pose in frames_to_try(model, thin, config, shape.upright)]
     best = best_first(predictor.fit_all(starts, rounds=1, draws=1))[0]
     return predictor.fit(placed, best.pose, draws=1).residual
+
+
+class Readings:
+    """`category_residual` of some repaired shapes by some models, which are loaded when they are asked.
+
+    ``found`` (M, S) is infinite where a model is damaged or cannot see a shape, and where it was not asked.
+    """
+
+    def __init__(
+        self, models: Sequence[Callable[[], TrainedModel]], shapes: Sequence[Shape], configs: Sequence[FitConfig]
+    ) -> None:
+        self._models, self._shapes, self._configs = models, shapes, configs
+        self._samples = parallel_map(category_samples, shapes, [config.seed for config in configs])
+        self.found = np.full((len(models), len(shapes)), np.inf)
+
+    def ask(self, rows: Iterable[int], numbers: Iterable[int]) -> None:
+        """Ask these models about these shapes."""
+        at = [(row, number) for row in rows for number in numbers]
+        for place, value in zip(at, parallel_map(lambda at: self._read(*at), at), strict=True):
+            self.found[place] = value
+
+    def _read(self, row: int, number: int) -> float:
+        try:
+            model = self._models[row]()
+            return category_residual(model, self._shapes[number], self._samples[number], self._configs[number])
+        except OptionError:  # a device that is not there: true of all models
+            raise
+        except MeshmatchError:  # also of a damaged model: `meshmatch models list` tells what is wrong with it
+            return np.inf
 
 
 @derived
