@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from meshmatch.api.inputs import MINIMUM_FACES, MINIMUM_POINTS
 from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.direct import MIRROR
@@ -34,8 +35,6 @@ from meshmatch.templates.sides import is_other_side, mirrored, other_side
 from meshmatch.templates.template import Scale, Template, save_arrays, save_template
 from meshmatch.threads import parallel_map
 
-MIN_FACES = 50
-MIN_POINTS = 100
 _ARRAYS = tuple(f"{name}.safetensors" for name in ("template", "points", "shapes"))
 _WRITTEN = (*_ARRAYS, "normalised", "prepared.json", "nodes.png")
 _MOST_SIDES = 200  # shapes among which sides are looked for: it takes a second or two a shape
@@ -409,11 +408,11 @@ def _template_landmarks(
 def _check_size(clean: Repaired) -> Repaired:
     """The same shape, if there is enough of it to learn from; `InputError` otherwise."""
     shape = clean.shape
-    if shape.is_cloud and shape.V < MIN_POINTS:
+    if shape.is_cloud and shape.V < MINIMUM_POINTS:
         places = "place" if shape.V == 1 else "places"
-        raise InputError(f"it has points in only {shape.V} {places}", f"at least {MIN_POINTS} are needed")
-    if not shape.is_cloud and shape.F < MIN_FACES:
+        raise InputError(f"it has points in only {shape.V} {places}", f"at least {MINIMUM_POINTS} are needed")
+    if not shape.is_cloud and shape.F < MINIMUM_FACES:
         triangles = "triangle" if shape.F == 1 else "triangles"
-        raise InputError(f"it has only {shape.F} usable {triangles}", f"at least {MIN_FACES} are needed")
+        raise InputError(f"it has only {shape.F} usable {triangles}", f"at least {MINIMUM_FACES} are needed")
     sqrt_area_frame(shape)  # refuses a shape without area
     return clean

@@ -69,6 +69,17 @@ def triangle_areas(verts: Float[Floats, "V 3"], faces: Int[NDArray[Any], "F 3"])
     return np.asarray(0.5 * np.sqrt(squared_lengths(triangle_vectors(verts, faces))))
 
 
+def signed_areas(corners: Float[Floats, "F 3 2"]) -> Float[Floats, " F"]:
+    """Areas of triangles in the plane, negative where their corners turn clockwise."""
+    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.asarray(0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]))
+
+
+def flat_areas(corners: Float[Floats, "F 3 2"]) -> Float[Floats, " F"]:
+    """Areas of triangles in the plane."""
+    return np.asarray(np.abs(signed_areas(corners)))
+
+
 def vertex_areas(verts: Float[Floats, "V 3"], faces: Int[NDArray[Any], "F 3"]) -> Float[Floats, " V"]:
     """A third of the area of the triangles around each vertex."""
     return share_areas(triangle_areas(verts, faces), faces, len(verts))

@@ -152,15 +152,12 @@ class Places(Brief):
     @cached_property
     def _surface(self) -> Surface:
         """The faces as they lie on the resting template."""
-        return self._surface_of(self._used)
+        return Surface(self.resting.astype(np.float64), self.stands[self.faces[self._used]].astype(np.int64))
 
     def _surface_of_some(self, faces: Int[Ints, " F"]) -> Surface:
         """The same of some faces, of their corners alone: what is asked of one part must not cost the whole."""
         corners, faces = np.unique(self.stands[self.faces[faces]], return_inverse=True)
         return Surface(self.resting[corners].astype(np.float64), faces.reshape(-1, 3).astype(np.int64))
-
-    def _surface_of(self, faces: Int[Ints, " F"]) -> Surface:
-        return Surface(self.resting.astype(np.float64), self.stands[self.faces[faces]].astype(np.int64))
 
     @cached_property
     def _points(self) -> Ints:

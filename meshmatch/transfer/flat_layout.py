@@ -13,7 +13,7 @@ from scipy.sparse.linalg import SuperLU
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.smoothing import factors
-from meshmatch.geometry.triangles import same_rows, together, triangle_areas, unit
+from meshmatch.geometry.triangles import flat_areas, same_rows, signed_areas, together, triangle_areas, unit
 from meshmatch.transfer.texels import faces_on
 
 # All of these were set by hand.
@@ -90,14 +90,14 @@ def laid_flat(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], most: float,
     uv = _untangled(uv, corners)
     if _stretch(uv[corners], flat, own) > most:
         return None
-    uv *= np.sqrt(own.sum() / np.abs(_signed(uv[corners])).sum())
+    uv *= np.sqrt(own.sum() / flat_areas(uv[corners]).sum())
     return Layout.of(uv, corners, own > _NOTHING * areas, least)
 
 
 def _bad(uv: Floats, corners: Ints, seen: Bools, least: int) -> tuple[Int[Ints, " K"], tuple[int, int] | None]:
     """Faces that are seen and turned over; and of two that share a texel the one closer to the border. And such two."""
     F, laid = len(corners), uv[corners]
-    over, pair = (_signed(laid) <= 0) & seen, None
+    over, pair = (signed_areas(laid) <= 0) & seen, None
     if not over.any() and _has_simple_border(uv, corners[seen]):
         return np.empty(0, np.int64), None
     grid = int(np.clip(_FINE * np.sqrt(F), least, _GRID))
@@ -216,7 +216,7 @@ def _as_conformal(points: Floats, corners: Ints, flat: Floats, areas: Floats) ->
         right = np.bincount(rows[held], pulled.real, M) + 1j * np.bincount(rows[held], pulled.imag, M)
         found[free] = _factors(products, rows, columns, free).solve(right[free])
     uv = np.stack([found.real, found.imag], axis=1)
-    return np.asarray(uv * np.sqrt(areas.sum() / max(np.abs(_signed(uv[corners])).sum(), 1e-300)))
+    return np.asarray(uv * np.sqrt(areas.sum() / max(flat_areas(uv[corners]).sum(), 1e-300)))
 
 
 def _as_rigid(uv: Floats, corners: Ints, flat: Floats) -> Iterator[Float[Floats, "M 2"]]:
@@ -255,7 +255,7 @@ def _factors(values: NDArray[Any], rows: Ints, columns: Ints, kept: Bools) -> Su
 
 def _untangled(uv: Floats, corners: Ints) -> Floats:
     """Corners around triangles that are turned over, moved between their neighbours (Tutte); further ones each round."""
-    if (_signed(uv[corners]) > 0).all():
+    if (signed_areas(uv[corners]) > 0).all():
         return uv
     M = len(uv)
     edges = corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
@@ -269,7 +269,7 @@ def _untangled(uv: Floats, corners: Ints) -> Floats:
     degree = np.bincount(begin, minlength=M)
     uv, moved = uv.copy(), np.zeros(M, bool)
     for _ in range(_UNTANGLED):
-        bad = _signed(uv[corners]) <= 0
+        bad = signed_areas(uv[corners]) <= 0
         if not bad.any():
             break
         moved[corners[bad].ravel()] = True
@@ -284,11 +284,6 @@ def _untangled(uv: Floats, corners: Ints) -> Floats:
         rows, columns = np.concatenate([begin, every]), np.concatenate([end, every])
         uv[inner] = _factors(values, rows, columns, inner).solve(right[inner])
     return uv
-
-
-def _signed(laid: Float[Floats, "F 3 2"]) -> Float[Floats, " F"]:
-    one, two = laid[:, 1] - laid[:, 0], laid[:, 2] - laid[:, 0]
-    return np.asarray(0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]))
 
 
 def _stretch(laid: Float[Floats, "F 3 2"], flat: Float[Floats, "F 3 2"], areas: Float[Floats, " F"]) -> float:

@@ -86,9 +86,9 @@ def load_labels(path: str | Path, shape: Shape, on: On | None = None) -> Labels:
     return _labels(name, values, shape, on or written)
 
 
-def labels_of(values: ArrayLike, shape: Shape, on: On | None = None) -> Labels:
+def labels_of(values: ArrayLike, shape: Shape) -> Labels:
     """Labels of the vertices or faces of `shape` from an array of whole numbers or words; see `load_labels`."""
-    return _labels("the array", _listed(np.asarray(values)), shape, on)
+    return _labels("the array", _listed(np.asarray(values)), shape, None)
 
 
 def _listed(array: NDArray[Any]) -> list[Any]:

@@ -26,9 +26,3 @@ def new_charts(
     for chart, uv in zip(charts, packed(charts, padding / size), strict=True):
         out[chart.members] = uv[chart.corners]
     return out
-
-
-def flat_areas(corners: Float[Floats, "F 3 2"]) -> Float[Floats, " F"]:
-    """Areas of triangles in the plane."""
-    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return np.asarray(0.5 * np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]))

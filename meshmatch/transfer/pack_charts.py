@@ -17,6 +17,7 @@ from scipy.ndimage import distance_transform_cdt
 from scipy.spatial import ConvexHull, QhullError
 
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
+from meshmatch.geometry.triangles import flat_areas
 from meshmatch.transfer.texels import texels_in
 from meshmatch.transfer.tighten_charts import tightened
 
@@ -115,8 +116,7 @@ class _Piece:
         self.low = (uv @ self.turn).min(axis=0)
         self.uv, self.corners = self.turned(uv), corners
         self.size = self.uv.max(axis=0)
-        one, two = (self.uv[corners[:, k]] - self.uv[corners[:, 0]] for k in (1, 2))
-        self.area = float(np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]).sum() / 2)
+        self.area = float(flat_areas(self.uv[corners]).sum())
         edges = corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         key = edges.min(axis=1) * len(uv) + edges.max(axis=1)
         first, count = np.unique(key, return_index=True, return_counts=True)[1:]

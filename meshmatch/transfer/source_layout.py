@@ -11,11 +11,10 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Ints, Ints32
 from meshmatch.errors import InputError, OptionError
-from meshmatch.geometry.triangles import interpolate
+from meshmatch.geometry.triangles import flat_areas, interpolate
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.new_charts import flat_areas
 from meshmatch.transfer.surface_walk import SurfaceWalker
 from meshmatch.transfer.texel_colors import TexelLocator, charts_of, images_of, seams_of
 

@@ -9,9 +9,10 @@ import numpy as np
 
 from meshmatch.arrays import Brief, Float, Floats, Int, Ints
 from meshmatch.errors import InputError, OptionError
+from meshmatch.geometry.triangles import flat_areas
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.flat_layout import joined
-from meshmatch.transfer.new_charts import flat_areas, new_charts
+from meshmatch.transfer.new_charts import new_charts
 from meshmatch.transfer.texels import MOST_ROWS, faces_on, rows_of
 
 Keep = Literal["auto", "keep", "new", "source"]

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter
 
-from meshmatch.geometry.triangles import triangle_areas
+from meshmatch.geometry.triangles import flat_areas, triangle_areas
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer import hinged_charts
 from meshmatch.transfer.chart_regions import chart_regions
 from meshmatch.transfer.flat_layout import Layout, laid_flat
-from meshmatch.transfer.new_charts import flat_areas, new_charts
+from meshmatch.transfer.new_charts import new_charts
 from meshmatch.transfer.pack_charts import Chart, packed, tightest
 from meshmatch.transfer.texels import faces_on
 from meshmatch.transfer.tighten_charts import tightened

@@ -8,11 +8,11 @@ import pytest
 
 import meshmatch
 from meshmatch.errors import InputError, OptionError
+from meshmatch.geometry.triangles import flat_areas
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.new_charts import flat_areas
 from meshmatch.transfer.source_layout import check_layout, source_layout
 from meshmatch.transfer.surface_walk import SurfaceWalker
 from meshmatch.transfer.texel_colors import charts_of
