@@ -14,7 +14,9 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.picture import Look
 from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape, save_upright
-from meshmatch.shapes.formats import Textured
+from meshmatch.shapes.formats import Textured, gltf_out
+from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_out import center_of, write_morphs
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance
@@ -146,3 +148,21 @@ def test_what_32_bits_cannot_hold_is_refused(sphere: Shape, tmp_path: Path, suff
     assert list(tmp_path.iterdir()) == []
     save_shape(tmp_path / "huge.ply", huge)
     assert np.array_equal(load_shape(tmp_path / "huge.ply").verts, huge.verts)
+
+
+def test_a_glb_that_would_be_larger_than_one_can_be_is_refused(
+    sphere: Shape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sequence of hundreds of shapes reaches 4 GiB, and so may a file that gets a rig."""
+    path = tmp_path / "sequence.glb"
+    targets = {f"{k}": sphere.verts * (1 + k) for k in range(20)}
+    write_morphs(path, sphere, targets)
+    held = path.read_bytes()
+    assert Editor(Document(path, held)).to_bytes() == held
+    path.unlink()
+    monkeypatch.setattr(gltf_out, "_LARGEST", len(held) - 1)
+    with pytest.raises(OutputError, match="becomes larger than a glb can be"):
+        write_morphs(path, sphere, targets)
+    with pytest.raises(OutputError, match=r"sequence\.glb becomes larger than a glb can be"):
+        Editor(Document(path, held)).to_bytes()
+    assert not path.exists()

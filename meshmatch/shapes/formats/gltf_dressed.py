@@ -18,8 +18,8 @@ from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.formats.gltf import COMPRESSED, Document
 from meshmatch.shapes.formats.gltf_attributes import laid_out, transform_of
-from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor, drawn
-from meshmatch.shapes.formats.gltf_out import smooth_normals
+from meshmatch.shapes.formats.gltf_edit import Editor, drawn
+from meshmatch.shapes.formats.gltf_out import VERTICES, smooth_normals
 from meshmatch.shapes.formats.gltf_prune import textures_in
 from meshmatch.shapes.formats.gltf_toon import ToonWear, toon_materials
 from meshmatch.shapes.formats.seams import split_at_seams, vertex_tangents

@@ -7,7 +7,6 @@ needs no other file.
 from __future__ import annotations
 
 import copy
-import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -17,19 +16,16 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.errors import InputError, OutputError
+from meshmatch.errors import InputError
 from meshmatch.shapes.formats import gltf_vrm
 from meshmatch.shapes.formats.gltf import INSTANCES, MOST_ORIGINS, ORIGINS, Document, digest, embedded
 from meshmatch.shapes.formats.gltf_compressed import COMPONENTS
+from meshmatch.shapes.formats.gltf_out import INDICES, TYPES, VERTICES, packed
 from meshmatch.shapes.formats.gltf_prune import prune, unused
 from meshmatch.shapes.shape import Shape
 
 _COMPONENTS = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
-_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _IMAGES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "image/webp", b"\xabKTX": "image/ktx2"}
-_LARGEST = 2**32 - 1
-VERTICES, INDICES = 34962, 34963
-"""The targets of buffer views that hold attributes of vertices, and triangles."""
 
 
 class Editor:
@@ -110,7 +106,7 @@ class Editor:
         entry: dict[str, Any] = {
             "bufferView": self.add_view(table.astype(table.dtype.newbyteorder("<")).tobytes(), target)
         }
-        entry |= {"componentType": kind, "count": len(table), "type": _TYPES[table.shape[1]]}
+        entry |= {"componentType": kind, "count": len(table), "type": TYPES[table.shape[1]]}
         if bounds:
             entry |= {"min": table.min(axis=0).tolist(), "max": table.max(axis=0).tolist()}
         return self.add("accessors", entry)
@@ -145,7 +141,7 @@ class Editor:
         numbers = rows.astype("<u2" if len(values) <= 2**16 else "<u4")
         if numbers.nbytes + values[rows].nbytes + 64 > values.nbytes:  # there are two views to describe
             return self.add_array(values, bounds=bounds, target=VERTICES)
-        entry: dict[str, Any] = {"componentType": 5126, "count": len(values), "type": _TYPES[values.shape[1]]}
+        entry: dict[str, Any] = {"componentType": 5126, "count": len(values), "type": TYPES[values.shape[1]]}
         if len(rows):
             indices = {
                 "bufferView": self.add_view(numbers.tobytes()),
@@ -199,13 +195,7 @@ class Editor:
         """The glb. `OutputError` where it would be larger than a glb can be."""
         if self._size:
             self.json["buffers"] = [{"byteLength": self._size}]
-        text = json.dumps(self.json, allow_nan=False).encode()
-        text += b" " * (-len(text) % 4)
-        size = 28 + len(text) + self._size
-        if size > _LARGEST:
-            raise OutputError(f"{self.name} becomes larger than a glb can be (4 GiB)", "decimate it first")
-        head = b"glTF" + np.array([2, size, len(text)], "<u4").tobytes() + b"JSON"
-        return b"".join([head, text, np.array([self._size], "<u4").tobytes(), b"BIN\0", *self._chunks])
+        return packed(self.name, self.json, self._chunks)
 
 
 def remembering(glb: bytes, of: Shape) -> bytes:

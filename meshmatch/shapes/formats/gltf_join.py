@@ -14,7 +14,8 @@ from meshmatch.arrays import Floats
 from meshmatch.shapes.formats import gltf_vrm
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_attributes import joint_nodes
-from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor, drawn
+from meshmatch.shapes.formats.gltf_edit import Editor, drawn
+from meshmatch.shapes.formats.gltf_out import VERTICES
 from meshmatch.shapes.formats.gltf_prune import references
 from meshmatch.shapes.formats.gltf_rig import Binding
 from meshmatch.shapes.formats.gltf_rigged import frame_of, straighten

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import edge_lengths, edges_of, unit
 from meshmatch.shapes.formats.gltf import Document
-from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor, drawn, frames_of
+from meshmatch.shapes.formats.gltf_edit import Editor, drawn, frames_of
+from meshmatch.shapes.formats.gltf_out import VERTICES
 
 
 def moved(document: Document, verts: Float[Floats, "V 3"], turns: Float[Floats, "V 3 3"]) -> bytes:

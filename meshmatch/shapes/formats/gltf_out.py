@@ -10,7 +10,7 @@ Specification: Khronos glTF 2.0.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.errors import OutputError
 from meshmatch.geometry.triangles import dot, same_rows, vertex_normals
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.formats import as_float32
@@ -29,8 +30,11 @@ _SHARP = 0.85
 _FAR = 8.0  # three of the 24 bits of a float
 _POINTS, _TRIANGLES = 0, 4
 _FLOAT, _UNSIGNED = 5126, 5125
-_VERTICES, _INDICES = 34962, 34963
-_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+_LARGEST = 2**32 - 1
+TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+"""Of accessors, by the numbers in a row."""
+VERTICES, INDICES = 34962, 34963
+"""The targets of buffer views that hold attributes of vertices, and triangles."""
 
 
 def write(path: Path, shape: Shape) -> None:
@@ -126,8 +130,8 @@ def _glb(
     for k, values in enumerate(arrays):
         whole = values.dtype.kind == "u"
         if k < drawn:
-            views[k]["target"] = _INDICES if whole else _VERTICES
-        kinds = {"componentType": _UNSIGNED if whole else _FLOAT, "type": _TYPES[values.shape[1]]}
+            views[k]["target"] = INDICES if whole else VERTICES
+        kinds = {"componentType": _UNSIGNED if whole else _FLOAT, "type": TYPES[values.shape[1]]}
         accessors.append({"bufferView": k, **kinds, "count": len(values)})
     for k in places:
         accessors[k] |= {"min": arrays[k].min(0).tolist(), "max": arrays[k].max(0).tolist()}
@@ -145,10 +149,22 @@ def _glb(
         sampler = {"input": drawn, "output": drawn + 1, "interpolation": "LINEAR"}
         document["animations"] = [{"name": name or "sequence", "channels": [channel], "samplers": [sampler]}]
     document |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}]}
-    text = json.dumps(document).encode()
+    return packed(name, document, padded)
+
+
+def packed(name: str, document: dict[str, Any], chunks: Sequence[bytes]) -> bytes:
+    """The glb of what describes a file, and the bytes of its one buffer, in multiples of four.
+
+    `OutputError` where it would be larger than a glb can be.
+    """
+    text = json.dumps(document, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    head = b"glTF" + np.array([2, 28 + len(text) + starts[-1], len(text)], "<u4").tobytes() + b"JSON"
-    return b"".join([head, text, np.array([starts[-1]], "<u4").tobytes(), b"BIN\0", *padded])
+    held = sum(map(len, chunks))
+    size = 28 + len(text) + held
+    if size > _LARGEST:
+        raise OutputError(f"{name} becomes larger than a glb can be (4 GiB)", "decimate it first")
+    head = b"glTF" + np.array([2, size, len(text)], "<u4").tobytes() + b"JSON"
+    return b"".join([head, text, np.array([held], "<u4").tobytes(), b"BIN\0", *chunks])
 
 
 def smooth_normals(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Float[Floats, "V 3"]:

@@ -14,8 +14,9 @@ import numpy as np
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import warn
 from meshmatch.shapes.formats.gltf import Document
-from meshmatch.shapes.formats.gltf_edit import VERTICES, Editor, drawn
+from meshmatch.shapes.formats.gltf_edit import Editor, drawn
 from meshmatch.shapes.formats.gltf_former import count_of, hang_over, tell_staying
+from meshmatch.shapes.formats.gltf_out import VERTICES
 from meshmatch.shapes.formats.gltf_prune import drop_nodes, nodes_are_ours
 from meshmatch.shapes.formats.gltf_rig import Binding, Clip, Rig, nodes_of_skeleton
 
