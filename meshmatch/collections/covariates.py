@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -98,7 +99,7 @@ def _read(path: Path) -> tuple[list[str], list[list[str]]]:
     if len(header) < 2 or not rows:
         raise InputError("it has no rows, or one column only", "write a row for each shape, commas between the cells")
     table.check_marks(rows)
-    twice = next((title for title in header if header.count(title) > 1), None)
+    twice = next((title for title, count in Counter(header).items() if count > 1), None)
     if twice is not None:
         raise InputError(f"two columns are called {twice or 'nothing'}", "the first row has the names of columns")
     return header, rows

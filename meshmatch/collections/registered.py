@@ -5,6 +5,7 @@ from __future__ import annotations
 import fnmatch
 import os
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -99,7 +100,7 @@ def registered_meshes(folder: str | Path, leave_out: Sequence[str] = ()) -> Iter
     """
     files = sorted(path for path in Path(folder).iterdir() if suffix_of(path) in PLAIN_SUFFIXES and path.is_file())
     called = [stem_of(path) for path in files]
-    twice = next((name for name in called if called.count(name) > 1), None)
+    twice = next((name for name, count in Counter(called).items() if count > 1), None)
     if twice is not None:
         raise InputError(f"{folder} holds two meshes called {twice}", "an atlas needs different names")
     out = dict.fromkeys(sorted(matching(called, leave_out)), "asked")

@@ -303,6 +303,8 @@ def _separator(text: str, blanks: bool) -> str:
         return ""
     even = {}
     for mark in "\t;,":
+        if not any(mark in line for line in body):  # nor need csv take a whole line for one cell, which may be too long
+            continue
         rows = list(_split(body, mark))
         if len({len(row) for row in rows}) == 1 and len(rows[0]) > 1:
             even[mark] = rows
@@ -326,7 +328,8 @@ def _separator(text: str, blanks: bool) -> str:
 
 def _holds_numbers(line: str) -> bool:
     """Whether a line is all numbers, whatever separates them."""
-    cells = [next(_split([line], mark)) for mark in ("\t", ";", ",", " ")]
+    one = len(line) <= csv.field_size_limit()  # whether it may be one cell
+    cells = [next(_split([line], mark)) for mark in ("\t", ";", ",", " ") if one or mark in line]
     return any(all(map(is_number, row)) and not all(map(is_missing, row)) for row in cells)
 
 

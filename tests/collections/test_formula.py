@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -125,3 +126,13 @@ def test_what_a_table_cannot_say(tmp_path: Path, rows: list[str], formula: str, 
 def test_columns_of_another_length_are_refused() -> None:
     with pytest.raises(InputError, match="age has 2 values for 7 shapes"):
         covariates({"age": [1, 2]}, NAMES, SIZES)
+
+
+def test_a_table_of_coordinates_is_read_soon(tmp_path: Path) -> None:
+    """As `meshmatch export` writes one, with columns for all vertices."""
+    titles = [f"{axis}{vertex}" for vertex in range(10_000) for axis in "xyz"]
+    rows = [",".join([name, *("0.5" for _ in titles)]) for name in NAMES]
+    begin = time.process_time()
+    known = covariates(write(tmp_path / "coords.csv", ",".join(["name", *titles]), *rows), NAMES, SIZES)
+    assert time.process_time() - begin < 2
+    assert known.column("z9999") == ("0.5",) * len(NAMES)

@@ -197,3 +197,14 @@ def test_rows_that_differ_are_told_by_their_line(tmp_path: Path) -> None:
     (tmp_path / "v.csv").write_text("a;b\n1;2\n\n3\n")
     with pytest.raises(InputError, match="line 4 has 1 cell, the first 2"):
         read_table(tmp_path / "v.csv").numbers()
+
+
+@pytest.mark.parametrize("mark", ["\t", ";", ","])
+def test_lines_longer_than_a_cell_may_be(tmp_path: Path, mark: str) -> None:
+    """csv takes no cell of more than 131,072 letters; a line of a table of coordinates has more."""
+    titles = ["name", *(f'"{axis}{vertex}"' for vertex in range(5000) for axis in "xyz")]
+    rows = [[name, *map(repr, np.random.default_rng(k).normal(size=15_000).tolist())] for k, name in enumerate("ab")]
+    (tmp_path / "a.csv").write_text("\n".join(mark.join(row) for row in (titles, *rows)))
+    table = read_table(tmp_path / "a.csv")
+    assert table.separator == mark
+    assert table.rows() == [[title.strip('"') for title in titles], *rows]
