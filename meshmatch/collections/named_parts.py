@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -23,6 +23,22 @@ WHOLE, EACH = "whole", "each"
 """Words for what is superimposed: the whole shape, or each of its connected parts alone."""
 Masks = Mapping[str, Bool[Bools, " V"]]
 """Which vertices the parts of a name have."""
+
+
+class _Owned(Mapping[str, "Bool[Bools, ' V']"]):
+    """Masks of names, one at a time, for there may be thousands of both: of each vertex the number of its name is kept."""
+
+    def __init__(self, names: Sequence[str], owner: Int[Ints, " V"]) -> None:
+        self.owner, self._numbers = owner, {name: k for k, name in enumerate(names)}
+
+    def __getitem__(self, name: str) -> Bool[Bools, " V"]:
+        return np.asarray(self.owner == self._numbers[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._numbers)
+
+    def __len__(self) -> int:
+        return len(self._numbers)
 
 
 def groups_of(shape: Shape, by: str, named: Callable[[], Masks]) -> Int[Ints, " V"] | None:
@@ -47,22 +63,24 @@ def groups_of(shape: Shape, by: str, named: Callable[[], Masks]) -> Int[Ints, " 
             count = "one connected part" if len(parts) == 1 else f"connected parts 1 to {len(parts)}"
             raise OptionError(f"these shapes have no part {by[:20]}", f"they have {count}, the largest first")
         return np.where(parts.number == int(by), 0, -1)
-    masks = {name: mask for name, mask in named().items() if mask.any()}
-    if by not in masks:
-        close = get_close_matches(by, masks, n=1)
+    masks = named()
+    if by not in masks or not masks[by].any():
+        there = [name for name, mask in masks.items() if mask.any()]
+        close = get_close_matches(by, there, n=1)
         known = f"did you mean {close[0]}? " if close else ""
-        names = f"names: {', '.join(list(masks)[:12])}; " if masks else "they have no names; "
+        names = f"names: {', '.join(there[:12])}; " if there else "they have no names; "
         numbers = f"numbers: 1 to {len(parts)}, the largest first; or {EACH}" if len(parts) > 1 else "and one part"
         hint = f"{known}{names}{numbers}"
         raise OptionError(f"these shapes have no part called {by!r}", hint)
     return np.where(masks[by], 0, -1)
 
 
-def parts_of_file(path: str | Path) -> Masks:
+def parts_of_file(path: str | Path) -> _Owned:
     """The meshes of a file by name; none for formats without names."""
     meshes = mesh_list(path)
-    owner = np.repeat([name for name, _ in meshes], [count for _, count in meshes]) if meshes else np.empty(0, "U1")
-    return {name: owner == name for name in dict.fromkeys(name for name, _ in meshes)}
+    numbers = {name: k for k, name in enumerate(dict.fromkeys(name for name, _ in meshes))}
+    each = np.array([(numbers[name], count) for name, count in meshes], np.int64).reshape(-1, 2)
+    return _Owned(list(numbers), np.repeat(*each.T))
 
 
 def parts_of_template(
@@ -73,21 +91,22 @@ def parts_of_template(
     nearest.
     """
     if len(template.label_names) > 1:
-        return {name: template.labels == k for k, name in enumerate(template.label_names)}
+        return _Owned(template.label_names, template.labels)
     number = Parts.of(template.shape).number
     for name in names:
         file = file_of.get(name)
         try:
-            masks = {} if file is None else parts_of_file(file)
-            if not masks or len(next(iter(masks.values()))) != len((places := places_of(name)).resting):
+            if file is None or len((named := parts_of_file(file)).owner) == 0:
+                continue
+            if len(named.owner) != len((places := places_of(name)).resting):
                 continue
         except InputError:  # it has been moved since
             continue
-        part, owners = number[places.on(template.shape).vertex], np.stack(list(masks.values()))
-        votes = np.stack([np.bincount(part[mask], minlength=number.max() + 1) for mask in owners])
+        part, count = number[places.on(template.shape).vertex], int(number.max()) + 1
+        votes = np.bincount(named.owner * count + part, minlength=len(named) * count).reshape(len(named), count)
         owner = votes.argmax(axis=0)[number]
         mixed = (votes.max(axis=0) < _NEARLY_ALL * votes.sum(axis=0))[number]
         if mixed.any():
-            owner[mixed] = owners.argmax(axis=0)[cKDTree(places.resting).query(template.shape.verts[mixed])[1]]
-        return {title: owner == k for k, title in enumerate(masks)}
+            owner[mixed] = named.owner[cKDTree(places.resting).query(template.shape.verts[mixed])[1]]
+        return _Owned(list(named), owner)
     return {}

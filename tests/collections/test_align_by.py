@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from meshmatch.collections import named_parts
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.atlas_arrays import FILE
 from meshmatch.collections.measures import measure_atlas
@@ -194,6 +196,16 @@ def test_meshes_of_a_scene_have_names(tmp_path: Path) -> None:
         assert atlas.groups is not None and atlas.weights[atlas.groups == 0].sum() > 0.5
     save_shape(tmp_path / "plain.ply", BALL)
     assert parts_of_file(tmp_path / "plain.ply") == {}
+
+
+def test_one_of_thousands_of_meshes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What an assembly of a CAD program has: a mask of each by all vertices would not fit into memory."""
+    monkeypatch.setattr(named_parts, "mesh_list", lambda path: [(f"bolt {k % 2000}", 100) for k in range(4000)])
+    begin = time.process_time()
+    masks = parts_of_file("assembly.glb")
+    assert np.flatnonzero(masks["bolt 7"]).tolist() == [*range(700, 800), *range(200_700, 200_800)]
+    assert len(masks) == 2000 and list(masks)[7] == "bolt 7"
+    assert time.process_time() - begin < 1
 
 
 def test_parts_of_a_template_are_named_by_the_scans(tmp_path: Path) -> None:
