@@ -11,7 +11,8 @@ from meshmatch.api.measure import own_points
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.landmarks import at_points
+from meshmatch.templates.location import bundled_folder
+from meshmatch.transfer.landmarks import at_points, load_landmarks
 from meshmatch.transfer.measurements import (
     Measurement,
     Measurements,
@@ -186,7 +187,8 @@ def test_the_body_has_the_measurements_of_a_person() -> None:
     known = {
         "head girth": 57.6,
         "waist girth": 78.6,
-        "left calf girth": 39.3,
+        "left calf girth": 37.4,
+        "left inside leg length": 82.5,
         "right wrist girth": 16.2,
         "left foot length": 26.9,
     }
@@ -194,6 +196,11 @@ def test_the_body_has_the_measurements_of_a_person() -> None:
     for name in found.names:
         if name.startswith("left "):
             assert values[name] == pytest.approx(values["right" + name[4:]], rel=0.02)
+    side = {"left": 1, "right": -1}
+    landmarks = load_landmarks(bundled_folder() / "measurements" / "body-landmarks.csv", points.shape)[0]
+    for name, x in zip(landmarks.names, landmarks.points[:, 0], strict=True):
+        if (first := name.split()[0]) in side:
+            assert 0.1 < side[first] * x, name
 
 
 def test_a_source_of_ones_own_needs_both(sphere: Shape) -> None:

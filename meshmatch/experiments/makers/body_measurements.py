@@ -89,7 +89,7 @@ def _landmarks(body: Shape) -> dict[str, Float[Floats, " 3"]]:
 
 
 def _leaves(body: Shape, start: ArrayLike, way: ArrayLike) -> Float[Floats, " 3"]:
-    """The last point of a ray, from a place in centimeters, on the surface."""
+    """Where a ray, from a place in centimeters within the body, comes out first: beyond may be the other leg."""
     corners = body.verts[body.faces]
     origin, ahead = np.asarray(start) / 100.0, np.asarray(way, np.float64)
     matrices = np.stack(
@@ -98,8 +98,8 @@ def _leaves(body: Shape, start: ArrayLike, way: ArrayLike) -> Float[Floats, " 3"
     solved = np.linalg.solve(matrices + 1e-15 * np.eye(3), (origin - corners[:, 0])[:, :, None])[:, :, 0]
     weights = np.column_stack([1 - solved[:, 0] - solved[:, 1], solved[:, :2]])
     hit = np.flatnonzero((weights >= -1e-9).all(axis=1) & (solved[:, 2] > 0))
-    last = hit[solved[hit, 2].argmax()]
-    return np.asarray(interpolate(body.verts, body.faces[[last]], weights[[last]])[0])
+    first = hit[solved[hit, 2].argmin()]
+    return np.asarray(interpolate(body.verts, body.faces[[first]], weights[[first]])[0])
 
 
 def _measurements() -> list[list[str]]:
