@@ -104,14 +104,25 @@ def measured_by(
     landmarks: Landmarks | ArrayLike | str | Path | None,
 ) -> tuple[ShapeLike, Sequence[Measurement] | str | Path, Landmarks | ArrayLike | str | Path]:
     """The shape, measurements and landmarks that are meant; `OptionError` if something is missing."""
-    if isinstance(source, str | Path) and str(source) == BODY:
+    if is_body(source):
         folder = bundled_folder() / "measurements"
-        source, own = folder / "body.ply", (folder / "body-measurements.csv", folder / "body-landmarks.csv")
+        own = folder / "body-measurements.csv", folder / "body-landmarks.csv"
+        source = meant_source(source)
         return source, own[0] if measurements is None else measurements, own[1] if landmarks is None else landmarks
     if measurements is None or landmarks is None:
         what = "measurements" if measurements is None else "landmarks"
         raise OptionError(f"of a source of your own the {what} are needed", f"{BODY} is a person that has its own")
     return source, measurements, landmarks
+
+
+def is_body(source: object) -> bool:
+    """Whether the word `BODY` is given for a shape."""
+    return isinstance(source, str | Path) and str(source) == BODY
+
+
+def meant_source(source: ShapeLike) -> ShapeLike:
+    """The same; of `BODY` its file."""
+    return bundled_folder() / "measurements" / "body.ply" if is_body(source) else source
 
 
 def _write_measurements(found: Measurements, path: Path, final: Path) -> None:

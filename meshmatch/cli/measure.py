@@ -38,14 +38,14 @@ def _table(table: Path, given: Mapping[str, Any], source: str, written: Mapping[
     """Write the measurements of SRC, unless it is the body, and all targets as one table."""
     import numpy as np
 
-    from meshmatch.api.measure import BODY, own_points
+    from meshmatch.api.measure import is_body, own_points
     from meshmatch.collections.registered import mixed_units
     from meshmatch.shapes.tables import write_rows
     from meshmatch.transfer.measurements import measured_values
 
     points = own_points(given["source"], given["measurements"], given["landmarks"])
     own = points.taken(points.points)
-    values = {source: dict(zip(own.names, own.values.tolist(), strict=True))} if str(given["source"]) != BODY else {}
+    values = {} if is_body(given["source"]) else {source: dict(zip(own.names, own.values.tolist(), strict=True))}
     values |= {name: measured_values(file) for name, file in written.items()}
     numbers = np.array([[row.get(name, np.nan) for name in own.names] for row in values.values()])
     with replace_on_success(table) as temporary:

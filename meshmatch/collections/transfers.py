@@ -11,6 +11,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from meshmatch.api.measure import is_body, meant_source
 from meshmatch.api.results import MapPair
 from meshmatch.collections.collection import Collection
 from meshmatch.collections.endings import ending_of
@@ -56,18 +57,20 @@ class Targets:
         """The shapes of files, folders and patterns, or those of one folder of fits; not the source, what lies in the
         output folder, or another input. `InputError` if there is none.
         """
-        fits, held = Path(given[0], _FITS), False
+        fits, held, meant = Path(given[0], _FITS), False, meant_source(source)
         if len(given) == 1 and fits.is_file():
             with fits.open(encoding="utf-8", newline="") as file:
                 rows = [row for row in csv.DictReader(file) if row.get("verdict") not in (FAILED, LEFT_OUT)]
             found = {_inner(str(row.get("name")), fits): Path(str(row.get("file"))) for row in rows}
-            held = Collection(fits.parent).holds(source)
+            held = Collection(fits.parent).holds(meant)
         else:
             sources, _ = find_sources([str(each) for each in given], None if output is None else Store.of(output))
             found = {each.name: Path(each.path) for each in sources}
-        taken = [os.path.realpath(each) for each in (source, other) if isinstance(each, str | Path)]
+        taken = [os.path.realpath(each) for each in (meant, other) if isinstance(each, str | Path)]
         inputs = {name: file for name, file in found.items() if os.path.realpath(file) in taken}
-        if isinstance(source, str | Path):
+        if is_body(source):
+            called = ""  # it is no specimen among others
+        elif isinstance(source, str | Path):
             own = [name for name, file in inputs.items() if os.path.realpath(file) == taken[0]]
             called = own[0] if own else stem_of(Path(source))
         else:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import meshmatch
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
@@ -71,3 +72,15 @@ def test_what_the_map_does_not_know_is_missing(run: Run, copies: Shape) -> None:
     assert "large.ply: 2 measurements are missing" in answer.err
     with Path("out.csv").open(newline="") as file:
         assert [row["name"] for row in csv.DictReader(file) if not row["value"]] == ["head girth", "head height"]
+
+
+def test_a_folder_of_fits_need_not_hold_the_body(run: Run, copies: Shape, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And a target may be called as the word for it is."""
+    asked = []
+    monkeypatch.setattr(meshmatch.Collection, "holds", lambda self, shape: bool(asked.append(load_shape(shape).V)))
+    Path("fits").mkdir()
+    Path("fits/fits.csv").write_text("name,file,verdict\nbody,in/small.ply,good\nlarge,in/large.ply,good\n")
+    well(run("measure", "body", "fits", "-o", "out", "--measurements", "own.csv", "--table", "all.csv"))
+    assert [row.split(",")[0] for row in Path("all.csv").read_text().splitlines()] == ["name", "body", "large"]
+    assert list(meshmatch.Transfers(meshmatch.measure, "body", "fits").files) == ["body", "large"]
+    assert set(asked) == {copies.V}
