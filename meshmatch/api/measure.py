@@ -54,12 +54,13 @@ def measure(
     measurements
         What is measured, or the path of a table of it. Needed of any source but ``"body"``.
     landmarks
-        As in `transfer_landmarks`. Needed of any source but ``"body"``.
+        As in `transfer_landmarks`; without names of their own they are called 0, 1, 2, ... in their order. Needed of any
+        source but ``"body"``.
     match
         As in `find_maps`.
     rule
-        A length or an angle is nan where one of its landmarks is less confident than the minimum; a girth where a quarter of
-        it is.
+        A length or an angle is nan where one of its landmarks is less confident than the minimum; a girth where more than a
+        quarter of it is, and where the map tears it.
 
     Returns
     -------

@@ -119,7 +119,7 @@ def read_landmark_file(path: Path, shape: str = "", space: Space = "") -> Landma
 
 def _place(record: Record, number: int, turned: bool) -> Place:
     given = record.get("name")
-    name = _one_line(str(number if given in (None, "") else given))
+    name = one_line(str(number if given in (None, "") else given))
     face, weights, vertex = record.get("face"), record.get("barycentric"), record.get("vertex")
     if face is not None and face != -1 and weights is not None:
         return Place(name, "face", (_whole(face, name), _three(weights, name)))
@@ -135,7 +135,8 @@ def _place(record: Record, number: int, turned: bool) -> Place:
     return Place(name, "missing", " is vertex -1" if vertex == -1 else " has no vertex and no position")
 
 
-def _one_line(name: str) -> str:
+def one_line(name: str) -> str:
+    """A name as files have it: without line ends and other marks that are not printed, and with single spaces."""
     words = "".join(c if c.isprintable() else " " for c in name)
     return plain_text(" ".join(words.split()))
 
@@ -438,12 +439,12 @@ def tps_lines(specimens: Mapping[str, Floats]) -> Iterable[str]:
     for name, points in specimens.items():
         yield f"LM3={len(points)}"
         yield from map(_three_words, points.tolist())
-        yield f"ID={_one_line(name)}"
+        yield f"ID={one_line(name)}"
 
 
 def morphologika_lines(specimens: Mapping[str, Floats]) -> Iterable[str]:
     """The lines of Morphologika's text, from the positions (L, 3) of each specimen's landmarks; nan is written as NA."""
-    names = [_one_line(name) for name in specimens]
+    names = [one_line(name) for name in specimens]
     length = len(next(iter(specimens.values())))
     yield from ("[individuals]", str(len(names)), "[landmarks]", str(length), "[dimensions]", "3", "[names]", *names)
     yield "[rawpoints]"

@@ -119,8 +119,9 @@ class Table:
                 return next(_split([line], self.separator)), end
         return [], end
 
-    def rows(self) -> list[list[str]]:
-        """The cells of every row that is not blank, the header too, all rows equally long; `InputError` if they are not.
+    def rows(self, even: bool = True) -> list[list[str]]:
+        """The cells of every row that is not blank, the header too. All rows are equally long; `InputError` if they are not,
+        unless they need not be ``even``.
 
         Cells have no spaces around them. A last column that is empty everywhere is left out, and so are empty rows at
         the end: spreadsheets write both.
@@ -131,8 +132,8 @@ class Table:
         rows = list(_split(_lines(self.text), self.separator))
         while len(rows) > 1 and len(rows[-1]) > 1 and not any(rows[-1]):
             rows.pop()
-        if not rows:
-            return []
+        if not rows or not even:
+            return rows
         first, others = len(rows[0]), {len(row) for row in rows[1:]} or {len(rows[0])}
         is_even = len(others) == 1 and (width := others.pop()) > 1
         if is_even and not any(row[-1] for row in rows[1:]) and (first < width or not rows[0][-1]):

@@ -4,12 +4,14 @@ are taken. "Measurements" in docs/measurements.md says what each kind is.
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, get_args
+from unicodedata import normalize
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -22,6 +24,7 @@ from meshmatch.geometry.triangles import squared_lengths
 from meshmatch.shapes import tables
 from meshmatch.shapes.faces import seams
 from meshmatch.shapes.input_files import read_json
+from meshmatch.shapes.landmark_files import one_line
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.landmarks import Landmarks, at_faces, joined
 
@@ -29,7 +32,12 @@ MeasurementKind = Literal["distance", "girth", "angle"]
 _LANDMARKS = {"distance": "two landmarks or more", "girth": "three landmarks", "angle": "three landmarks"}
 _HINT = "a row each: name,kind,landmark,landmark,...; the kinds are distance, girth and angle"
 _SPACING = 1 / 64  # of a girth: so far apart its points lie at most
-_ENOUGH = 0.75  # share of a girth's points that must be trusted
+_ENOUGH = 0.75  # share of a girth that must be there
+_TORN = 1 / 5  # of a girth: no neighbours on its line are that far apart
+_STEPS = 4  # nor so many times as far as they are where the points of a cloud are rare
+_FEWEST = 6  # points of a girth: the hull of fewer is shorter by five percent or more
+_MOST_POINTS = 3_000_000  # of all girths
+_COLUMNS = ["name", "kind", "value", "confidence"]
 MEASUREMENT_SUFFIXES = (".csv", ".json")
 check_measurements_suffix = partial(tables.check_suffix, suffixes=MEASUREMENT_SUFFIXES, what="measurements")
 
@@ -59,8 +67,17 @@ class Measurement:
     landmarks: tuple[str, ...]
 
     def __post_init__(self) -> None:
+        if not self.name:
+            raise InputError("a measurement has no name", _HINT)
         if self.kind not in get_args(MeasurementKind):
             raise InputError(f"measurement {self.name}: {self.kind!r} is no kind of measurement", _HINT)
+        if isinstance(self.landmarks, str):
+            raise InputError(f"measurement {self.name}: its landmarks are one word", f"pass ({self.landmarks!r}, ...)")
+        object.__setattr__(
+            self, "landmarks", tuple(map(str, self.landmarks))
+        )  # also numbers: of vertices, or of an array
+        if "" in self.landmarks:
+            raise InputError(f"measurement {self.name}: one of its landmarks has no name", _HINT)
         count = len(self.landmarks)
         if count < 2 or (self.kind != "distance" and count != 3):
             raise InputError(f"measurement {self.name}: {self.kind} needs {_LANDMARKS[self.kind]}, not {count}", _HINT)
@@ -77,9 +94,10 @@ class Measurements(Brief):
     kinds
         ``distance``, ``girth`` or ``angle``.
     values
-        (N,) in the unit of the shape's file; angles in degrees. What lies where the shape is missing is nan.
+        (N,) in the unit of the shape's file; angles in degrees; nan where the shape is missing, or a map tears a girth.
     confidence
-        (N,) of the map where each was taken, from 0 (a guess) to 1 (certain); nan where that is not known.
+        (N,) of the map where each was taken, from 0 (a guess) to 1 (certain): of a girth the mean along it, else that of
+        the least certain landmark; nan where that is not known.
     lines
         The points, (M, 3) each, that a measurement leads through, in the frame of the file; of a girth a closed line.
 
@@ -103,36 +121,54 @@ class MeasuringPoints:
     shape: Shape
     measurements: tuple[Measurement, ...]
     points: Landmarks  # on the shape; of all, one after the other
-    ends: Int[Ints, " N"]  # where those of each end
+    shares: Float[Floats, " P"]  # of its measurement, that each stands for
+    ends: Int[Ints, " N"]  # where those of each measurement end
 
     @classmethod
     def of(cls, shape: Shape, landmarks: Landmarks, measurements: Sequence[Measurement]) -> MeasuringPoints:
-        """On the shape whose landmarks they are defined by; `InputError` for a landmark that is not one of these."""
-        row = {name: k for k, name in enumerate(landmarks.names)}
-        surface, parts = _Surface(shape), []
+        """On the shape whose landmarks they are defined by; `InputError` for a landmark that is not one of these, and for
+        what cannot be taken on the shape.
+        """
+        names = _Names(landmarks)
+        parts, order, shares = [landmarks], [], []
+        surface, count = _Surface(shape), len(landmarks.names)
         for each in measurements:
-            for name in each.landmarks:
-                if name not in row:
-                    near = get_close_matches(name, row, 1)
-                    hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(list(row)[:8])}"
-                    raise InputError(f"measurement {each.name}: no landmark is called {name!r}", hint)
-            rows = np.array([row[name] for name in each.landmarks])
-            own = joined([landmarks], rows)
-            parts.append(surface.loop(own.points, each.name) if each.kind == "girth" else own)
-        ends = np.cumsum([len(part.names) for part in parts])
-        return cls(shape, tuple(measurements), joined(parts), ends)
+            rows = names.rows(each)
+            if each.kind == "girth":
+                loop, share = surface.loop(landmarks.points[rows], each.name)
+                parts.append(loop)
+                rows = count + np.arange(len(share))
+                count += len(share)
+                if count > _MOST_POINTS:
+                    raise InputError(
+                        f"the girths up to {each.name} go through more than {_MOST_POINTS:,} points",
+                        "measure fewer at a time, or by a source with fewer faces",
+                    )
+            else:
+                share = np.full(len(rows), 1 / len(rows))
+                if each.kind == "angle" and np.isnan(_angle(landmarks.points[rows])[0]):
+                    raise InputError(
+                        f"measurement {each.name}: two of its landmarks are one point, which makes no angle"
+                    )
+            order.append(rows)
+            shares.append(share)
+        ends = np.cumsum([len(rows) for rows in order])
+        return cls(shape, tuple(measurements), joined(parts, np.concatenate(order)), np.concatenate(shares), ends)
 
     def taken(self, places: Landmarks, minimum: float = 0.0) -> Measurements:
         """By where the points are on a shape; what is less confident than the minimum is not trusted."""
         values, confidence, lines = [], [], []
         for each, begin, end in zip(self.measurements, [0, *self.ends[:-1]], self.ends, strict=True):
-            points, sure = places.points[begin:end], places.confidence[begin:end]
+            points, sure, shares = places.points[begin:end], places.confidence[begin:end], self.shares[begin:end]
             trusted = ~(sure < minimum) & np.isfinite(points).all(axis=1)  # unknown confidence is none
-            missing = trusted.mean() < (_ENOUGH if each.kind == "girth" else 1.0)
-            value, line = (np.nan, np.empty((0, 3))) if missing else _MEASURE[each.kind](points[trusted])
+            value, line = np.nan, np.empty((0, 3))
+            if trusted.all() or (each.kind == "girth" and shares[trusted].sum() >= _ENOUGH):
+                value, line = _MEASURE[each.kind](points[trusted])
+            if each.kind == "girth" and _is_torn(points, trusted, self.points.face[begin:end], value):
+                value = np.nan
             values.append(value)
-            confidence.append(float(sure.mean()))
-            lines.append(line)
+            confidence.append(float(shares @ sure if each.kind == "girth" else sure.min()))
+            lines.append(np.empty((0, 3)) if np.isnan(value) else line)
         names, kinds = zip(*((each.name, each.kind) for each in self.measurements), strict=True)
         return Measurements(names, kinds, np.array(values), np.array(confidence), tuple(lines))
 
@@ -149,18 +185,23 @@ def load_measurements(path: str | Path) -> tuple[Measurement, ...]:
 
 
 def _read(path: Path) -> tuple[Measurement, ...]:
-    rows = tables.read_table(path).rows()
-    if rows and len(rows[0]) > 1 and rows[0][1].lower() == "kind":
+    rows = [[one_line(cell) for cell in row] for row in tables.read_table(path, blanks=False).rows(even=False)]
+    if rows and rows[0][1:2] and rows[0][1].lower() == "kind":
         rows = rows[1:]
     found = []
-    for name, kind, *landmarks in rows if rows and len(rows[0]) > 2 else ():
-        found.append(Measurement(name, kind.lower(), tuple(each for each in landmarks if each)))  # type: ignore[arg-type]
+    for row in rows:
+        while row and not row[-1]:
+            row.pop()
+        if row:
+            name, kind, *landmarks = [*row, ""] if len(row) < 2 else row
+            found.append(Measurement(name, kind.lower(), tuple(landmarks)))  # type: ignore[arg-type]
     return each_once(found)
 
 
 def each_once(measurements: Sequence[Measurement]) -> tuple[Measurement, ...]:
     """The same; `InputError` where two are of one name, or there are none."""
     seen: set[str] = set()
+    measurements = (measurements,) if isinstance(measurements, Measurement) else tuple(measurements)
     for each in measurements:
         if not isinstance(each, Measurement):
             raise InputError(
@@ -171,7 +212,7 @@ def each_once(measurements: Sequence[Measurement]) -> tuple[Measurement, ...]:
         seen.add(each.name)
     if not seen:
         raise InputError("there is nothing to measure", _HINT)
-    return tuple(measurements)
+    return measurements
 
 
 def save_measurements(path: Path, found: Measurements) -> None:
@@ -181,9 +222,9 @@ def save_measurements(path: Path, found: Measurements) -> None:
     rows = list(zip(found.names, found.kinds, values, sure, strict=True))
     if check_measurements_suffix(path) == ".csv":
         cells = [["" if cell is None else cell for cell in row] for row in rows]
-        tables.write_rows(path, ["name", "kind", "value", "confidence"], cells)
+        tables.write_rows(path, _COLUMNS, cells)
         return
-    keys = ("name", "kind", "value", "confidence", "line")
+    keys = (*_COLUMNS, "line")
     lines = (line.tolist() for line in found.lines)
     records: list[dict[str, Any]] = [
         dict(zip(keys, (*row, line), strict=True)) for row, line in zip(rows, lines, strict=True)
@@ -196,12 +237,50 @@ def measured_values(path: Path) -> dict[str, float]:
     if path.suffix.lower() == ".json":
         records = tables.read_by_suffix(path, {".json": _read_json}, "measurements", _HINT)
         return {str(each["name"]): float("nan" if each["value"] is None else each["value"]) for each in records}
-    rows = tables.read_by_suffix(path, {".csv": lambda path: tables.read_table(path).rows()}, "measurements", _HINT)
+    rows = tables.read_by_suffix(path, {".csv": _read_csv}, "measurements", _HINT)
     return {name: tables.number(value) for name, _, value, *_ in rows[1:]}
+
+
+def _read_csv(path: Path) -> list[list[str]]:
+    with path.open(encoding="utf-8", newline="") as file:  # names may hold what separates cells elsewhere
+        rows = list(csv.reader(file))
+    return rows if rows[0] == _COLUMNS else tables.read_table(path).rows()
 
 
 def _read_json(path: Path) -> list[dict[str, Any]]:
     return list(read_json(path)["measurements"])
+
+
+class _Names:
+    """The names of landmarks, however their letters are composed and their words are spaced."""
+
+    def __init__(self, landmarks: Landmarks) -> None:
+        self.missing, self.row, self.several = landmarks.missing, dict[str, int](), set[str]()
+        for k, name in enumerate(map(self._key, landmarks.names)):
+            if self.row.setdefault(name, k) != k:
+                self.several.add(name)
+
+    @staticmethod
+    def _key(name: str) -> str:
+        return normalize("NFC", one_line(name))
+
+    def rows(self, measurement: Measurement) -> Int[Ints, " N"]:
+        """(N,) which landmarks are meant; `InputError` if that is not clear, or one is missing."""
+        found = []
+        for name in map(self._key, measurement.landmarks):
+            row, problem, hint = self.row.get(name), "", ""
+            if row is None:
+                near = get_close_matches(name[:80], self.row, 1)
+                hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(list(self.row)[:8])}"
+                problem = f"no landmark is called {name!r}"
+            elif name in self.several:
+                problem, hint = f"two landmarks are called {name!r}", "give each a name of its own"
+            elif self.missing[row]:
+                problem = f"landmark {name} is missing on the shape that has the landmarks"
+            if row is None or problem:
+                raise InputError(f"measurement {measurement.name}: {problem}", hint)
+            found.append(row)
+        return np.array(found)
 
 
 class _Surface:
@@ -216,9 +295,10 @@ class _Surface:
         """The vertex to use instead of each where the file has copies along seams."""
         return seams(self.shape.verts, self.faces)
 
-    def loop(self, points: Float[Floats, "3 3"], name: str) -> Landmarks:
+    def loop(self, points: Float[Floats, "3 3"], name: str) -> tuple[Landmarks, Float[Floats, " N"]]:
         """Points along the line in which the plane through the first point, perpendicular to the way from the second to the
-        third, cuts the surface: of the pieces of that line the one nearest to the point. `InputError` if there is none.
+        third, cuts the surface, and the share of the line that each stands for: of the pieces of that line the one nearest
+        to the point. `InputError` if there is none, or much of it is missing.
         """
         (at, start, end), verts = points, self.shape.verts
         if not len(self.faces):
@@ -247,10 +327,16 @@ class _Surface:
             keys[:, side] = edge[0] * self.shape.V + edge[1]
         pieces = np.einsum("nsk,nkd->nsd", weights, verts[corners])
         own = np.flatnonzero(_in_one_line(keys, _nearest(pieces, at)))
-        row, along = _evenly(np.sqrt(squared_lengths(pieces[own, 1] - pieces[own, 0])))
+        lengths = np.sqrt(squared_lengths(pieces[own, 1] - pieces[own, 0]))
+        row, along, share = _evenly(lengths)
         ends = weights[own[row]]
         found = (1 - along)[:, None] * ends[:, 0] + along[:, None] * ends[:, 1]
-        return at_faces(self.shape, self.rows[cut[own[row]]], found)
+        line = at_faces(self.shape, self.rows[cut[own[row]]], found)
+        if not lengths.sum() >= _ENOUGH * _girth(line.points)[0]:
+            raise InputError(
+                f"measurement {name}: a quarter of the girth or more is missing, for the surface is open there"
+            )
+        return line, share
 
 
 def _in_one_line(ends: Int[Ints, "N 2"], first: int) -> Bool[Bools, " N"]:
@@ -262,15 +348,28 @@ def _in_one_line(ends: Int[Ints, "N 2"], first: int) -> Bool[Bools, " N"]:
     return np.asarray(line == line[first])
 
 
-def _evenly(lengths: Float[Floats, " N"]) -> tuple[Int[Ints, " M"], Float[Floats, " M"]]:
-    """Points on pieces of a line of these lengths: on which each is, and where from 0 to 1; the ends of each piece, and more
-    on long ones.
+def _evenly(lengths: Float[Floats, " N"]) -> tuple[Int[Ints, " M"], Float[Floats, " M"], Float[Floats, " M"]]:
+    """Points on pieces of a line of these lengths: on which each is, where from 0 to 1, and the share of the line that it
+    stands for; the ends of each piece, and more on long ones.
     """
-    most = max(float(lengths.sum()) * _SPACING, 1e-300)
-    steps = np.maximum(np.ceil(lengths / most).astype(np.int64), 1)
+    lengths = lengths if lengths.any() else np.ones(len(lengths))  # all in one point
+    whole = float(lengths.sum())
+    steps = np.maximum(np.ceil(lengths / (whole * _SPACING)).astype(np.int64), 1)
     row = np.repeat(np.arange(len(lengths)), steps + 1)
     first = np.cumsum(steps + 1) - steps - 1
-    return row, (np.arange(len(row)) - first[row]) / steps[row]
+    along = (np.arange(len(row)) - first[row]) / steps[row]
+    halves = np.where((along == 0) | (along == 1), 1, 2)
+    return row, along, halves * (lengths / (2 * steps * whole))[row]
+
+
+def _is_torn(points: Float[Floats, "N 3"], trusted: Bool[Bools, " N"], face: Int[Ints, " N"], girth: float) -> bool:
+    """Whether neighbours on a girth, which are in one face, lie far apart, as by a map that leads to another limb; or it has
+    a few points only.
+    """
+    pairs = np.flatnonzero((face[1:] == face[:-1]) & trusted[1:] & trusted[:-1])
+    longest = float(squared_lengths(points[pairs + 1] - points[pairs]).max(initial=0.0)) ** 0.5
+    apart = len(np.unique(points[trusted], axis=0))
+    return longest > girth * max(_TORN, _STEPS / max(apart, 1)) or apart < _FEWEST
 
 
 def _nearest(pieces: Float[Floats, "N 2 3"], point: Float[Floats, " 3"]) -> int:
@@ -286,6 +385,8 @@ def _distance(points: Float[Floats, "N 3"]) -> tuple[float, Floats]:
 
 def _angle(points: Float[Floats, "3 3"]) -> tuple[float, Floats]:
     first, second = points[0] - points[1], points[2] - points[1]
+    if not (first.any() and second.any()):
+        return np.nan, points
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second))), points
 
 

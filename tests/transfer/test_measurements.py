@@ -12,7 +12,8 @@ from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
-from meshmatch.transfer.landmarks import at_points, load_landmarks
+from meshmatch.transfer import measurements
+from meshmatch.transfer.landmarks import at_points, at_vertices, joined, load_landmarks
 from meshmatch.transfer.measurements import (
     Measurement,
     Measurements,
@@ -117,6 +118,80 @@ def test_what_is_not_trusted_is_missing() -> None:
     assert np.isfinite(unknown.values).all() and np.isnan(unknown.confidence).all()
 
 
+def measured(source: Shape, target: Shape, index: np.ndarray, sure: np.ndarray | None = None) -> Measurements:
+    marks = at_points(source, np.array([[1, 1.1, 0], [1, 0, 0], [1, 2, 0], [0, 0, 1]]), NAMES)[0]
+    map = VertexMap.between(source, target, index, confidence=sure)
+    return meshmatch.measure(source, target, [AROUND, SQUARE], marks, map).data
+
+
+def test_what_is_lost_of_a_girth_goes_by_its_length() -> None:
+    """Not by points: one half of the outline has many small edges."""
+    angle = np.concatenate([np.linspace(-0.5, 0.5, 200, endpoint=False), np.linspace(0.5, 1.5, 6, endpoint=False)])
+    shape = tube(np.column_stack([np.cos(np.pi * angle), np.sin(np.pi * angle)]))
+    far = shape.verts[:, 0] < -0.01
+    found = measured(shape, shape, np.arange(shape.V), np.where(far, 0.1, 0.9))
+    assert np.isnan(found.values[0]) and 0.4 < found.confidence[0] < 0.6
+    assert measured(shape, shape, np.arange(shape.V), np.where(far, 0.9, 0.1)).confidence[1] == pytest.approx(0.1)
+
+
+def test_a_girth_that_a_map_tears_is_missing() -> None:
+    """Some of it goes to another limb, or all of it goes to a few points of a cloud."""
+    shape = tube(circle(1.0))
+    other = tube(circle(1.0), x=6.0)
+    two = Shape(np.concatenate([shape.verts, other.verts]), np.concatenate([shape.faces, other.faces + shape.V]))
+    index, ahead = np.arange(shape.V), shape.verts[:, 0] > 0.98
+    assert measured(shape, two, index).values[0] == pytest.approx(6.2767, rel=1e-4)
+    assert np.isnan(measured(shape, two, np.where(ahead, index + shape.V, index)).values[0])
+    for count, known in ((5, False), (10, True)):
+        cloud = Shape(np.column_stack([circle(1.0, count), np.ones(count)])[:, [0, 2, 1]], np.empty((0, 3), np.int64))
+        value = measured(shape, cloud, (index % 40) * count // 40).values[0]
+        assert np.isnan(value) != known and (not known or value == pytest.approx(6.28, rel=0.02))
+
+
+def test_an_angle_needs_two_ways() -> None:
+    shape = tube(circle(1.0))
+    found = measured(shape, shape, np.zeros(shape.V, np.int64))
+    assert np.isnan(found.values[1]) and len(found.lines[1]) == 0
+    with pytest.raises(InputError, match="two of its landmarks are one point"):
+        points_on(shape, [Measurement("none", "angle", ("side", "side", "top"))])
+
+
+def test_a_girth_of_a_surface_that_is_open_there_is_refused() -> None:
+    shape = tube(circle(1.0))
+    for least, is_open in ((-0.8, False), (0.0, True)):
+        part = Shape(shape.verts, shape.faces[shape.verts[shape.faces][:, :, 0].min(axis=1) > least], "part")
+        if is_open:
+            with pytest.raises(InputError, match="a quarter of the girth or more is missing, for the surface is open"):
+                points_on(part, [AROUND])
+        else:
+            assert taken(points_on(part, [AROUND])).values[0] == pytest.approx(6.2, rel=0.02)
+
+
+def test_it_is_clear_which_landmarks_are_meant() -> None:
+    """Also where they are numbers, or their letters are composed otherwise; not if two have one name, or one is missing."""
+    shape = tube(circle(1.0))
+    marks = at_vertices(shape, np.array([3, 5, 9, 9]), ("\u00e9pine\u00a0iliaque", "5", "end", "end"))
+    meant = Measurement("a", "distance", ["e\u0301pine  iliaque", 5])  # type: ignore[arg-type]
+    assert MeasuringPoints.of(shape, marks, [meant]).points.vertex.tolist() == [3, 5]
+    with pytest.raises(InputError, match="two landmarks are called 'end'"):
+        MeasuringPoints.of(shape, marks, [Measurement("a", "distance", ("5", "end"))])
+    with pytest.raises(InputError, match="landmark 5 is missing"):
+        MeasuringPoints.of(shape, marks.without(np.array([False, True, False, False])), [meant])
+    with pytest.raises(InputError, match="its landmarks are one word"):
+        Measurement("a", "distance", "ab")  # type: ignore[arg-type]
+
+
+def test_each_landmark_is_looked_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many there are, and distances between them."""
+    shape, calls = tube(circle(1.0)), []
+    monkeypatch.setattr(measurements, "joined", lambda *given: calls.append(1) or joined(*given))
+    points_on(shape, [replace(ALONG, name=str(k)) for k in range(9)])
+    assert len(calls) == 1
+    monkeypatch.setattr(measurements, "_MOST_POINTS", 400)
+    with pytest.raises(InputError, match="the girths up to 2 go through more than 400 points"):
+        points_on(shape, [replace(AROUND, name=str(k)) for k in range(9)])
+
+
 def test_a_shape_is_measured_along_a_map(sphere: Shape) -> None:
     """In the unit of its own file."""
     stretched = Shape(sphere.verts * [2, 3, 2], sphere.faces[::-1], "stretched")
@@ -135,6 +210,8 @@ def test_files(tmp_path: Path) -> None:
     assert load_measurements(table) == (AROUND, ALONG)
     table.write_text("around;girth;side;bottom;top\n")  # without a header, as spreadsheets write it
     assert load_measurements(table) == (AROUND,)
+    table.write_text("name,kind,landmarks\nalong, distance,bottom ,top\n,,,\naround,girth,side,bottom,top\n")
+    assert load_measurements(table) == (ALONG, AROUND)  # rows as long as they need be
     found = taken(points_on(tube(circle(1.0)), [AROUND, ALONG]))
     found = replace(found, values=np.array([found.values[0], np.nan]))
     for name in ("m.csv", "m.json"):
@@ -142,6 +219,9 @@ def test_files(tmp_path: Path) -> None:
         values = measured_values(tmp_path / name)
         assert list(values) == ["around", "along"] and np.isnan(values["along"])
         assert values["around"] == pytest.approx(found.values[0])
+        odd = ("#1; left", 'the "long"\tone')
+        save_measurements(tmp_path / name, replace(found, names=odd))
+        assert tuple(measured_values(tmp_path / name)) == odd
     with pytest.raises(MeshmatchError, match=r"'\.txt' is not a format for measurements"):
         save_measurements(tmp_path / "m.txt", found)
 
@@ -157,6 +237,9 @@ def test_files(tmp_path: Path) -> None:
         ("a,distance,top,botom", "no landmark is called 'botom'"),
         ("name,kind,first,second", "there is nothing to measure"),
         ("a,girth,side,top,top", "are one point"),
+        ("a,distance,side,,top", "one of its landmarks has no name"),
+        (",distance,side,top", "a measurement has no name"),
+        ("a", "'' is no kind of measurement"),
     ],
 )
 def test_what_cannot_be_measured_is_told(tmp_path: Path, text: str, message: str) -> None:
@@ -208,5 +291,7 @@ def test_a_source_of_ones_own_needs_both(sphere: Shape) -> None:
         meshmatch.measure(sphere, sphere)
     with pytest.raises(MeshmatchError, match="the landmarks are needed"):
         meshmatch.measure(sphere, sphere, [ALONG])
+    with pytest.raises(MeshmatchError, match="no landmark is called 'bottom'"):  # one, not in a list
+        meshmatch.measure(sphere, sphere, ALONG, [0])  # type: ignore[arg-type]
     with pytest.raises(MeshmatchError, match="str is no measurement"):
         meshmatch.measure(sphere, sphere, ["waist"], [0])  # type: ignore[list-item]
