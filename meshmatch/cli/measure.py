@@ -51,10 +51,11 @@ def _table(table: Path, given: Mapping[str, Any], source: str, written: Mapping[
     with replace_on_success(table) as temporary:
         cells = zip(values, numbers.tolist(), strict=True)
         write_rows(temporary, ["name", *own.names], [[name, *map(_cell, row)] for name, row in cells])
-    lengths = numbers[:, [kind != "angle" for kind in own.kinds]]
+    are_lengths = (np.array(own.kinds) != "angle") & (own.values > 0)
+    lengths = numbers[:, are_lengths]
     known = np.isfinite(lengths).any(axis=1)
     if known.any():
-        sizes = np.nanmedian(lengths[known] / own.values[[kind != "angle" for kind in own.kinds]], axis=1)
+        sizes = np.nanmedian(lengths[known] / own.values[are_lengths], axis=1)
         if units := mixed_units([name for name, there in zip(values, known, strict=True) if there], sizes):
             warn(units)
     return f"wrote {table}: {len(own.names)} measurements of {len(values)} shapes"
@@ -83,7 +84,10 @@ def measure(
     maps: MapOptionsWithPairs,
     run: RunOptions,
     min_confidence: float = Option(
-        0.3, min=0.0, max=1.0, help="Of landmarks below this confidence nothing is measured on TGT."
+        0.3,
+        min=0.0,
+        max=1.0,
+        help="A length or an angle is missing where a landmark is below this confidence, a girth where a quarter of it is.",
     ),
     table: Path | None = optional("FILE", "With several targets, also one table of them all: .csv."),
     picture: Picture = None,
@@ -115,7 +119,8 @@ def measure(
         console.say(_ROW.format(name, told, "unknown" if np.isnan(sure) else f"{sure:.2f}"))
     lost = int(np.isnan(found.values).sum())
     if lost:
-        console.warn(f"{transfer.names[1]}: {lost} measurements are missing, for their landmarks are not trusted there")
+        why = "the map is not trusted there, or tears a girth"
+        console.warn(f"{transfer.names[1]}: {lost} of {len(found.names)} measurements are missing: {why}")
     told = "in the unit of its file; angles in degrees" if "angle" in found.kinds else "in the unit of its file"
     console.say(f"wrote {output}: {len(found.names) - lost} measurements of {transfer.names[1]}, {told}")
     if picture is not None:

@@ -50,13 +50,14 @@ def test_others_by_its_landmarks_with_their_lines(run: Run, copies: Shape) -> No
 
 
 def test_all_are_one_table_whose_units_are_told(run: Run, copies: Shape) -> None:
+    Path("own.csv").write_text(f"{OWN}none,distance,crown,crown\n")
     words = ("measure", "body", "in", "-o", "out", "--measurements", "own.csv", "--table", "all.csv")
     for suffix in (".csv", ".json"):
         answer = well(run(*words, "--format", suffix))
-        assert "wrote all.csv: 2 measurements of 2 shapes" in answer.err
+        assert "wrote all.csv: 3 measurements of 2 shapes" in answer.err
         assert "small is 500 times as large as large: do the files have one unit?" in " ".join(answer.err.split())
         header, large, small = Path("all.csv").read_text().splitlines()
-        assert header == "name,legs,reach" and large.split(",")[1][:6] == small.split(",")[1][:6]
+        assert header == "name,legs,reach,none" and large.split(",")[1][:6] == small.split(",")[1][:6]
     assert "'.npz' is not a format for a table of measurements" in run(*words[:-1], "all.npz").err
     save_shape("mine.ply", copies)
     landmarks = str(bundled_folder() / "measurements" / "body-landmarks.csv")
@@ -69,7 +70,7 @@ def test_what_the_map_does_not_know_is_missing(run: Run, copies: Shape) -> None:
     sure = np.where(copies.verts[:, 1] > 1.6, 0.1, 0.9)
     save_map("map.npz", VertexMap.between(copies, large, np.arange(copies.V), confidence=sure))
     answer = well(run("measure", "body", "in/large.ply", "-o", "out.csv", "--map", "map.npz", "--picture", "out.png"))
-    assert "large.ply: 2 measurements are missing" in answer.err
+    assert "large.ply: 2 of 30 measurements are missing" in " ".join(answer.err.split())
     with Path("out.csv").open(newline="") as file:
         assert [row["name"] for row in csv.DictReader(file) if not row["value"]] == ["head girth", "head height"]
 
