@@ -64,26 +64,34 @@ def _name(measurement: str) -> str:
 
 
 def _spread(people: list[Float[Floats, "S M"]]) -> float:
-    """The standard deviation within people, of S scans with M measurements each."""
+    """The standard deviation within people, of S scans with M measurements each; nan if none was taken twice."""
     apart = [values - np.nanmean(values, axis=0) for values in people]
     free = sum(int((np.isfinite(each).sum(axis=0) - 1).sum()) for each in apart)
-    return float(np.sqrt(sum(float(np.nansum(each**2)) for each in apart) / free))
+    return float(np.sqrt(sum(float(np.nansum(each**2)) for each in apart) / free)) if free else np.nan
+
+
+def _columns(values: Float[Floats, "S M"]) -> Float[Floats, "S N"]:
+    """The measurements that were taken of a person at least once."""
+    return np.asarray(values[:, np.isfinite(values).any(axis=0)])
 
 
 def _row(name: str, people: list[Float[Floats, "S 2 M"]]) -> dict[str, Any]:
     """Of S scans of each person, and M measurements, on both sides of the body."""
-    ours, true = ([values[:, k] for values in people] for k in range(2))
+    missing = int(sum(np.isnan(values[:, 0]).sum() for values in people))
+    ours, true = ([_columns(values[:, k]) for values in people] for k in range(2))
     mean = float(np.nanmean(np.concatenate([each.ravel() for each in ours])))
     spread = _spread(ours)
     return {
         "measurement": name,
         "people": len(people),
         "scans": sum(map(len, people)),
-        "missing": int(sum(np.isnan(each).sum() for each in ours)),
+        "missing": missing,
         "mean": mean,
         "spread": spread,
         "percent": 100 * spread / mean,
-        "worst": float(max(np.nanmax(np.abs(each - np.nanmedian(each, axis=0))) for each in ours)),
+        "worst": float(
+            max((np.nanmax(np.abs(each - np.nanmedian(each, axis=0))) for each in ours if each.size), default=np.nan)
+        ),
         "true": _spread(true),
     }
 
