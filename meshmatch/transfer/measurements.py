@@ -55,7 +55,7 @@ class Measurement:
         lies on, in the plane through it that the line from the second to the third is perpendicular to, as a tape lies.
         ``angle``: at the second of three, in degrees.
     landmarks
-        Their names.
+        Their names; of such as have none their numbers, from 0 in their order.
 
     Examples
     --------
