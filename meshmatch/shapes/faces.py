@@ -22,6 +22,7 @@ _HULL_FACES, _TOUCHING = (
     64,
     1e-3,
 )  # that a plain hull has at most; how far what it holds may reach out of it, of its length
+_FURTHER, _SUNK = 1.5, 0.1  # times as far a ground reaches as what is on it; how much of that may be below it
 _NEAR = 0.05  # gap up to which a small part belongs to a shape that is made of small parts
 
 
@@ -144,7 +145,7 @@ def find_parts(
     spared: Bool[Bools, " V"] | None = None,
 ) -> tuple[Bool[Bools, " F"], int, int, int, float]:
     """Judge the connected parts of a mesh; `cross` as in `flat_faces`. A part with a `spared` vertex is no outlier; a plain
-    hull of all others is one.
+    hull of all others is one, and so is a flat ground that reaches far beyond them.
 
     Returns the faces of outlier parts; how many parts are outliers, and how many are not; how many of the latter are
     big but lie far from the rest; and the share of the surface that these have, in 0..1.
@@ -152,7 +153,9 @@ def find_parts(
     part = triangles.face_parts(faces, len(verts))
     if part.max() == 0:
         return np.zeros(len(faces), bool), 0, 1, 0, 0.0
-    around = None if spared is not None else _container(verts, faces, part)
+    around = _container(verts, faces, part) if spared is None else None
+    if around is None and spared is None:
+        around = _ground(verts, faces, part, cross)
     if around is not None:
         inside = part != around
         dropped = np.ones(len(faces), bool)
@@ -209,6 +212,27 @@ def _container(verts: Floats, faces: Ints, part: Ints) -> int | None:
         if held and np.linalg.matrix_rank(normals, 1e-3) == 3:
             return int(each)
     return None
+
+
+def _ground(verts: Floats, faces: Ints, part: Ints, cross: Floats) -> int | None:
+    """The part with the largest area, if it is plain and flat, reaches far beyond all others, and has them on one side."""
+    areas = np.bincount(part, np.sqrt(squared_lengths(cross)))
+    largest = int(areas.argmax())
+    own = part == largest
+    if np.count_nonzero(own) > _HULL_FACES or np.count_nonzero(~own) < _FEWEST:
+        return None
+    flat, rest = (verts[np.flatnonzero(np.bincount(faces[some].ravel()))] for some in (own, ~own))
+    middle = flat.mean(axis=0)
+    axes = np.linalg.svd(flat - middle, full_matrices=False)[2]
+    flat, rest = (flat - middle) @ axes.T, (rest - middle) @ axes.T
+    slack = _TOUCHING * float(np.ptp(flat, axis=0).max())
+    beyond = (np.ptp(flat[:, :2], axis=0) >= _FURTHER * np.ptp(rest[:, :2], axis=0)).all()
+    on_it = (flat.min(axis=0)[:2] <= rest.min(axis=0)[:2]).all() and (
+        flat.max(axis=0)[:2] >= rest.max(axis=0)[:2]
+    ).all()
+    height = float(np.abs(rest[:, 2]).max())
+    one_side = min(-rest[:, 2].min(), rest[:, 2].max()) <= _SUNK * height
+    return largest if np.ptp(flat[:, 2]) <= slack and beyond and on_it and one_side else None
 
 
 def _gaps(verts: Floats, faces: Ints, face_areas: Floats, part: Ints, body: Ints, others: Ints) -> tuple[Floats, float]:

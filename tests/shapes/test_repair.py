@@ -305,14 +305,33 @@ def test_a_plain_hull_of_all_the_rest_is_left_out(kind: str, torus: Shape) -> No
     assert (done.shape.V, done.notes[0]) == (torus.V, f"1 outlier part dropped ({around.F} faces)")
 
 
-def test_a_body_on_a_huge_ground_is_no_dirt(sphere: Shape) -> None:
-    """Also beside a crate, and of several parts; but a bolt is none of a table."""
-    ground = Shape(
-        np.array([[-99.0, -1, -99], [99, -1, -99], [99, -1, 99], [-99, -1, 99]]), np.array([[0, 1, 2], [0, 2, 3]])
-    )
-    crate = Shape(9 * (box().verts - 0.5) + [9, 0, 0], box().faces)
+def ground(half: float, height: float = -1.0) -> Shape:
+    corners = half * np.array([[-1.0, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]]) + [0, height, 0]
+    return Shape(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+@pytest.mark.parametrize("half", [2.5, 99.0])
+def test_a_flat_ground_is_left_out(sphere: Shape, half: float) -> None:
+    """Turned anyhow, and below several parts."""
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
     hat = move(sphere, [0, 1.2, 0], 0.5)
-    for bodies, parts in ((join(sphere, ground), 2), (join(sphere, hat, ground), 3), (join(sphere, crate, ground), 3)):
+    scene = join(sphere, hat, ground(half))
+    done = repair(Shape(scene.verts @ turn, scene.faces))
+    assert done.shape.V == 2 * sphere.V and done.notes[0] == "1 outlier part dropped (2 faces)"
+
+
+def test_a_plate_that_is_no_ground_is_kept(sphere: Shape) -> None:
+    """A table top, as large as what carries it; and a sheet that something passes through."""
+    legs = [Shape(sphere.verts * [0.1, 0.5, 0.1] + [x, -0.5, z], sphere.faces) for x in (-2, 2) for z in (-2, 2)]
+    for plates in (join(*legs, ground(2.5, 0.1)), join(sphere, ground(3.0, 0.0))):
+        assert repair(plates).shape.V == plates.V
+
+
+def test_a_body_beside_something_plain_and_huge_is_no_dirt(sphere: Shape) -> None:
+    """Such as a wall with a niche for it, also of several parts; but a bolt is dirt beside a table."""
+    block = Shape(99 * (box().verts - [0.5, 1, 0.5]) + [0, -1, 0], box().faces)
+    hat, crate = move(sphere, [0, 1.2, 0], 0.5), Shape(9 * (box().verts - 0.5) + [9, 0, 0], box().faces)
+    for bodies, parts in ((join(sphere, block), 2), (join(sphere, hat, block), 3), (join(sphere, crate, block), 3)):
         done = repair(bodies)
         assert done.shape.V == bodies.V and f"{parts} separate parts kept" in done.notes
     panels = [Shape(9 * (box().verts - 0.5) * [1, 1, 0.1] + [0, 0, 9 * k], box().faces) for k in range(3)]
