@@ -190,7 +190,10 @@ def train_model(
     `InputError` of a single shape; `OptionError` if the model to start from has another template, network or kernel.
     """
     checkpoint = (output := Path(output)) / CHECKPOINT
-    record = recipe_record(recipe)  # what the card could not hold is refused now, not at the end
+    name = facts.name or output.resolve().name
+    facts = replace(facts, name=name, category=facts.category or name)
+    record = recipe_record(recipe)
+    _card(template, recipe, facts, record)  # what a card could not hold is refused now, not at the end
     make_folder(checkpoint.parent)
     config, kernel = recipe.train, recipe.kernel
     if recipe.scan.sphere and getattr(source, "scale", "sphere") == "sphere":  # the paper's lengths are in it
@@ -287,17 +290,25 @@ def export(trainer: Trainer, template: Template, output: Path, recipe: Recipe, f
     if isinstance(facts.start, TrainedModel):
         begun = facts.start.card
         settings["start"] = {"model": begun.name, "weights_sha256": begun.weights_sha256, "steps": begun.steps}
+    card = replace(
+        _card(template, recipe, facts, settings), steps=trainer.step, training_minutes=round(trainer.seconds / 60, 1),
+        metrics={"validation": {"distance": round(score, 5)}}, weights_sha256=digest,
+    )  # fmt: skip
+    write_card(card, output / CARD)
+
+
+def _card(template: Template, recipe: Recipe, facts: CardFacts, settings: dict[str, Any]) -> ModelCard:
+    """The card of a model that has learned nothing yet; `ModelError` of facts that no card can hold."""
     frame: dict[str, Any] = {} if facts.frame is None else {"frame": facts.frame}
-    card = ModelCard(
+    return ModelCard(
         name=facts.name, category=facts.category, template=template.name, template_hash=template.hash,
         network=recipe.network.to_dict(),
         field={"kernel": recipe.kernel, "radius": template.reach, "nodes": template.K},
-        data=facts.data, licence=facts.licence, recipe=settings, seed=recipe.train.seed, steps=trainer.step,
-        training_minutes=round(trainer.seconds / 60, 1), metrics={"validation": {"distance": round(score, 5)}},
-        weights_sha256=digest, created=datetime.date.today().isoformat(), stiffness=facts.stiffness,
-        mirror=facts.mirror or "no", correspondence=recipe.train.loss.needs_correspondence, **frame,
+        data=facts.data, licence=facts.licence, recipe=settings, seed=recipe.train.seed, steps=0,
+        training_minutes=0.0, metrics={}, weights_sha256=64 * "0", created=datetime.date.today().isoformat(),
+        stiffness=facts.stiffness, mirror=facts.mirror or "no",
+        correspondence=recipe.train.loss.needs_correspondence, **frame,
     )  # fmt: skip
-    write_card(card, output / CARD)
 
 
 def fill_basis(points: Float[Tensor, "B P 3"], M: int, generator: torch.Generator) -> Float[Tensor, "M 3"]:

@@ -149,6 +149,23 @@ def test_what_no_card_could_hold_is_refused_before_the_work(prepared: Path, tmp_
         with pytest.raises(OptionError, match="a card cannot hold"):
             trained(prepared, tmp_path / "model", recipe)
     assert not (tmp_path / "model" / "metrics.jsonl").exists()
+    template = read_template(prepared / "template.safetensors")
+    source = egg_source(prepared, template)
+    for facts, words in (
+        (CardFacts("My eggs"), "cannot be the name"),
+        (CardFacts("eggs", stiffness=0.0), "stiffness must be above 0"),
+        (CardFacts("eggs", mirror="yes"), "mirror must be one of"),
+    ):
+        with pytest.raises(ModelError, match=words):
+            train_model(template, source, tmp_path / "other", SMALL, facts)
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_model_without_words_is_called_as_its_folder(prepared: Path, tmp_path: Path) -> None:
+    template = read_template(prepared / "template.safetensors")
+    train_model(template, egg_source(prepared, template), tmp_path / "eggs", SMALL, CardFacts())
+    card = verify_model(tmp_path / "eggs")
+    assert (card.name, card.category) == ("eggs", "eggs")
 
 
 def test_the_best_model_so_far_is_kept_beside_the_last(prepared: Path, tmp_path: Path, monkeypatch: Any) -> None:
