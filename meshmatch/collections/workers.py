@@ -206,6 +206,14 @@ class Cluster:
     def __init__(self, address: str) -> None:
         with needs("distributed", "cluster"):
             from distributed import Client
+            from distributed.comm.addressing import resolve_address
+        try:
+            resolve_address(address)  # else the client asks for a minute, and leaves a trace of it at the end
+        except ValueError as error:
+            hint = "`dask scheduler` tells it, such as tcp://127.0.0.1:8786"
+            raise OptionError(f"{address} is no address of a Dask scheduler", hint) from error
+        except OSError as error:
+            raise OptionError(f"there is no machine at {address}", "is the name right?") from error
         try:
             self._client = Client(address, timeout=_CONNECT, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:

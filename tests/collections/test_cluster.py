@@ -103,3 +103,19 @@ def test_nobody_at_the_address(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     monkeypatch.setattr("meshmatch.collections.workers._CONNECT", 0.5)
     with pytest.raises(OptionError, match="no Dask scheduler answers"):
         meshmatch.Collection(tmp_path / "fits", workers="tcp://127.0.0.1:9").fit(SAMPLES / "dancer.ply", model="human")
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        ("nonsense", "no address of"),
+        ("tcp://127.0.0.1", "no address of"),
+        ("http://127.0.0.1:8786", "no address of"),
+        ("tcp://name.invalid:8786", "no machine at"),
+    ],
+)
+def test_what_is_no_address_is_told_at_once(address: str, words: str, tmp_path: Path) -> None:
+    start = time.perf_counter()
+    with pytest.raises(OptionError, match=words):
+        meshmatch.Collection(tmp_path / "fits", workers=address).fit(SAMPLES / "dancer.ply", model="human")
+    assert time.perf_counter() - start < 20
