@@ -8,7 +8,7 @@ import pytest
 
 from meshmatch.arrays import Ints
 from meshmatch.errors import InputError
-from meshmatch.experiments.bench.standard import errors_of, interval_over_shapes, main, split_of
+from meshmatch.experiments.bench.standard import errors_of, interval_over_shapes, main, not_published, split_of
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
@@ -39,6 +39,7 @@ def test_the_splits_are_the_published_ones(tmp_path: Path) -> None:
         write(tmp_path / "FAUST_r", f"tr_reg_{number:03d}", np.arange(5))
     found = split_of("FAUST_r", tmp_path)
     assert list(found.shapes) == [f"tr_reg_{number:03d}" for number in range(80, 100)] and len(found.pairs) == 380
+    assert not not_published("FAUST_r", list(found.shapes)) and not not_published("SMAL_r", ["cow_b"])
     for name in ("cow_a", "cow_b", "dog"):
         write(tmp_path / "SMAL_r", name, np.arange(3))
     with pytest.raises(InputError, match=r"has no test_cat\.txt"):
@@ -116,7 +117,9 @@ def test_the_command_finds_the_sets_that_are_there(tmp_path: Path, capsys: pytes
         write(tmp_path / "FAUST_r", name, np.arange(10))
     words = ["--data", str(tmp_path), "--cache", str(tmp_path / "cache"), "--model", str(model)]
     assert main(words) == 0
-    (row,) = json.loads(capsys.readouterr().out.splitlines()[-1])["rows"]
+    told = capsys.readouterr()
+    assert "published split of FAUST_r is 080 to 099, not these 3: 1 to 3" in told.err
+    (row,) = json.loads(told.out.splitlines()[-1])["rows"]
     assert (row["set"], row["shapes"], row["pairs"]) == ("FAUST_r", 3, 6) and row["low"] <= row["mean"] <= row["high"]
     assert row["minutes"] > 0
     assert main(["--data", str(tmp_path / "egg")]) == 1
