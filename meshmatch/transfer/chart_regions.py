@@ -27,6 +27,7 @@ from meshmatch.transfer.whole_polygons import unfolded_polygon
 
 # All of these were set by hand; areas are shares of the whole.
 _COARSE = 2_000  # triangles of the copy
+_MOST_STEPS = 100  # of smoothing borders of the surface; beyond, a copy between the two takes them
 _CELLS = 80
 _BEND = 4.0  # how much further it is to a triangle that faces another way
 _CENTERED = 4  # rounds in which cells are grown from their middles
@@ -96,16 +97,16 @@ def chart_regions(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], polygons
         What each triangle is part of: these stay whole where charts meet.
     """
     surface = _Surface(verts, faces, _TEXELS[1])
-    copy = _Surface(*_coarse(verts, faces), _TEXELS[0])
+    copy = _Surface(*_coarse(verts, faces, _COARSE), _TEXELS[0])
     alone = np.arange(len(copy.faces))
     cells = _flat_parts(copy, _smooth(copy, _cells(copy), _SOFT), _STRETCH, alone)
     regions = np.empty(len(copy.faces), np.int64)
     for joined, chart in enumerate(_Joining(copy, cells, _STRETCH).charts()):
         regions[chart.members] = joined
-    places = [np.concatenate([each.middles, _FACING * each.normals], axis=1) for each in (copy, surface)]
-    region = regions[cKDTree(places[0]).query(places[1])[1]]
-    if len(copy.faces) < len(faces):
-        region = _smooth(surface, region, len(faces) // len(copy.faces))
+    if len(faces) // len(copy.faces) > _MOST_STEPS:
+        between = _Surface(*_coarse(verts, faces, int(np.sqrt(len(faces) * len(copy.faces)))), _TEXELS[1])
+        copy, regions = between, _carried_over(copy, regions, between)
+    region = _carried_over(copy, regions, surface)
     first, number = np.unique(polygons, return_index=True, return_inverse=True)[1:]
     region = _hanging(surface, region[first][number])
     charts = _flat_parts(surface, region, _MORE, number)
@@ -113,10 +114,19 @@ def chart_regions(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], polygons
     return Hinging(surface.verts, surface.faces, charts, _MORE, surface.texels).charts()
 
 
-def _coarse(verts: Floats, faces: Ints) -> tuple[Floats, Ints]:
-    if len(faces) <= _COARSE:
+def _carried_over(copy: _Surface, regions: Ints, surface: _Surface) -> Int[Ints, " F"]:
+    """The regions of the triangles beside, with borders that do not follow the larger triangles of the copy."""
+    places = [np.concatenate([each.middles, _FACING * each.normals], axis=1) for each in (copy, surface)]
+    region = regions[cKDTree(places[0]).query(places[1])[1]]
+    if len(copy.faces) >= len(surface.faces):
+        return np.asarray(region)
+    return _smooth(surface, region, len(surface.faces) // len(copy.faces))
+
+
+def _coarse(verts: Floats, faces: Ints, count: int) -> tuple[Floats, Ints]:
+    if len(faces) <= count:
         return verts, faces
-    copy = decimate(Shape(verts, faces), _COARSE)
+    copy = decimate(Shape(verts, faces), count)
     real = copy.face_areas > 0
     return (copy.verts, copy.faces[real]) if real.any() else (verts, faces)
 

@@ -1,6 +1,7 @@
 """New charts: they lie flat and apart, hold together, and do not cover themselves."""
 
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from scipy.ndimage import maximum_filter
 
 from meshmatch.geometry.triangles import flat_areas, triangle_areas
 from meshmatch.shapes.shape import Shape
+from meshmatch.transfer import chart_regions as chart_regions_module
 from meshmatch.transfer import hinged_charts
 from meshmatch.transfer.chart_regions import chart_regions
 from meshmatch.transfer.flat_layout import Layout, laid_flat
@@ -104,6 +106,25 @@ def test_a_smooth_surface_needs_few_charts(torus: Shape) -> None:
         laid = chart.uv[chart.corners]
         assert (np.linalg.det(np.diff(laid, axis=1)) > 0).all()
         assert flat_areas(laid).sum() == pytest.approx(areas[chart.members].sum(), rel=1e-6)
+
+
+def test_borders_on_fine_surfaces_are_smoothed_by_way_of_a_copy_between(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All triangles, as often as the surface is finer than its copy, would grow with the square of their number."""
+    done = []
+
+    def counted(surface: Any, region: np.ndarray, steps: int) -> np.ndarray:
+        done.append((len(surface.faces), steps))
+        return smooth(surface, region, steps)
+
+    smooth = chart_regions_module._smooth
+    monkeypatch.setattr(chart_regions_module, "_smooth", counted)
+    monkeypatch.setattr(chart_regions_module, "_COARSE", 100)
+    monkeypatch.setattr(chart_regions_module, "_MOST_STEPS", 40)
+    ball = icosphere(4)  # 5,120 triangles
+    charts = chart_regions(scaled(ball), ball.faces, np.arange(ball.F))
+    np.testing.assert_array_equal(np.sort(np.concatenate([chart.members for chart in charts])), np.arange(ball.F))
+    assert len(charts) < 30
+    assert max(steps for _, steps in done) < 10 and done[-1][0] == ball.F
 
 
 def test_charts_fill_the_image(torus: Shape) -> None:
