@@ -135,32 +135,40 @@ def test_morph_targets(tmp_path: Path, primitives: int, targets: int) -> None:
 
 @pytest.mark.parametrize(("nodes", "channels", "clips"), [(500, 40_000, 0), (1, 0, 14_000)])
 def test_clips(tmp_path: Path, nodes: int, channels: int, clips: int) -> None:
-    """A clip turns the first node very often, and animates weights; others are added."""
+    """A clip turns very many nodes, and animates weights; others are added."""
     square = SQUARE | {"targets": [{"POSITION": 0}]}
     document: dict[str, Any] = {"scenes": [{"nodes": [0]}], "scene": 0, "meshes": [{"primitives": [square]}] * nodes}
-    document["nodes"] = [{"mesh": k, "children": [k + 1] * (k < nodes - 1)} for k in range(nodes)]
+    document["nodes"] = [{"mesh": k} | node for k, node in enumerate(chain(nodes, {}))] + [{}] * channels
+    if channels:
+        document["nodes"][-channels - 1]["children"] = list(range(nodes, nodes + channels))
     of_weights = [{"sampler": 0, "target": {"node": k, "path": "weights"}} for k in range(nodes)]
-    turns = [{"sampler": 0, "target": {"node": 0, "path": "rotation"}}] * channels
-    document["animations"] = [{"samplers": [{"input": 2, "output": 3}], "channels": [*turns, *of_weights]}]
+    turns = [{"sampler": 1, "target": {"node": nodes + k, "path": "rotation"}} for k in range(channels)]
+    samplers = [{"input": 2, "output": 3}, {"input": 2, "output": 4}][: 2 if channels else 1]
+    document["animations"] = [{"samplers": samplers, "channels": [*turns, *of_weights]}]
     path = tmp_path / "a.gltf"
-    write_document(path, document, CORNERS.astype("f4"), FACES.ravel().astype("u2"), *np.zeros((2, 1), "f4"))
+    arrays = CORNERS.astype("f4"), FACES.ravel().astype("u2"), *np.zeros((2, 1), "f4"), np.array([[0, 0, 0, 1]], "f4")
+    write_document(path, document, *arrays)
     scene, shape = Document(path, path.read_bytes()), load_shape(path)
     added = tuple(WeightClip(f"new {k}", np.zeros(1), np.ones((1, 1)), "LINEAR") for k in range(clips))
     shapes = BlendShapes(("wide",), np.ones((1, shape.V, 3), np.float32), np.zeros(1), normals=False, clips=added)
     made = Document(tmp_path / "b.glb", quickly(lambda: with_morphs(scene, shape, shapes, np.eye(3))))
     first, *others = made.json["animations"]
-    assert {channel["sampler"] for channel in first["channels"]} == set(range(0 if channels else 1, nodes + 1))
+    own = range(1, nodes + 1 + bool(channels))  # each node's weights have a sampler of their own
+    assert {channel["sampler"] for channel in first["channels"]} == set(own)
     assert len(others) == clips
 
 
 def test_materials(tmp_path: Path) -> None:
     """A primitive has very many variants."""
     N = 20_000
-    mappings = [{"material": k, "variants": [0]} for k in range(1, N)]
+    mappings = [{"material": k, "variants": [k]} for k in range(1, N)]
     part = {"attributes": {"POSITION": 0, "TEXCOORD_0": 4}, "indices": 1, "material": 0}
     part["extensions"] = {"KHR_materials_variants": {"mappings": mappings}}
     materials = [{"name": f"{k}"} for k in range(N)]
-    document = write(tmp_path / "a.gltf", nodes=[{"mesh": 0}], meshes=[{"primitives": [part]}], materials=materials)
+    names = {"variants": [{"name": f"{k}"} for k in range(N)]}
+    variants = {"extensionsUsed": ["KHR_materials_variants"], "extensions": {"KHR_materials_variants": names}}
+    meshes = [{"primitives": [part]}]
+    document = write(tmp_path / "a.gltf", nodes=[{"mesh": 0}], meshes=meshes, materials=materials, **variants)
     baked = BakedMaterial(np.full((4, 4, 4), 255, np.uint8))
     glb = quickly(lambda: dressed(document, np.zeros((2, 3, 2)), True, baked, np.eye(3)))
     assert [each["name"] for each in Document(tmp_path / "b.glb", glb).json["materials"]] == [f"{k}" for k in range(N)]
