@@ -22,6 +22,7 @@ _HULL_FACES, _TOUCHING = (
     64,
     1e-3,
 )  # that a plain hull has at most; how far what it holds may reach out of it, of its length
+_AROUND = 4  # hulls and grounds at most, one around another
 _FURTHER, _SUNK = 1.5, 0.1  # times as far a ground reaches as what is on it; how much of that may be below it
 _NEAR = 0.05  # gap up to which a small part belongs to a shape that is made of small parts
 
@@ -143,9 +144,11 @@ def find_parts(
     faces: Int[Ints, "F 3"],
     cross: Float[Floats, "F 3"],
     spared: Bool[Bools, " V"] | None = None,
+    around: int = _AROUND,
 ) -> tuple[Bool[Bools, " F"], int, int, int, float]:
     """Judge the connected parts of a mesh; `cross` as in `flat_faces`. A part with a `spared` vertex is no outlier; a plain
-    hull of all others is one, and so is a flat ground that reaches far beyond them.
+    hull of all others is one, and so is a flat ground that reaches far beyond them, as
+    long as there are no more than ``around`` of these.
 
     Returns the faces of outlier parts; how many parts are outliers, and how many are not; how many of the latter are
     big but lie far from the rest; and the share of the surface that these have, in 0..1.
@@ -153,13 +156,14 @@ def find_parts(
     part = triangles.face_parts(faces, len(verts))
     if part.max() == 0:
         return np.zeros(len(faces), bool), 0, 1, 0, 0.0
-    around = _container(verts, faces, part) if spared is None else None
-    if around is None and spared is None:
-        around = _ground(verts, faces, part, cross)
-    if around is not None:
-        inside = part != around
+    outer = None
+    if spared is None and around:
+        outer = _container(verts, faces, part)
+        outer = _ground(verts, faces, part, cross) if outer is None else outer
+    if outer is not None:
+        inside = part != outer
         dropped = np.ones(len(faces), bool)
-        dropped[inside], many, kept, apart, share = find_parts(verts, faces[inside], cross[inside])
+        dropped[inside], many, kept, apart, share = find_parts(verts, faces[inside], cross[inside], None, around - 1)
         return dropped, many + 1, kept, apart, share
     face_areas = 0.5 * np.sqrt(squared_lengths(cross))
     areas = np.bincount(part, weights=face_areas)

@@ -327,6 +327,26 @@ def test_a_plate_that_is_no_ground_is_kept(sphere: Shape) -> None:
         assert repair(plates).shape.V == plates.V
 
 
+def test_boxes_in_boxes_end_soon(sphere: Shape) -> None:
+    boxes = [Shape((2 + k) * (box().verts - 0.5), box().faces) for k in range(2000)]
+    assert repair(join(sphere, *boxes)).shape.V > sphere.V
+
+
+def test_what_only_looks_like_a_hull_a_ground_or_a_spike_is_kept(sphere: Shape) -> None:
+    """Something plain as large as a body that sticks out of it, a plate beside one, a sheet of two pieces, a short thorn."""
+    corners = 1.05 * np.concatenate([np.eye(3), -np.eye(3)])
+    faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
+    flat = Shape(sphere.verts * [1, 0, 1], sphere.faces)
+    for shape in (join(sphere, Shape(corners, faces)), join(sphere, move(ground(2.5), [3, 0, 0]))):
+        assert repair(shape).shape.V == shape.V
+    assert not any("outlier" in note for note in repair(join(flat, ground(1.0, 0.0))).notes)
+    thorn = with_a_cone(sphere, 1.2, 0.005)
+    near = thorn.faces[(thorn.faces == thorn.verts[:, 2].argmax()).any(axis=1)]
+    verts = thorn.verts.copy()
+    verts[np.setdiff1d(near, thorn.verts[:, 2].argmax()), 2] = 1.4
+    assert not any("spike" in note for note in repair(Shape(verts, thorn.faces)).notes)
+
+
 def test_a_body_beside_something_plain_and_huge_is_no_dirt(sphere: Shape) -> None:
     """Such as a wall with a niche for it, also of several parts; but a bolt is dirt beside a table."""
     block = Shape(99 * (box().verts - [0.5, 1, 0.5]) + [0, -1, 0], box().faces)
