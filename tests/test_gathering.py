@@ -102,7 +102,7 @@ def test_an_error_is_heard_by_all_who_asked_together_and_by_nobody_later() -> No
 
 
 def test_who_asks_no_more_or_fails_keeps_nobody_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gathering, "_PATIENCE", 30.0)
+    monkeypatch.setattr(gathering, "_PATIENCE", 90.0)
     squares = Squares()
 
     def work(number: int) -> int:
@@ -113,12 +113,12 @@ def test_who_asks_no_more_or_fails_keeps_nobody_waiting(monkeypatch: pytest.Monk
     began = time.monotonic()
     found = run(5, 1, 5, work)
     assert isinstance(found[0], ValueError) and found[1:] == [1, 8, 27, 64]
-    assert squares.asked == [3, 3, 2, 1] and time.monotonic() - began < 10
+    assert squares.asked == [3, 3, 2, 1] and time.monotonic() - began < 60
 
 
 def test_what_is_computed_once_for_all_is_asked_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first holds a lock that the others need before they can ask."""
-    monkeypatch.setattr(gathering, "_PATIENCE", 30.0)
+    monkeypatch.setattr(gathering, "_PATIENCE", 90.0)
     squares = Squares()
 
     class Owner:
@@ -130,7 +130,7 @@ def test_what_is_computed_once_for_all_is_asked_alone(monkeypatch: pytest.Monkey
 
     owner, began = Owner(), time.monotonic()
     assert run(4, 2, 4, lambda number: known(owner) + gathered(squares, number)) == [9, 10, 13, 18]
-    assert squares.asked[0] == 1 and sum(squares.asked) == 5 and time.monotonic() - began < 10
+    assert squares.asked[0] == 1 and sum(squares.asked) == 5 and time.monotonic() - began < 60
 
 
 def test_nobody_waits_for_long_for_one_who_is_at_something_else() -> None:
