@@ -1,4 +1,4 @@
-"""The mesh of one fitted shape, deformed onto the shape of another fit of the same template."""
+"""Deform the mesh of one fitted shape onto another, by two fits of the same template."""
 
 from __future__ import annotations
 
@@ -16,29 +16,32 @@ from meshmatch.shapes.shape import Shape
 
 
 def deformed(part: Repaired, source: Fit, target: Fit, workers: int = 1) -> Shape:
-    """The shape of the source's file, in the frame and unit of the target's: its vertices follow the template from one fit
-    to the other, and keep their offsets from it, which turn with it.
+    """Return the source's mesh in the pose and shape of the target.
+
+    Vertices follow the template from one fit to the other and keep their offsets from it, rotated with its surface. The
+    result has the vertices and faces of the source's file, in the frame and unit of the target's.
     """
     source.check_template(target.template_hash)
-    still = np.tile(np.eye(3), (len(source.points), 1, 1))
-    turns = surface_rotations(source.points, target.points, source.faces)
-    binding = SurfaceBinding(part, source, still, workers)
-    moved = binding.shape(target.frame.undo(binding.at(target.points, turns)), part.original.name)
-    other_side = source.frame.mirrored != target.frame.mirrored
-    return replace(moved, faces=moved.faces[:, ::-1]) if other_side else moved
+    identity = np.tile(np.eye(3), (len(source.points), 1, 1))
+    rotations = surface_rotations(source.points, target.points, source.faces)
+    binding = SurfaceBinding(part, source, identity, workers)
+    result = binding.shape(target.frame.undo(binding.at(target.points, rotations)), part.original.name)
+    is_mirrored = source.frame.mirrored != target.frame.mirrored
+    return replace(result, faces=result.faces[:, ::-1]) if is_mirrored else result
 
 
 def surface_rotations(
     before: Float[Floats, "V 3"], after: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]
 ) -> Float[Floats, "V 3 3"]:
-    """The rotation around each vertex of a mesh that moved: the best one of its edges and of its normal, which tells where
-    the edges lie in a plane.
+    """Best rotation around each vertex from one position of a mesh to another.
+
+    Fitted to the vertex's edges and, because those alone are ambiguous where they lie in a plane, to its normal.
     """
     edges = edges_of(faces).vertices
     a, b = edges[:, 0], edges[:, 1]
-    here, there = before[b] - before[a], after[b] - after[a]
-    products = there[:, :, None] * here[:, None, :]
-    length = np.square(here).sum(1)
+    edges_before, edges_after = before[b] - before[a], after[b] - after[a]
+    products = edges_after[:, :, None] * edges_before[:, None, :]
+    length = np.square(edges_before).sum(1)
     total, weight = np.zeros((len(before), 3, 3)), np.zeros(len(before))
     for end in (a, b):
         np.add.at(total, end, products)

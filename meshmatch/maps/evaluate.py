@@ -1,4 +1,4 @@
-"""How good a map is: errors where the truth is known, coverage and distortion where it is not."""
+"""Quality measures of maps: errors where ground truth is known, coverage and distortion where it is not."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ SKIN_M2 = 1.9
 CM_PER_UNIT = 100.0 * float(np.sqrt(SKIN_M2))
 """Centimetres in one sqrt(area) of a person with 1.9 m2 of skin."""
 LOST_CM = 15.0
-"""An error above this is a point on the wrong limb; a pair whose mean lies above it is a left-right flip."""
-_TRUTH = "give one target vertex for every source vertex, or a pair of lists of the same length"
-_LOST = 0.1  # the same of other shapes, in units of sqrt(area)
+"""A point with a larger error is on the wrong limb; a pair with a larger mean error is a left-right flip."""
+_TRUTH_HINT = "give one target vertex for every source vertex, or a pair of lists of the same length"
+_LOST_ERROR = 0.1  # an error above this is a point in a wrong place, on shapes other than people; units of sqrt(area)
 
 
 @dataclass(frozen=True)
 class ErrorUnit:
-    """What errors are told in.
+    """The unit that errors are reported in.
 
     Attributes
     ----------
     name
         "cm" (the target scaled to 1.9 m2 of skin), "file" (unit of the target's file) or "x100" (hundredths of sqrt(area)).
     factor
-        How many are one sqrt(area) of the target.
+        Number of these units in one sqrt(area) of the target.
     symbol
-        What stands after a number.
+        Written after a number.
     words
-        What stands at an axis.
+        Label of a plot's axis.
     lost
-        A larger error is a point in a wrong place.
+        Threshold above which a point is in a wrong place.
     """
 
     name: str
@@ -58,7 +58,7 @@ class ErrorUnit:
         Parameters
         ----------
         target
-            What errors were measured on.
+            The shape on which errors were measured.
 
         Returns
         -------
@@ -66,25 +66,25 @@ class ErrorUnit:
             ``factor`` is the square root of the target's area.
         """
         size = float(np.sqrt(target.area))
-        return cls("file", size, "(unit of the file)", "unit of the file", _LOST * size)
+        return cls("file", size, "(unit of the file)", "unit of the file", _LOST_ERROR * size)
 
 
 CM = ErrorUnit("cm", CM_PER_UNIT, "cm", "cm, target scaled to 1.9 m² of skin", LOST_CM)
-X100 = ErrorUnit("x100", 100.0, "x 0.01 sqrt(area)", "hundredths of sqrt(area)", 100 * _LOST)
+X100 = ErrorUnit("x100", 100.0, "x 0.01 sqrt(area)", "hundredths of sqrt(area)", 100 * _LOST_ERROR)
 
 
 @dataclass(frozen=True)
 class SurfaceDistance:
-    """How far two surfaces lie apart.
+    """Distance between two surfaces.
 
     Attributes
     ----------
     mean
-        On average over both, in ``unit``.
+        Mean distance over both surfaces, in ``unit``.
     most
-        At most, in ``unit``.
+        Largest distance, in ``unit``.
     unit
-        What lengths are told in.
+        Unit of lengths.
 
     Examples
     --------
@@ -98,7 +98,7 @@ class SurfaceDistance:
     unit: ErrorUnit
 
     def __str__(self) -> str:
-        """In words."""
+        """One line of text."""
         name, length = self.unit.name, "" if self.unit.name == "file" else f" {self.unit.symbol}"
         place = {"file": ", in the unit of the file", "cm": ", on a body of 1.9 square metres of skin"}.get(name, "")
         return f"surfaces lie {self.mean:.2g}{length} apart on average, {self.most:.2g} at most{place}"
@@ -116,10 +116,10 @@ class SurfaceDistance:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Errors(Brief, Pickled):
-    """Errors of a map, one for each point whose truth is known.
+    """Errors of a map, one for each point with known ground truth.
 
-    An error is the distance between predicted and true point along the target's surface, over the square root of the
-    target's area; in "cm", with the target scaled to 1.9 m2, the skin of a person.
+    An error is the geodesic distance between the predicted and the true point on the target, divided by the square root of
+    the target's area. In centimetres, the target is scaled to 1.9 m2, the skin of a person.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ class Errors(Brief, Pickled):
     Raises
     ------
     InputError
-        There is no error, or one is negative or not finite.
+        The list is empty, or an error is negative or not finite.
 
     Examples
     --------
@@ -152,31 +152,31 @@ class Errors(Brief, Pickled):
 
     @property
     def mean(self) -> float:
-        """Their mean, in units of sqrt(area)."""
+        """Mean error, in units of sqrt(area)."""
         return float(self.values.mean(dtype=np.float64))
 
     @property
     def median(self) -> float:
-        """Their median, in units of sqrt(area)."""
+        """Median error, in units of sqrt(area)."""
         return float(np.median(self.values))
 
     @property
     def mean_cm(self) -> float:
-        """Their mean in centimetres."""
+        """Mean error in centimetres."""
         return self.mean * CM_PER_UNIT
 
     @property
     def median_cm(self) -> float:
-        """Their median in centimetres."""
+        """Median error in centimetres."""
         return self.median * CM_PER_UNIT
 
     def share_over(self, cm: float = LOST_CM) -> float:
-        """Share of the points with a large error.
+        """Share of the points with an error above a threshold.
 
         Parameters
         ----------
         cm
-            What an error must exceed, in centimetres.
+            The threshold, in centimetres.
 
         Returns
         -------
@@ -204,7 +204,7 @@ class Errors(Brief, Pickled):
 
 @dataclass(frozen=True)
 class Coverage:
-    """How much of a target a map reaches: shares (0..1) of its vertices that are hit, and of the area around them.
+    """How much of a target a map reaches: the shares (0..1) of its vertices, and of their areas, that are hit.
 
     A source with fewer vertices than the target cannot reach all: `vertices` is at most V_source / V_target.
     """
@@ -220,21 +220,21 @@ def map_errors(
     geodesics: GeodesicDistances,
     progress: Callable[[float], None] | None = None,
 ) -> Errors:
-    """Errors at known points: is ``index[source_points[n]]`` the vertex ``target_points[n]``?
+    """Geodesic distances between ``index[source_points[n]]`` and the true vertices ``target_points[n]``.
 
-    `index` (V_source,) is the map; both kinds of points (N,) are vertices, `geodesics` those of the target.
-    Points of which one is -1 have no counterpart, and are left out with a warning.
-    `InputError` if the lists are no integers, differ in length, or name a vertex that is not there.
+    `index` (V_source,) is the map; both lists of points (N,) are vertices; `geodesics` are distances on the target.
+    Pairs with a -1 have no counterpart, and are left out with a warning.
+    `InputError` if the lists are not integers, differ in length, or name a vertex that does not exist.
     """
-    index, a, b = (as_array(ids, "the truth", _TRUTH) for ids in (index, source_points, target_points))
+    index, a, b = (as_array(ids, "the truth", _TRUTH_HINT) for ids in (index, source_points, target_points))
     for ids in (a, b):
         if ids.dtype.kind not in "iu":
             raise InputError(f"the truth must be numbers of vertices, not {ids.dtype}", "integers, counted from 0")
     if a.shape != b.shape or a.ndim != 1 or not a.size:
-        raise InputError(f"the truth has {a.shape} vertices of the source and {b.shape} of the target", _TRUTH)
+        raise InputError(f"the truth has {a.shape} vertices of the source and {b.shape} of the target", _TRUTH_HINT)
     known = (a != -1) & (b != -1)
     if not known.any():
-        raise InputError("the truth has no vertex with a counterpart", _TRUTH)
+        raise InputError("the truth has no vertex with a counterpart", _TRUTH_HINT)
     if not known.all():
         warn(f"{np.count_nonzero(~known)} of {len(known)} vertices have no counterpart: left out")
         a, b = a[known], b[known]
@@ -248,8 +248,11 @@ def map_errors(
 def placed_pairs(
     source_points: ArrayLike, target_points: ArrayLike, source: Shape, target: Shape
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """The known points of which both vertices have a position; warns of others. What `map_errors` refuses stays."""
-    a, b = (as_array(ids, "the truth", _TRUTH) for ids in (source_points, target_points))
+    """Known pairs whose vertices both have a position; others are left out with a warning.
+
+    Lists that are not valid are returned unchanged, for `map_errors` to refuse.
+    """
+    a, b = (as_array(ids, "the truth", _TRUTH_HINT) for ids in (source_points, target_points))
     known = (source.invalid is not None or target.invalid is not None) and a.shape == b.shape and a.ndim == 1
     if not known or not all(ids.dtype.kind in "iu" for ids in (a, b)):
         return a, b
@@ -277,8 +280,8 @@ def distortion(
     """Mean change of the distance between two points under a map, in units of sqrt(area).
 
     Compares ``samples`` random source vertices pairwise; both shapes in units of their own sqrt(area). 0 for an
-    isometry; a random map between two bodies has about 0.45. It needs no truth, and sees no left-right flip. Vertices
-    that no face uses are on no surface, and left out.
+    isometry; a random map between two bodies has about 0.45. It needs no ground truth, and does not see a left-right
+    flip. Vertices that no face uses are left out.
     """
     index = np.asarray(index)
     chosen = rng.choice(source.on_surface, size=min(samples, len(source.on_surface)), replace=False)
@@ -290,9 +293,9 @@ def distortion(
 
 
 def dirichlet_energy(found: VertexMap, source: Shape, target: Shape) -> float:
-    """Half of the integral of the squared gradient of a map over its source, both shapes scaled to area 1.
+    """Dirichlet energy of a map: half the integral of its squared gradient over the source, both shapes scaled to area 1.
 
-    1 for an isometry; the rougher a map, the more. Triangles without area are left out.
+    1 for an isometry, larger for rougher maps. Triangles without area are left out.
     """
     images, verts = found.points(target) / np.sqrt(target.area), source.verts
     faces = source.faces[source.valid_faces & (source.face_areas > 0)]
@@ -304,8 +307,9 @@ def dirichlet_energy(found: VertexMap, source: Shape, target: Shape) -> float:
 
 
 def round_trip(found: VertexMap, backward: VertexMap, source: GeodesicDistances) -> float:
-    """How far from itself a vertex of the source's faces arrives by a map and the one back, on average, in units of
-    sqrt(area).
+    """Mean distance between a source vertex and its image under the map and then the map back, in units of sqrt(area).
+
+    Vertices that no face uses are left out.
     """
     there_and_back, rows = found.compose(backward).index, source.on_surface
     return float(source.between(rows, there_and_back[rows]).mean())
@@ -325,17 +329,17 @@ class Evaluation:
         Shares (0..1) of the source's area that are ``flipped`` and ``crushed``, and the median ``stretch`` (a factor of 1
         or more); None unless both are meshes.
     errors
-        Distances from the truth; None where it is not known.
+        Distances from the ground truth; None where it is not known.
     unit
-        What errors are told in.
+        The unit that errors are reported in.
     geodesic
         How distances along a surface are measured.
     dirichlet
         Dirichlet energy, both shapes scaled to area 1: 1 for an isometry, more for a rough map; None unless both are
         meshes.
     bijectivity
-        Mean distance between a vertex of the source and where the maps there and back lead, in units of sqrt(area); None
-        where the map back is not given, and for a cloud.
+        Mean distance between a vertex of the source and its image under both maps in succession, in units of sqrt(area);
+        None where the map back is not given, and for a cloud.
 
     Examples
     --------
@@ -363,7 +367,7 @@ class Evaluation:
         Parameters
         ----------
         threshold
-            What an error must exceed to count in ``share_over_threshold``, in ``unit``; its ``lost`` by default.
+            Errors above this count in ``share_over_threshold``; in ``unit``, by default the unit's ``lost``.
 
         Returns
         -------
@@ -396,17 +400,17 @@ class Evaluation:
         return record
 
     def share_over(self, threshold: float | None = None) -> float:
-        """Share of the points with a large error.
+        """Share of the points with an error above a threshold.
 
         Parameters
         ----------
         threshold
-            What an error must exceed, in ``unit``; its ``lost`` by default.
+            In ``unit``; by default the unit's ``lost``.
 
         Returns
         -------
         float
-            From 0 to 1; nan where the truth is not known.
+            From 0 to 1; nan where the ground truth is not known.
         """
         if self.errors is None:
             return float("nan")
@@ -426,26 +430,27 @@ def evaluate_map(
     rng: np.random.Generator | None = None,
     progress: ProgressCallback | None = None,
 ) -> Evaluation:
-    """Coverage, distortion, Dirichlet energy and folds (if both shapes are meshes), bijectivity where the map back is given
-    and, where the truth is given as in `map_errors`, errors.
+    """Compute all measures of a map that the arguments allow.
 
-    With `target_points` alone, entry i belongs to vertex i of the source. `unit` is what errors are told in; `rng`,
-    ``default_rng(0)`` if none is given, chooses the points of `distortion`. `InputError` if the map does not belong to
-    these shapes, or the truth to them; or if the truth is given and the target is a cloud.
+    Coverage always; distortion, Dirichlet energy and folds if both shapes are meshes; bijectivity if the map back
+    (``backward``) is given; errors if ground truth is given, as in `map_errors`. With `target_points` alone, entry i
+    belongs to vertex i of the source. `unit` is the unit that errors are reported in; `rng`, ``default_rng(0)`` if None,
+    chooses the points of `distortion`. `InputError` if the maps or the ground truth do not belong to these shapes, or if
+    ground truth is given and the target is a cloud.
     """
     vertex_map = vertex_map.for_shapes(source, target)
-    over = errors = stretched = folds = energy = astray = None
+    geodesics_target = errors = stretched = folds = energy = bijectivity_error = None
     backward = None if backward is None else backward.for_shapes(target, source, "the map back")
     report = Progress(progress, target.name).stage("measuring errors")
     if target_points is not None:
         source_points = np.arange(source.V) if source_points is None else source_points
-        over, pairs = GeodesicDistances(target), placed_pairs(source_points, target_points, source, target)
-        errors = map_errors(vertex_map.index, *pairs, over, report)
+        geodesics_target, pairs = GeodesicDistances(target), placed_pairs(source_points, target_points, source, target)
+        errors = map_errors(vertex_map.index, *pairs, geodesics_target, report)
     if not source.is_cloud and not target.is_cloud:
-        both = GeodesicDistances(source), over or GeodesicDistances(target)
+        both = GeodesicDistances(source), geodesics_target or GeodesicDistances(target)
         stretched = distortion(vertex_map.index, *both, rng or np.random.default_rng(0))
         folds, energy = Folds.of(vertex_map, source, target), dirichlet_energy(vertex_map, source, target)
     if backward is not None and not source.is_cloud:
-        astray = round_trip(vertex_map, backward, GeodesicDistances(source))
-    measured: dict[str, Any] = {"dirichlet": energy, "bijectivity": astray}
+        bijectivity_error = round_trip(vertex_map, backward, GeodesicDistances(source))
+    measured: dict[str, Any] = {"dirichlet": energy, "bijectivity": bijectivity_error}
     return Evaluation(coverage(vertex_map.index, target), stretched, folds, errors, unit, **measured)
