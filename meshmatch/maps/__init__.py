@@ -1,4 +1,4 @@
-"""Maps between shapes: the type, its files, geodesic distances and errors. Arrays only, no torch."""
+"""Maps between shapes: the type, its files, geodesic distances and errors. NumPy only, no torch."""
 
 MAP_SUFFIXES = (".npy", ".npz", ".csv", ".txt", ".mat", ".json")
-"""What `meshmatch.maps.files` reads and writes; here, because a command asks before it loads NumPy."""
+"""Suffixes that `meshmatch.maps.files` reads and writes; defined here because commands need them before NumPy is loaded."""

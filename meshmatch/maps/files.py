@@ -1,4 +1,4 @@
-"""Maps from files and to files, by suffix. Write then read gives the same value, as far as the format can hold it.
+"""Read and write maps; the suffix selects the format. A map survives writing and reading, as far as the format stores it.
 
 =====  ===========================================================================================
 .npy   ``index`` alone: int64 ``(V_source,)``, 0-based
@@ -6,7 +6,7 @@
 .csv   a row per source vertex: source_vertex, target_vertex, face, w0, w1, w2, confidence
 .npz   everything
 .mat   everything, and ``matlab_index`` = index + 1 for programs that count from 1
-.json  everything, in words
+.json  everything, as text
 =====  ===========================================================================================
 """
 
@@ -31,23 +31,23 @@ from meshmatch.shapes.input_files import check_memory, read_bytes, read_json, re
 from meshmatch.shapes.tables import read_table, whole
 
 CSV_COLUMNS = ("source_vertex", "target_vertex", "face", "w0", "w1", "w2", "confidence")
-_ARRAYS = ("index", "face", "barycentric", "confidence")
-_WORDS = ("source", "target", "verdict", "source_hash", "target_hash", "source_up", "target_up")
-_COUNTS = ("source_vertices", "target_vertices")
-_KNOWN = (*_ARRAYS, *_WORDS, *_COUNTS, "reasons")
+_ARRAY_FIELDS = ("index", "face", "barycentric", "confidence")
+_TEXT_FIELDS = ("source", "target", "verdict", "source_hash", "target_hash", "source_up", "target_up")
+_COUNT_FIELDS = ("source_vertices", "target_vertices")
+_ALL_FIELDS = (*_ARRAY_FIELDS, *_TEXT_FIELDS, *_COUNT_FIELDS, "reasons")
 _FORMAT = "meshmatch map 1"
-_FROM_ONE = "matlab_index"
-_VERTEX = 140  # bytes of memory for each vertex, while a map is read
+_MATLAB_INDEX = "matlab_index"
+_BYTES_PER_VERTEX = 140  # memory needed while a map is read
 check_suffix = partial(tables.check_suffix, suffixes=MAP_SUFFIXES, what="maps")
 
 
 def save_map(path: str | Path, vertex_map: VertexMap) -> None:
-    """Write a map in the format of the suffix, whole or not at all.
+    """Write a map atomically, in the format that the suffix names.
 
     Parameters
     ----------
     path
-        Where to; see `meshmatch.maps.MAP_SUFFIXES`.
+        Output file; see `meshmatch.maps.MAP_SUFFIXES`.
     vertex_map
         The map.
 
@@ -56,7 +56,7 @@ def save_map(path: str | Path, vertex_map: VertexMap) -> None:
     OptionError
         The suffix is not supported.
     InputError
-        It is no `VertexMap`.
+        ``vertex_map`` is not a `VertexMap`.
     OutputError
         The file cannot be written.
 
@@ -73,16 +73,16 @@ def save_map(path: str | Path, vertex_map: VertexMap) -> None:
 
 
 def load_map(path: str | Path, source: ShapeLike | None = None, target: ShapeLike | None = None) -> VertexMap:
-    """Read a map, and check it against the shapes if they are given (`VertexMap.for_shapes`).
+    """Read a map and, if shapes are given, check it against them (`VertexMap.for_shapes`).
 
     Parameters
     ----------
     path
-        Its suffix names the format, see `meshmatch.maps.MAP_SUFFIXES`.
+        File whose suffix names the format, see `meshmatch.maps.MAP_SUFFIXES`.
     source
-        Fills in name, count and hash where the file does not have them.
+        Supplies name, vertex count and hash that the file lacks.
     target
-        The same, and the faces.
+        Supplies the same for the target, and its faces.
 
     Returns
     -------
@@ -92,8 +92,8 @@ def load_map(path: str | Path, source: ShapeLike | None = None, target: ShapeLik
     Raises
     ------
     InputError
-        The file is missing or damaged, or holds no map; or the map was made for other shapes, or runs from `target` to
-        `source`.
+        The file is missing or damaged, or contains no map; or the map was made for other shapes, or runs from `target`
+        to `source`.
     OptionError
         The suffix is not supported.
 
@@ -115,30 +115,30 @@ def _read(path: Path) -> VertexMap:
     record = _FORMATS[path.suffix.lower()][1](path)
     if not isinstance(record, dict) or "index" not in record:
         raise InputError("there is no 'index' in it")
-    texts = {name: [record.get(name, "")] for name in _WORDS} | {"reasons": list(record.get("reasons", ()))}
+    texts = {name: [record.get(name, "")] for name in _TEXT_FIELDS} | {"reasons": list(record.get("reasons", ()))}
     if odd := [name for name, found in texts.items() if not all(isinstance(each, str) for each in found)]:
         raise InputError(f"'{odd[0]}' is not text")
-    others = sum(np.size(record[name]) for name in _ARRAYS if isinstance(record.get(name), np.ndarray | list))
-    check_memory(path.name, path.stat().st_size, _VERTEX * np.size(record["index"]) + 16 * others)
-    return VertexMap(**{"source": "", "target": "", **{k: v for k, v in record.items() if k in _KNOWN}})
+    others = sum(np.size(record[name]) for name in _ARRAY_FIELDS if isinstance(record.get(name), np.ndarray | list))
+    check_memory(path.name, path.stat().st_size, _BYTES_PER_VERTEX * np.size(record["index"]) + 16 * others)
+    return VertexMap(**{"source": "", "target": "", **{k: v for k, v in record.items() if k in _ALL_FIELDS}})
 
 
-def _record(m: VertexMap) -> dict[str, Any]:
-    fields = {name: getattr(m, name) for name in (*_ARRAYS, *_WORDS, *_COUNTS)}
+def _to_record(m: VertexMap) -> dict[str, Any]:
+    fields = {name: getattr(m, name) for name in (*_ARRAY_FIELDS, *_TEXT_FIELDS, *_COUNT_FIELDS)}
     return {"format": _FORMAT, "direction": DIRECTION, **fields, "reasons": list(m.reasons)}
 
 
-def _plain(arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """Words and counts out of arrays of one element."""
-    record = dict(arrays)
-    for name in _WORDS:
-        record[name] = str(record.get(name, "")) or ("unknown" if name == "verdict" else "")
-    for name in _COUNTS:
-        record[name] = int(np.ravel(record.get(name, UNKNOWN))[0])
-    return record
+def _unpack_scalars(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """Replace arrays of one element by the texts and counts in them."""
+    values = dict(arrays)
+    for name in _TEXT_FIELDS:
+        values[name] = str(values.get(name, "")) or ("unknown" if name == "verdict" else "")
+    for name in _COUNT_FIELDS:
+        values[name] = int(np.ravel(values.get(name, UNKNOWN))[0])
+    return values
 
 
-def _bare(index: NDArray[Any]) -> dict[str, Any]:
+def _index_record(index: NDArray[Any]) -> dict[str, Any]:
     return {"index": index.reshape(-1) if index.ndim == 2 and 1 in index.shape else index}
 
 
@@ -147,15 +147,15 @@ def _write_txt(path: Path, m: VertexMap) -> None:
 
 
 def _read_txt(path: Path) -> dict[str, Any]:
-    return _bare(whole(read_table(path, comments="ends", whole=True).numbers()[1]))
+    return _index_record(whole(read_table(path, comments="ends", whole=True).numbers()[1]))
 
 
 def _write_npz(path: Path, m: VertexMap) -> None:
-    tables.write_npz(path, _record(m) | {"reasons": np.array(m.reasons, dtype=np.str_)})
+    tables.write_npz(path, _to_record(m) | {"reasons": np.array(m.reasons, dtype=np.str_)})
 
 
 def _read_npz(path: Path) -> dict[str, Any]:
-    record = _plain(read_npz(path, _KNOWN))
+    record = _unpack_scalars(read_npz(path, _ALL_FIELDS))
     return record | {"reasons": tuple(str(reason) for reason in np.ravel(record.get("reasons", ())))}
 
 
@@ -168,7 +168,7 @@ def _write_csv(path: Path, m: VertexMap) -> None:
 def _read_csv(path: Path) -> dict[str, Any]:
     names, table = read_table(path, whole=True).numbers()
     if not names and table.shape[1] == 1:
-        return _bare(table)
+        return _index_record(table)
     column = {name.lower(): table[:, k] for k, name in enumerate(names)}
     if "target_vertex" not in column:
         raise InputError("there is no column 'target_vertex'", f"the columns are {','.join(CSV_COLUMNS)}")
@@ -182,20 +182,20 @@ def _read_csv(path: Path) -> dict[str, Any]:
 
 
 def _write_json(path: Path, m: VertexMap) -> None:
-    record = _record(m)
+    record = _to_record(m)
     record |= {name: record[name].tolist() for name in ("index", "face", "barycentric")}
     tables.write_json(path, record | {"confidence": tables.short_floats(m.confidence)})
 
 
 def _read_json(path: Path) -> Any:
     record = read_json(path)
-    return _bare(np.array(record)) if isinstance(record, list) else record
+    return _index_record(np.array(record)) if isinstance(record, list) else record
 
 
 def _write_mat(path: Path, m: VertexMap) -> None:
     from scipy.io import savemat
 
-    record = _record(m) | {_FROM_ONE: m.index + 1, "reasons": np.array(list(m.reasons), dtype=object)}
+    record = _to_record(m) | {_MATLAB_INDEX: m.index + 1, "reasons": np.array(list(m.reasons), dtype=object)}
     with path.open("wb") as file:
         savemat(file, record, oned_as="column")  # type: ignore[arg-type]  # files serve as well
         file.seek(0)  # the first 116 bytes are free text; the time in it would make every file differ
@@ -203,21 +203,21 @@ def _write_mat(path: Path, m: VertexMap) -> None:
 
 
 def _read_mat(path: Path) -> dict[str, Any]:
-    record = _plain(read_mat(read_bytes(path), (*_KNOWN, _FROM_ONE)))
-    from_one = record.pop(_FROM_ONE, None)
+    record = _unpack_scalars(read_mat(read_bytes(path), (*_ALL_FIELDS, _MATLAB_INDEX)))
+    from_one = record.pop(_MATLAB_INDEX, None)
     if isinstance(from_one, np.ndarray):
         if "index" not in record:
-            return _bare(from_one - 1)
+            return _index_record(from_one - 1)
         if not np.array_equal(np.ravel(from_one), np.ravel(record["index"]) + 1):
-            hint = f"save one of the two; {_FROM_ONE} alone is read as well"
-            raise InputError(f"its {_FROM_ONE} is not index + 1", hint)
+            hint = f"save one of the two; {_MATLAB_INDEX} alone is read as well"
+            raise InputError(f"its {_MATLAB_INDEX} is not index + 1", hint)
     reasons = record.get("reasons", ())
     record["reasons"] = tuple(reasons) if isinstance(reasons, list) else ()
     return record | {name: np.ravel(record[name]) for name in ("index", "face", "confidence") if name in record}
 
 
 _FORMATS: dict[str, tuple[Callable[[Path, VertexMap], None], Callable[[Path], Any]]] = {
-    ".npy": (lambda path, m: tables.write_npy(path, m.index), lambda path: _bare(read_npy(path))),
+    ".npy": (lambda path, m: tables.write_npy(path, m.index), lambda path: _index_record(read_npy(path))),
     ".npz": (_write_npz, _read_npz),
     ".csv": (_write_csv, _read_csv),
     ".txt": (_write_txt, _read_txt),

@@ -1,8 +1,8 @@
-"""Fits as files: safetensors with the arrays, and a JSON header for the words.
+"""Read and write fits: safetensors files with the arrays, and a JSON header with everything else.
 
-A collection keeps a fit in two states. Alone, it has the samples of its shape with it, for it has yet to agree with others.
-Finished, it knows where the vertices of its shape belong on the template (`Places`), which is all that maps ask. A user's
-fit has the shape itself. None holds the template, nor anything that differs from run to run.
+A collection stores a fit in two states. Before it agrees with the others, the file contains the samples of its shape.
+Once finished, it contains the places of the shape's vertices on the template (`Places`), which is all that maps need.
+A fit that a user saves contains the shape itself. No file contains the template, or anything that differs between runs.
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ from meshmatch.templates.template import Template, save_arrays
 
 SCHEMA = 1
 _HINT = "fit the shape again; in a folder of fits, remove the file, and run `meshmatch fit` as before"
-_SHAPE = "shape_"  # begins the names of a shape's arrays
+_SHAPE_PREFIX = "shape_"  # prefix of the names of the shape's arrays
 _SHAPE_ARRAYS = ("verts", "faces", "colors", "invalid", "weights", "skinned")
-_FIT_WORDS = {
+_FIT_FIELDS = {
     **dict.fromkeys(("template_hash", "verdict", "up", "front", "model"), str),
     **{"residual": float, "trust": float, "seed": int, "partial": bool},
 }
-_PLACES = ("resting", "height", "distance", "stands", "faces", "fitted")
-_FAR = 1e6  # units of sqrt(area)
-_OPTIONAL = ("moved", "spread")
+_PLACES_ARRAYS = ("resting", "height", "distance", "stands", "faces", "fitted")
+_MAX_VALUE = 1e6  # no number in an array is larger; units of sqrt(area)
+_OPTIONAL_ARRAYS = ("moved", "spread")
 Words = dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
 class StoredFit:
-    """A fit that was read from a file, a `PlacedFit` if it was finished.
+    """A fit that was read from a file; a `PlacedFit` if it was finished.
 
-    ``verts`` of the fit are none, and its ``seconds`` 0. ``words`` are what else the file says.
+    The fit has no ``verts``, and ``seconds`` 0.
     """
 
     fit: Fit
-    samples: OrientedPoints | None  # of a fit alone, in the fit's core frame
-    shape: Shape | None  # as its file had it, of a user's fit
-    words: Words
+    samples: OrientedPoints | None  # before agreement; in the fit's core frame
+    shape: Shape | None  # of a fit that a user saved, as its file had it
+    words: Words  # the extra metadata that `write_fit` was given
 
 
 def write_fit(
@@ -62,12 +62,13 @@ def write_fit(
     shape: Shape | None = None,
     words: Words | None = None,
 ) -> None:
-    """Write a fit, with the places of a finished one, the samples of its shape, or the shape as its file had it; ``words``
-    are what else is worth knowing (JSON).
+    """Write a fit, with its places if it is a `PlacedFit`.
+
+    ``samples`` are those of its shape, ``shape`` is the shape as its file had it, ``words`` is extra metadata (JSON).
     """
     arrays: dict[str, np.ndarray] = {"points": fit.points, "vectors": fit.vectors}
     arrays |= {"rotation": fit.frame.rotation, "center": fit.frame.center}
-    about: Words = {name: getattr(fit, name) for name in _FIT_WORDS}
+    about: Words = {name: getattr(fit, name) for name in _FIT_FIELDS}
     about |= {"reasons": [[reason.code, str(reason)] for reason in fit.reasons], "scale": fit.frame.scale}
     about |= {"left_out": list(fit.left_out)} if fit.left_out else {}
     about |= {"side": fit.side} if fit.side else {}
@@ -75,8 +76,8 @@ def write_fit(
         about["regularity"] = asdict(fit.regularity)
     if isinstance(fit, PlacedFit):
         places = fit.places
-        arrays |= {name: getattr(places, name) for name in _PLACES}
-        arrays |= {name: kept for name in _OPTIONAL if (kept := getattr(places, name)) is not None}
+        arrays |= {name: getattr(places, name) for name in _PLACES_ARRAYS}
+        arrays |= {name: kept for name in _OPTIONAL_ARRAYS if (kept := getattr(places, name)) is not None}
         about |= {"shape": places.name, "shape_hash": places.hash}
     if samples is not None:
         arrays |= {"sample_points": samples.points, "sample_normals": samples.normals}
@@ -84,14 +85,14 @@ def write_fit(
             arrays["sample_weights"] = samples.weights
         about["signed"] = samples.signed
     if shape is not None:
-        arrays |= {_SHAPE + name: kept for name in _SHAPE_ARRAYS if (kept := getattr(shape, name)) is not None}
+        arrays |= {_SHAPE_PREFIX + name: kept for name in _SHAPE_ARRAYS if (kept := getattr(shape, name)) is not None}
         about |= {"shape": shape.name, "upright": shape.upright, "made_of": shape.made_of, "notes": fit.notes}
     header = {"schema": SCHEMA, "fit": about, "more": words or {}}
     save_arrays(path, arrays, {"fit": json.dumps(header, sort_keys=True)})
 
 
 def load_words(path: str | Path) -> tuple[Words, Words]:
-    """What a fit's file says in words: of the fit, and what else; the arrays are not read. Errors as `read_fit`."""
+    """Read the header of a fit's file: the fit's fields and the extra metadata, without arrays. Errors as `read_fit`."""
     path = Path(path)
     try:
         read_header(path)
@@ -100,7 +101,7 @@ def load_words(path: str | Path) -> tuple[Words, Words]:
         if header["schema"] != SCHEMA:
             raise InputError(f"{path.name} has fit schema {header['schema']!r}, not {SCHEMA}", "update meshmatch")
         about, more = dict(header["fit"]), dict(header["more"])
-        odd = [name for name, kind in _FIT_WORDS.items() if type(about[name]) is not kind]
+        odd = [name for name, kind in _FIT_FIELDS.items() if type(about[name]) is not kind]
         if not odd and not 0 <= about["trust"] <= 1:
             odd = ["trust"]
         if odd or about["verdict"] not in VERDICTS:
@@ -127,18 +128,18 @@ def read_fit(path: str | Path, template: Template) -> StoredFit:
         V = template.shape.V
         fit = Fit(
             frame=Frame(float(about["scale"]), arrays["rotation"], arrays["center"]),
-            points=_checked(arrays, "points", np.float64, (V, 3)),
-            vectors=_checked(arrays, "vectors", np.float64, (template.K, 3)),
+            points=_checked_array(arrays, "points", np.float64, (V, 3)),
+            vectors=_checked_array(arrays, "vectors", np.float64, (template.K, 3)),
             resting=np.asarray(template.shape.verts),
             faces=np.asarray(template.shape.faces),
             verts=np.empty((0, 3)),
             reasons=tuple(Reason(code, str(sentence)) for code, sentence in about["reasons"]),
             seconds=0.0,
-            left_out=_numbers(about.get("left_out", [])),
+            left_out=_part_numbers(about.get("left_out", [])),
             regularity=regularity_of(about),
             side=float(about.get("side", 0.0)),
             notes=tuple(map(str, about.get("notes", ()))),
-            **{name: about[name] for name in _FIT_WORDS},
+            **{name: about[name] for name in _FIT_FIELDS},
         )
         if not (1 / LARGEST < fit.frame.scale < LARGEST and (np.abs(fit.frame.center) < LARGEST).all()):
             raise ValueError("its frame cannot be")
@@ -149,17 +150,17 @@ def read_fit(path: str | Path, template: Template) -> StoredFit:
         raise InputError(f"{path.name} is damaged: {error}", _HINT) from error
 
 
-def _numbers(values: Any) -> tuple[int, ...]:
-    """Numbers of parts; `ValueError` for anything else."""
+def _part_numbers(values: Any) -> tuple[int, ...]:
+    """The numbers of the parts that were left out, counted from 1; `ValueError` if they are anything else."""
     if not isinstance(values, list) or not all(type(each) is int and each > 0 for each in values):
         raise ValueError("its parts cannot be")
     return tuple(values)
 
 
 def regularity_of(about: Words) -> Regularity | None:
-    """How regular the deformation is, by what a fit's file says of it; None if it is of a version that did not say.
+    """Regularity of the deformation, from a fit's header; None if the file is of a version that did not store it.
 
-    `ValueError`, `KeyError` or `TypeError` for numbers that cannot be.
+    `ValueError`, `KeyError` or `TypeError` for invalid numbers.
     """
     if "regularity" not in about:
         return None
@@ -179,12 +180,12 @@ def _places(arrays: dict[str, np.ndarray], about: Words, fit: Fit) -> Places | N
         **{"resting": (np.float32, (V, 3)), "moved": (np.float32, (V, 3)), "stands": (np.int32, (V,))},
         **{"faces": (np.int32, (F, 3)), "fitted": (np.bool_, (F,))},
     }
-    found = {name: _checked(arrays, name, *kinds[name]) for name in kinds if name in arrays}
+    found = {name: _checked_array(arrays, name, *kinds[name]) for name in kinds if name in arrays}
     for name in ("stands", "faces"):
         if found[name].size and not (0 <= found[name].min() and found[name].max() < V):
             raise ValueError(f"{name} names a vertex that is not there")
-    optional: Words = {name: found.get(name) for name in _OPTIONAL}
-    required: Words = {name: found[name] for name in _PLACES}
+    optional: Words = {name: found.get(name) for name in _OPTIONAL_ARRAYS}
+    required: Words = {name: found[name] for name in _PLACES_ARRAYS}
     words: Words = {"name": str(about["shape"]), "hash": str(about["shape_hash"]), "template_hash": fit.template_hash}
     judged: Words = {"verdict": fit.verdict, "reasons": tuple(map(str, fit.reasons)), "trust": fit.trust}
     return Places(**words, **required, **optional, **judged)
@@ -194,25 +195,25 @@ def _samples(arrays: dict[str, np.ndarray], about: Words) -> OrientedPoints | No
     if "sample_points" not in arrays:
         return None
     P = len(arrays["sample_points"])
-    points, normals = (_checked(arrays, f"sample_{name}", np.float64, (P, 3)) for name in ("points", "normals"))
-    weights = _checked(arrays, "sample_weights", np.float64, (P,)) if "sample_weights" in arrays else None
+    points, normals = (_checked_array(arrays, f"sample_{name}", np.float64, (P, 3)) for name in ("points", "normals"))
+    weights = _checked_array(arrays, "sample_weights", np.float64, (P,)) if "sample_weights" in arrays else None
     return OrientedPoints(points, normals, bool(about["signed"]), weights)
 
 
 def _shape(arrays: dict[str, np.ndarray], about: Words) -> Shape | None:
-    if _SHAPE + "verts" not in arrays:
+    if _SHAPE_PREFIX + "verts" not in arrays:
         return None
-    known: Words = {name: arrays[_SHAPE + name] for name in _SHAPE_ARRAYS if _SHAPE + name in arrays}
+    known: Words = {name: arrays[_SHAPE_PREFIX + name] for name in _SHAPE_ARRAYS if _SHAPE_PREFIX + name in arrays}
     if not (np.abs(known["verts"]) < LARGEST).all():
         raise ValueError("its shape has vertices that cannot be")
     made_of = tuple(map(str, about["made_of"]))
     return Shape(name=str(about["shape"]), upright=about["upright"] is True, made_of=made_of, **known)
 
 
-def _checked(arrays: dict[str, np.ndarray], name: str, kind: Any, shape: tuple[int, ...]) -> Any:
+def _checked_array(arrays: dict[str, np.ndarray], name: str, kind: Any, shape: tuple[int, ...]) -> Any:
     array = arrays[name]
     if array.dtype != kind or array.shape != shape:
         raise ValueError(f"{name} is an array of {array.shape} {array.dtype}, not of {shape} {np.dtype(kind)}")
-    if array.dtype.kind == "f" and not (np.abs(array) < _FAR).all():
+    if array.dtype.kind == "f" and not (np.abs(array) < _MAX_VALUE).all():
         raise ValueError(f"{name} has numbers that cannot be")
     return array

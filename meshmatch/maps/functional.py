@@ -1,6 +1,6 @@
-"""Functional maps as the literature has them: Laplacian eigenfunctions, and the way back from matrix to vertices.
+"""Functional maps (Ovsjanikov et al. 2012): Laplacian eigenfunctions, and recovery of vertex maps from matrices.
 
-The way there is `VertexMap.functional`.
+`VertexMap.functional` computes the functional map of a vertex map.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import ShapeLike, as_shape
 
-_LOOK = "meshmatch info FILE says what is in it"
+_INFO_HINT = "meshmatch info FILE says what is in it"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -31,7 +31,7 @@ class LaplacianBasis(Brief, Pickled):
     Attributes
     ----------
     vectors
-        (V, K) one function a column, the constant one first.
+        (V, K) eigenfunctions, one per column, the constant one first.
     values
         (K,) eigenvalues, ascending, in 1 / area.
     mass
@@ -49,17 +49,18 @@ class LaplacianBasis(Brief, Pickled):
 
 
 def laplacian_basis(shape: ShapeLike, K: int = 100) -> LaplacianBasis:
-    """The first eigenfunctions of the Laplacian of a mesh or a cloud.
+    """Compute the first eigenfunctions of the Laplacian of a mesh or a cloud.
 
-    Of the intrinsic Delaunay Laplacian with lumped areas (Sharp and Crane, *A Laplacian for Nonmanifold Triangle Meshes*,
-    2020), which needs neither good triangles nor a manifold. The sign of a function is arbitrary, but the same every time.
+    The Laplacian is the intrinsic Delaunay one with lumped areas (Sharp and Crane, *A Laplacian for Nonmanifold Triangle
+    Meshes*, 2020), which needs neither good triangles nor a manifold. The sign of a function is arbitrary but
+    reproducible.
 
     Parameters
     ----------
     shape
         As in `match`; all vertices must have a position.
     K
-        How many.
+        Number of eigenfunctions.
 
     Returns
     -------
@@ -90,11 +91,11 @@ def laplacian_basis(shape: ShapeLike, K: int = 100) -> LaplacianBasis:
         else:
             stiffness, mass = robust_laplacian.mesh_laplacian(verts, found.faces)
     except RuntimeError as error:
-        raise InputError(f"{name} is no surface: its points or triangles span no area", _LOOK) from error
+        raise InputError(f"{name} is no surface: its points or triangles span no area", _INFO_HINT) from error
     areas = np.asarray(mass.diagonal(), np.float64)
     floor = 1e-9 * areas.mean()
     if not (np.isfinite(areas).all() and floor > 0):
-        raise InputError(f"{name} has no surface area", _LOOK)
+        raise InputError(f"{name} has no surface area", _INFO_HINT)
     areas = np.maximum(areas, floor)  # vertices that no face uses
     start = np.random.default_rng(0).standard_normal(found.V)
     values, vectors = eigsh(csr_matrix(stiffness), K, csr_matrix((areas, (range(found.V),) * 2)), sigma=-1e-8, v0=start)
@@ -107,10 +108,10 @@ def laplacian_basis(shape: ShapeLike, K: int = 100) -> LaplacianBasis:
 def map_from_functional(
     C: ArrayLike, source: ShapeLike, target: ShapeLike, basis_source: ArrayLike, basis_target: ArrayLike
 ) -> VertexMap:
-    """The vertex map of a functional map: each source vertex goes where its row of functions is found on the target.
+    """Recover a vertex map from a functional map, by nearest neighbors in the spectral embedding.
 
     The matrix is as `VertexMap.functional` gives it: from functions on the target to functions on the source. pyFM's
-    ``FM_12``, of ``mesh1`` and ``mesh2``, is one whose target is ``mesh1`` and whose source is ``mesh2``.
+    ``FM_12`` for ``mesh1`` and ``mesh2`` has ``mesh1`` as target and ``mesh2`` as source.
 
     Parameters
     ----------
@@ -121,7 +122,7 @@ def map_from_functional(
     target
         As in `match`.
     basis_source
-        (V_source, K) functions, one a column; the first K_source are used.
+        (V_source, K) functions, one per column; the first K_source are used.
     basis_target
         (V_target, K), the same on the target.
 
@@ -133,7 +134,7 @@ def map_from_functional(
     Raises
     ------
     InputError
-        An array is of the wrong shape, or holds values that are not finite.
+        An array has the wrong shape, or values that are not finite.
 
     Examples
     --------

@@ -1,8 +1,7 @@
-"""Reading MATLAB's MAT-files of level 5 (``-v6``, ``-v7``): numbers, text, and cells of text.
+"""Read MATLAB's level 5 MAT-files (``-v6``, ``-v7``): numbers, text, and cell arrays of text.
 
-Specification: MathWorks, *MAT-File Format*, level 5. Not `scipy.io.loadmat`, which trusts the sizes that a damaged file
-states and reads beyond its memory: of 1,940 files with one byte changed, 34 ended the interpreter (SciPy 1.17.1), which
-no ``except`` can catch.
+Specification: MathWorks, *MAT-File Format*, level 5. `scipy.io.loadmat` is not used because it trusts the sizes stated in
+a damaged file and reads out of bounds: of 1,940 files with one byte changed, 34 crashed the interpreter (SciPy 1.17.1).
 """
 
 from __future__ import annotations
@@ -18,19 +17,19 @@ from meshmatch.errors import InputError
 from meshmatch.shapes.input_files import ROOM
 
 Value = NDArray[np.generic] | str | list[str]
-"""Numbers in the array's own shape; the letters of a text, row by row; the texts of a cell array."""
+"""Numbers in the array's own shape; the characters of a text, row by row; the texts of a cell array."""
 
-LARGEST = 1 << 30  # bytes of all variables, unpacked; fewer where the file is small
+LARGEST = 1 << 30  # bytes of all variables after decompression; the limit of small files is lower
 _HEADER = 128
 _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-_LETTERS = {1: "latin-1", 2: "latin-1", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
+_ENCODINGS = {1: "latin-1", 2: "latin-1", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
 _CELL, _CHAR, _SMALLEST_NUMBER, _LARGEST_NUMBER = 1, 4, 6, 15  # classes of arrays
 _HINT = "save it with -v7, or as .csv"
 
 
 def read_mat(data: bytes, names: Iterable[str]) -> dict[str, Value]:
-    """Those of the named variables that the file holds and that are numbers, text, or cells of text.
+    """Read the named variables, as far as the file contains them and they are numbers, text, or cell arrays of text.
 
     `InputError` if it is not a MAT-file of level 5, is damaged, or its variables are larger than `LARGEST`.
     """
@@ -40,7 +39,7 @@ def read_mat(data: bytes, names: Iterable[str]) -> dict[str, Value]:
     if order is None:
         raise InputError("it is not a MAT-file of version 5 to 7", _HINT)
     wanted, found = set(names), {}
-    left = min(LARGEST, len(data) + ROOM // 4)  # what is unpacked is held up to four times while it is read
+    left = min(LARGEST, len(data) + ROOM // 4)  # up to four copies of the data exist during reading
     try:
         for kind, body in _elements(data[_HEADER:], order):
             if kind == _COMPRESSED:
@@ -50,7 +49,7 @@ def read_mat(data: bytes, names: Iterable[str]) -> dict[str, Value]:
                 if left < 0:
                     raise ValueError("variables that unpack to too many bytes")
                 kind, body = next(_elements(unpacked, order))
-            name, value = _matrix(body, order) if kind == _MATRIX else ("", None)
+            name, value = _parse_array(body, order) if kind == _MATRIX else ("", None)
             if name in wanted and value is not None:
                 found[name] = value
     except (ValueError, StopIteration, zlib.error) as error:
@@ -59,7 +58,7 @@ def read_mat(data: bytes, names: Iterable[str]) -> dict[str, Value]:
 
 
 def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
-    """Kind and bytes of all elements, one after the other; none is longer than what is there."""
+    """Yield type and bytes of all elements; sizes are checked against the available data."""
     at = 0
     while at + 8 <= len(data):
         kind, size = (int(n) for n in np.frombuffer(data, f"{order}u4", 2, at))
@@ -78,8 +77,8 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
         raise ValueError("it ends in the middle of a tag")
 
 
-def _matrix(body: bytes, order: str, inside: bool = False) -> tuple[str, Value | None]:
-    """Name and value of an array; None if it is of a class that is not read."""
+def _parse_array(body: bytes, order: str, inside: bool = False) -> tuple[str, Value | None]:
+    """Parse name and value of an array; the value is None if its class is not supported."""
     parts = _elements(body, order)
     flags = np.frombuffer(next(parts)[1], f"{order}u4")
     shape = [int(n) for n in np.frombuffer(next(parts)[1], f"{order}i4")]
@@ -89,12 +88,12 @@ def _matrix(body: bytes, order: str, inside: bool = False) -> tuple[str, Value |
         raise ValueError(f"an array of {shape}")
     count = math.prod(shape)
     if kind == _CELL and not inside:
-        texts = [_matrix(inner, order, True)[1] for _, inner in parts]
+        texts = [_parse_array(inner, order, True)[1] for _, inner in parts]
         if len(texts) != count:
             raise ValueError(f"a cell array of {len(texts)} instead of {count}")
         return name, [text for text in texts if isinstance(text, str)]
     if kind == _CHAR:
-        return name, _text(*next(parts, (2, b"")), shape, order)
+        return name, _decode_text(*next(parts, (2, b"")), shape, order)
     if not _SMALLEST_NUMBER <= kind <= _LARGEST_NUMBER:
         return name, None
     stored, numbers = next(parts)
@@ -106,9 +105,9 @@ def _matrix(body: bytes, order: str, inside: bool = False) -> tuple[str, Value |
     return name, values.reshape(shape, order="F").astype(values.dtype.newbyteorder("="))
 
 
-def _text(stored: int, letters: bytes, shape: list[int], order: str) -> str:
-    """Text row by row; MATLAB keeps it column by column."""
-    coding = _LETTERS.get(stored, "utf-16")
+def _decode_text(stored: int, letters: bytes, shape: list[int], order: str) -> str:
+    """Decode text and reorder it from MATLAB's column-major order to rows."""
+    coding = _ENCODINGS.get(stored, "utf-16")
     if coding in ("utf-16", "utf-32"):
         coding += "-le" if order == "<" else "-be"
     text = letters.decode(coding)

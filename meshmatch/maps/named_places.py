@@ -1,4 +1,4 @@
-"""Numbers of vertices and faces that a map names: what they may be, and which corners they stand for."""
+"""Check the vertex and face indices of a map, and look up the corners of faces."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError
 
 UNKNOWN = -1
-"""A number of vertices that is not known."""
+"""Stands for an unknown number of vertices."""
 
 
 def check_range(index: Int[Ints, ...], target_vertices: int, label: str) -> None:
-    """Refuse vertices that a target of so many does not have (`InputError`)."""
+    """Raise `InputError` if a vertex index is negative or not below ``target_vertices``."""
     if index.min() < 0:
         first = int(np.argmin(index))
         raise InputError(f"{label}: vertex {first} is matched to {int(index.min())}; indices start at 0")
@@ -24,13 +24,13 @@ def check_range(index: Int[Ints, ...], target_vertices: int, label: str) -> None
 
 
 def check_faces(face: Int[Ints, " V_source"], target_faces: int, label: str) -> None:
-    """Refuse faces that a target of so many does not have (`InputError`)."""
+    """Raise `InputError` if a face index is not below ``target_faces``."""
     if face.max() >= target_faces:
         raise InputError(f"{label} names face {int(face.max())}, but its target has only {target_faces} faces")
 
 
 def corners_of(faces: Int[Ints, "F 3"] | None, face: Int[Ints, " N"], vertex: Int[Ints, " N"]) -> Int[Ints, "N 3"]:
-    """Corners of faces (N,); where the face is -1, three times the vertex itself."""
+    """(N, 3) corners of faces; where the face is -1, three times the vertex itself."""
     inside = face >= 0
     if faces is not None and inside.all():
         return faces.take(face, 0)

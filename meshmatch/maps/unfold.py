@@ -36,7 +36,7 @@ from meshmatch.geometry.triangles import (
     triangle_vectors,
     unit,
 )
-from meshmatch.maps.folds import CRUSHED, area_ratios, facing, known_normals, normals_at, wound_alike
+from meshmatch.maps.folds import CRUSHED_RATIO, area_ratios, facing, known_normals, normals_at, consistent_faces
 from meshmatch.maps.mapped_mesh import MappedMesh, invert_map, length_of
 from meshmatch.maps.named_places import corners_of
 from meshmatch.maps.vertex_map import VertexMap
@@ -170,7 +170,7 @@ class _Images:
         self._found, self.source, self._target_in_file, self.workers = found, source, target, workers
         self.index, self.face, self.weights = found.index.copy(), found.face.copy(), found.barycentric.copy()
         self.opposite: _Images | None = None  # of the way back, which follows what is laid flat
-        faces = wound_alike(source)[source.valid_faces]
+        faces = consistent_faces(source)[source.valid_faces]
         self.verts, self.points = source.verts / length_of(source), found.points(target) / length_of(target)
         sides = self.verts[faces] - self.verts[faces[:, [1, 2, 0]]]
         longest = squared_lengths(sides.reshape(-1, 3)).reshape(-1, 3).max(axis=1)
@@ -199,7 +199,7 @@ class _Images:
         source, target = self.source, self._target_in_file
         return _Images(invert_map(self.map, source, target, self.workers), target, source, self.workers)
 
-    def repeat(self, move: Callable[[int, float], bool], rounds: tuple[int, ...], least: float = CRUSHED) -> None:
+    def repeat(self, move: Callable[[int, float], bool], rounds: tuple[int, ...], least: float = CRUSHED_RATIO) -> None:
         """Move what lies around folds, triangles whose area shrinks to less, round by round so many triangles wide."""
         for rings in rounds:
             if not move(rings, least):
@@ -384,7 +384,7 @@ class _Images:
         near = np.zeros(len(self.verts), bool)
         near[self.faces[laid].ravel()] = True
         around = np.flatnonzero(self._touches(near))
-        sound = around[~self.torn[around] & (self.ratio[around] >= CRUSHED)]
+        sound = around[~self.torn[around] & (self.ratio[around] >= CRUSHED_RATIO)]
         area = self.areas[sound]
         vertices = np.unique(self.faces[around])
         local = np.full(len(self.verts), -1)
@@ -484,7 +484,7 @@ def _ratios(points: Floats, normals: Floats, verts: Floats, faces: Ints) -> Floa
 
 def _badness(ratio: Floats) -> Floats:
     """(N,) what is wrong with triangles of these ratios of areas."""
-    return np.where(ratio <= 0, _TURNED, ratio < CRUSHED)
+    return np.where(ratio <= 0, _TURNED, ratio < CRUSHED_RATIO)
 
 
 def _heaviest(corners: Ints, weights: Floats) -> Ints:

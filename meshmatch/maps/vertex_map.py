@@ -1,4 +1,4 @@
-"""Where every vertex of one shape lies on another: `VertexMap`, the type that all other rooms pass around."""
+"""`VertexMap`, the map from the vertices of one shape to points on another."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from meshmatch.shapes.shape import Shape, checked_shape
 
 DIRECTION = "index[i] is the vertex of the target matched to vertex i of the source"
 VERDICTS = ("good", "fair", "poor", "unknown")
-_UPS = ("", "+x", "-x", "+y", "-y", "+z", "-z")
-_OTHER_MESH = (
+_UP_AXES = ("", "+x", "-x", "+y", "-y", "+z", "-z")
+_OTHER_MESH_HINT = (
     "match these two again; a map needs one entry for each vertex of the source, in the order of its file, and one "
     "kept as .npy or .csv goes by the count of vertices alone"
 )
-_READ_WITH_SHAPES = "read it with load_map(path, source, target)"
+_READ_WITH_SHAPES_HINT = "read it with load_map(path, source, target)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,15 +45,15 @@ class VertexMap(Pickled):
     """A map from every vertex of a source to a target: *index[i] is the vertex of the target matched to vertex i of the
     source.*
 
-    Valid once built; its arrays are read-only. `VertexMap.between` fills in names, counts and hashes from two shapes;
+    Checked when built; its arrays are read-only. `VertexMap.between` fills in names, counts and hashes from two shapes;
     `for_shapes` does so for a map that was read from a file.
 
     Attributes
     ----------
     source
-        Name of the source, for people.
+        Name of the source, for display.
     target
-        Name of the target, for people.
+        Name of the target, for display.
     index
         (V_source,) the target vertex of each source vertex.
     face
@@ -64,29 +64,29 @@ class VertexMap(Pickled):
     confidence
         (V_source,) float32 from 0 (a guess) to 1 (certain); all nan if it is not known, as in a map from elsewhere.
     verdict
-        "good", "fair" or "poor", of the map as a whole; "unknown" if a file does not say.
+        "good", "fair" or "poor", for the map as a whole; "unknown" if its file has none.
     reasons
-        Why it is not good, one line each.
+        Why the verdict is not good, one line each.
     source_vertices
         Number of vertices of the source.
     target_vertices
-        The same of the target; -1 where not known (a plain list of indices does not contain it).
+        Number of vertices of the target; -1 where not known, as for a plain list of indices.
     source_hash
         `Shape.hash` of the source; empty where not known.
     target_hash
         `Shape.hash` of the target; empty where not known.
     source_up
-        The axis of the source that the match took for up, such as "+z"; empty where not known.
+        The axis of the source that was used as up, such as "+z"; empty where not known.
     target_up
-        The same of the target.
+        The axis of the target that was used as up; empty where not known.
     target_faces
         (F_target, 3) triangles whose corners ``barycentric`` weights; not written to files.
 
     Raises
     ------
     InputError
-        Arrays of the wrong shape or kind, an index outside the target, weights that do not sum to 1, or an unknown
-        verdict or axis.
+        An array has the wrong shape or type, an index lies outside the target, weights do not sum to 1, or the verdict or
+        an axis is unknown.
 
     Examples
     --------
@@ -121,8 +121,8 @@ class VertexMap(Pickled):
         if self.verdict not in VERDICTS:
             raise InputError(f"{label}: a verdict is one of {', '.join(VERDICTS)}, not '{self.verdict}'")
         for axis in (self.source_up, self.target_up):
-            if axis not in _UPS:
-                raise InputError(f"{label}: up is one of {', '.join(_UPS[1:])}, not '{axis[:20]}'")
+            if axis not in _UP_AXES:
+                raise InputError(f"{label}: up is one of {', '.join(_UP_AXES[1:])}, not '{axis[:20]}'")
         for name, array in arrays.items():
             object.__setattr__(self, name, frozen(array))
         if self.target_faces is not None:
@@ -130,9 +130,9 @@ class VertexMap(Pickled):
         object.__setattr__(self, "reasons", tuple(str(reason) for reason in self.reasons))
         object.__setattr__(self, "source_vertices", size)
 
-    @np.errstate(invalid="ignore")  # of a nan that signals; it is refused
+    @np.errstate(invalid="ignore")  # signaling nan; refused below
     def _checked_arrays(self, label: str) -> dict[str, NDArray[Any]]:
-        """Copies of the arrays, if they are what the class says."""
+        """Return copies of the arrays, with defaults filled in; `InputError` if one is invalid."""
         vertex = whole_numbers(self.index, f"{label}: index")
         if vertex.ndim != 1 or (size := len(vertex)) == 0:
             raise InputError(f"{label}: index must be a list of (V_source,) vertices, not an array of {vertex.shape}")
@@ -140,11 +140,11 @@ class VertexMap(Pickled):
             raise InputError(f"{label}: a target needs vertices, not {self.target_vertices}")
         check_range(vertex, self.target_vertices, label)
         faces = np.full(size, -1) if self.face is None else whole_numbers(self.face, f"{label}: face")
-        corner = np.eye(1, 3).repeat(size, 0) if self.barycentric is None else self.barycentric
-        weights = np.array(as_numbers(corner, f"{label}: barycentric"))
-        trusted = np.full(size, np.nan) if self.confidence is None else self.confidence
-        given = as_numbers(trusted, f"{label}: confidence")
-        trust = np.clip(given, -1, 2).astype(np.float32)  # a short float holds no 1e300, which is refused below
+        weights_given = np.eye(1, 3).repeat(size, 0) if self.barycentric is None else self.barycentric
+        weights = np.array(as_numbers(weights_given, f"{label}: barycentric"))
+        confidence_given = np.full(size, np.nan) if self.confidence is None else self.confidence
+        numbers = as_numbers(confidence_given, f"{label}: confidence")
+        trust = np.clip(numbers, -1, 2).astype(np.float32)  # float32 cannot represent 1e300, which is refused below
         arrays: dict[str, NDArray[Any]] = {"index": vertex, "face": faces, "barycentric": weights, "confidence": trust}
         for name, array in arrays.items():
             shape = (size, 3) if name == "barycentric" else (size,)
@@ -165,9 +165,9 @@ class VertexMap(Pickled):
         Parameters
         ----------
         source
-            Gives the source's name, count and hash.
+            Supplies the source's name, vertex count and hash.
         target
-            Gives the same of the target, and its faces.
+            Supplies the target's name, vertex count, hash and faces.
         index
             (V_source,) the target vertex of each source vertex.
         rest
@@ -181,9 +181,9 @@ class VertexMap(Pickled):
         Raises
         ------
         InputError
-            As for the class, or a face that the target does not have.
+            As for the class, or the target lacks a face that the map names.
         """
-        fields = _side("source", source) | _side("target", target)
+        fields = _side_fields("source", source) | _side_fields("target", target)
         return cls(index=whole_numbers(index, "index"), target_faces=target.faces, **fields, **rest)
 
     @classmethod
@@ -203,35 +203,35 @@ class VertexMap(Pickled):
         Raises
         ------
         InputError
-            It is no `Shape`.
+            ``shape`` is not a `Shape`.
         """
         index = np.arange(checked_shape(shape, "the shape").V)
         return cls.between(shape, shape, index, confidence=np.ones(len(index)), verdict="good")
 
     @property
     def assumed_confidence(self) -> Float[Floats32, " V_source"]:
-        """(V_source,) the confidence, or 1 where it is not known: a transfer follows the map that it is given."""
+        """(V_source,) the confidence, or 1 where it is not known: transfers rely on the map that they are given."""
         return np.nan_to_num(self.confidence, nan=1.0)
 
     def for_shapes(self, source: Shape | None, target: Shape | None, label: str = "the map") -> VertexMap:
-        """This map, checked to be one from `source` to `target`, with names, counts and hashes filled in.
+        """Check that this map is from `source` to `target`, and fill in names, counts and hashes.
 
-        Vertex counts must agree, and hashes where the map has them: a map of another pose, or of a mesh that was edited
-        since, is refused. What a transfer made of a mesh (`Shape.made_of`) takes the maps of that mesh.
+        Vertex counts must agree, and hashes where the map has them: a map for another mesh, or for one that was edited
+        since, is refused. Results of transfers (`Shape.made_of`) accept the maps of the meshes that they were made from.
 
         Parameters
         ----------
         source
-            None is not checked.
+            The source; not checked if None.
         target
-            None is not checked.
+            The target; not checked if None.
         label
-            What error messages call the map.
+            Name of the map in error messages.
 
         Returns
         -------
         VertexMap
-            The map with what the shapes say.
+            The map with names, counts, hashes and faces filled in.
 
         Raises
         ------
@@ -248,17 +248,17 @@ class VertexMap(Pickled):
                 way = f"{label} runs the wrong way: from {b} to {a}, where one from {a} to {b} is needed"
                 raise InputError(way, f"swap the two shapes, or match {a} to {b} ({DIRECTION})")
         for found in filter(None, misfits):
-            raise InputError(f"{label} was made for another {found}", _OTHER_MESH)
+            raise InputError(f"{label} was made for another {found}", _OTHER_MESH_HINT)
         fill: dict[str, Any] = {} if target is None else {"target_faces": target.faces}
         for side, shape in sides:
-            fill |= _side(side, shape) | ({side: getattr(self, side)} if getattr(self, side) else {})
+            fill |= _side_fields(side, shape) | ({side: getattr(self, side)} if getattr(self, side) else {})
         try:
             return replace(self, **fill)
         except InputError as error:
             raise InputError(f"{label}: {error.message}", error.hint) from error
 
     def _misfit(self, side: str, shape: Shape) -> str:
-        """In what `shape` differs from the source or target ("side") that the map was made for; empty if in nothing."""
+        """How `shape` differs from the source or target ("side") that the map was made for; empty if it matches."""
         vertices, digest = getattr(self, f"{side}_vertices"), getattr(self, f"{side}_hash")
         made_for, name = getattr(self, side) or "a mesh", shape.name or f"the {side}"
         if digest in shape.made_of and (vertices == shape.V or (side == "target" and vertices < shape.V)):
@@ -288,7 +288,7 @@ class VertexMap(Pickled):
             Points lie in faces that are not known: the map was read without its target.
         """
         if self.target_faces is None and self.face.max() >= 0:
-            raise InputError(f"the faces that the map {_way(self)} leads to are unknown", _READ_WITH_SHAPES)
+            raise InputError(f"the faces that the map {_arrow(self)} leads to are unknown", _READ_WITH_SHAPES_HINT)
         return corners_of(self.target_faces, self.face, self.index)
 
     def points(self, target: Shape) -> Float[Floats, "V_source 3"]:
@@ -307,13 +307,13 @@ class VertexMap(Pickled):
         Raises
         ------
         InputError
-            The target has other vertices or faces than the shape that this map leads to.
+            The vertices or faces of `target` are not those of the map's target.
         """
         if self.target_vertices not in (UNKNOWN, checked_shape(target, "the target").V):
             led = f"the map leads to {self.target} with {self.target_vertices} vertices"
             raise InputError(f"{led}, but {target.name or 'the target'} has {target.V}")
-        check_range(self.index, target.V, f"the map {_way(self)}")
-        check_faces(self.face, target.F, f"the map {_way(self)}")
+        check_range(self.index, target.V, f"the map {_arrow(self)}")
+        check_faces(self.face, target.F, f"the map {_arrow(self)}")
         return interpolate(target.verts, corners_of(target.faces, self.face, self.index), self.barycentric)
 
     def sparse(self) -> csr_array:
@@ -330,8 +330,8 @@ class VertexMap(Pickled):
             The map was read without its target, whose vertices or faces are unknown.
         """
         if self.target_vertices == UNKNOWN:
-            what = f"the number of vertices that the map {_way(self)} leads to is unknown"
-            raise InputError(what, _READ_WITH_SHAPES)
+            what = f"the number of vertices that the map {_arrow(self)} leads to is unknown"
+            raise InputError(what, _READ_WITH_SHAPES_HINT)
         weight = self.barycentric.ravel()
         kept = weight > 0
         places = np.repeat(np.arange(self.source_vertices), 3)[kept], self.corners().ravel()[kept]
@@ -354,18 +354,18 @@ class VertexMap(Pickled):
         Returns
         -------
         (V_source,) or (V_source, D) float64
-            At each source vertex the value at its matched point; of a tensor, a tensor like it, with its gradient.
+            The value at the matched point of each source vertex; for a tensor, a tensor of its kind, with gradients.
 
         Raises
         ------
         InputError
-            As for `sparse`, or there is not one row for each vertex of the target.
+            As for `sparse`, or the number of rows is not the number of the target's vertices.
         """
         numbers = as_numbers(values, "values")
         matrix = self.sparse()
         if numbers.ndim not in (1, 2) or len(numbers) != matrix.shape[1]:
             needed = f"values (V,) or (V, D) of the {matrix.shape[1]} vertices of its target"
-            raise InputError(f"the map {_way(self)} needs {needed}, not an array of {numbers.shape}")
+            raise InputError(f"the map {_arrow(self)} needs {needed}, not an array of {numbers.shape}")
         return product(matrix, values)
 
     def functional(
@@ -374,17 +374,18 @@ class VertexMap(Pickled):
         """The functional map C of this map (Ovsjanikov et al. 2012), which goes the other way: it takes coefficients of
         a function on the *target* to those of the pulled-back function on the *source*.
 
-        ``basis_source @ C`` is the least-squares fit to ``apply(basis_target)``. With the vertex areas of the source for
-        ``mass`` it is that of the literature, and pyFM's for points within triangles. `map_from_functional` is the way back.
+        ``basis_source @ C`` is the least-squares fit to ``apply(basis_target)``. With the vertex areas of the source as
+        ``mass`` this is the definition of the literature, and pyFM's for points within triangles. `map_from_functional`
+        is the inverse.
 
         Parameters
         ----------
         basis_source
-            (V_source, K_source) linearly independent functions, such as Laplacian eigenvectors, one a column.
+            (V_source, K_source) linearly independent functions, such as Laplacian eigenvectors, one per column.
         basis_target
             (V_target, K_target), the same on the target.
         mass
-            (V_source,) how much each vertex of the source counts, positive; all the same by default.
+            (V_source,) positive weights of the source's vertices; equal by default.
 
         Returns
         -------
@@ -394,8 +395,8 @@ class VertexMap(Pickled):
         Raises
         ------
         InputError
-            As for `apply`; functions or masses of the source are not one for each vertex; or a value is not finite, or a
-            mass not positive.
+            As for `apply`; or the rows of the source's basis or masses are not one for each vertex, a value is not finite,
+            or a mass is not positive.
         """
         basis = as_numbers(basis_source, "a basis", finite=True)
         V = self.source_vertices
@@ -411,10 +412,10 @@ class VertexMap(Pickled):
         return np.asarray(np.linalg.lstsq(basis, pulled, rcond=None)[0])
 
     def compose(self, other: VertexMap) -> VertexMap:
-        """This map, then `other`: from this source to the other's target.
+        """Compose this map with `other`: first this map, then `other`.
 
-        The point of a vertex is where `other` puts the vertex ``index[i]``; the confidence is the lower of the two, unknown
-        if one of them is; the verdict is the worse.
+        The image of vertex i is that of the vertex ``index[i]`` under `other`. The confidence is the lower of the two, and
+        unknown if either is; the verdict is the worse of the two.
 
         Parameters
         ----------
@@ -429,19 +430,19 @@ class VertexMap(Pickled):
         Raises
         ------
         InputError
-            `other` is no map, or does not start on the shape where this one ends.
+            `other` is not a map, or does not start on the shape where this one ends.
         """
         check_map(other)
         counts = {self.target_vertices, other.source_vertices} - {UNKNOWN}
         hashes = {self.target_hash, other.source_hash} - {""}
         if len(counts) > 1 or len(hashes) > 1:
-            ends = _named(self.target, self.target_vertices, self.target_hash)
-            starts = _named(other.source, other.source_vertices, other.source_hash)
-            backwards = ends == _named(other.target, other.target_vertices, other.target_hash)
-            what = f"cannot join {_way(self)} with {_way(other)}: the first ends on {ends}, the second starts on"
+            ends = _describe(self.target, self.target_vertices, self.target_hash)
+            starts = _describe(other.source, other.source_vertices, other.source_hash)
+            backwards = ends == _describe(other.target, other.target_vertices, other.target_hash)
+            what = f"cannot join {_arrow(self)} with {_arrow(other)}: the first ends on {ends}, the second starts on"
             hint = "the second runs the wrong way round" if backwards else "the first must end where the second starts"
             raise InputError(f"{what} {starts}", hint)
-        check_range(self.index, other.source_vertices, _way(self))
+        check_range(self.index, other.source_vertices, _arrow(self))
         worse = max(self.verdict, other.verdict, key=("good", "fair", "unknown", "poor").index)
         return replace(
             other,
@@ -459,24 +460,24 @@ class VertexMap(Pickled):
 
     def __repr__(self) -> str:
         target = "?" if self.target_vertices == UNKNOWN else self.target_vertices
-        return f"VertexMap({_way(self)}, {self.source_vertices} -> {target} vertices, {self.verdict})"
+        return f"VertexMap({_arrow(self)}, {self.source_vertices} -> {target} vertices, {self.verdict})"
 
 
 def check_map(found: object) -> None:
-    """Refuse what is no `VertexMap` (`InputError`)."""
+    """Raise `InputError` if ``found`` is not a `VertexMap`."""
     if not isinstance(found, VertexMap):
         hint = "pass a VertexMap: a MatchResult has one as .map, and VertexMap.between makes one of an index"
         raise InputError(f"{type(found).__name__} is not a map", hint)
 
 
-def _side(side: str, shape: Shape) -> dict[str, Any]:
+def _side_fields(side: str, shape: Shape) -> dict[str, Any]:
     return {side: checked_shape(shape, f"the {side}").name, f"{side}_vertices": shape.V, f"{side}_hash": shape.hash}
 
 
-def _way(m: VertexMap) -> str:
+def _arrow(m: VertexMap) -> str:
     return f"{m.source or '?'} -> {m.target or '?'}"
 
 
-def _named(name: str, vertices: int, digest: str) -> str:
+def _describe(name: str, vertices: int, digest: str) -> str:
     count = "vertices unknown" if vertices == UNKNOWN else f"{vertices} vertices"
     return f"{name or '?'} ({count}{', ' + digest if digest else ''})"
