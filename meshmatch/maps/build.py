@@ -21,8 +21,8 @@ _DISTANCE_SCALE, _AGREEMENT_SCALE = 0.0353, 0.0487
 # that a vertex is. Maximum likelihood on 82 right and wrong fits, seeds 60 and 61 of docs/results.md, which measures
 # calibration on other shapes.
 _WRONG_FIT_CONFIDENCE, _RIGHT_FIT_CONFIDENCE, _ODDS_FACTOR, _MAX_TRUST = 0.072, 0.968, 0.091, 0.999
-# A known pair whose image is farther off than this on the target (units of sqrt(area); 5 and 14 cm on a person) is missed, or
-# makes the map poor; the number of missed pairs to report.
+# A known pair is missed, or makes the map poor, if its image is farther off than this on the target (units of sqrt(area); 5
+# and 14 cm on a person); the number of missed pairs to report.
 _MISSED_DISTANCE, _POOR_DISTANCE, _MAX_REASONS = 0.036, 0.1, 3
 
 
@@ -97,4 +97,6 @@ def _confidence(doubt: Float[Floats, " V"], trust: float) -> Float[Floats, " V"]
     """
     trust = min(trust, _MAX_TRUST)
     odds = _ODDS_FACTOR * trust / (1 - trust) / np.sqrt(np.expm1(np.clip(doubt, 1e-6, 50.0)))
-    return np.exp(-doubt) * (_WRONG_FIT_CONFIDENCE + (_RIGHT_FIT_CONFIDENCE - _WRONG_FIT_CONFIDENCE) * odds / (1 + odds))
+    return np.exp(-doubt) * (
+        _WRONG_FIT_CONFIDENCE + (_RIGHT_FIT_CONFIDENCE - _WRONG_FIT_CONFIDENCE) * odds / (1 + odds)
+    )

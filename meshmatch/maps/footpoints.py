@@ -1,12 +1,12 @@
-"""Closest points on a surface among those that face the same way, and where a shape's vertices belong on the template.
+"""Closest points on a surface, among those with similar normals, and the footpoints of a shape's vertices on the template.
 
-`Surface` is for many queries that lie near it, such as the vertices of a shape around a fitted template: the nearest
-vertex in a space of positions and normals, then the closest of its triangles. It is fast and knows the resting
-template, but not exact for triangles that are large compared with the distance. `meshmatch.maps.mapped_mesh` is
-exact for triangles of any size; `meshmatch.transfer.surface_walk` starts from a known face and keeps to its sheet.
+`Surface` is made for many queries near it, such as the vertices of a shape around a fitted template: it finds the nearest
+vertex in a space of positions and normals, then the closest of that vertex's triangles. It is fast and can use places
+on the rest template, but is not exact for triangles that are large compared with the distance. `meshmatch.maps.mapped_mesh`
+is exact for triangles of any size; `meshmatch.transfer.surface_walk` starts from a known face and stays on its sheet.
 
-Where two sheets of a surface touch, the closest point may lie on the wrong one. Neighbours whose images lie far apart
-reveal it: the small islands that such discontinuities cut off are searched again, near the images around them.
+Where two sheets of a surface touch, the closest point may lie on the wrong one. Discontinuities reveal it: neighbors whose
+images lie far apart. The small islands that discontinuities cut off are searched again, near the images around them.
 """
 
 from __future__ import annotations
@@ -36,36 +36,37 @@ from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map
 
-# By how much a neighbour whose normal points the other way (2 units) is further away than it is, in units of
-# sqrt(area): enough to separate the sides of a thin wall. A larger weight would move points along the surface to where
-# it bends the same way. Set by hand.
+# Distance per unit of difference between unit normals, in units of sqrt(area); opposite normals differ by 2. Enough to
+# separate the sides of a thin wall. A larger weight would move points along the surface to where it bends the same way.
+# Set by hand.
 NORMAL_WEIGHT = 0.02
-# How much a distance on the resting template counts compared with one in space. Set by hand.
+# Weight of a distance on the rest template relative to one in space. Set by hand.
 RESTING_WEIGHT = 0.4
-# Queries at a time: what belongs to them then stays in the processor's cache.
+# Queries per chunk, so that their data stay in the processor's cache.
 _CHUNK = 2048
 _ROUNDS = 3
-# The share of a cloud's points that are neighbours of one where noise is 1 % of the diagonal; and the least and the
-# largest number of them. Set by hand on noisy scans of bodies.
+# Neighbors of a point, as a share of a cloud's points, where noise is 1 % of the diagonal; and the range of their number.
+# Set by hand on noisy scans of bodies.
 _NEIGHBOURS, _NEIGHBOUR_RANGE = 0.005, (9, 64)
-_MEDIANS = 16_384  # points at a time whose neighbours' median is taken
-# A piece with at least this share of the surface is not an island. Set by hand.
-_MAINLAND = 0.06
-# An island as large as a hand (share of the surface) that would come to lie near (units of sqrt(area)), and to face another
-# way (by how much the mean cosine falls), is a limb that a scan has fused with what it lies on, and stays. One that would
-# lie far away was fitted wrong, and a smaller one may be a sheet in doubt. Set by hand.
-_LIMB, _AGAINST, _FACES_WORSE = 0.01, 0.04, 0.35
-# Steps from the rim into an island over which images of the surroundings are extended.
-_STEPS = 120
+_MEDIAN_CHUNK = 16_384  # points per chunk
+# A connected piece with at least this share of the surface is not an island. Set by hand.
+_MAX_ISLAND = 0.06
+# An island at least as large as a hand (share of the surface) stays where it is if its new images would be near the template
+# (units of sqrt(area)) but face another way (loss of the mean cosine): it is a limb that a scan has fused with what it
+# touches. An island whose new images would be far away was fitted wrong, and a smaller one may lie on either sheet. Set
+# by hand.
+_MIN_LIMB, _MAX_LIMB_DISTANCE, _MIN_COSINE_LOSS = 0.01, 0.04, 0.35
+# Steps by which images of the surroundings are extended from the rim into an island.
+_DIFFUSION_STEPS = 120
 Found = TypeVar("Found", bound="Footpoints")
 
 
 @dataclass(frozen=True, eq=False)
 class Footpoints:
-    """Closest points on a surface to N queries, and how far they are, in the unit of the surface.
+    """Closest points on a surface to N queries, with distances in the unit of the surface.
 
-    `vertex` is the corner with the largest weight, or the one that the search began with. `face` is -1 where the point
-    is the vertex itself (always for a cloud); its corners' weights are then (1, 0, 0).
+    `vertex` is the corner with the largest weight, or the one at which the search started. `face` is -1 where the point is
+    the vertex itself (always for a cloud); the barycentric weights are then (1, 0, 0).
     """
 
     vertex: Int[Ints, " N"]
@@ -74,7 +75,7 @@ class Footpoints:
     distance: Float[Floats, " N"]
 
     def values(self, faces: Int[Ints, "F 3"], values: Float[Floats, "V D"]) -> Float[Floats, "N D"]:
-        """Values of the surface's vertices, interpolated at the points."""
+        """Interpolate values (V, D) of the surface's vertices at the points."""
         found = np.empty((len(self.vertex), values.shape[1]))
         for low in range(0, len(found), _CHUNK):
             part = slice(low, low + _CHUNK)
@@ -83,11 +84,11 @@ class Footpoints:
         return found
 
     def rows(self, rows: Int[Ints, " M"]) -> Self:
-        """M of the points."""
+        """Select M of the points."""
         return replace(self, **{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
     def updated(self, rows: Int[Ints, " M"], other: Self) -> Self:
-        """These points with M rows taken from `other`."""
+        """Return a copy in which M rows are replaced by those of `other`."""
         arrays = {field.name: getattr(self, field.name).copy() for field in fields(self)}
         for name, array in arrays.items():
             array[rows] = getattr(other, name)
@@ -95,17 +96,16 @@ class Footpoints:
 
 
 def joined(parts: Sequence[Footpoints]) -> Footpoints:
-    """Points one after the other."""
+    """Concatenate footpoints."""
     names = [field.name for field in fields(Footpoints)]
     return Footpoints(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 class Surface:
-    """A mesh (or cloud) arranged for many closest-point queries; lengths in units of sqrt(area).
+    """A search structure for closest points on a mesh or cloud; lengths in units of sqrt(area).
 
-    `normals` are of unit length, zeros where unknown, None where they do not count. `resting` is where each vertex belongs
-    on the resting template: queries with such a place of their own find the right one of two sheets that touch, such as
-    a hand on a thigh.
+    `normals` are unit vectors, zeros where unknown; None ignores them. `resting` are the vertices' places on the rest
+    template: queries that have such places as well find the right one of two sheets that touch, such as a hand on a thigh.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class Surface:
         resting: Float[Floats, "V 3"] | None = None,
     ) -> None:
         self.verts, self.faces = verts, faces
-        # the faces at every vertex, one vertex after the other
+        # the faces around each vertex, concatenated (CSC)
         corners = np.ones(faces.size, np.int8), faces.reshape(-1), np.arange(0, faces.size + 1, 3)
         at_vertices = csr_matrix(corners, (len(faces), len(verts))).tocsc()
         self._around, self._start = (array.astype(np.int64) for array in (at_vertices.indices, at_vertices.indptr))
@@ -131,14 +131,14 @@ class Surface:
         workers: int = 1,
         resting: Float[Floats, "N 3"] | None = None,
     ) -> Footpoints:
-        """Closest points to points with unit normals (zeros where unknown); ``normals``, ``resting`` as the surface's."""
+        """Find the closest points; ``normals`` and ``resting`` are given if and only if the surface has them."""
         N = len(points)
         vertex = np.empty(N, np.int64)
         face = np.full(N, -1, np.int64)
         weights = np.tile([1.0, 0.0, 0.0], (N, 1))
         distance = np.empty(N)
 
-        def answer(low: int) -> None:
+        def query_chunk(low: int) -> None:
             part = slice(low, min(low + _CHUNK, N))
             features = _features(*(None if rows is None else rows[part] for rows in (points, normals, resting)))
             vertex[part] = self._used[self._tree.query(features)[1]]
@@ -147,35 +147,35 @@ class Surface:
             else:
                 distance[part] = np.linalg.norm(points[part] - self.verts[vertex[part]], axis=1)
 
-        parallel_map(answer, range(0, N, _CHUNK), threads=workers)
+        parallel_map(query_chunk, range(0, N, _CHUNK), threads=workers)
         return Footpoints(vertex, face, weights, distance)
 
     def _on_faces(self, points: Floats, vertex: Ints) -> tuple[Ints, Floats, Floats]:
-        """The closest of the faces around each vertex (N,), its weights (N, 3) and the distance (N,)."""
+        """Closest of the faces around each vertex (N,), barycentric weights (N, 3) and distance (N,)."""
         counts = (self._start[1:] - self._start[:-1]).take(vertex)
         first = np.cumsum(counts) - counts
         query = np.repeat(np.arange(len(vertex)), counts)
         face = self._around.take(np.arange(len(query)) + (self._start.take(vertex) - first).take(query))
         a, b, c = (self.verts.take(corner.take(face), 0) for corner in self.faces.T)
-        asked = points.take(query, 0)
-        weights = closest_on_triangles(asked, a, b, c)
-        squared = squared_lengths(interpolate(self.verts, self.faces.take(face, 0), weights) - asked)
-        # The first of the nearest of each query's faces.
+        query_points = points.take(query, 0)
+        weights = closest_on_triangles(query_points, a, b, c)
+        squared = squared_lengths(interpolate(self.verts, self.faces.take(face, 0), weights) - query_points)
+        # Of equally near faces of a query, the first.
         nearest = np.flatnonzero(squared == np.minimum.reduceat(squared, first).take(query))
         best = nearest[np.searchsorted(nearest, first)]
         return face[best], weights[best], np.sqrt(squared[best])
 
 
 def _features(*rows: Floats | None) -> Floats:
-    weighed = zip((1.0, NORMAL_WEIGHT, RESTING_WEIGHT), rows, strict=True)
-    return np.concatenate([weight * each for weight, each in weighed if each is not None], 1)
+    weighted = zip((1.0, NORMAL_WEIGHT, RESTING_WEIGHT), rows, strict=True)
+    return np.concatenate([weight * each for weight, each in weighted if each is not None], 1)
 
 
 def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footpoints, Float[Floats, "V 3"]]:
-    """The point of the fitted template for every vertex, and the same point of the resting template.
+    """Find the footpoint of every vertex on the fitted template, and the corresponding points on the rest template.
 
-    Points of a cloud have no edges that would reveal an island, and noise takes them across: each is searched again,
-    near the median of its neighbours.
+    Islands of a mesh are searched again (`reassign_islands`). A cloud has no edges that would reveal islands, and its noise
+    moves points to other sheets: each point is searched again near the median of its neighbors' places.
     """
     points, normals = in_core_frame(shape, fit)
     facing = vertex_normals(fit.points, fit.faces)
@@ -183,13 +183,13 @@ def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footp
     surface = Surface(fit.points, fit.faces, facing, fit.resting)
 
     def fused(rows: Ints, island: Ints, before: Footpoints, after: Footpoints) -> Bools:
-        """Of islands by their numbers, which are fused with what is around them."""
+        """Which islands (indexed by number) are limbs that a scan has fused with their surroundings."""
         areas = shape.vertex_areas[rows]
         alike = [(normals[rows] * foot.values(fit.faces, facing)).sum(1) for foot in (after, before)]
         sums = [np.bincount(island, areas * each) for each in (after.distance, alike[1] - alike[0])]
         area = np.bincount(island, areas)
-        limb = area >= _LIMB * shape.vertex_areas.sum()
-        return np.asarray(limb & (sums[0] < _AGAINST * area) & (sums[1] > _FACES_WORSE * area))
+        limb = area >= _MIN_LIMB * shape.vertex_areas.sum()
+        return np.asarray(limb & (sums[0] < _MAX_LIMB_DISTANCE * area) & (sums[1] > _MIN_COSINE_LOSS * area))
 
     def resting(foot: Footpoints) -> Floats:
         return foot.values(fit.faces, fit.resting)
@@ -201,7 +201,7 @@ def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footp
 
         return reassign_islands(
             points, shape.edges.vertices, shape.vertex_areas, found, resting, search, _ROUNDS,
-            fused if fit.verdict != "poor" else None,  # whose limbs may be on others as well
+            fused if fit.verdict != "poor" else None,  # a poor fit may have put a limb onto another
         )  # fmt: skip
     near = neighbours(points, shape.roughness)
     for _ in range(_ROUNDS):
@@ -210,28 +210,28 @@ def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footp
 
 
 def closest_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> Footpoints:
-    """Closest points of the fitted template, of those that face the same way as the vertices of a shape."""
+    """Closest points on the fitted template, among those with normals like the shape's; islands are left as they are."""
     surface = Surface(fit.points, fit.faces, vertex_normals(fit.points, fit.faces))
     return surface.query(*in_core_frame(shape, fit), workers)
 
 
 def neighbours(points: Float[Floats, "V 3"], roughness: float) -> Int[Ints, "V K"]:
-    """The nearest points of each of a cloud, itself first: more of them where noise is large (`Shape.roughness`)."""
+    """Indices of each point's nearest points, itself first; K grows with noise (``roughness``, `Shape.roughness`)."""
     k = int(np.clip(_NEIGHBOURS * roughness * len(points), *_NEIGHBOUR_RANGE))
     return np.asarray(cKDTree(points).query(points, min(k, len(points)))[1])
 
 
 def neighbour_medians(values: Float[Floats, "V D"], near: Int[Ints, "V K"]) -> Float[Floats, "V D"]:
-    """Median, coordinate by coordinate, of the values of neighbours."""
+    """Componentwise median of the neighbors' values."""
     found = np.empty_like(values)
-    for low in range(0, len(values), _MEDIANS):
-        part = slice(low, low + _MEDIANS)
+    for low in range(0, len(values), _MEDIAN_CHUNK):
+        part = slice(low, low + _MEDIAN_CHUNK)
         found[part] = np.median(values[near[part]], axis=1)
     return found
 
 
 def in_core_frame(shape: Shape, fit: Fit) -> tuple[Float[Floats, "V 3"], Float[Floats, "V 3"]]:
-    """Vertices and unit normals of a shape in the core frame, where its fit is; zero normals for a cloud."""
+    """Vertices and unit normals of a shape in the core frame of its fit; zero normals for a cloud."""
     points = fit.frame.apply(shape.verts)
     return points, np.zeros_like(points) if shape.is_cloud else shape.vertex_normals @ fit.frame.rotation.T
 
@@ -246,12 +246,28 @@ def reassign_islands(
     rounds: int,
     stay: Callable[[Int[Ints, " M"], Int[Ints, " M"], Found, Found], Bool[Bools, " I"]] | None = None,
 ) -> tuple[Found, Float[Floats, "V 3"]]:
-    """Search again for the vertices on small islands of a map of a mesh, whose edges are as `Edges` has them.
+    """Search again for the images of vertices on small islands of a map of a mesh.
 
-    The mesh is in units of sqrt(area), `areas` are those around its vertices in any unit. Each vertex lies at a place in
-    `found`; `images` are the points themselves, in units of their own surface's sqrt(area), and `search` gives
-    footpoints of some vertices near such points. ``stay`` says which islands stay as they are, of vertices, the number of
-    the island of each, and their footpoints before and after. Returns the footpoints and their images.
+    Parameters
+    ----------
+    verts, edges, areas
+        The mesh, in units of sqrt(area); its edges as `Edges` sorts them; areas around vertices, in any unit.
+    found
+        Footpoints of all vertices.
+    images
+        Returns the positions of footpoints, in units of their own surface's sqrt(area).
+    search
+        Returns footpoints of some vertices, near given positions.
+    rounds
+        Maximum number of repetitions.
+    stay
+        Returns which islands, indexed by number, are left unchanged; called with vertices, the number of the island of each,
+        and their footpoints before and after.
+
+    Returns
+    -------
+    tuple
+        The footpoints and their positions.
     """
     length = edge_lengths(verts, edges)
     image = images(found)
@@ -272,10 +288,10 @@ def reassign_islands(
 def small_islands(
     edges: Int[Ints32, "E 2"], length: Float[Floats, " E"], image: Float[Floats, "V 3"], areas: Float[Floats, " V"]
 ) -> Int[Ints, " V"]:
-    """Numbers of small pieces between discontinuities, edges whose ends have images much further apart than they are; -1 on
-    all else.
+    """Label the small pieces that discontinuities cut off; -1 for all other vertices.
 
-    Edges are sorted by their first vertex. Lengths are in units of sqrt(area); ``areas`` are those around the vertices.
+    Discontinuities are edges whose ends have images much farther apart than the ends are. Edges are sorted by their first
+    vertex. Lengths are in units of sqrt(area); ``areas`` are those around the vertices.
     """
     V = len(image)
     continuous = ~is_discontinuous(edge_lengths(image, edges), length)
@@ -285,24 +301,24 @@ def small_islands(
     np.cumsum(np.bincount(edges[continuous, 0], minlength=V), out=begins[1:])
     graph = csr_matrix((np.ones(begins[-1], np.int8), edges[continuous, 1], begins), (V, V))
     piece = connected_components(graph, directed=False)[1]
-    small = np.bincount(piece, areas) < _MAINLAND * areas.sum()
+    small = np.bincount(piece, areas) < _MAX_ISLAND * areas.sum()
     return np.where(small[piece], piece, -1).astype(np.int64)
 
 
 def surrounding_values(
     edges: Int[Ints32, "E 2"], values: Float[Floats, "V D"], unknown: Bool[Bools, " V"]
 ) -> Float[Floats, "V D"]:
-    """Values with the unknown rows replaced by the average of their surroundings; NaN out of reach."""
+    """Fill in unknown rows by diffusion from their surroundings; NaN out of reach."""
     edges = edges[unknown[edges[:, 0]] | unknown[edges[:, 1]]]
-    # the unknown vertices and those around them
+    # the unknown vertices and their neighbors
     near, ends = np.unique(np.concatenate([edges.reshape(-1), np.flatnonzero(unknown)]), return_inverse=True)
     start, end = ends[: edges.size].reshape(-1, 2).T
     graph = csr_matrix((np.ones(len(start)), (start, end)), (len(near), len(near)))
     rows = np.flatnonzero(unknown[near])
     part = (graph + graph.T).tocsr()[rows]
-    # values and, in the last column, whether they are known; zeros where they are not
+    # values, and 1 in the last column; zeros where unknown
     state = np.where(unknown[near, None], 0.0, np.column_stack([values[near], np.ones(len(near))]))
-    for _ in range(_STEPS):
+    for _ in range(_DIFFUSION_STEPS):
         total = part @ state
         weight = total[:, -1:]
         state[rows] = np.where(weight > 0, total / np.maximum(weight, 1e-12), state[rows])
@@ -313,10 +329,10 @@ def surrounding_values(
 
 
 class SurfaceBinding:
-    """Every vertex of a shape is bound to its footpoint on the fitted template.
+    """Binds every vertex of a shape to its footpoint on the fitted template.
 
-    The offset from the footpoint is kept, and turns with the template (``turns`` are rotations at its vertices): so the
-    pose of the fit reproduces the shape with all its detail.
+    Offsets from the footpoints are kept, and rotate with the template (``turns`` are rotations at its vertices), so the
+    pose of the fit reproduces the shape in full detail.
     """
 
     def __init__(self, part: Repaired, fit: Fit, turns: Float[Floats, "V 3 3"], workers: int = 1) -> None:
@@ -326,13 +342,13 @@ class SurfaceBinding:
         self._corners, self._weights = fit.faces[foot.face[rows]], foot.barycentric[rows]
         here = fit.frame.apply(part.original.verts)
         self._apart = np.zeros_like(here)
-        if part.copied is not None:  # a copy moves as what stands for it, at the place where it is
+        if part.copied is not None:  # a copy moves with its original, at a constant offset
             self._apart[part.copied] = (here - here[part.kept_vertex[rows]])[part.copied]
         offset = here - self._apart - self._on(fit.points)
         self._offsets = [np.einsum("nji,nj->ni", turns[self._corners[:, k]], offset) for k in range(3)]
 
     def at(self, points: Float[Floats, "V 3"], turns: Float[Floats, "V 3 3"]) -> Float[Floats, "N 3"]:
-        """Vertices (N, 3) of the shape for points (V, 3) and rotations (V, 3, 3) of the template; core frame."""
+        """Compute the shape's vertices (N, 3) from the template's points (V, 3) and rotations (V, 3, 3); core frame."""
         verts = self._on(points) + self._apart
         for k, offset in enumerate(self._offsets):
             turned = np.einsum("nij,nj->ni", turns[self._corners[:, k]], offset)
@@ -340,7 +356,7 @@ class SurfaceBinding:
         return verts
 
     def shape(self, verts: Float[Floats, "N 3"], name: str = "") -> Shape:
-        """The shape with other positions (N, 3) of its vertices."""
+        """Return the shape with new positions (N, 3) of its vertices."""
         return Shape(verts, self._shape.faces, name, self._shape.colors, self._shape.invalid)
 
     def _on(self, points: Floats) -> Floats:

@@ -1,11 +1,11 @@
-"""The source as it lies on the target: every source vertex at its matched point, with the source's own faces.
+"""The image of the source on the target: every source vertex at its matched point, with the source's faces.
 
-A point of the target finds its place on the source as the closest point of that image; those of all its vertices are
-the inverse of a map. Where several parts of the image pass by, the most trustworthy wins: facing the same way, mapped
-with confidence, near, on the same connected part of the target, and never a triangle that the map has pulled apart.
+The closest point of this image takes a point of the target to the source; doing so for all vertices of the target inverts
+a map. Where several parts of the image are near, the search prefers parts with similar normals, high confidence, small
+distance, and on the same connected part of the target. Triangles that the map tears apart are excluded.
 
-The search is exact for triangles of any size, which an image needs: a map stretches some and shrinks others, and
-leaves vertices without a triangle. `meshmatch.maps.footpoints` says how other searches differ.
+The search is exact for triangles of any size, which an image needs: a map stretches some triangles, shrinks others, and
+leaves vertices without any. `meshmatch.maps.footpoints` lists the other searches.
 """
 
 from __future__ import annotations
@@ -29,44 +29,43 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map
 
 # All set by hand; lengths in units of sqrt(area).
-# Distance to the image at which confidence is 1/e = 0.37, as in maps.
+# Distance to the image at which confidence is 1/e = 0.37.
 _DISTANCE_SCALE = 0.03
-# By how much a part of the image that faces the other way is further away than it is.
-_FACING = 0.15
-# By how much a part of the image that lies on another connected part of the target is further away than it is: walls of
-# two chambers may touch.
-_ELSEWHERE = 0.03
-# How much a distance on the source counts compared with one on the target, where a nearby point of the source is given.
-_NEAR = 0.2
-# Above this confidence the closest point wins. A less certain part of the image counts as further away, by little: by
-# 1.2 % of sqrt(area) where the map knows nothing, so that of parts that lie on one another the certain one wins.
-_TRUSTED, _UNCERTAIN = 0.5, 0.003
-# An edge of the image may be this many times as long as the source's, and a little more.
-_STRETCH, _SLACK = 3.0, 0.02
-# Balls are searched by size, each class up to twice as large as the one before, and at most so many classes.
+# Penalties are lengths that are added to the distance, as squares. For opposite normals:
+_OPPOSED_PENALTY = 0.15
+# For a part of the image on another connected part of the target: walls of two chambers may touch.
+_OTHER_PART_PENALTY = 0.03
+# Weight of a distance on the source relative to one on the target, where a nearby point of the source is given.
+_SOURCE_WEIGHT = 0.2
+# Below this confidence, lower confidence is penalized slightly: by 1.1 % of sqrt(area) at 0, so that of parts that coincide
+# the more certain one wins.
+_SURE_CONFIDENCE, _DOUBT_PENALTY = 0.5, 0.003
+# An edge of the image may be this many times as long as the source's, plus a constant.
+_MAX_STRETCH, _STRETCH_OFFSET = 3.0, 0.02
+# Covering balls are grouped by size, in classes of up to twice the size of the one before; number of classes.
 _CLASSES = 12
-# Queries at a time; how many balls are tried first, and at most.
-_CHUNK, _FIRST, _MAX_TRIED = 8192, 12, 512
-_LEAST = 256  # queries of one of several threads
+# Queries per chunk; number of balls that are tried first, and at most.
+_CHUNK, _FIRST_TRIED, _MAX_TRIED = 8192, 12, 512
+_MIN_CHUNK = 256  # queries per chunk with several threads
 # Rounds in which islands of an inverse are searched again.
 _ROUNDS = 2
-# Of the source vertices that meet on a target vertex, those with this share of the highest confidence count.
-_MEETING = 0.5
+# Of the source vertices mapped to one target vertex, those with at least this share of the highest confidence count.
+_MIN_RELATIVE_CONFIDENCE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class MappedFootpoints(Footpoints):
-    """Where N points of the target lie on the source; distances are to the image, in the unit of the target's file."""
+    """Points on the source for N points of the target; distances are to the image, in the unit of the target's file."""
 
-    confidence: Float[Floats, " N"]  # that of the map there, falling with the distance to the image
+    confidence: Float[Floats, " N"]  # the map's confidence, reduced by the distance to the image
 
 
 class MappedMesh:
-    """The source laid on the target by a map that was made for these two shapes; see `VertexMap.for_shapes`."""
+    """The image of the source on the target under a map for these two shapes; see `VertexMap.for_shapes`."""
 
     @classmethod
     def of(cls, shape: Shape) -> MappedMesh:
-        """A shape as it is, to find the closest points of its surface."""
+        """Make the identity's image, to find closest points on a shape itself."""
         return cls(VertexMap.identity(shape), shape, shape)
 
     def __init__(self, source_to_target: VertexMap, source: Shape, target: Shape) -> None:
@@ -81,23 +80,23 @@ class MappedMesh:
         self._source_unit = length_of(source)
         self._source = source.verts / self._source_unit
         single = np.flatnonzero(lone)
-        # Triangles, then the points that no triangle holds: those of a cloud, or between discontinuities.
+        # Triangles, then the vertices that are in no kept triangle: those of a cloud, or between discontinuities.
         self.corners = np.concatenate([source.faces[kept], np.repeat(single[:, None], 3, axis=1)])
         self.face = np.concatenate([kept, np.full(len(single), -1)])
         held = self.points[self.corners]
         self._center = held.mean(axis=1)
-        # For balls of each size: a tree of their centers, which triangles they cover, their radii, and the largest.
+        # For balls of each size class: a tree of their centers, the items they cover, their radii, and the largest.
         item, center, radius = covering_balls(held)
         largest = float(radius.max()) or 1.0
         size = np.floor(np.log2(np.maximum(radius / largest, 0.5**_CLASSES)))
         groups = [np.flatnonzero(size == k) for k in np.unique(size)]
         self._trees = [(cKDTree(center[own]), item[own], radius[own], float(radius[own].max())) for own in groups]
-        # A cloud has gaps between its points, which are no reason for low confidence.
+        # Gaps between the points of a cloud do not reduce confidence.
         self._gap = self.unit / np.sqrt(len(np.unique(self.points, axis=0))) if source.is_cloud else 0.0
 
     @cached_property
     def part(self) -> Int[Ints, " V_source"]:
-        """Which of the target's `connected_parts` the vertices of the source are on."""
+        """The target's connected part (`connected_parts`) that each vertex of the source is mapped to."""
         return connected_parts(self._target)[self._index]
 
     def query(
@@ -108,9 +107,11 @@ class MappedMesh:
         near: Float[Floats, "N 3"] | None = None,
         parts: Int[Ints, " N"] | None = None,
     ) -> MappedFootpoints:
-        """Points on the source of points on the target, in its file's frame, where it has these unit normals (zeros
-        where unknown). `near` are points of the source, in its file's frame, which select one of two sheets that touch;
-        ``parts`` are the `connected_parts` of the target that the points are on.
+        """Find the points on the source that correspond to points on the target.
+
+        ``points`` are in the target's frame; ``normals`` are the target's unit normals there, zeros where unknown. ``near``
+        are approximate points on the source, in its frame, which select one of two sheets that touch. ``parts`` are the
+        target's `connected_parts` of the points.
         """
         points = np.asarray(points, np.float64)
         facing = np.zeros((len(points), 3)) if normals is None else normals
@@ -122,7 +123,7 @@ class MappedMesh:
         beyond = np.maximum(distance - self._gap, 0.0)
         confidence = np.einsum("nk,nk->n", weights, self.confidence[corners])
         confidence = np.clip(confidence, 0, 1) * np.exp(-np.square(beyond / (_DISTANCE_SCALE * self.unit)))
-        confidence *= np.exp(-np.square(_FACING / _DISTANCE_SCALE * self._opposed(facing, corners)))
+        confidence *= np.exp(-np.square(_OPPOSED_PENALTY / _DISTANCE_SCALE * self._opposition(facing, corners)))
         face = self.face[item]
         vertex = corners[np.arange(len(points)), weights.argmax(axis=1)]
         weights[face < 0] = (1.0, 0.0, 0.0)
@@ -131,7 +132,10 @@ class MappedMesh:
     def _search(
         self, points: Floats, normals: Floats, workers: int, near: Floats | None, parts: Ints | None
     ) -> tuple[Ints, Floats]:
-        """The best triangle or lone vertex of each point, with weights: exact until `_MAX_TRIED` of a size were tried."""
+        """Best item (triangle or lone vertex) of each point, with barycentric weights.
+
+        Exact unless `_MAX_TRIED` balls of a size class were tried for a point.
+        """
         N = len(points)
         best, item, weights = np.full(N, np.inf), np.zeros(N, np.int64), np.zeros((N, 3))
 
@@ -141,10 +145,10 @@ class MappedMesh:
             found, costs = self._costs(points[rows], normals[rows], items)
             if near is not None:
                 place = interpolate(self._source, self.corners[items], found)
-                costs = costs + (_NEAR * self.unit) ** 2 * squared_lengths(place - near[rows])
+                costs = costs + (_SOURCE_WEIGHT * self.unit) ** 2 * squared_lengths(place - near[rows])
             if parts is not None:
                 elsewhere = (self.part[self.corners[items]] != parts[rows][:, None]).all(axis=1)
-                costs = costs + (_ELSEWHERE * self.unit) ** 2 * elsewhere
+                costs = costs + (_OTHER_PART_PENALTY * self.unit) ** 2 * elsewhere
             order = np.lexsort((items, costs, rows))
             first = order[np.flatnonzero(np.diff(rows[order], prepend=-1))]
             row = rows[first]
@@ -159,7 +163,7 @@ class MappedMesh:
 
         def search(rows: Ints) -> None:
             for tree, which, radius, largest in self._trees:
-                asking, done, ask = rows, 0, min(_FIRST, len(which))
+                asking, done, ask = rows, 0, min(_FIRST_TRIED, len(which))
                 while len(asking):
                     reach = (np.sqrt(best[asking].max()) + largest) * (1 + 1e-9)
                     found = tree.query(points[asking], ask, distance_upper_bound=reach)
@@ -174,32 +178,35 @@ class MappedMesh:
                     asking = asking[np.maximum(distance[:, -1] - largest, 0.0) ** 2 <= best[asking]]
                     done, ask = ask, min(3 * ask, len(which), _MAX_TRIED)
 
-        easy = np.argsort(best, kind="stable")  # those near the image together: their searches reach less far
-        size = min(_CHUNK, max(_LEAST, -(-N // (4 * workers)))) if workers > 1 else _CHUNK
-        parallel_map(search, [easy[low : low + size] for low in range(0, N, size)], threads=workers)
+        order = np.argsort(
+            best, kind="stable"
+        )  # points near the image first, in common chunks: their searches are shorter
+        size = min(_CHUNK, max(_MIN_CHUNK, -(-N // (4 * workers)))) if workers > 1 else _CHUNK
+        parallel_map(search, [order[low : low + size] for low in range(0, N, size)], threads=workers)
         return item, weights
 
     def _costs(self, points: Floats, normals: Floats, items: Ints) -> tuple[Floats, Floats]:
-        """Weights (N, 3) of the closest points of items (N,), and what they cost: squared lengths."""
+        """Barycentric weights (N, 3) of the closest points on items (N,), and their costs: squared lengths."""
         corners = self.corners[items]
         a, b, c = (self.points[corners[:, k]] for k in range(3))
         weights = closest_on_triangles(points, a, b, c)
         foot = weights[:, :1] * a + weights[:, 1:2] * b + weights[:, 2:] * c
         confidence = np.einsum("nk,nk->n", weights, self.confidence[corners])
-        doubt = np.log(_TRUSTED / np.clip(confidence, 1e-6, _TRUSTED))
-        opposed = self._opposed(normals, corners)
+        doubt = np.log(_SURE_CONFIDENCE / np.clip(confidence, 1e-6, _SURE_CONFIDENCE))
+        opposed = self._opposition(normals, corners)
         squared = squared_lengths(foot - points)
-        return weights, squared + self.unit**2 * (_UNCERTAIN**2 * doubt + (_FACING * opposed) ** 2)
+        return weights, squared + self.unit**2 * (_DOUBT_PENALTY**2 * doubt + (_OPPOSED_PENALTY * opposed) ** 2)
 
-    def _opposed(self, normals: Floats, corners: Ints) -> Floats:
-        """(N,) 0 where one of three corners faces into one half of space with a normal, up to 1 where all face away."""
+    def _opposition(self, normals: Floats, corners: Ints) -> Floats:
+        """(N,) 0 where the normal of any corner makes an acute angle with the given one, up to 1 where all are opposite."""
         cosine = np.einsum("nd,nkd->nk", normals, self.normals[corners]).max(axis=1)
         return np.asarray(np.maximum(-cosine, 0.0))
 
 
 def discontinuous_faces(source_to_target: VertexMap, source: Shape, target: Shape) -> Bool[Bools, " F_source"]:
-    """True for a face whose image on the target is far longer than the face itself, and than the edges of a target to
-    whose vertices the map was rounded.
+    """True for faces that the map tears: those with an edge whose image is much longer than the edge.
+
+    Where images are vertices of the target, edges may be longer by the target's edges, as by rounding.
     """
     if source.is_cloud:
         return np.zeros(0, bool)
@@ -211,12 +218,12 @@ def discontinuous_faces(source_to_target: VertexMap, source: Shape, target: Shap
     total = float(own[usual].sum())
     scale = float(image[usual].sum()) / total if total > 0 else 0.0
     rounded = np.where(source_to_target.on_vertex, _edge_lengths(target)[source_to_target.index], 0.0)
-    allowed = _STRETCH * scale * own + rounded[source.faces] + rounded[around] + _SLACK * length_of(target)
+    allowed = _MAX_STRETCH * scale * own + rounded[source.faces] + rounded[around] + _STRETCH_OFFSET * length_of(target)
     return np.asarray((image > allowed).any(axis=1))
 
 
 def _edge_lengths(shape: Shape) -> Floats:
-    """(V,) mean length of the edges at each vertex; of a cloud, of the gaps between its points."""
+    """(V,) mean length of the edges at each vertex; for a cloud, of the gaps between its points."""
     if shape.is_cloud:
         return np.sqrt(shape.vertex_areas)
     edges = shape.edges.vertices
@@ -224,16 +231,14 @@ def _edge_lengths(shape: Shape) -> Floats:
 
 
 def mean_around(corners: Int[NDArray[Any], "N K"], values: Float[Floats, " N"], V: int) -> Float[Floats, " V"]:
-    """Mean of the values of the edges, or faces, at each vertex; 0 where there is none."""
+    """Mean over the edges, or faces, at each vertex; 0 where there are none."""
     total = np.bincount(corners.T.ravel(), np.tile(values, corners.shape[1]), V)
     return np.asarray(total / np.maximum(np.bincount(corners.ravel(), minlength=V), 1))
 
 
 @derived
 def connected_parts(shape: Shape) -> Int[Ints, " V"]:
-    """The number of the connected part that each vertex of a mesh is in, copies along the seams of a file being one;
-    -1 without a face.
-    """
+    """Label the connected parts of a mesh, per vertex; copies of vertices along seams are connected, -1 without a face."""
     faces = shape.faces[shape.valid_faces]
     part = np.full(shape.V, -1, np.int64)
     if len(faces):
@@ -243,14 +248,15 @@ def connected_parts(shape: Shape) -> Int[Ints, " V"]:
 
 
 def length_of(shape: Shape) -> float:
-    """The length that others are compared with: sqrt(area), or the diagonal of a shape without area."""
+    """Characteristic length of a shape: sqrt(area), or the diagonal of a shape without area."""
     return float(np.sqrt(shape.area)) or shape.diagonal or 1.0
 
 
 def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, workers: int = 1) -> VertexMap:
-    """A map from target to source, from one from source to target; `InputError` as `VertexMap.for_shapes`. Its
-    confidence falls with the distance to the image: it is low where nothing of the source was mapped to, and that is
-    all it says where the confidence of the map is not known.
+    """Compute a map from target to source, given one from source to target; `InputError` as `VertexMap.for_shapes`.
+
+    Confidence decreases with the distance to the image of the source, so it is low where the map does not reach. A map of
+    unknown confidence is treated as certain.
     """
     checked = source_to_target.for_shapes(source, target)
     identical = bool((checked.index == np.arange(source.V)).all() and (checked.face < 0).all())
@@ -259,11 +265,11 @@ def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, worker
     image = MappedMesh(checked, source, target)
     normals, parts = known_normals(target), connected_parts(target)
     found = image.query(target.verts, normals, workers, parts=parts)
-    several, vertex = _meeting_vertices(checked, source, target.V)
-    weights = np.tile([1.0, 0.0, 0.0], (len(several), 1))
+    shared, vertex = _shared_images(checked, source, target.V)
+    weights = np.tile([1.0, 0.0, 0.0], (len(shared), 1))
     confidence = checked.assumed_confidence[vertex].astype(np.float64)
-    met = MappedFootpoints(vertex, np.full(len(several), -1), weights, found.distance[several], confidence)
-    found = found.updated(several, met)
+    replacements = MappedFootpoints(vertex, np.full(len(shared), -1), weights, found.distance[shared], confidence)
+    found = found.updated(shared, replacements)
     if not target.is_cloud:
         length, source_length = (float(np.sqrt(shape.area)) or 1.0 for shape in (target, source))
         found, _ = reassign_islands(
@@ -277,19 +283,19 @@ def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, worker
             ),
             _ROUNDS,
         )
-    sure = np.where(target.valid, np.clip(found.confidence, 0.0, 1.0), 0.0)
-    rest: dict[str, Any] = {"face": found.face, "barycentric": found.barycentric, "confidence": sure}
+    confidence_to = np.where(target.valid, np.clip(found.confidence, 0.0, 1.0), 0.0)
+    rest: dict[str, Any] = {"face": found.face, "barycentric": found.barycentric, "confidence": confidence_to}
     rest |= {"source_up": checked.target_up, "target_up": checked.source_up}
     return VertexMap.between(target, source, found.vertex, verdict=checked.verdict, reasons=checked.reasons, **rest)
 
 
-def _meeting_vertices(found: VertexMap, source: Shape, V: int) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
-    """Target vertices on which several source vertices meet, and of these the one nearest to their mean."""
+def _shared_images(found: VertexMap, source: Shape, V: int) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
+    """Target vertices to which several source vertices are mapped, and for each the source vertex nearest to their mean."""
     highest = np.zeros(V)
     rows = np.flatnonzero(found.on_vertex)
     at = found.index[rows]
     np.maximum.at(highest, at, found.assumed_confidence[rows])
-    trusted = (found.assumed_confidence[rows] >= _MEETING * highest[at]) & source.valid[rows]
+    trusted = (found.assumed_confidence[rows] >= _MIN_RELATIVE_CONFIDENCE * highest[at]) & source.valid[rows]
     rows, at = rows[trusted], at[trusted]
     count = np.bincount(at, minlength=V)
     sums = np.stack([np.bincount(at, source.verts[rows, k], V) for k in range(3)], axis=1)

@@ -1,11 +1,12 @@
-"""Where the vertices of a shape belong on the template: what one fit knows, and all that maps need of it.
+"""Places: where the vertices of a shape belong on the rest template. Maps are built from the places of two shapes.
 
-A vertex belongs to its footpoint on the fitted template, and as high above the resting one as it lies above the fitted
-one: what a fit smooths away tells points apart, and the two sides of a thin wall.
+The place of a vertex is its footpoint on the fitted template, moved to the rest template and raised above it by as much as
+the vertex lies above the fitted one. This height keeps detail that the fit smooths away, and distinguishes the two sides
+of a thin wall.
 
-Of a noisy cloud no place is known for a point, but how likely each is. Noise moves points across the surface and along it
-alike. Taking the closest point of the template undoes the first and keeps the second. Here a point belongs to all of the
-template within reach, with Gaussian weights; its place is the expectation, and its spread says how well it is known.
+For a point of a noisy cloud a place is not known exactly. Noise moves points across the surface and along it alike; the
+closest point of the template removes the first error and keeps the second. Such a point is therefore assigned to all of
+the template within reach, with Gaussian weights: its place is the expectation, its spread the standard deviation.
 """
 
 from __future__ import annotations
@@ -27,32 +28,34 @@ from meshmatch.maps.mapped_mesh import MappedMesh
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 
-_HIGH = 0.03  # units of sqrt(area): what lies further off is something else than the template's surface. Set by hand.
-# Of noisy clouds, set by hand:
-_ROUGH = 0.5  # from this `Shape.roughness` on, noise is larger than the template's triangles
-_SAMPLES = 48  # of the template that share a point
+_MAX_HEIGHT = (
+    0.03  # largest height, units of sqrt(area): what is farther off is not the template's surface. Set by hand.
+)
+# For noisy clouds, set by hand:
+_MIN_NOISY_ROUGHNESS = 0.5  # from this `Shape.roughness` on, noise is larger than the template's triangles
+_N_SAMPLES = 48  # nearest samples of the template over which the expectation of a point is taken
 _NOISE_RANGE = 0.006, 0.03  # units of sqrt(area)
-_CHUNK = 8192  # points at a time
+_CHUNK = 8192  # points per chunk
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Places(Brief):
-    """Where the vertices of one shape belong on the template. Two of them, of one template, make a map.
+    """Places of one shape's vertices on the rest template. Those of two shapes, on one template, make a map.
 
     Vertices and faces are those of the shape's file, lengths in units of sqrt(area).
 
     Attributes
     ----------
-    name, hash : of the shape, see `Shape.hash`
-    template_hash : which template
-    resting : (V, 3) where each vertex belongs on, or just above, the resting template, template frame
-    height : (V,) how far above it
-    distance : (V,) how far each vertex lies from the fitted template
-    moved : (V, 3) how each place moved on the resting template when the fit had to agree with others; None if it had not
-    spread : (V,) of a noisy cloud, standard deviation of the place; None for other shapes
-    stands : (V,) which vertex stands for each: itself, its twin, or the nearest that was fitted
-    faces : (F, 3) all triangles; fitted : (F,) whether each was fitted, or dropped as broken
-    verdict, reasons, trust : of the fit
+    name, hash : name and hash of the shape, see `Shape.hash`
+    template_hash : hash of the template
+    resting : (V, 3) place of each vertex on, or just above, the rest template, in the template's frame
+    height : (V,) height of each place above the rest template
+    distance : (V,) distance between each vertex and the fitted template
+    moved : (V, 3) how each place moved on the rest template when the fit was made to agree with others; None if it was not
+    spread : (V,) standard deviation of the place, for a noisy cloud; None for other shapes
+    stands : (V,) the vertex that represents each one: itself, its duplicate, or the nearest that was fitted
+    faces : (F, 3) all triangles; fitted : (F,) False for those that were left out of the fit
+    verdict, reasons, trust : those of the fit
     """
 
     name: str
@@ -72,7 +75,7 @@ class Places(Brief):
 
     @classmethod
     def of(cls, part: Repaired, fit: Fit, before: Fit | None = None, workers: int = 1) -> Places:
-        """The places of a repaired shape; ``before`` is its fit before it agreed with others."""
+        """Compute the places of a repaired shape; ``before`` is its fit before it was made to agree with others."""
         if not isinstance(part, Repaired):
             hint = "a fit of a collection has its places: fit.places"
             raise InputError(f"places are of a repaired shape (fit.repaired), not of {type(part).__name__}", hint)
@@ -89,18 +92,18 @@ class Places(Brief):
             normals = vertex_normals(fit.resting, fit.faces)
             resting += height[:, None] * foot.values(fit.faces, normals)
         if before is not None:
-            moved = foot.values(fit.faces, _places_moved(before, fit))
+            moved = foot.values(fit.faces, _displacement_on_rest(before, fit))
 
         def of_file(values: Floats) -> Floats32:
             return values.astype(np.float32)[part.original_to_repaired]
 
         original = part.original
         stands = part.kept_vertex[part.original_to_repaired]
-        # What was left out is as near to the template as the vertex that stands for it, and the way there; what has no
-        # position may be anywhere on the shape.
+        # The distance of a vertex that was left out is that of its representative plus the distance to it; a vertex without
+        # a position may be anywhere on the shape.
         away = np.linalg.norm(original.verts - original.verts[stands], axis=1)
         away = np.where(original.valid, away, original.diagonal) / fit.frame.scale
-        if part.copied is not None:  # but a copy is where it is for another reason
+        if part.copied is not None:  # copies match their originals however far apart they are
             away[part.copied] = 0.0
         fitted = np.zeros(original.F, bool)
         fitted[part.kept_face] = True
@@ -122,70 +125,75 @@ class Places(Brief):
         )
 
     def on(self, template: Shape) -> Footpoints:
-        """The points of the resting template where the vertices belong."""
+        """Closest points on the rest template to the places."""
         return Surface(np.asarray(template.verts), np.asarray(template.faces)).query(self.resting.astype(np.float64))
 
     def nearest(
         self, resting: Float[Floats32, "N 3"], workers: int = 1, among: Int[Ints, " F"] | None = None
     ) -> Footpoints:
-        """The points of this shape that belong nearest to N places on the resting template; of a mesh, ``among`` some of
-        the faces that were fitted."""
-        asked = resting.astype(np.float64)
-        if len(self._used):
-            used = self._used if among is None else among
-            surface = self._surface if among is None else self._surface_of_some(among)
-            found = surface.query(asked, None, workers)
-            corners = self.faces[used].take(found.face, 0)
+        """Find the points of this shape whose places are nearest to N places on the rest template.
+
+        For a mesh, ``among`` restricts the search to some of the faces that were fitted.
+        """
+        query = resting.astype(np.float64)
+        if len(self._fitted_faces):
+            faces = self._fitted_faces if among is None else among
+            surface = self._surface if among is None else self._surface_of_faces(among)
+            found = surface.query(query, None, workers)
+            corners = self.faces[faces].take(found.face, 0)
             nearest = np.take_along_axis(corners, found.barycentric.argmax(1)[:, None], 1)[:, 0]
             vertex = self.stands[nearest].astype(np.int64)
-            return Footpoints(vertex, used[found.face], found.barycentric, found.distance)
-        known = np.zeros((len(asked), 0 if self.spread is None else 1))
-        distance, index = self._tree.query(np.column_stack([asked, known]), workers=workers)
-        weights = np.tile([1.0, 0.0, 0.0], (len(asked), 1))
-        return Footpoints(self._points[index], np.full(len(asked), -1, np.int64), weights, distance)
+            return Footpoints(vertex, faces[found.face], found.barycentric, found.distance)
+        known = np.zeros((len(query), 0 if self.spread is None else 1))
+        distance, index = self._tree.query(np.column_stack([query, known]), workers=workers)
+        weights = np.tile([1.0, 0.0, 0.0], (len(query), 1))
+        return Footpoints(self._kept_vertices[index], np.full(len(query), -1, np.int64), weights, distance)
 
     @cached_property
-    def _used(self) -> Ints:
-        """Numbers of the faces that were fitted."""
+    def _fitted_faces(self) -> Ints:
+        """Indices of the faces that were fitted."""
         return np.flatnonzero(self.fitted)
 
     @cached_property
     def _surface(self) -> Surface:
-        """The faces as they lie on the resting template."""
-        return Surface(self.resting.astype(np.float64), self.stands[self.faces[self._used]].astype(np.int64))
+        """The fitted faces, with vertices at their places."""
+        return Surface(self.resting.astype(np.float64), self.stands[self.faces[self._fitted_faces]].astype(np.int64))
 
-    def _surface_of_some(self, faces: Int[Ints, " F"]) -> Surface:
-        """The same of some faces, of their corners alone: what is asked of one part must not cost the whole."""
+    def _surface_of_faces(self, faces: Int[Ints, " F"]) -> Surface:
+        """The same for some faces, built from their corners only, so that a query of one part does not cost the whole."""
         corners, faces = np.unique(self.stands[self.faces[faces]], return_inverse=True)
         return Surface(self.resting[corners].astype(np.float64), faces.reshape(-1, 3).astype(np.int64))
 
     @cached_property
-    def _points(self) -> Ints:
-        """Vertices that stand for themselves."""
+    def _kept_vertices(self) -> Ints:
+        """Vertices that represent themselves."""
         return np.flatnonzero(self.stands == np.arange(len(self.stands)))
 
     @cached_property
     def _tree(self) -> cKDTree:
-        """Of a cloud. The expected squared distance is that of the means, plus the variance of this shape's point."""
+        """Search tree for a cloud; the spread is an additional coordinate.
+
+        The expected squared distance to an uncertain point is that to its mean plus its variance.
+        """
         columns = [self.resting] if self.spread is None else [self.resting, self.spread[:, None]]
-        return cKDTree(np.concatenate(columns, 1)[self._points])
+        return cKDTree(np.concatenate(columns, 1)[self._kept_vertices])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class PlacedFit(Fit):
-    """A fit that was read from a folder of fits: it does not know its shape, but where the shape's vertices belong.
+    """A fit that was read from a folder of fits: it has the places of its shape's vertices, but not the shape.
 
     Attributes
     ----------
     places
-        Where they belong on the template.
+        Places of the vertices on the template.
     """
 
     places: Places
 
     @classmethod
     def of(cls, fit: Fit, places: Places) -> PlacedFit:
-        """A fit with the places of its shape's vertices, in place of the shape."""
+        """Replace the shape of a fit by the places of its vertices."""
         known = {field.name: getattr(fit, field.name) for field in fields(Fit)}
         return cls(**known | {"verts": np.empty((0, 3)), "repaired": None, "places": places})
 
@@ -195,10 +203,10 @@ class PlacedFit(Fit):
 
 
 def surface_distance(shape: Shape, fitted: Shape, one_way: bool = False) -> tuple[float, float]:
-    """How far two surfaces in one frame lie apart, on average over both and at most, in its unit: from every vertex of each
-    to the nearest place of the other.
+    """Mean and maximum distance between two surfaces in one frame, in its unit.
 
-    Of a cloud, and with ``one_way`` of what is only a part of the fitted one, only from there.
+    Measured from every vertex of each surface to the closest point of the other, and averaged over both directions. If
+    ``shape`` is a cloud, or with ``one_way``, for a shape that is only a part of the fitted one, only from ``shape``.
     """
     ways = [(MappedMesh.of(fitted).query(shape.verts).distance, shape.vertex_areas)]
     if not (one_way or shape.is_cloud):
@@ -207,8 +215,12 @@ def surface_distance(shape: Shape, fitted: Shape, one_way: bool = False) -> tupl
     return float(mean), float(max(distance.max() for distance, _ in ways))
 
 
-def _places_moved(before: Fit, after: Fit) -> Float[Floats, "V 3"]:
-    """How places on the resting template move when the fitted one slides: as far, and back, as each triangle has it."""
+def _displacement_on_rest(before: Fit, after: Fit) -> Float[Floats, "V 3"]:
+    """Displacement from after to before agreement, per vertex, pulled back from the fitted to the rest template.
+
+    Each triangle's mean displacement is expressed in its edges on the fitted template and rebuilt from those of the rest
+    template; vertices get area-weighted means.
+    """
     faces = after.faces
     slid = (before.points - after.points)[faces].mean(1)
     edges, resting = ((verts[faces[:, 1:]] - verts[faces[:, :1]]) for verts in (after.points, after.resting))
@@ -223,19 +235,19 @@ def _places_moved(before: Fit, after: Fit) -> Float[Floats, "V 3"]:
 
 
 def heights(shape: Shape, fit: Fit, foot: Footpoints) -> Float[Floats, " V"]:
-    """How far the vertices of a shape lie above their footpoints on the fitted template, at most `_HIGH` either way."""
+    """Signed heights of a shape's vertices above their footpoints on the fitted template, clipped to `_MAX_HEIGHT`."""
     above = in_core_frame(shape, fit)[0] - foot.values(fit.faces, fit.points)
     above *= foot.values(fit.faces, vertex_normals(fit.points, fit.faces))
-    return np.asarray(np.clip(above.sum(1), -_HIGH, _HIGH))
+    return np.asarray(np.clip(above.sum(1), -_MAX_HEIGHT, _MAX_HEIGHT))
 
 
 def is_noisy(shape: Shape) -> bool:
-    """Whether a shape is a cloud so noisy that expectations pay."""
-    return shape.roughness >= _ROUGH
+    """Whether a shape is a cloud so noisy that places are computed as expectations."""
+    return shape.roughness >= _MIN_NOISY_ROUGHNESS
 
 
 def noise_level(distance: Float[Floats, " N"]) -> float:
-    """Standard deviation of noise, from distances between points and a surface: robust against outliers.
+    """Robust estimate of the standard deviation of noise, from distances between points and a surface.
 
     The median of a Gaussian's absolute values is 0.6745 standard deviations.
     """
@@ -245,13 +257,13 @@ def noise_level(distance: Float[Floats, " N"]) -> float:
 def expectation(
     points: Float[Floats, "N 3"], fit: Fit, noise: float, values: Sequence[Float[Floats, "T D"]]
 ) -> tuple[list[Float[Floats, "N D"]], Float[Floats, " N"]]:
-    """Expected values over the places of the template where points may belong, and how uncertain the first are.
+    """Expected values at noisy points, over their possible footpoints on the template, and the variance of the first.
 
     `points` are in the fit's core frame; `noise` is the standard deviation along each axis, in units of sqrt(area);
     `values` belong to the vertices of the fitted template. Returns the mean of each, and the variance of the first,
     summed over D.
     """
-    # vertices and face centers of the template, as a matrix over the vertices, and the area that each stands for
+    # samples: vertices and face centers of the template, as a matrix over the vertices, and the area that each represents
     F, T = len(fit.faces), len(fit.points)
     rows = np.repeat(np.arange(F), 3)
     centers = csr_matrix((np.full(3 * F, 1 / 3), (rows, fit.faces.reshape(-1))), (F, T))
@@ -264,7 +276,7 @@ def expectation(
     variance = np.empty(len(points))
     for low in range(0, len(points), _CHUNK):
         part = slice(low, low + _CHUNK)
-        distance, index = tree.query(points[part], min(_SAMPLES, tree.n))
+        distance, index = tree.query(points[part], min(_N_SAMPLES, tree.n))
         further = np.square(distance) - np.square(distance[:, :1])  # the closest keeps its weight at any distance
         weight = prior[index] * np.exp(-0.5 * further / noise**2)
         weight /= weight.sum(1, keepdims=True)

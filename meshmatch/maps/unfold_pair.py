@@ -1,8 +1,8 @@
-"""The two maps of a pair without folds, between what nobody left out of the two shapes.
+"""Remove folds from the maps of a pair of shapes, restricted to the parts that were fitted.
 
-What was left out, such as the floor under a scan, is matched like the nearest vertex that was fitted, and so is a vertex
-without a position or a face like the one that stands for it. Those images would count as folds, and the inverse would look
-for each such vertex on all of the other shape.
+What was left out, such as the floor under a scan, is matched like the nearest vertex that was fitted; a vertex without a
+position or a face is matched like its representative. Such images would count as folds, and an inverse would search the
+whole other shape for each such vertex.
 """
 
 from __future__ import annotations
@@ -17,52 +17,55 @@ from meshmatch.maps.unfold import unfolded, unfolded_both_ways
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
-_LARGEST_BOTH_WAYS = 60_000  # vertices for which both maps are made at once: of more that takes longer than matching
+_MAX_BOTH_WAYS = 60_000  # vertices up to which both maps are unfolded together: beyond, that takes longer than matching
 
 
 def unfolded_pair(
     found: VertexMap, opposite: Callable[[], VertexMap], source: Shape, target: Shape, partial: bool, workers: int = 1
 ) -> tuple[VertexMap, VertexMap | None]:
-    """A map between two shapes with fewer folds; of two whole meshes that match well, and are not too large, with its
-    inverse, which takes the place of the map that ``opposite`` makes.
+    """Reduce the folds of a map between two shapes.
+
+    For two whole meshes with a good match, and not too large, the second result is the inverse, which replaces the map that
+    ``opposite`` makes; otherwise it is None. Maps from or to clouds are returned unchanged.
     """
     if source.is_cloud or target.is_cloud:
         return found, None
-    here, there = _Kept.of(source), _Kept.of(target)
-    some = here.between(found, there)
-    if some is None:
+    a, b = _FittedPart.of(source), _FittedPart.of(target)
+    inside = a.between(found, b)
+    if inside is None:
         return found, None
-    if partial or found.verdict != "good" or max(here.shape.V, there.shape.V) > _LARGEST_BOTH_WAYS:
-        return here.in_file(unfolded(some, here.shape, there.shape, workers), found, there), None
+    if partial or found.verdict != "good" or max(a.shape.V, b.shape.V) > _MAX_BOTH_WAYS:
+        return a.in_file(unfolded(inside, a.shape, b.shape, workers), found, b), None
     back = opposite()
-    some_back = there.between(back, here)
-    if some_back is None:
-        return here.in_file(unfolded(some, here.shape, there.shape, workers), found, there), None
-    forward, backward = unfolded_both_ways(some, some_back, here.shape, there.shape, workers)
-    return here.in_file(forward, found, there), there.in_file(backward, back, here)
+    inside_back = b.between(back, a)
+    if inside_back is None:
+        return a.in_file(unfolded(inside, a.shape, b.shape, workers), found, b), None
+    forward, backward = unfolded_both_ways(inside, inside_back, a.shape, b.shape, workers)
+    return a.in_file(forward, found, b), b.in_file(backward, back, a)
 
 
 def both_unfolded(
     found: VertexMap, opposite: VertexMap, source: Shape, target: Shape, partial: bool
 ) -> tuple[VertexMap, VertexMap]:
-    """A map between two shapes and its opposite with fewer folds: as `unfolded_pair` makes them, or each by itself."""
+    """Reduce the folds of a map and of its opposite: together where `unfolded_pair` does so, otherwise independently."""
     forward, backward = unfolded_pair(found, lambda: opposite, source, target, partial)
     return forward, backward or unfolded_pair(opposite, lambda: found, target, source, partial=True)[0]
 
 
 @dataclass(frozen=True, eq=False)
-class _Kept:
-    """What is left of a mesh of which vertices have weight 0, no position or no face: ``shape``, of which vertices and faces
-    of the file.
+class _FittedPart:
+    """A mesh without the vertices that have weight 0, no position or no face.
+
+    ``verts`` and ``faces`` are the indices, in the file, of the vertices and faces of ``shape``.
     """
 
     shape: Shape
     verts: Int[Ints, " N"]
     faces: Int[Ints, " M"]
-    all_of_it: bool
+    is_whole: bool
 
     @classmethod
-    def of(cls, shape: Shape) -> _Kept:
+    def of(cls, shape: Shape) -> _FittedPart:
         chosen = shape.valid_faces
         if shape.weights is not None:
             chosen = chosen & (shape.weights > 0)[shape.faces].any(axis=1)  # as repair keeps them
@@ -73,9 +76,9 @@ class _Kept:
         corners = np.searchsorted(verts, shape.faces[faces])
         return cls(Shape(shape.verts[verts], corners, shape.name), verts, faces, False)
 
-    def between(self, found: VertexMap, target: _Kept) -> VertexMap | None:
-        """A map between two files as one between what is left of them; None where one has images on what is not."""
-        if self.all_of_it and target.all_of_it:
+    def between(self, found: VertexMap, target: _FittedPart) -> VertexMap | None:
+        """Restrict a map between two files to the fitted parts; None if an image lies outside the target's."""
+        if self.is_whole and target.is_whole:
             return found
         index, face = found.index[self.verts], found.face[self.verts]
         vertex = np.minimum(np.searchsorted(target.verts, index), len(target.verts) - 1)
@@ -87,9 +90,9 @@ class _Kept:
         face = np.where(on_face, number, -1)
         return VertexMap.between(self.shape, target.shape, vertex, face=face, verdict=found.verdict, **arrays)
 
-    def in_file(self, some: VertexMap, found: VertexMap, target: _Kept) -> VertexMap:
-        """A map between two files, with the images of a map between what is left of them."""
-        if self.all_of_it and target.all_of_it:
+    def in_file(self, some: VertexMap, found: VertexMap, target: _FittedPart) -> VertexMap:
+        """Insert the images of a map between the fitted parts into a map between the files."""
+        if self.is_whole and target.is_whole:
             return some
         index, face, weights = found.index.copy(), found.face.copy(), found.barycentric.copy()
         index[self.verts], weights[self.verts] = target.verts[some.index], some.barycentric

@@ -216,7 +216,7 @@ class VertexMap(Pickled):
     def for_shapes(self, source: Shape | None, target: Shape | None, label: str = "the map") -> VertexMap:
         """Check that this map is from `source` to `target`, and fill in names, counts and hashes.
 
-        Vertex counts must agree, and hashes where the map has them: a map for another mesh, or for one that was edited
+        Vertex counts must agree, and hashes where the map has them: a map for another pose, or for a mesh that was edited
         since, is refused. Results of transfers (`Shape.made_of`) accept the maps of the meshes that they were made from.
 
         Parameters

@@ -95,7 +95,7 @@ def test_pairs_near_each_other_are_as_far_as_in_the_whole(monkeypatch: pytest.Mo
     monkeypatch.setattr(
         geodesics, "chunks", lambda starts: asked.append(len(starts)) or GeodesicDistances.chunks(geodesics, starts)
     )
-    monkeypatch.setattr("meshmatch.maps.geodesics._NEARBY", 0.5)
+    monkeypatch.setattr("meshmatch.maps.geodesics._MAX_REACH", 0.5)
     shares: list[float] = []
     assert geodesics.between(a, b, shares.append) == pytest.approx(true, abs=1e-12)
     assert asked[0] < 700  # most pairs did not need all of the surface
@@ -112,7 +112,7 @@ def test_many_far_pairs_are_bounded_from_few_vertices(monkeypatch: pytest.Monkey
     a, b = rng.integers(0, bent.V, (2, 3000))
     b[:300] = a[:300]
     true = geodesics.rows(a)[np.arange(3000), b]
-    monkeypatch.setattr("meshmatch.maps.geodesics._MOST_DISTANCES", 100 * bent.V)
+    monkeypatch.setattr("meshmatch.maps.geodesics._MAX_DISTANCES", 100 * bent.V)
     asked: list[int] = []
     rows = geodesics.rows
     monkeypatch.setattr(geodesics, "rows", lambda sources: asked.extend(sources) or rows(sources))

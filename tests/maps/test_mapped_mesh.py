@@ -30,7 +30,7 @@ def test_more_points_than_one_portion_are_each_answered(monkeypatch: pytest.Monk
     points = np.random.default_rng(2).normal(size=(500, 3))
     whole = MappedMesh.of(sphere).query(points)
     monkeypatch.setattr("meshmatch.maps.mapped_mesh._CHUNK", 37)
-    monkeypatch.setattr("meshmatch.maps.mapped_mesh._LEAST", 11)
+    monkeypatch.setattr("meshmatch.maps.mapped_mesh._MIN_CHUNK", 11)
     parts = MappedMesh.of(sphere).query(points)
     shared = MappedMesh.of(sphere).query(points, workers=3)
     for each in (parts, shared):

@@ -71,7 +71,7 @@ def test_the_way_back_follows_what_is_laid_flat() -> None:
     back = invert_map(found, source, target)
     images = _Images(found, source, target, 1)
     images.opposite = _Images(back, target, source, 1)
-    images.repeat(images.flattened, (1, 2))
+    images.repeat(images.flatten, (1, 2))
     followed = images.opposite.map
     assert (followed.points(source) != back.points(source)).any(axis=1).mean() < 0.1
     assert missed(images.map, followed, source, target) < 0.5 * missed(images.map, back, source, target)
@@ -90,8 +90,8 @@ def test_what_folds_the_way_back_more_is_undone(monkeypatch: pytest.MonkeyPatch)
         followed.append(len(near))
         back.ratio[near] = -1.0
 
-    monkeypatch.setattr(back, "_follow", folds)
-    images.repeat(images.flattened, (1, 2))
+    monkeypatch.setattr(back, "_update_from", folds)
+    images.repeat(images.flatten, (1, 2))
     np.testing.assert_array_equal(images.map.points(target), found.points(target))
     np.testing.assert_array_equal(back.ratio, before)
     assert followed and min(followed) > 0
@@ -201,7 +201,7 @@ def test_what_it_does_not_touch() -> None:
 def test_large_meshes_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
     source, target = ball(3), ball(3, 0.0)
     found = folded(source, target)
-    monkeypatch.setattr("meshmatch.maps.unfold._LARGEST", 500)
+    monkeypatch.setattr("meshmatch.maps.unfold._MAX_VERTICES", 500)
     assert unfolded(found, source, target) is found
 
 
@@ -219,10 +219,10 @@ def test_nothing_becomes_worse(seed: int) -> None:
 def test_what_does_not_become_better_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     source, target = ball(3), ball(3, 0.0)
     found = folded(source, target)
-    monkeypatch.setattr(_Images, "_solved", lambda images, rows, laid: np.zeros((len(rows), 3)))
+    monkeypatch.setattr(_Images, "_solve_poisson", lambda images, rows, laid: np.zeros((len(rows), 3)))
     smoothed = Folds.of(unfolded(found, source, target), source, target)
     assert smoothed == Folds(0.0, 0.0, pytest.approx(1.0, abs=0.15))  # what cannot be laid out is smoothed
-    monkeypatch.setattr("meshmatch.maps.unfold._SMOOTHED", ())
+    monkeypatch.setattr("meshmatch.maps.unfold._SMOOTHING_RINGS", ())
     flat = Folds.of(unfolded(found, source, target), source, target)
     assert flat == Folds(0.0, 0.0, pytest.approx(1.0, abs=0.15))  # or laid flat
     monkeypatch.setattr(Disk, "laid_flat", lambda *each: None)
@@ -277,7 +277,7 @@ def test_triangles_without_height_do_not_keep_folds_shut() -> None:
 
 
 def test_what_would_be_torn_from_its_surroundings_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    mesh, solved = icosphere(5), _Images._solved
+    mesh, solved = icosphere(5), _Images._solve_poisson
     disc = Shape(mesh.vertices * [1.0, 1.0, 0.1], mesh.faces)
     away = np.linalg.norm(disc.verts[:, :2] - [0.5, 0], axis=1, keepdims=True)
     inward = np.clip((away - 0.2) / 0.2, 0.2, 1.0)  # one place on both sides is crushed
@@ -285,9 +285,9 @@ def test_what_would_be_torn_from_its_surroundings_stays(monkeypatch: pytest.Monk
     places[:, 2] = disc.verts[:, 2]
     found = put(disc, disc, places)
     assert Folds.of(unfolded(found, disc, disc), disc, disc).crushed < Folds.of(found, disc, disc).crushed
-    for name in ("_SMOOTHED", "_FLAT", "_LAST"):
+    for name in ("_SMOOTHING_RINGS", "_FLATTENING_RINGS", "_FINAL_RINGS"):
         monkeypatch.setattr(f"meshmatch.maps.unfold.{name}", ())
-    monkeypatch.setattr(_Images, "_solved", lambda *each: solved(*each) - [0.4, 0, 0])  # without a fold, but far away
+    monkeypatch.setattr(_Images, "_solve_poisson", lambda *each: solved(*each) - [0.4, 0, 0])  # without a fold, but far away
     np.testing.assert_array_equal(unfolded(found, disc, disc).points(disc), found.points(disc))
 
 
@@ -310,7 +310,7 @@ def test_seams_of_the_target_are_not_in_the_way(monkeypatch: pytest.MonkeyPatch)
     cut = Shape(target.verts[target.faces].reshape(-1, 3), np.arange(3 * target.F).reshape(-1, 3))
     whole = folded(source, target)
     found = put(source, cut, whole.points(target))
-    for name in ("_RINGS", "_SMOOTHED"):
+    for name in ("_POISSON_RINGS", "_SMOOTHING_RINGS"):
         monkeypatch.setattr(f"meshmatch.maps.unfold.{name}", ())
     assert Folds.of(found, source, cut).flipped > 0.003
     assert Folds.of(unfolded(found, source, cut), source, cut).flipped == 0
