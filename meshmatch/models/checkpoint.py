@@ -1,10 +1,10 @@
-"""Weights to a compact safetensors file and back, strictly.
+"""Save and load network weights as compact safetensors files, with strict checks.
 
-Only the matrices of linear layers (``*.weight``, two or more axes) are kept compactly: they are nearly all of
-a model. As ``int8`` a matrix has one float32 scale a row beside it, ``name.scale``: q = round(w / scale),
-scale = max |w| / 127; the error is at most half a scale. As ``float16`` it is at most 2^-11 of each value.
+Only the matrices of linear layers (``*.weight``, two or more axes) are compressed: they are nearly all of
+a model. An ``int8`` matrix is stored with one float32 scale per row, ``name.scale``: q = round(w / scale),
+scale = max |w| / 127; the error is at most half a scale. With ``float16`` the error is at most 2^-11 of each value.
 Biases, norms and buffers (nodes, basis points, shape functions, running variances) stay float32: they are
-small, and their laws must hold exactly.
+small, and properties such as partition of unity must hold exactly.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ Storage = Literal["float32", "float16", "int8"]
 STORAGES: tuple[Storage, ...] = get_args(Storage)
 SCALE = ".scale"
 _KEY, _FORMAT = "meshmatch", "weights 1"
-_SHORT_ROW = 64  # of a matrix with fewer columns the scales would weigh as much as they save
+_MIN_COLUMNS = 64  # in matrices with fewer columns, scales would take as much space as they save
 
 
 def save_weights(state: Mapping[str, Any], path: str | Path, *, storage: str = "float16") -> str:
-    """Write a state dict and return the sha256 of the file (64 hex digits). Same state, same file.
+    """Write a state dict and return the sha256 of the file (64 hex digits). Equal states give equal files.
 
-    The state has arrays, or torch tensors on any device. "int8" quantises the matrices of linear layers with at least 64
-    columns; other weights become float16. `ModelError` if a tensor is not finite, `OptionError` if the storage is unknown,
-    `OutputError` if the file cannot be written.
+    Values are arrays, or torch tensors on any device. "int8" quantizes the matrices of linear layers with at least 64
+    columns, and stores other matrices as float16. `ModelError` if a tensor is not finite, `OptionError` if the storage is
+    unknown, `OutputError` if the file cannot be written.
     """
     if storage not in STORAGES:
         raise OptionError(f"unknown storage {storage!r}", f"choose one of {', '.join(STORAGES)}")
@@ -50,9 +50,9 @@ def save_weights(state: Mapping[str, Any], path: str | Path, *, storage: str = "
             raise ModelError(f"{name} is reserved for the scale of {name.removesuffix(SCALE)}")
         if storage == "float32" or not (name.endswith("weight") and floating and array.ndim > 1):
             arrays[name] = array
-        elif storage == "int8" and array.ndim == 2 and array.shape[1] >= _SHORT_ROW:
+        elif storage == "int8" and array.ndim == 2 and array.shape[1] >= _MIN_COLUMNS:
             scale = np.abs(array).max(axis=1) / np.float32(127.0)
-            scale = np.where(scale > 0, scale, np.float32(1))  # a row of zeros stays one
+            scale = np.where(scale > 0, scale, np.float32(1))  # rows of zeros
             arrays[name] = np.clip(np.round(array / scale[:, None]), -127, 127).astype(np.int8)
             arrays[name + SCALE] = scale
         else:
@@ -66,13 +66,14 @@ def save_weights(state: Mapping[str, Any], path: str | Path, *, storage: str = "
 
 
 def load_weights(path: str | Path, expected: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
-    """Read what `save_weights` wrote: float32 where it was floating. Each tensor must have the shape that is ``expected``.
+    """Read what `save_weights` wrote; floating-point tensors become float32.
 
-    `ModelError` if the file is missing or damaged, or its tensors are not those expected.
+    ``expected`` are the names and shapes of the tensors. `ModelError` if the file is missing or damaged, or its tensors are
+    not those expected.
     """
     path = Path(path)
     held = read_header(path)
-    _check(path, held, expected)
+    _check_tensors(path, held, expected)
     try:
         with safe_open(str(path), framework="numpy") as file:
             if (file.metadata() or {}).get(_KEY) != _FORMAT:
@@ -83,7 +84,7 @@ def load_weights(path: str | Path, expected: Mapping[str, tuple[int, ...]]) -> d
     found: dict[str, np.ndarray] = {}
     for name in expected:
         array = arrays[name]
-        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused below
+        with np.errstate(invalid="ignore", over="ignore"):  # values that are not finite are refused below
             if array.dtype == np.int8:
                 array = array.astype(np.float32) * arrays[name + SCALE][:, None]
             elif array.dtype.kind == "f":
@@ -94,8 +95,8 @@ def load_weights(path: str | Path, expected: Mapping[str, tuple[int, ...]]) -> d
     return found
 
 
-def _check(path: Path, held: Mapping[str, TensorInfo], expected: Mapping[str, tuple[int, ...]]) -> None:
-    """Refuse a file whose names, shapes or scales are not those of the expected tensors."""
+def _check_tensors(path: Path, held: Mapping[str, TensorInfo], expected: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise `ModelError` unless the names, shapes and scales in a file are those of the expected tensors."""
     scales = {name for name in held if name.endswith(SCALE) and name.removesuffix(SCALE) in held}
     names = held.keys() - scales
     for word, wrong in (("missing", sorted(expected.keys() - names)), ("unexpected", sorted(names - expected.keys()))):

@@ -1,9 +1,8 @@
-"""Models by name: those that ship with the package, and the user's own.
+"""The registry: models by name, those that ship with the package and the user's own.
 
-A model is a folder with ``card.json`` (written last), ``weights.safetensors`` and ``template.safetensors``, and maybe
-``pairs.safetensors`` (`meshmatch.models.pair_statistics`); an implicit model one with ``implicit.json`` (written last) and
-``weights.safetensors``.
-Listing models loads neither NumPy nor torch.
+A model is a folder with ``card.json`` (written last), ``weights.safetensors``, ``template.safetensors`` and optionally
+``pairs.safetensors`` (`meshmatch.models.pair_statistics`). An implicit model is a folder with ``implicit.json`` (written
+last) and ``weights.safetensors``. Listing models loads neither NumPy nor torch.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from meshmatch.models.card import (
     read_implicit_card,
 )
 from meshmatch.models.tensor_file import is_whole, read_header
-from meshmatch.models.unfinished import changing, copy_for, needs_settling, put, settle
+from meshmatch.models.transactions import exclusive_changes, incomplete_path, needs_recovery, put_in_place, recover
 from meshmatch.outputs import as_path, home_folder
 
 if TYPE_CHECKING:
@@ -39,33 +38,33 @@ CARD, WEIGHTS, TEMPLATE = "card.json", "weights.safetensors", "template.safetens
 PAIRS = "pairs.safetensors"
 HOME_VARIABLE = "MESHMATCH_HOME"
 AUTO = "auto"
-"""In place of a model's name: the shapes decide which of the installed models fits them."""
+"""In place of a model's name: choose the installed model that fits the shapes."""
 NO_MODEL = "none"
-"""In place of a model's name: shapes are registered without one."""
-_ELSEWHERE = f"try again, or set {HOME_VARIABLE} to a folder of yours"
+"""In place of a model's name: register shapes without a model."""
+_FOLDER_HINT = f"try again, or set {HOME_VARIABLE} to a folder of yours"
 _loading = threading.Lock()
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One model of the registry. A built-in one came with the package and cannot be removed."""
+    """One model of the registry. Built-in models are part of the package and cannot be removed."""
 
     name: str
     folder: Path
     built_in: bool
-    card: ModelCard | ImplicitCard | None  # None if it cannot be read
-    problem: str = ""  # then why
+    card: ModelCard | ImplicitCard | None  # None if the model is damaged
+    problem: str = ""  # what is wrong with a damaged model
 
 
 def built_in_folder() -> Path:
-    """Where the models of the package are."""
+    """Folder of the models that are part of the package."""
     from meshmatch.templates.location import bundled_folder
 
     return bundled_folder() / "models"
 
 
 def user_folder() -> Path:
-    """Where the user's own models are; may not exist yet. The variable MESHMATCH_HOME moves it."""
+    """Folder of the user's own models, which may not exist yet; the environment variable MESHMATCH_HOME changes it."""
     home = os.environ.get(HOME_VARIABLE)
     if home:
         return _expanded(home) / "models"
@@ -73,21 +72,21 @@ def user_folder() -> Path:
 
 
 def list_models() -> tuple[Entry, ...]:
-    """All models, built-in ones first, by name; damaged ones too, with their problem."""
-    if needs_settling(user_folder()):
-        settle(user_folder())
+    """List all models, built-in ones first, sorted by name; damaged ones are included, with their problem."""
+    if needs_recovery(user_folder()):
+        recover(user_folder())
     found: dict[str, Entry] = {}
     for parent, built_in in ((built_in_folder(), True), (user_folder(), False)):
-        for folder in sorted(parent.glob("[!.]*/")):  # a hidden folder is a copy in the making
+        for folder in sorted(parent.glob("[!.]*/")):  # hidden folders are incomplete copies
             if folder.name not in found:
                 found[folder.name] = _entry(folder, built_in)
     return tuple(found.values())
 
 
 def locate_model(name: str | Path) -> Path:
-    """The folder of a model, given by its name or by its folder; `ModelError` if it is neither.
+    """Find the folder of a model, given by name or folder; `ModelError` if there is no such model.
 
-    A name wins over a folder of the same name here; write ``./name`` for the folder.
+    A name takes precedence over a folder of that name in the working directory; write ``./name`` for the folder.
     """
     text, folder = str(name), _expanded(name)
     if isinstance(name, Path) or os.sep in text or "/" in text or text in (".", ".."):
@@ -104,13 +103,13 @@ def locate_model(name: str | Path) -> Path:
 
 
 def check_model(name: str | Path) -> None:
-    """`ModelError` if a model is neither ``auto`` or ``none`` nor the name or the folder of one."""
+    """Raise `ModelError` unless ``name`` is ``auto``, ``none``, or the name or folder of a model."""
     if name not in (AUTO, NO_MODEL):
         locate_model(name)
 
 
 def implicit_folder(name: str | Path) -> Path | None:
-    """The folder of an implicit model, given by its name or its folder; None if it is anything else."""
+    """Folder of an implicit model, given by name or folder; None for anything else."""
     try:
         folder = None if name in (AUTO, NO_MODEL) else locate_model(name)
     except ModelError:
@@ -119,14 +118,14 @@ def implicit_folder(name: str | Path) -> Path | None:
 
 
 def read_any_card(folder: Path) -> ModelCard | ImplicitCard:
-    """The card of a model of either kind; `ModelError` as `read_card` has it."""
+    """Read the card of a model, implicit or not; `ModelError` as `read_card`."""
     return read_implicit_card(folder) if is_implicit(folder) else read_card(folder / CARD)
 
 
 def find_model(name: str | Path) -> tuple[Path, ModelCard]:
-    """Folder and card of a model that is safe to load: headers are bounded, the weights have the card's hash.
+    """Find a model and check that it is safe to load: sizes are bounded, the weights have the hash on the card.
 
-    `ModelError` if there is no such model, or it is damaged.
+    Returns its folder and card. `ModelError` if there is no such model, it is implicit, or it is damaged.
     """
     folder = locate_model(name)
     if is_implicit(folder):
@@ -140,7 +139,7 @@ def find_model(name: str | Path) -> tuple[Path, ModelCard]:
 
 
 def check_weights(folder: Path, card: ModelCard | ImplicitCard) -> None:
-    """`ModelError` if a model's weights are not those of its card."""
+    """Raise `ModelError` if the hash of a model's weights is not that on its card."""
     import hashlib
 
     with (folder / WEIGHTS).open("rb") as file:
@@ -159,18 +158,18 @@ def load_model(name: str | Path = "human", encoder: type | None = None) -> Train
     name
         Registry name or folder.
     encoder
-        The class of its encoder, if the model was trained with one of somebody's own: no code is run that a file names.
+        The class of its encoder, if the model was trained with a custom one: code that a file names is never run.
 
     Returns
     -------
     TrainedModel
-        For `match`, `register`, `Matcher` and `interpolate`.
+        For use with `match`, `register`, `Matcher` and `interpolate`.
 
     Raises
     ------
     ModelError
-        Unknown name, damaged files, an unknown kernel, weights that are not those of the card's network, a template
-        that is not the one the model was trained with, or another encoder than the card's.
+        The name or the kernel is unknown, files are damaged, the weights do not match the network on the card, or the
+        template or the encoder is not the one that the model was trained with.
     TemplateError
         The template's file is damaged.
 
@@ -183,13 +182,13 @@ def load_model(name: str | Path = "human", encoder: type | None = None) -> Train
     from meshmatch.models.trained import trained_model  # torch
 
     folder, card = find_model(name)
-    known_as = folder.name if _is_registered(folder) else os.path.abspath(folder)
-    again = partial(_unpickled, known_as, card, encoder)
-    return trained_model(card, folder / TEMPLATE, folder / WEIGHTS, again, encoder, folder / PAIRS)
+    reference = folder.name if _is_registered(folder) else os.path.abspath(folder)
+    reload = partial(_unpickled, reference, card, encoder)
+    return trained_model(card, folder / TEMPLATE, folder / WEIGHTS, reload, encoder, folder / PAIRS)
 
 
 def load_once(name: str | Path, encoder: type | None = None) -> TrainedModel:
-    """As `load_model`, but once in each process, and again if the model's files have changed since."""
+    """Load a model as `load_model`, cached per process until its files change."""
     folder = locate_model(name)
     try:
         changed = max(os.stat(folder / name).st_mtime_ns for name in (WEIGHTS, CARD))
@@ -205,7 +204,7 @@ def _loaded(folder: Path, changed: int, encoder: type | None) -> TrainedModel:
 
 
 def _unpickled(name: str, card: ModelCard, encoder: type | None = None) -> TrainedModel:
-    """What a pickled model becomes: the model of this name or folder, which must be the same."""
+    """Load the model that a pickle refers to by name or folder; `ModelError` if its card is another."""
     hint = "add the same model here (`meshmatch models add`), or make the Matcher where it is used"
     try:
         model = load_once(name, encoder)
@@ -217,9 +216,9 @@ def _unpickled(name: str, card: ModelCard, encoder: type | None = None) -> Train
 
 
 def verify_model(name: str | Path) -> ModelCard | ImplicitCard:
-    """The card of a model that was loaded to be sure that it can be; `ModelError` if anything about it is wrong.
+    """Load a model to verify it, and return its card; `ModelError` if anything about it is wrong.
 
-    Of an implicit model its card and the checksum of its weights are looked at.
+    For an implicit model only the card and the hash of the weights are checked.
     """
     folder = locate_model(name)
     card: ModelCard | ImplicitCard
@@ -241,10 +240,10 @@ def verify_model(name: str | Path) -> ModelCard | ImplicitCard:
 
 
 def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
-    """Copy a model folder into the registry, under the name on its card, in place of the user's own one with ``replace``.
+    """Copy a model folder into the registry, under the name on its card; ``replace`` allows replacing the user's own models.
 
-    The copy is verified before it gets its name: what is registered is what was checked. `ModelError` if it is not a model,
-    damaged, or its name is taken; `OutputError` if the registry's folder cannot be written.
+    The copy is verified before it is registered. `ModelError` if it is not a model, is damaged, or its name is taken;
+    `OutputError` if the registry's folder cannot be written.
     """
     source = _expanded(folder)
     if not os.path.isdir(source):
@@ -252,58 +251,61 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
     card = read_any_card(source)
     if card.name in (AUTO, NO_MODEL):
         raise ModelError(f"no model can be called {card.name}", "change the name on its card")
-    large: tuple[str, ...] = (WEIGHTS,) if isinstance(card, ImplicitCard) else (TEMPLATE, WEIGHTS)
+    files: tuple[str, ...] = (WEIGHTS,) if isinstance(card, ImplicitCard) else (TEMPLATE, WEIGHTS)
     last = IMPLICIT if isinstance(card, ImplicitCard) else CARD
     if last == CARD and (source / PAIRS).is_file():
-        large = (*large, PAIRS)
-    for file in large:
-        read_header(source / file)  # before a huge file is copied
+        files = (*files, PAIRS)
+    for file in files:
+        read_header(source / file)  # check sizes before copying
     if (built_in_folder() / card.name).exists():
         raise ModelError(f"an included model is called {card.name}", "change the name on its card")
-    target, temporary = user_folder() / card.name, copy_for(user_folder(), card.name)
-    with changing(user_folder(), _ELSEWHERE):
+    target, temporary = user_folder() / card.name, incomplete_path(user_folder(), card.name)
+    with exclusive_changes(user_folder(), _FOLDER_HINT):
         if target.exists() and not replace:
             hint = f"`meshmatch models remove {card.name}`, or --replace"
             raise ModelError(f"there is a model called {card.name} already", hint)
         try:
             temporary.mkdir()
-            for file in (*large, last):
+            for file in (*files, last):
                 shutil.copyfile(source / file, temporary / file)
             if verify_model(temporary) != card:
                 raise ModelError(f"{source} changed while it was copied", "try again")
-            put(temporary, target)
-        except ModelError as error:  # of the copy, which is gone when it is read
+            put_in_place(temporary, target)
+        except ModelError as error:  # the message names the copy, which is about to be deleted
             message = error.message.replace(str(temporary), str(source)).replace(temporary.name, card.name)
             raise ModelError(message, error.hint) from error
         except OSError as error:
-            raise OutputError(f"cannot write {user_folder()}: {error.strerror}", _ELSEWHERE) from error
+            raise OutputError(f"cannot write {user_folder()}: {error.strerror}", _FOLDER_HINT) from error
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
     return _entry(target, False)
 
 
 def remove_model(name: str) -> None:
-    """Remove one of the user's own models: `ModelError` if there is no such model, `OutputError` if it cannot be done."""
+    """Remove one of the user's own models.
+
+    `ModelError` if there is no such model or it is built in, `OutputError` if it cannot be removed.
+    """
     folder = _registered(name)
     if folder.parent == built_in_folder():
         raise ModelError(f"{name} is an included model and cannot be removed", "only models that you added can be")
-    with changing(user_folder(), _ELSEWHERE):
+    with exclusive_changes(user_folder(), _FOLDER_HINT):
         try:
             if folder.is_symlink():
                 folder.unlink()
                 return
-            grave = copy_for(user_folder(), name)
-            os.rename(folder, grave)  # it loses its name at once, so that a half-removed model is never found
-            shutil.rmtree(grave)
+            trash = incomplete_path(user_folder(), name)
+            os.rename(folder, trash)  # atomic, so that a half-removed model is never found
+            shutil.rmtree(trash)
         except OSError as error:
             raise OutputError(f"cannot remove {folder}: {error.strerror}") from error
 
 
 def _registered(name: str) -> Path:
-    """The folder of a registered model; `ModelError` if there is none."""
-    for again in (False, True):
-        if again:
-            settle(user_folder())
+    """Find the folder of a registered model; `ModelError` if there is none."""
+    for after_recovery in (False, True):
+        if after_recovery:
+            recover(user_folder())
         for parent in (built_in_folder(), user_folder()):
             if is_name(name) and (parent / name).is_dir():
                 return parent / name

@@ -1,4 +1,4 @@
-"""What a safetensors file holds, told by its header; safetensors itself checks that header and file belong together."""
+"""Inspect safetensors files by their headers; safetensors itself checks that the header matches the file."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from typing import NamedTuple
 from meshmatch.errors import ModelError
 
 MAX_BYTES = 500_000_000
-"""A larger file is refused."""
+"""Larger files are refused."""
 _MAX_HEADER = 1_000_000  # bytes
 
 
 class TensorInfo(NamedTuple):
-    """Of one tensor in a file."""
+    """Type and shape of one tensor in a file."""
 
     dtype: str
     shape: tuple[int, ...]
 
 
 def read_header(path: str | Path) -> dict[str, TensorInfo]:
-    """The tensors of a safetensors file; nothing else of it is read.
+    """Read the header of a safetensors file: types and shapes of its tensors by name.
 
-    `ModelError` if it is missing, not a regular file, larger than `MAX_BYTES`, or its header and its bytes do not match.
+    `ModelError` if it is missing, not a regular file, larger than `MAX_BYTES`, or the header does not match the contents.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -41,7 +41,7 @@ def read_header(path: str | Path) -> dict[str, TensorInfo]:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a safetensors file is there, and as long as its header says; quickly, and without NumPy."""
+    """Whether a safetensors file exists with the length that its header requires; a quick check without NumPy."""
     try:
         if not path.is_file():
             return False
@@ -50,8 +50,8 @@ def is_whole(path: Path) -> bool:
             length = int.from_bytes(file.read(8), "little")
             if not 0 < length <= min(size - 8, _MAX_HEADER):
                 return False
-            words = json.loads(file.read(length))
-        ends = [tensor["data_offsets"][1] for name, tensor in words.items() if name != "__metadata__"]
+            header = json.loads(file.read(length))
+        ends = [tensor["data_offsets"][1] for name, tensor in header.items() if name != "__metadata__"]
         return bool(size == 8 + length + max(ends, default=0))
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return False

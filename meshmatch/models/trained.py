@@ -27,22 +27,22 @@ if TYPE_CHECKING:
 class TrainedModel:
     """A model, as `load_model` returns it.
 
-    A model can be pickled, for processes of Python. One that `load_model` returned travels as its name or folder and its
-    card: whoever unpickles it loads it there, once in each process (`ModelError` if it is missing there, or has other
-    weights). Of any other model the arrays travel. What was derived stays behind.
+    Models can be pickled, to be sent to other processes. The pickle of a model that `load_model` returned contains only
+    its name or folder and its card; unpickling loads the model, once in each process (`ModelError` if it is missing there,
+    or is another). The pickle of any other model contains its arrays. Cached values are not pickled.
 
     Attributes
     ----------
     card
-        What it is, what it was trained on and how.
+        Metadata: what the model is and how it was trained.
     template
         The mesh that is deformed, its control nodes, labels and core.
     inference
-        The network as fits ask it, in arrays; `network` is the same in torch.
+        The network as fits use it, with arrays; `network` is the same in torch.
     pairs
-        How fits of two shapes differ, if that is known of its kind: see `meshmatch.models.pair_statistics`.
+        Statistics of the differences between fits, if the category has them: see `meshmatch.models.pair_statistics`.
     load_again
-        What a pickle of it calls; None for a model that was not loaded.
+        Called to unpickle the model; None for a model that was not loaded.
 
     Examples
     --------
@@ -60,16 +60,16 @@ class TrainedModel:
 
     @classmethod
     def of(cls, card: ModelCard, template: Template, network: Deformer) -> TrainedModel:
-        """A model of a network at hand.
+        """Make a model from a network in memory.
 
         Parameters
         ----------
         card
-            Its card.
+            The model's card.
         template
-            Whose nodes it moves.
+            The template whose nodes the network moves.
         network
-            In evaluation mode.
+            The network, in evaluation mode.
 
         Returns
         -------
@@ -115,7 +115,7 @@ class TrainedModel:
         Returns
         -------
         ShapeFunctions or PointwiseField
-            Says where node vectors (K, 3), such as ``Fit.vectors``, move the points, and the deformation gradient there.
+            Computes where node vectors (K, 3), such as ``Fit.vectors``, move the points, and the deformation gradients.
 
         Raises
         ------
@@ -133,17 +133,17 @@ class TrainedModel:
         return torch_network(self)
 
     def on(self, device: str) -> Network:
-        """The network for fits: in arrays on "cpu", in torch on another device.
+        """Return the network for fits on a device: with arrays on "cpu", in torch on others.
 
         Parameters
         ----------
         device
-            Such as "cpu" or "cuda".
+            "cpu", or a device of torch such as "cuda".
 
         Returns
         -------
         Network
-            What a fit asks.
+            The network that fits use.
 
         Raises
         ------
@@ -154,13 +154,13 @@ class TrainedModel:
 
     @property
     def has_nodes(self) -> bool:
-        """Whether its fits are node vectors, which can be solved for; a pointwise model has codes alone."""
+        """Whether fits are node vectors, which can be solved for; those of a pointwise model are codes only."""
         return has_nodes(self.inference.config.field)
 
 
 @derived
 def torch_network(model: TrainedModel, device: str = "cpu") -> Deformer:
-    """The network of a model as torch has it, see `meshmatch.models.inference.in_torch`."""
+    """The network of a model in torch, see `meshmatch.models.inference.in_torch`."""
     return in_torch(model.inference, model.template.K, device)
 
 
@@ -172,13 +172,13 @@ def trained_model(
     encoder: type | None = None,
     pairs_file: Path | None = None,
 ) -> TrainedModel:
-    """The model of a card, from files that are safe to read; `meshmatch.models.registry.load_model` finds them.
+    """Build a model from its card and files, which must be safe to read; `meshmatch.models.registry.load_model` finds them.
 
-    ``pairs_file`` need not be there. ``load_again`` is what a pickle of the model holds, a function that survives it;
-    ``encoder`` is the class that the card names, if it has one of its author's own.
+    ``pairs_file`` need not exist. ``load_again`` unpickles the model, and must be picklable itself; ``encoder`` is the class
+    that the card names, if the model has a custom one.
 
-    `ModelError` for a kernel that is not known here, weights that are not those of the card's network, or a template that
-    is not the one the model was trained with; `TemplateError` if its file is damaged.
+    `ModelError` if the kernel is unknown, the weights do not match the network on the card, or the template is not the one
+    that the model was trained with; `TemplateError` if the template's file is damaged.
     """
     template = load_template(template_file)
     if template.hash != card.template_hash or template.K != card.field["nodes"]:

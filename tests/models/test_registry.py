@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from meshmatch.errors import ModelError, OutputError
-from meshmatch.models import registry, unfinished
+from meshmatch.models import registry, transactions
 from meshmatch.models.card import card_to_json, write_card
 from meshmatch.models.registry import (
     add_model,
@@ -303,11 +303,11 @@ def test_a_killed_replacement_gives_the_old_model_back(blob: Path, monkeypatch: 
     def killed(source: Path, target: Path) -> None:
         rename(source, target)
         if str(target).endswith(".replaced"):
-            monkeypatch.setattr(unfinished, "_give_back", lambda folder: None)  # no time left
+            monkeypatch.setattr(transactions, "_restore", lambda folder: None)  # no time left
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(unfinished.os, "rename", killed)
+        patch.setattr(transactions.os, "rename", killed)
         with pytest.raises(KeyboardInterrupt):
             add_model(blob, replace=True)
     assert names() == ["human"]
