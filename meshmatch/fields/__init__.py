@@ -1,7 +1,7 @@
-"""Deformation fields: what moves points by the vectors of a few nodes, and what such a motion costs.
+"""Deformation fields, which move points by the vectors of a few nodes, and energies of such deformations.
 
-`node_field` is for nodes and points of one's own, in NumPy or torch (docs/fields.md). The names below are loaded when they
-are first used; the two energies need torch.
+`node_field` is for arbitrary nodes and points, in NumPy or torch (docs/fields.md). The public names are imported on first
+use; the two energies need torch.
 """
 
 from __future__ import annotations

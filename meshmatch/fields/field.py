@@ -1,17 +1,16 @@
-"""What every representation of a deformation does on fixed points, in torch: for training, and for searches by gradient.
+"""Deformation fields on fixed points in torch, with a common interface: for training and for gradient descent.
 
-A decoder answers a code with *rows* (R, 3). For the linear representations (moving least squares, radial basis
-functions) these are the vectors of the nodes; for the pointwise one they are the code itself. Who
-moves points needs to know neither: a field says where its points go and what the deformation gradient is there.
+A decoder maps a code to *rows* (R, 3), which parameterize a deformation. For the linear representations (moving least
+squares, radial basis functions) rows are the vectors of the nodes; for the pointwise one they contain the code. Callers need
+not know which: a field computes the displacements of its points and the deformation gradients there from rows.
 
-The pointwise representation is a network that says for each point and code where the point goes. There are no node
-vectors. The rows that stand for a deformation are the code, three numbers a row, and last three rows T of a turn that
-comes after the network:
+The pointwise representation is a network that displaces each point, given a code; there are no node vectors. Its rows are
+the code, three numbers per row, followed by three rows T of a linear map that is applied after the network:
 
     x' = y + T^T y,   y = x + u(x, code)
 
-T is 0 for what a decoder answers; it is there so that a deformation read in a turned frame can be turned back. The
-deformation gradient comes from automatic differentiation.
+Decoders return T = 0; T expresses a rotation of the result, so that a deformation found in a rotated frame can be converted
+back. Deformation gradients are computed by automatic differentiation.
 """
 
 from __future__ import annotations
@@ -29,23 +28,23 @@ from meshmatch.errors import InputError
 from meshmatch.fields.local_fits import namespace
 from meshmatch.fields.shape_functions import ShapeFunctions
 
-# (points (B, P, 3), code (B, D)) -> displacements (B, P, 3); what happens to a point depends on no other point.
+# (points (B, P, 3), code (B, D)) -> displacements (B, P, 3); the displacement of a point does not depend on other points.
 Motion = Callable[[Float[torch.Tensor, "B P 3"], Float[torch.Tensor, "B D"]], Float[torch.Tensor, "B P 3"]]
 TURN_ROWS = 3
-# So many codes at a time: what a network makes of more points does not stay in the processor's cache.
-CODES = 8
+# Codes per batch: with more, the network's activations do not stay in the processor's cache.
+CODE_BATCH = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """`ShapeFunctions` of K nodes on P fixed points as tensors, sparse (CSR) or dense."""
+    """`ShapeFunctions` of K nodes on P fixed points, as tensors, sparse (CSR) or dense."""
 
     phi: Float[torch.Tensor, "P K"]
     gradient: Float[torch.Tensor, "P3 K"]
 
     @classmethod
     def of(cls, functions: ShapeFunctions) -> Field:
-        """The same shape functions as tensors."""
+        """Convert shape functions to tensors."""
         return cls(_tensor(functions.phi), _tensor(functions.gradient))
 
     @property
@@ -53,11 +52,11 @@ class Field:
         return int(self.phi.shape[1])
 
     def displacement(self, rows: Float[torch.Tensor, "B K 3"]) -> Float[torch.Tensor, "B P 3"]:
-        """Where the points go, relative to where they are."""
+        """Displacements of the points."""
         return self._apply(self.phi, rows)
 
     def deformation_gradient(self, rows: Float[torch.Tensor, "B K 3"]) -> Float[torch.Tensor, "B P 3 3"]:
-        """F = I + sum_i u_i (grad Phi_i)^T, F[..., a, k] = dx'_a / dx_k: on all points, except after `for_training`."""
+        """F = I + sum_i u_i (grad Phi_i)^T, F[..., a, k] = dx'_a / dx_k; at all points, unless limited by `for_training`."""
         columns = self._apply(self.gradient, rows).unflatten(1, (-1, 3))  # B P k a
         # At least float32: in bfloat16 the small difference from the identity would be lost.
         kind = torch.promote_types(rows.dtype, torch.float32)
@@ -65,20 +64,20 @@ class Field:
         return result
 
     def for_training(self, gradients: int | None = None) -> Field:
-        """The same arranged for large batches; the gradient at the first ``gradients`` points alone."""
-        # Dense, for a large batch is one product: a sparse one would be slower.
+        """Convert to dense matrices for large batches; gradients are kept at the first ``gradients`` points only."""
+        # A large batch is one product, which would be slower with sparse matrices.
         rows = None if gradients is None else 3 * gradients
         return Field(self.phi.to_dense(), self.gradient.to_dense()[:rows])
 
     def for_descent(self) -> Field:
-        """The same arranged for many steps with gradients of a single answer."""
+        """Precompute transposes for many gradient steps on a single deformation (B = 1)."""
         if self.phi.layout == torch.strided:
             return self
         transposes = (self.phi.t().to_sparse_csr(), self.gradient.t().to_sparse_csr())
         return _DescentField(self.phi, self.gradient, *transposes)
 
     def part(self, start: int, stop: int) -> Field:
-        """The same on the points from ``start`` to ``stop``; after `for_training`."""
+        """The field on the points from ``start`` to ``stop``; call `for_training` before."""
         return Field(self.phi[start:stop], self.gradient[3 * start : 3 * stop])
 
     def to(self, device: str | torch.device) -> Field:
@@ -90,7 +89,7 @@ class Field:
 
 @dataclass(frozen=True, eq=False)
 class _DescentField(Field):
-    """A sparse field that keeps its transposes: torch would sort new ones for each gradient. One answer at a time."""
+    """A sparse field for a single deformation that stores transposes, which torch would compute for each gradient."""
 
     phi_transpose: torch.Tensor
     gradient_transpose: torch.Tensor
@@ -102,7 +101,7 @@ class _DescentField(Field):
 
 
 class _Product(torch.autograd.Function):
-    """A sparse matrix times a dense one, whose gradient uses a kept transpose."""
+    """Sparse-dense matrix product whose backward pass uses a stored transpose."""
 
     @staticmethod
     def forward(ctx: Any, dense: torch.Tensor, matrix: torch.Tensor, transpose: torch.Tensor) -> torch.Tensor:
@@ -117,9 +116,9 @@ class _Product(torch.autograd.Function):
 def apply_shape_functions(
     matrix: Float[torch.Tensor, "R K"], vectors: Float[torch.Tensor, "B K 3"]
 ) -> Float[torch.Tensor, "B R 3"]:
-    """One matrix, sparse or dense, on a batch of node vectors.
+    """Multiply one matrix, sparse or dense, by a batch of node vectors.
 
-    As a single product: a batched one with three columns is twenty times slower on a CPU.
+    Done as a single product: a batched one with three columns is twenty times slower on a CPU.
     """
     B, K, _ = vectors.shape
     flat = vectors.transpose(0, 1).reshape(K, B * 3)
@@ -128,19 +127,19 @@ def apply_shape_functions(
 
 
 def _tensor(matrix: Any) -> torch.Tensor:
-    """A float32 tensor, sparse CSR or dense as the matrix is."""
+    """Convert to a float32 tensor, sparse CSR or dense like the matrix."""
     if isinstance(matrix, np.ndarray):
         return torch.from_numpy(matrix)
     start, column = (torch.from_numpy(part.astype(np.int64)) for part in (matrix.indptr, matrix.indices))
     values = torch.from_numpy(matrix.data)
     with warnings.catch_warnings():
-        # Torch announces its CSR layout as beta at the first use: nothing a user could act on.
+        # At first use torch warns that its CSR layout is in beta, which is of no use to users.
         warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
         return torch.sparse_csr_tensor(start, column, values, matrix.shape, check_invariants=True)
 
 
 def volume_energy(F: Any) -> Any:
-    """How far a deformation is from keeping volumes, at each point: (det F - 1)^2.
+    """Deviation from volume preservation at each point: (det F - 1)^2.
 
     Parameters
     ----------
@@ -150,20 +149,20 @@ def volume_energy(F: Any) -> Any:
     Returns
     -------
     (...)
-        As F is; a tensor keeps its gradient.
+        An array or a tensor like F; a tensor keeps its gradient.
 
     Raises
     ------
     InputError
-        F are not 3 x 3 numbers.
+        F are not 3 x 3 matrices of numbers.
     """
     a, b, c = _columns(F)
-    # written out: several times faster than a batched LU
+    # triple product: several times faster than a batched LU
     return ((namespace(a).linalg.cross(a, b) * c).sum(-1) - 1) ** 2
 
 
 def arap_energy(F: Any) -> Any:
-    """How far a deformation is from a rigid one, at each point: the Frobenius norm of F^T F - I.
+    """Deviation from rigidity at each point: the Frobenius norm of F^T F - I.
 
     Parameters
     ----------
@@ -173,12 +172,12 @@ def arap_energy(F: Any) -> Any:
     Returns
     -------
     (...)
-        As F is; a tensor keeps its gradient.
+        An array or a tensor like F; a tensor keeps its gradient.
 
     Raises
     ------
     InputError
-        F are not 3 x 3 numbers.
+        F are not 3 x 3 matrices of numbers.
     """
     # Six dot products of columns: a batched 3 x 3 matmul is several times slower on a CPU.
     a, b, c = _columns(F)
@@ -198,12 +197,12 @@ def _columns(F: Any) -> tuple[Any, Any, Any]:
 
 
 def code_rows(D: int) -> int:
-    """How many rows of three numbers hold a code of D."""
+    """Number of rows of three numbers that a code of length D takes."""
     return -(-D // 3)
 
 
 def pack(code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B R 3"]:
-    """Rows of codes, without a turn."""
+    """Pack codes into rows, with T = 0."""
     D = code.shape[1]
     fill = 3 * (code_rows(D) + TURN_ROWS) - D
     result: torch.Tensor = torch.nn.functional.pad(code, (0, fill)).unflatten(1, (-1, 3))
@@ -213,12 +212,12 @@ def pack(code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B R 3"]:
 def unpack(
     rows: Float[torch.Tensor, "B R 3"], D: int
 ) -> tuple[Float[torch.Tensor, "B D"], Float[torch.Tensor, "B 3 3"]]:
-    """Codes and turns T of rows."""
+    """Split rows into codes and T."""
     return rows[:, :-TURN_ROWS].flatten(1)[:, :D], rows[:, -TURN_ROWS:]
 
 
-def turned_rows(rows: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "R 3"]:
-    """Rows of the deformation whose moved points are those of ``rows`` times ``turn`` (points are rows)."""
+def rotated_rows(rows: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "R 3"]:
+    """Rows of the deformation followed by a rotation: its moved points (row vectors) are those of ``rows`` @ turn."""
     turned = rows.copy()
     turned[-TURN_ROWS:] = (np.eye(3) + rows[-TURN_ROWS:]) @ turn - np.eye(3)
     return turned
@@ -226,7 +225,7 @@ def turned_rows(rows: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointwiseField(Brief):
-    """A network's motion on fixed points, with gradients at ``gradient_points``; codes have D numbers."""
+    """A network's motion on fixed points, with deformation gradients at ``gradient_points``; codes have length D."""
 
     points: Float[torch.Tensor, "P 3"]
     gradient_points: Float[torch.Tensor, "G 3"]
@@ -235,13 +234,15 @@ class PointwiseField(Brief):
 
     def displacement(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B P 3"]:
         code, turn = unpack(rows, self.D)
-        u = torch.cat([self.motion(self.points.expand(len(part), -1, -1), part) for part in code.split(CODES)])
+        u = torch.cat([self.motion(self.points.expand(len(part), -1, -1), part) for part in code.split(CODE_BATCH)])
         return u + (self.points + u) @ turn
 
     def deformation_gradient(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B G 3 3"]:
         code, turn = unpack(rows, self.D)
         at = self.gradient_points
-        parts = (value_and_jacobian(self.motion, at.expand(len(part), -1, -1), part)[1] for part in code.split(CODES))
+        parts = (
+            value_and_jacobian(self.motion, at.expand(len(part), -1, -1), part)[1] for part in code.split(CODE_BATCH)
+        )
         F = torch.cat(list(parts))
         F = F + torch.eye(3, dtype=F.dtype, device=F.device)
         return F + turn.transpose(1, 2)[:, None] @ F
@@ -253,7 +254,7 @@ class PointwiseField(Brief):
     def deformation_gradient_at(
         self, rows: Float[Floats, "R 3"], at: Int[Ints, " N"] | slice = slice(None)
     ) -> Float[Floats, "N 3 3"]:
-        """F of one answer at some of the points, in float64."""
+        """F of one deformation at some of the points, in float64."""
         index = at if isinstance(at, slice) else torch.from_numpy(at)
         part = PointwiseField(self.points, self.points[index], self.motion, self.D)
         with torch.no_grad():
@@ -271,7 +272,7 @@ class PointwiseField(Brief):
         return PointwiseField(points, points, self.motion, self.D)
 
     def to(self, device: str | torch.device) -> PointwiseField:
-        """Where the points are; the network is moved by whoever owns it."""
+        """Move the points to a device; the caller moves the network."""
         points, gradient_points = (each.to(device) for each in (self.points, self.gradient_points))
         return PointwiseField(points, gradient_points, self.motion, self.D)
 
@@ -279,10 +280,10 @@ class PointwiseField(Brief):
 def value_and_jacobian(
     motion: Motion, points: Float[torch.Tensor, "B P 3"], code: Float[torch.Tensor, "B D"]
 ) -> tuple[Float[torch.Tensor, "B P O"], Float[torch.Tensor, "B P O 3"]]:
-    """What a network answers at points (of a motion u), and du_a / dx_k; differentiable where gradients are.
+    """Outputs u_a of a network at points, and du_a / dx_k; differentiable if gradients are enabled.
 
-    Points do not act on one another, so the gradient of a sum over points holds each point's own. Backwards through the
-    network once for each output: forward mode costs the same here and more memory for its tangents.
+    Points are independent, so the gradient of a sum over points consists of the gradients at each point. One backward pass
+    for each output; forward mode takes the same time and more memory.
     """
     wanted = torch.is_grad_enabled() and not torch.is_inference_mode_enabled()
     with torch.inference_mode(False), torch.enable_grad():
@@ -296,5 +297,5 @@ def value_and_jacobian(
     return moved if wanted else moved.detach(), torch.stack(rows, -2)
 
 
-# A representation on P fixed points; both answer the same questions, and take rows (B, R, 3).
+# A representation on P fixed points; both have the same interface, with rows (B, R, 3).
 PointField = Field | PointwiseField

@@ -1,6 +1,6 @@
-"""The formula of moving least squares (see `shape_functions`), for arrays of NumPy and tensors of torch alike.
+"""Moving least squares (see `shape_functions`), for NumPy arrays and torch tensors.
 
-Of tensors everything is differentiable: with respect to points, nodes and radii.
+With tensors, results are differentiable with respect to points, nodes and radii.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ from meshmatch.errors import TemplateError
 from meshmatch.geometry.kernels import CURVATURES, KERNELS, MINIMUM_EIGENVALUE, Kernel, support_pairs, support_scale
 
 Pairs = tuple[Int[Ints, " N"], Int[Ints, " N"]]
-_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_AXIS_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 @dataclass(frozen=True, eq=False)
 class LocalFits:
-    """The least squares of P points: N pairs of a point (``at``) and a node that reaches it, sorted by point."""
+    """Local least squares fits at P points, as N pairs of a point and a node that reaches it, sorted by point."""
 
-    at: Any
-    of_node: Any
-    offset: Any  # (N, 3) of the point from the node
+    at: Any  # (N,) index of the point
+    of_node: Any  # (N,) index of the node
+    offset: Any  # (N, 3) from the node to the point
     radius: Any  # (N,) of the node
     kernel: Kernel
-    weight: Any  # (N,)
+    weight: Any  # (N,) w(d)
     slope: Any  # (N,) (dw/dd) / d
-    scale: Any  # (N,)
-    basis: Any  # (N, 4) p(q_i) seen from x
-    inverse: Any  # (P, 4, 4) of the moment matrices
+    scale: Any  # (N,) unit of length of the basis at the point
+    basis: Any  # (N, 4) p(q_i), centered on x
+    inverse: Any  # (P, 4, 4) inverse moment matrices
 
     @classmethod
     def of(
         cls, points: Any, nodes: Any, radii: Any, kernel: Kernel, pairs: Pairs | None = None, flat: float = 0.0
     ) -> LocalFits:
-        """Those of points (P, 3), nodes (K, 3) and radii (K,), all arrays or all tensors, in float64 or float32.
+        """Fit at points (P, 3) with nodes (K, 3) and radii (K,), all arrays or all tensors, in float64 or float32.
 
-        ``pairs`` are of a point and a node that moves it; by default those in reach. ``flat`` regularises moment matrices
-        by so much of their weight; without it `TemplateError` names points that lack nodes.
+        ``pairs`` are indices of points and of nodes that move them, by default those in reach. ``flat`` regularizes moment
+        matrices by this share of their weight; without it `TemplateError` names points that lack nodes.
         """
         xp = namespace(points)
         at, of_node = support_pairs(plain(points), plain(nodes), plain(radii)) if pairs is None else pairs
@@ -93,7 +93,7 @@ class LocalFits:
     def second(self) -> Any:
         """(N, 3, 3) d2Phi_i / dx_k dx_l at the points.
 
-        With M a = p(x) and Phi_i = w_i p(q_i)^T a, in a basis that is centred on the point and stays there.
+        With M a = p(x) and Phi_i = w_i p(q_i)^T a, in a basis that is centered on the point and fixed.
         """
         at, basis, inverse, P = self.at, self.basis, self.inverse, len(self.inverse)
         xp, full, a = namespace(basis), outer(basis), inverse[:, :, 0]
@@ -108,7 +108,7 @@ class LocalFits:
             right[:, k + 1] += 1 / scale
             change.append((inverse @ right[..., None])[..., 0])
         rows: dict[tuple[int, int], Any] = {}
-        for k, m in _PAIRS:
+        for k, m in _AXIS_PAIRS:
             weight = curvature * self.offset[:, k] * self.offset[:, m] + (self.slope if k == m else 0.0)
             both = sums(weight[:, None] * full, at, P).reshape(P, 4, 4)
             right = moment[k] @ change[m][..., None] + moment[m] @ change[k][..., None] + both @ a[..., None]
@@ -119,7 +119,7 @@ class LocalFits:
 
 
 def namespace(array: Any) -> Any:
-    """The library that has the functions for an array."""
+    """The module with the functions for an array: `numpy` or `torch`."""
     if isinstance(array, np.ndarray):
         return np
     import torch
@@ -128,12 +128,12 @@ def namespace(array: Any) -> Any:
 
 
 def plain(array: Any) -> Any:
-    """An array of NumPy, without its gradient."""
+    """Convert to a NumPy array, without gradients."""
     return array if isinstance(array, np.ndarray) else array.numpy(force=True)
 
 
 def alike(array: Any, like: Any) -> Any:
-    """An array of NumPy as the other is: on its device, numbers with a fraction in its precision."""
+    """Convert a NumPy array to the type and device of ``like``, floating-point numbers to its precision."""
     if isinstance(like, np.ndarray):
         return array
     import torch
@@ -143,26 +143,26 @@ def alike(array: Any, like: Any) -> Any:
 
 
 def length(offset: Any) -> Any:
-    """(N,) of vectors; differentiable at 0."""
+    """(N,) lengths of vectors; differentiable at 0."""
     if isinstance(offset, np.ndarray):
         return np.linalg.norm(offset, axis=1)
     return offset.square().sum(1).clip(min=1e-36).sqrt()
 
 
 def outer(basis: Any) -> Any:
-    """(N, 16) products of four numbers."""
+    """(N, 16) flattened outer products of vectors (N, 4) with themselves."""
     return (basis[:, :, None] * basis[:, None, :]).reshape(-1, 16)
 
 
 def sums(values: Any, at: Any, P: int) -> Any:
-    """(P, C) sums of the values (N, C) of each point."""
+    """(P, C) sums of values (N, C) by point."""
     if isinstance(values, np.ndarray):
         return csr_matrix((np.ones(len(at)), (at, np.arange(len(at)))), (P, len(at))) @ values
     return values.new_zeros(P, values.shape[1]).index_add(0, at, values)
 
 
 def product(matrix: csr_array, values: Any) -> Any:
-    """A sparse matrix of SciPy times numbers (K,) or (K, C); of a tensor in its precision, and with its gradient."""
+    """Multiply a SciPy sparse matrix by values (K,) or (K, C); a tensor keeps its precision and gradients."""
     if not is_tensor(values):
         return np.asarray(matrix @ as_numbers(values, "values"))
     values = values if values.is_floating_point() else values.double()
@@ -172,15 +172,15 @@ def product(matrix: csr_array, values: Any) -> Any:
     return found.reshape(-1, *values.shape[1:])
 
 
-def weak(moment: Float[Floats, "P 4 4"]) -> Int[Ints, " N"]:
-    """Points without four non-coplanar nodes in reach, by their moment matrices."""
+def unsupported(moment: Float[Floats, "P 4 4"]) -> Int[Ints, " N"]:
+    """Indices of points without four non-coplanar nodes in reach, according to their moment matrices."""
     trace = np.maximum(np.trace(moment, axis1=1, axis2=2), 1e-30)
     return np.flatnonzero(np.linalg.eigvalsh(moment)[:, 0] / trace < MINIMUM_EIGENVALUE)
 
 
 def check_support(moment: Float[Floats, "P 4 4"]) -> None:
-    """`TemplateError` naming the `weak` points."""
-    bad = weak(moment)
+    """Raise `TemplateError` if there are points without enough nodes."""
+    bad = unsupported(moment)
     if len(bad):
         some = ", ".join([*map(str, bad[:5]), *(["..."] if len(bad) > 5 else [])])
         problem = f"{len(bad)} points have fewer than four non-coplanar nodes in reach (points {some})"

@@ -1,4 +1,4 @@
-"""Moving least squares on nodes and points of one's own: in NumPy or torch, batched, with derivatives."""
+"""Moving least squares for arbitrary nodes and points: in NumPy or torch, batched, with derivatives."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from scipy.sparse import csr_matrix
 from meshmatch.arrays import Floats, Ints, as_numbers, is_tensor
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fields.local_fits import LocalFits, alike, namespace, plain, sums
-from meshmatch.fields.shape_functions import check_kernel, checked_radii, tell_amplification
+from meshmatch.fields.shape_functions import check_kernel, checked_radii, warn_amplification
 from meshmatch.geometry.kernels import Kernel, poorly_supported, support_pairs
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.shapes.shape import LARGEST
 
 Outside = Literal["error", "mask", "nearest"]
-_NEAREST = 4  # nodes that carry a point out of reach
-_SOFT = 1e-3  # units of a node's radius: nearer than that it weighs no more
-_MARGIN = 2.0  # of what points need, so that rounding refuses none that is not masked
+_N_NEAREST = 4  # nodes that move a point out of reach
+_SOFTENING = 1e-3  # units of a node's radius: the weight grows no further at smaller distances
+_SUPPORT_MARGIN = 2.0  # factor on the required support, so that no point that is not masked fails because of rounding
 
 
 @dataclass(frozen=True, eq=False)
 class NodeField:
-    """A deformation field on P points: where vectors of K nodes move them, and how that changes from place to place.
+    """A deformation field of K nodes on P points, with its spatial derivatives. Made by `node_field`.
 
-    Made by `node_field`. Vectors are (K, C), or (B, K, C) for a batch, of any number C of values. Results are tensors where
-    points or vectors are, in the precision of both, and batched where one of them is. Tensors keep their gradients: with
-    respect to the vectors, and to the points, nodes and radii that the field was made of.
+    Vectors are (K, C), or (B, K, C) for a batch, with any number C of components. Results are tensors if points or vectors
+    are, in the precision of both, and batched if either is. Tensors keep their gradients with respect to the vectors, and
+    to the points, nodes and radii that the field was made from.
 
     Attributes
     ----------
@@ -39,9 +39,9 @@ class NodeField:
     K
         Number of nodes.
     reached
-        (P,) or (B, P) bool, an array: whether the nodes carry a point, or it is out of their reach.
+        (P,) or (B, P) bool array: False for points out of reach of the nodes.
     pieces
-        Which points each part of the calculation is about, and the calculation.
+        Parts of the calculation: indices of points, and the shape functions there.
     """
 
     points: Any
@@ -57,9 +57,9 @@ class NodeField:
 
     @property
     def lebesgue(self) -> Floats:
-        """(P,) or (B, P): by how much errors of the vectors can grow at a point, the sum of the absolute shape functions.
+        """(P,) or (B, P) sums of the absolute shape functions: the factor by which errors of the vectors can grow.
 
-        Its maximum is the Lebesgue constant; 1 is best.
+        The maximum is the Lebesgue constant; 1 is best.
         """
         at, _ = self._pairs
         return (
@@ -67,7 +67,7 @@ class NodeField:
         )
 
     def displacement(self, vectors: Any) -> Any:
-        """How far vectors of the nodes move the points.
+        """Displacement of the points by vectors of the nodes.
 
         Parameters
         ----------
@@ -82,12 +82,12 @@ class NodeField:
         Raises
         ------
         InputError
-            There is not one vector for each node, or their batch is another.
+            There is not one vector for each node, or the batch sizes differ.
         """
         return self._applied(self._values, vectors)[..., 0]
 
     def moved(self, vectors: Any) -> Any:
-        """Where vectors of the nodes move the points.
+        """Positions of the points after they are moved by vectors of the nodes.
 
         Parameters
         ----------
@@ -97,19 +97,19 @@ class NodeField:
         Returns
         -------
         (P, 3) or (B, P, 3)
-            The points and their displacement.
+            The points plus their displacement.
 
         Raises
         ------
         InputError
-            As for `displacement`, or the vectors have not three components.
+            As for `displacement`, or the vectors do not have three components.
         """
         found = self.displacement(vectors)
         _check_three(found.shape[-1])
-        return _as(self.points, found) + found
+        return _convert(self.points, found) + found
 
     def gradient(self, vectors: Any) -> Any:
-        """The derivative of the displacement with respect to the place.
+        """The derivative of the displacement with respect to position.
 
         Parameters
         ----------
@@ -129,7 +129,7 @@ class NodeField:
         return self._applied(self._gradients, vectors)
 
     def deformation_gradient(self, vectors: Any) -> Any:
-        """F, the derivative of where points go with respect to where they are: the identity plus `gradient`.
+        """The deformation gradient F, the derivative of moved positions with respect to positions: identity plus `gradient`.
 
         Parameters
         ----------
@@ -148,10 +148,10 @@ class NodeField:
         """
         found = self.gradient(vectors)
         _check_three(found.shape[-2])
-        return found + _as(np.eye(3), found)
+        return found + _convert(np.eye(3), found)
 
     def second_derivative(self, vectors: Any) -> Any:
-        """The second derivatives of the displacement with respect to the place.
+        """The second derivatives of the displacement with respect to position.
 
         Parameters
         ----------
@@ -172,44 +172,44 @@ class NodeField:
         return found.reshape(*found.shape[:-1], 3, 3)
 
     def matrix(self) -> csr_matrix:
-        """The shape functions as a matrix of SciPy, without gradients: ``matrix() @ vectors`` is `displacement`.
+        """The shape functions as a SciPy matrix, without gradients: ``matrix() @ vectors`` is `displacement`.
 
         Returns
         -------
         (P, K) csr_matrix, float64
-            Of a batch (B P, B K), with a block for each.
+            For a batch (B P, B K), block diagonal.
         """
         values = plain(self._values[:, 0]).astype(np.float64)
         return csr_matrix((values, self._pairs), (self.reached.size, self._fields * self.K))
 
     @property
     def _fields(self) -> int:
-        """Fields in the batch."""
+        """Number of fields in the batch."""
         return len(self.points) if self.points.ndim == 3 else 1
 
     @cached_property
     def _pairs(self) -> tuple[Ints, Ints]:
-        """(N,) numbers of points and of nodes, in all of the batch."""
+        """(N,) indices of points and of nodes, counted over the whole batch."""
         at, nodes = zip(*((rows[plain(fit.at)], plain(fit.of_node)) for rows, fit in self.pieces), strict=True)
         return np.concatenate(at), np.concatenate(nodes)
 
     @cached_property
     def _values(self) -> Any:
-        """(N, 1)"""
-        return _joined([fit.values[:, None] for _, fit in self.pieces])
+        """(N, 1) shape functions of the pairs."""
+        return _concatenate([fit.values[:, None] for _, fit in self.pieces])
 
     @cached_property
     def _gradients(self) -> Any:
-        """(N, 3)"""
-        return _joined([fit.gradient for _, fit in self.pieces])
+        """(N, 3) their gradients."""
+        return _concatenate([fit.gradient for _, fit in self.pieces])
 
     @cached_property
     def _seconds(self) -> Any:
-        """(N, 9)"""
-        return _joined([fit.second.reshape(-1, 9) for _, fit in self.pieces])
+        """(N, 9) their second derivatives."""
+        return _concatenate([fit.second.reshape(-1, 9) for _, fit in self.pieces])
 
     def _applied(self, values: Any, vectors: Any) -> Any:
-        """(..., P, C, D) the sums over nodes of values (N, D) times vectors (..., K, C)."""
+        """(..., P, C, D) sums over nodes of pair values (N, D) times vectors (..., K, C)."""
         given: Any = vectors if is_tensor(vectors) else as_numbers(vectors, "vectors", finite=True)
         shape, B = tuple(given.shape), self._fields
         dense = not is_tensor(given) or str(given.layout) == "torch.strided"
@@ -221,7 +221,7 @@ class NodeField:
         kind = _precision([self.points, vectors], given if is_tensor(given) else values)
         if is_tensor(given) and not is_tensor(values):
             values = alike(values, given.double() if given.device.type != "mps" else given)
-        given = _as(given, values)
+        given = _convert(given, values)
         at, of_node = (alike(each, values) for each in self._pairs)
         C, D, single = shape[-1], values.shape[1], len(shape) == 2 and self.points.ndim == 2
         given = given[None] if len(shape) == 2 else given
@@ -239,11 +239,11 @@ class NodeField:
 
 @dataclass(frozen=True, eq=False)
 class NearestNodes:
-    """Points out of reach, carried by the mean of the nearest nodes, weighted by 1 / d^2; N pairs, sorted by point."""
+    """Shape functions of points out of reach: nearest nodes, weighted by 1 / d^2, as N pairs sorted by point."""
 
-    at: Any
-    of_node: Any
-    offset: Any  # (N, 3) of the point from the node
+    at: Any  # (N,) index of the point
+    of_node: Any  # (N,) index of the node
+    offset: Any  # (N, 3) from the node to the point
     weight: Any  # (N,)
     P: int
 
@@ -251,10 +251,10 @@ class NearestNodes:
     def of(cls, points: Any, nodes: Any, radii: Any, pairs: tuple[Ints, Ints]) -> NearestNodes:
         at, of_node = (alike(each, points) for each in pairs)
         offset = points[at] - nodes[of_node]
-        return cls(at, of_node, offset, 1 / ((offset**2).sum(1) + (_SOFT * radii[of_node]) ** 2), len(points))
+        return cls(at, of_node, offset, 1 / ((offset**2).sum(1) + (_SOFTENING * radii[of_node]) ** 2), len(points))
 
     def _total(self, values: Any) -> Any:
-        """The sums over the nodes of each point, at each pair."""
+        """Sums over the nodes of a point, repeated at each of its pairs."""
         columns = int(np.prod(values.shape[1:]))
         return sums(values.reshape(len(self.at), columns), self.at, self.P)[self.at].reshape(values.shape)
 
@@ -264,27 +264,31 @@ class NearestNodes:
 
     @property
     def gradient(self) -> Any:
-        rise = -2 * (self.weight**2)[:, None] * self.offset  # dw/dx
-        return (rise - self.values[:, None] * self._total(rise)) / self._total(self.weight)[:, None]
+        weight_gradient = -2 * (self.weight**2)[:, None] * self.offset  # dw/dx
+        return (weight_gradient - self.values[:, None] * self._total(weight_gradient)) / self._total(self.weight)[
+            :, None
+        ]
 
     @property
     def second(self) -> Any:
         w, o = self.weight[:, None, None], self.offset
-        bend = 8 * w**3 * o[:, :, None] * o[:, None] - 2 * w**2 * alike(np.eye(3), o)
+        weight_hessian = 8 * w**3 * o[:, :, None] * o[:, None] - 2 * w**2 * alike(np.eye(3), o)
         total = self._total(-2 * (self.weight**2)[:, None] * o)
         mixed = self.gradient[:, :, None] * total[:, None]
-        change = bend - mixed - mixed.swapaxes(1, 2) - self.values[:, None, None] * self._total(bend)
+        change = (
+            weight_hessian - mixed - mixed.swapaxes(1, 2) - self.values[:, None, None] * self._total(weight_hessian)
+        )
         return change / self._total(self.weight)[:, None, None]
 
 
 def node_field(
     points: Any, nodes: Any, radius: Any, *, kernel: Kernel = "smooth", outside: Outside = "error"
 ) -> NodeField:
-    """The deformation field of moving least squares, on nodes and points of one's own.
+    """Build the deformation field of moving least squares for given nodes and points.
 
-    Around each point it is the affine motion that best fits the vectors of the nodes in reach; it reproduces affine motions
-    exactly. Computed in float64. Everything is differentiable if points, nodes or radii are tensors of torch, except which
-    nodes reach a point.
+    At each point it is the affine motion that best fits the vectors of the nodes in reach; it reproduces affine motions
+    exactly. Computed in float64. If points, nodes or radii are torch tensors, results are differentiable with respect to
+    them; the set of nodes that reach a point is treated as constant.
 
     Parameters
     ----------
@@ -293,18 +297,18 @@ def node_field(
     nodes
         (K, 3) or (B, K, 3), in the frame and unit of the points.
     radius
-        How far nodes reach: one number, or (K,) one for each.
+        Support radius of the nodes: one number, or (K,) one for each.
     kernel
         "smooth", (1 - d^2 / r^2)^3, or "cubic", (1 - d / r)^3, whose second derivatives have no limit at a node.
     outside
-        What becomes of points without four non-coplanar nodes in reach: "error"; "mask", they stay where they are and are
-        not ``reached``; or "nearest", they follow the mean of the four nearest nodes, weighted by 1 / d^2, which reproduces
-        translations, and jumps where the reach of the nodes ends.
+        Treatment of points without four non-coplanar nodes in reach: "error"; "mask", they are not moved and not
+        ``reached``; or "nearest", they follow the mean of the four nearest nodes, weighted by 1 / d^2, which reproduces
+        translations, and is discontinuous where the reach of the nodes ends.
 
     Returns
     -------
     NodeField
-        Says where vectors move the points.
+        The field on the points.
 
     Raises
     ------
@@ -313,12 +317,12 @@ def node_field(
     InputError
         Points, nodes or radii are not finite numbers of these shapes.
     OptionError
-        The kernel, or what becomes of points outside, is not known.
+        ``kernel`` or ``outside`` is unknown.
 
     Warns
     -----
     MeshmatchWarning
-        Nodes are so badly placed that errors of their vectors grow fifty times or more, see `NodeField.lebesgue`.
+        Nodes are placed so badly that errors of their vectors can grow more than fifty times, see `NodeField.lebesgue`.
 
     Examples
     --------
@@ -336,7 +340,7 @@ def node_field(
     x, q = _positions(points, "points", like), _positions(nodes, "nodes", like)
     K = int(q.shape[-2])
     checked_radii(radius, K)
-    r = _as(radius if is_tensor(radius) else np.asarray(radius, np.float64), like)
+    r = _convert(radius if is_tensor(radius) else np.asarray(radius, np.float64), like)
     batches = {len(each) for each in (x, q) if each.ndim == 3}
     if len(batches) > 1:
         raise InputError(
@@ -353,7 +357,9 @@ def node_field(
     blocks = [(slice(b * P, b * P + P), slice(b * K, b * K + K)) for b in range(B)]
     px, pq, pr = (plain(each).astype(np.float64) for each in (flat, flat_q, flat_r))
     if outside != "error":
-        bad = [b * P + poorly_supported(px[i], pq[k], pr[k], kernel, _MARGIN) for b, (i, k) in enumerate(blocks)]
+        bad = [
+            b * P + poorly_supported(px[i], pq[k], pr[k], kernel, _SUPPORT_MARGIN) for b, (i, k) in enumerate(blocks)
+        ]
         out = np.concatenate(bad)
         rows = np.setdiff1d(rows, out)
     if len(rows):
@@ -367,7 +373,7 @@ def node_field(
         )
     if outside == "nearest" and len(out):
         near = np.concatenate([
-            k.start + cKDTree(pq[k]).query(px[out[out // P == b]], range(1, min(_NEAREST, K) + 1))[1].astype(np.int64)
+            k.start + cKDTree(pq[k]).query(px[out[out // P == b]], range(1, min(_N_NEAREST, K) + 1))[1].astype(np.int64)
             for b, (_, k) in enumerate(blocks)
         ])  # fmt: skip
         pairs_out = np.repeat(np.arange(len(out)), near.shape[1]), near.ravel()
@@ -375,15 +381,15 @@ def node_field(
     reached = np.ones(B * P, bool)
     reached[out] = False
     if not pieces:  # all are masked
-        nobody = np.zeros(0, np.int64), np.zeros(0, np.int64)
-        pieces.append((out, NearestNodes.of(flat, flat_q, flat_r, nobody)))
+        no_pairs = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        pieces.append((out, NearestNodes.of(flat, flat_q, flat_r, no_pairs)))
     made = NodeField(shown, K, reached.reshape(shown.shape[:-1]), tuple(pieces))
-    tell_amplification(made.lebesgue.ravel())
+    warn_amplification(made.lebesgue.ravel())
     return made
 
 
 def _positions(values: Any, what: str, like: Any) -> Any:
-    """As `like` is, (N, 3) or (B, N, 3); `InputError` for anything but finite numbers."""
+    """Positions (N, 3) or (B, N, 3) in the type of `like`; `InputError` if they are not finite numbers of this shape."""
     found = as_numbers(values, what, finite=True)
     if found.ndim not in (2, 3) or found.shape[-1] != 3 or 0 in found.shape:
         raise InputError(
@@ -391,18 +397,18 @@ def _positions(values: Any, what: str, like: Any) -> Any:
         )
     if not abs(found).max() < LARGEST:
         raise InputError(f"{what} are too far away", "measure them in another unit")
-    return _as(values if is_tensor(values) else np.array(found), like)
+    return _convert(values if is_tensor(values) else np.array(found), like)
 
 
-def _as(array: Any, like: Any) -> Any:
-    """An array or tensor as the other is: its kind, device and precision."""
+def _convert(array: Any, like: Any) -> Any:
+    """Convert an array or tensor to the type, device and precision of `like`."""
     if is_tensor(array) and is_tensor(like):
         return array.to(like.device, like.dtype)
     return alike(plain(array), like) if is_tensor(like) else np.asarray(plain(array), like.dtype)
 
 
 def _precision(arrays: Sequence[Any], like: Any) -> Any:
-    """What a result of arrays and tensors is in, at least float32: a dtype of torch, or of NumPy, as `like` has."""
+    """Result dtype of arrays and tensors, at least float32: one of torch if `like` is a tensor, otherwise of NumPy."""
     if not is_tensor(like):
         kinds = [np.asarray(each).dtype for each in arrays]
         return np.result_type(*(kind if kind.kind == "f" else np.float64 for kind in kinds), np.float32)
@@ -420,7 +426,7 @@ def _cast(array: Any, kind: Any) -> Any:
     return array.to(kind) if is_tensor(array) else array.astype(kind, copy=False)
 
 
-def _joined(parts: list[Any]) -> Any:
+def _concatenate(parts: list[Any]) -> Any:
     return parts[0] if len(parts) == 1 else namespace(parts[0]).concatenate(parts)
 
 

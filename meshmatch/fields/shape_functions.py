@@ -1,4 +1,4 @@
-"""Fields that are linear in the vectors of their nodes: shape functions on fixed points, as NumPy and SciPy hold them.
+"""Shape functions of fields that are linear in the vectors of their nodes, on fixed points, in NumPy and SciPy.
 
 First-order moving least squares, after *Reduced Representation of Deformation Fields for Effective Non-rigid Shape
 Matching* (NeurIPS 2022), supplement:
@@ -7,17 +7,17 @@ Matching* (NeurIPS 2022), supplement:
     Phi_i  = p(x)^T M(x)^-1 w_i(x) p(q_i),    p(x) = [1, x, y, z]^T
     M(x)   = sum_i w_i(x) p(q_i) p(q_i)^T
 
-The basis is evaluated in coordinates that are centred on x and scaled by the support radius (the largest there, where
-nodes have radii of their own): the functions are the same (they do not depend on the affine frame of the basis), and the
-4 x 4 moment matrices stay well conditioned.
+The basis is evaluated in coordinates centered on x and scaled by the support radius (the largest one there, if nodes have
+different radii). The functions do not depend on the affine frame of the basis, and the 4 x 4 moment matrices are well
+conditioned in this one.
 
-Radial basis functions, the multiquadric that the paper compares with:
+Radial basis functions, with the multiquadric that the paper compares to:
 
     u(x)      = sum_i (A^-1 U)_i phi(x, q_i),    A_ij = phi(q_i, q_j)
     phi(a, b) = sqrt(C + eps |a - b|^2),         C = 1, eps = 50
 
-Shape functions are Phi(x) = A^-1 phi(x, .): the field passes through its node vectors. They have no compact support, so
-that their matrices are dense; a rigid motion of the nodes is rigid nearly, not exactly.
+Shape functions are Phi(x) = A^-1 phi(x, .): the field interpolates its node vectors. They have no compact support, so
+their matrices are dense; a rigid motion of the nodes is reproduced only approximately.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ from meshmatch.shapes.shape import LARGEST
 FieldName = Literal["mls", "rbf", "pointwise"]
 FIELDS: tuple[FieldName, ...] = get_args(FieldName)
 CONSTANT, STEEPNESS = 1.0, 50.0  # of the multiquadric
-AMPLIFIED = 50.0
-"""Sum of the absolute shape functions at a point from which on it is told that nodes are placed badly. Of the models that
-ship it is at most 22; above 1 / sqrt(`MINIMUM_EIGENVALUE`), 1,000, nodes are refused anyway."""
+MAX_AMPLIFICATION = 50.0
+"""Sum of the absolute shape functions at a point above which there is a warning that nodes are placed badly. For the models
+that ship it is at most 22; above 1 / sqrt(`MINIMUM_EIGENVALUE`), 1,000, nodes are refused anyway."""
 _MAX_CONDITION = 1e13
 _BLOCK = 4096
-_FLAT = 1e-3
+_REGULARIZATION = 1e-3  # regularization of moment matrices, relative to their weight
 
 
 def has_nodes(name: FieldName) -> bool:
-    """Whether a deformation is given by node vectors, in which it is linear."""
+    """Whether deformations of this field are linear in node vectors."""
     return name != "pointwise"
 
 
@@ -56,20 +56,20 @@ def has_nodes(name: FieldName) -> bool:
 class ShapeFunctions(Brief):
     """Shape functions of K nodes on P fixed points.
 
-    ``phi`` (P, K) and ``gradient`` (3 P, K), made when it is asked for, are float32, sparse (CSR) or dense. With moving
-    least squares each row of ``phi`` sums to one. Row 3 p + k of ``gradient`` is the derivative at point p along axis k
-    (1 / length).
+    ``phi`` (P, K) and ``gradient`` (3 P, K), which is computed on first use, are float32, sparse (CSR) or dense. With
+    moving least squares each row of ``phi`` sums to one. Row 3 p + k of ``gradient`` is the derivative at point p along
+    axis k (1 / length).
     """
 
     phi: Any
-    gradient_rows: Any = field(repr=False)  # the gradient, or a function that gives its rows at some points
+    gradient_rows: Any = field(repr=False)  # the gradient, or a function from indices of points to its rows
 
     @cached_property
     def gradient(self) -> Any:
         return self.gradient_rows(np.arange(self.phi.shape[0])) if callable(self.gradient_rows) else self.gradient_rows
 
     def gradient_at(self, at: Int[Ints, " N"]) -> Any:
-        """The rows (3 N, K) of ``gradient`` at some of the points: of moving least squares, no others are computed."""
+        """The rows (3 N, K) of ``gradient`` at some of the points; with moving least squares no others are computed."""
         if callable(self.gradient_rows):
             return self.gradient_rows(at)
         return self.gradient_rows[(3 * at[:, None] + np.arange(3)).reshape(-1)]
@@ -97,9 +97,9 @@ def shape_functions(
     radius: float | Float[Floats, " K"],
     kernel: Kernel,
 ) -> ShapeFunctions:
-    """A representation that has nodes, on fixed points of the template's frame; radial basis functions take all nodes.
+    """Evaluate the shape functions of a field that has nodes; ``radius`` and ``kernel`` are for moving least squares.
 
-    `TemplateError` where the nodes do not carry the points: too few in reach (mls), two in one place (rbf).
+    `TemplateError` if points have too few nodes in reach (mls), or two nodes coincide (rbf).
     """
     assert has_nodes(name)
     return build_rbf(points, nodes) if name == "rbf" else build_field(points, nodes, radius, kernel)
@@ -108,31 +108,31 @@ def shape_functions(
 def build_field(points: ArrayLike, nodes: ArrayLike, radius: ArrayLike, kernel: Kernel) -> ShapeFunctions:
     """Evaluate moving least squares and their gradient on fixed points: sparse, computed in float64.
 
-    Points (P, 3), nodes (K, 3) and the nodes' support radius (of all, or (K,) of each) are in one unit and frame. The
-    kernel is the model's: vectors learned with one mean something else with another.
+    Points (P, 3), nodes (K, 3) and the nodes' support radius (one, or (K,) one for each) are in one unit and frame. Vectors
+    are only valid with the kernel with which they were learned.
 
-    `TemplateError` names the points that have fewer than four non-coplanar nodes in reach; where the absolute shape
-    functions sum to more than `AMPLIFIED`, that is a warning (`MeshmatchWarning`). `InputError` for positions or radii that
-    are not finite numbers of these shapes, `OptionError` for a kernel that is not known.
+    `TemplateError` names the points that have fewer than four non-coplanar nodes in reach; `MeshmatchWarning` if the
+    absolute shape functions at a point sum to more than `MAX_AMPLIFICATION`. `InputError` for positions or radii that are
+    not finite numbers of these shapes, `OptionError` for an unknown kernel.
     """
     check_kernel(kernel)
     points, nodes = checked_positions(points, "points"), checked_positions(nodes, "nodes")
     radii = checked_radii(radius, len(nodes))
     fit = LocalFits.of(points, nodes, radii, kernel)
     phi = fit.values.astype(np.float32)
-    tell_amplification(np.bincount(fit.at, np.abs(phi), len(points)).astype(np.float64))
+    warn_amplification(np.bincount(fit.at, np.abs(phi), len(points)).astype(np.float64))
     values = csr_matrix((phi, (fit.at, fit.of_node)), (len(points), len(nodes)))
     return ShapeFunctions(values, lambda some: _gradient(points[some], nodes, radii, kernel))
 
 
 def check_kernel(kernel: Kernel) -> None:
-    """`OptionError` for one that is not known."""
-    if kernel not in tuple(KERNELS):  # anything else may not be hashable
+    """Raise `OptionError` if the kernel is unknown."""
+    if kernel not in tuple(KERNELS):  # a tuple, because invalid values may not be hashable
         raise OptionError(f"invalid kernel {kernel!r}", f"choose one of {', '.join(KERNELS)}")
 
 
 def checked_radii(radius: ArrayLike, K: int) -> Float[Floats, " K"]:
-    """The radius of each of K nodes; `InputError` for what cannot be one."""
+    """Return the radius of each of K nodes; `InputError` if one is invalid."""
     radii = as_numbers(radius, "the radius", finite=True)
     if radii.shape not in ((), (K,)) or not (radii > 0).all():
         what = f"the radius must be positive, one number or one for each of {K} nodes"
@@ -148,19 +148,19 @@ def build_surface_field(
     radii: Float[Floats, " K"],
     pairs: tuple[Int[Ints, " N"], Int[Ints, " N"]],
 ) -> ShapeFunctions:
-    """Moving least squares in which a node moves only some of the points within its radius: those of ``pairs``.
+    """Evaluate moving least squares in which a node moves only some of the points within its radius: those of ``pairs``.
 
-    Pairs are of a point and a node, sorted by point, at least one for each point. So the two sides of a thin sheet, or
-    two limbs that touch, can have nodes of their own. These may lie in a plane: moment matrices are regularised by
-    `_FLAT` of their weight, so that across it the field is nearly constant. Rows of ``phi`` sum to one nearly.
+    Pairs are indices of points and nodes, sorted by point, at least one for each point. Thus the two sides of a thin
+    sheet, or two limbs that touch, can have separate nodes. The nodes of a point may lie in a plane: moment matrices are
+    regularized, so that the field is nearly constant across the plane. Rows of ``phi`` sum to nearly one.
     """
-    fit = LocalFits.of(points, nodes, radii, "smooth", pairs, _FLAT)
+    fit = LocalFits.of(points, nodes, radii, "smooth", pairs, _REGULARIZATION)
     values = csr_matrix((fit.values, (fit.at, fit.of_node)), (len(points), len(nodes)))
-    return ShapeFunctions(values, _gradient_of(fit, len(points), len(nodes)))
+    return ShapeFunctions(values, _gradient_matrix(fit, len(points), len(nodes)))
 
 
 def checked_positions(values: ArrayLike, what: str) -> Float[Floats, "N 3"]:
-    """A copy of positions; `InputError` for anything but finite numbers in three columns."""
+    """Return a copy of positions; `InputError` if they are not finite numbers in three columns."""
     found = as_numbers(values, what, finite=True)
     if found.ndim != 2 or found.shape[1] != 3 or not len(found):
         raise InputError(f"{what} must be an array of (N, 3), not {found.shape}", "one position in each row")
@@ -171,21 +171,22 @@ def _gradient(
     points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radii: Float[Floats, " K"], kernel: Kernel
 ) -> Any:
     """The gradient of moving least squares (3 P, K)."""
-    return _gradient_of(LocalFits.of(points, nodes, radii, kernel), len(points), len(nodes))
+    return _gradient_matrix(LocalFits.of(points, nodes, radii, kernel), len(points), len(nodes))
 
 
-def _gradient_of(fit: LocalFits, P: int, K: int) -> Any:
+def _gradient_matrix(fit: LocalFits, P: int, K: int) -> Any:
     rows = 3 * fit.at[:, None] + np.arange(3)
     columns = np.broadcast_to(fit.of_node[:, None], rows.shape)
     return csr_matrix((fit.gradient.astype(np.float32).ravel(), (rows.ravel(), columns.ravel())), (3 * P, K))
 
 
-def tell_amplification(total: Float[Floats, " P"]) -> None:
-    """Warn of nodes from which a point is extrapolated, by the sum of its absolute shape functions (whose maximum is the
-    Lebesgue constant): an error in the nodes' vectors can grow by so much on its way there.
+def warn_amplification(total: Float[Floats, " P"]) -> None:
+    """Warn if a point is extrapolated from its nodes, according to the sums of its absolute shape functions.
+
+    Errors of the nodes' vectors can grow by this factor; its maximum is the Lebesgue constant.
     """
     worst = int(total.argmax())
-    if total[worst] > AMPLIFIED:
+    if total[worst] > MAX_AMPLIFICATION:
         what = f"point {worst} may move by {total[worst]:,.0f} times as much as the nodes around it"
         warn(f"{what}, which lie nearly in a plane or on one side: use more nodes or a larger radius")
 
@@ -193,30 +194,30 @@ def tell_amplification(total: Float[Floats, " P"]) -> None:
 def build_rbf(points: ArrayLike, nodes: ArrayLike) -> ShapeFunctions:
     """Evaluate radial basis functions and their gradient on fixed points: dense, computed in float64.
 
-    Points (P, 3) and nodes (K, 3) are in one unit and frame. The paper's numbers are for shapes in the unit sphere, so
-    lengths are measured in the largest distance of a node from the middle of all: the functions do not depend on the unit.
-    `TemplateError` if two nodes are (nearly) in one place; `InputError` as `build_field`.
+    Points (P, 3) and nodes (K, 3) are in one unit and frame. The paper's constants are for shapes in the unit sphere, so
+    lengths are divided by the largest distance of a node from the mean of all; the functions do not depend on the unit.
+    `TemplateError` if two nodes (nearly) coincide; `InputError` as `build_field`.
     """
     points, nodes = checked_positions(points, "points"), checked_positions(nodes, "nodes")
     unit = float(np.linalg.norm(nodes - nodes.mean(0), axis=1).max())
     q = nodes / unit
-    among = multiquadric(q[:, None] - q)
-    if not np.linalg.cond(among) < _MAX_CONDITION:
+    matrix = multiquadric(q[:, None] - q)
+    if not np.linalg.cond(matrix) < _MAX_CONDITION:
         hint = "use fewer nodes, or another field than rbf"
         raise TemplateError("nodes lie too close together to interpolate between them", hint)
-    inverse = np.linalg.inv(among)
+    inverse = np.linalg.inv(matrix)
     phi = np.empty((len(points), len(q)), np.float32)
     gradient = np.empty((len(points), 3, len(q)), np.float32)
     for start in range(0, len(points), _BLOCK):
-        here = slice(start, start + _BLOCK)
-        offset = points[here, None] / unit - q  # P K 3
+        chunk = slice(start, start + _BLOCK)
+        offset = points[chunk, None] / unit - q  # P K 3
         value = multiquadric(offset)
-        phi[here] = value @ inverse
+        phi[chunk] = value @ inverse
         for k in range(3):
-            gradient[here, k] = (STEEPNESS * offset[..., k] / value) @ inverse / unit
+            gradient[chunk, k] = (STEEPNESS * offset[..., k] / value) @ inverse / unit
     return ShapeFunctions(phi, gradient.reshape(3 * len(points), len(q)))
 
 
 def multiquadric(offset: Float[Floats, "*N 3"]) -> Float[Floats, "*N"]:
-    """phi of offsets, in units of the nodes' radius."""
+    """Multiquadric of offsets, in units of the largest distance of a node from the mean of all."""
     return np.asarray(np.sqrt(CONSTANT + STEEPNESS * np.square(offset).sum(-1)))

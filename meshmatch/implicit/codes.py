@@ -1,8 +1,8 @@
-"""The code of a shape that no training saw: found by gradient descent on its samples, the network as it is.
+"""Find the code of a new shape by gradient descent on its samples, with the network fixed.
 
-As for the shapes of the training (an auto-decoder), there is no encoder. The descent begins with the code of the training
-whose distances fit the samples best. Codes know one orientation: a shape that stands otherwise than those of the training is
-turned first, by the rotation of the cube that lets some shape of the training fit it best.
+There is no encoder (the model is an auto-decoder). The descent starts from the code of the training shape whose distances
+fit the samples best. Codes represent one orientation only: a shape in another orientation than the training shapes is
+rotated first, by the rotation of the cube after which some training shape fits it best.
 """
 
 from __future__ import annotations
@@ -26,28 +26,35 @@ from meshmatch.models.card import ImplicitCard
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
 
-_SAMPLES, _POINTS, _FEW = 8192, 1024, 512  # of the shape, in a step, and to choose where to begin
-_RATE = 1e-2  # of codes of length 1
-_ASKED, _SHOWN = 32, 256  # codes of the training that are asked about a turn, and samples that are shown to them
-_CLEARLY = 0.6  # a shape is turned if it then fits so much better; set by hand
-_THIN, _ENOUGH = 0.02, 100  # nearer than this, samples are taken for the surface if there are so many
+_N_SAMPLES, _STEP_SAMPLES, _INITIAL_SAMPLES = (
+    8192,
+    1024,
+    512,
+)  # samples of the shape, in one step, and to choose the initial code
+_RATE = 1e-2  # learning rate of codes of length 1
+_TURN_CODES, _TURN_SAMPLES = 32, 256  # training codes, and samples, that are used to choose a rotation
+_MAX_ERROR_RATIO = 0.6  # a shape is rotated if that reduces the error below this share; set by hand
+_SURFACE_DISTANCE, _MIN_SURFACE_POINTS = (
+    0.02,
+    100,
+)  # samples nearer than this count as surface points; minimum number of them
 
 
 def fit_implicit(
     model: ImplicitModel, shape: ShapeLike, *, steps: int = 200, seed: int = 0, progress: ProgressCallback | None = None
 ) -> ImplicitFit:
-    """The code of a shape, so that the model's surface is the shape's.
+    """Find the code with which the model's surface is that of a shape.
 
     Parameters
     ----------
     model
         The model.
     shape
-        A mesh, a cloud, or the path of one or of ``.npz`` samples (the page on formats). It is turned by quarter turns if it
-        clearly stands otherwise than the shapes of the training, which ``notes`` then say. Of meshes that are not watertight
-        only the surface is known, as of clouds.
+        A mesh, a cloud, or the path of one or of ``.npz`` samples (the page on formats). It is rotated by quarter turns if
+        its orientation clearly differs from that of the training shapes; ``notes`` then say so. For meshes that are not
+        watertight only the surface is known, as for clouds.
     steps
-        Of the search.
+        Number of steps of the gradient descent.
     seed
         The same seed gives the same code.
     progress
@@ -56,7 +63,7 @@ def fit_implicit(
     Returns
     -------
     ImplicitFit
-        The code, and how well the model knows the shape.
+        The code, and how well the model represents the shape.
 
     Raises
     ------
@@ -75,21 +82,21 @@ def fit_implicit(
     source = load_source(shape) if isinstance(shape, str | Path) else as_shape(shape)
     name = source.name or "shape"
     rng = np.random.default_rng(seed)
-    frame, found = samples_of(source, _SAMPLES, rng, closed=False)
-    rows, half = torch.from_numpy(found), _SAMPLES // 2
-    turn = best_turn(model, rows[:: _SAMPLES // _SHOWN])
+    frame, found = samples_of(source, _N_SAMPLES, rng, closed=False)
+    rows, half = torch.from_numpy(found), _N_SAMPLES // 2
+    turn = best_turn(model, rows[:: _N_SAMPLES // _TURN_SAMPLES])
     notes: tuple[str, ...] = ()
     if not np.array_equal(turn, np.eye(3)):
-        frame, rows = Frame(frame.scale, turn, frame.center), _turned(rows, turn)
-        notes = (f"{name}: turned, it stands otherwise than the shapes of the training: {_axes(turn)}",)
+        frame, rows = Frame(frame.scale, turn, frame.center), _rotated(rows, turn)
+        notes = (f"{name}: turned, it stands otherwise than the shapes of the training: {_axes_text(turn)}",)
     network, loss, rate = model.network, loss_of(model.card), _RATE * model.network.config.length
     generator = torch.Generator().manual_seed(seed)
-    code = nearest_code(model, rows[:: _SAMPLES // _FEW]).clone().requires_grad_(True)
+    code = nearest_code(model, rows[:: _N_SAMPLES // _INITIAL_SAMPLES]).clone().requires_grad_(True)
     descent = torch.optim.Adam([code], rate)
     for step in range(steps):
         for group in descent.param_groups:
             group["lr"] = rate * (1 - step / steps)
-        drawn = rng.integers(half, size=(2, _POINTS // 2))
+        drawn = rng.integers(half, size=(2, _STEP_SAMPLES // 2))
         some = rows[np.concatenate([drawn[0], drawn[1] + half])]
         total = loss.of(network, code[None], some[None], generator)["total"]
         (code.grad,) = torch.autograd.grad(total, [code])
@@ -101,35 +108,35 @@ def fit_implicit(
         away = network.distance(on[None, :, :3], code[None])[0][0] - on[:, 3]
     fit = ImplicitFit(name, code.detach(), frame, percent_of_side(float(away.abs().mean())))
     fit = replace(fit, owner=model, source=source, seed=seed, notes=notes)
-    surface = on[on[:, 3].abs() < _THIN, :3].double().numpy()
-    if len(surface) >= _ENOUGH:
+    surface = on[on[:, 3].abs() < _SURFACE_DISTANCE, :3].double().numpy()
+    if len(surface) >= _MIN_SURFACE_POINTS:
         missed, invented = model.shares(fit, surface, seed)
         fit = replace(fit, missed=missed, invented=invented)
     return replace(fit, seconds=time.monotonic() - began)
 
 
 def loss_of(card: ImplicitCard) -> ImplicitLoss:
-    """The terms and weights that the model was trained by, as far as they act on a code: DIF-Net's, or the usual ones."""
+    """Loss with which codes of a model are found: DIF-Net's if the model was trained with that, otherwise the default."""
     known = card.recipe.get("loss")
     return PUBLISHED if isinstance(known, dict) and known.get("published") is True else ImplicitLoss()
 
 
 def nearest_code(model: ImplicitModel, rows: Float[torch.Tensor, "P 7"]) -> Float[torch.Tensor, " D"]:
-    """The code of the training that fits samples best."""
+    """The code of the training shape that fits samples best."""
     return model.network.codes[int(_errors(model, rows, model.network.codes).argmin())].detach()
 
 
 def best_turn(model: ImplicitModel, rows: Float[torch.Tensor, "P 7"]) -> Float[Floats, "3 3"]:
-    """The rotation of the cube onto itself after which a code of the training fits samples best; none unless clearly."""
+    """Rotation of the cube after which a training code fits samples best; the identity unless another is clearly better."""
     codes = model.network.codes
-    some = codes[torch.linspace(0, len(codes) - 1, min(_ASKED, len(codes))).round().long()]
-    errors = [float(_errors(model, _turned(rows, turn), some).min()) for turn in TURNS]
+    chosen = codes[torch.linspace(0, len(codes) - 1, min(_TURN_CODES, len(codes))).round().long()]
+    errors = [float(_errors(model, _rotated(rows, turn), chosen).min()) for turn in TURNS]
     best = int(np.argmin(errors))
-    return TURNS[best] if errors[best] < _CLEARLY * errors[0] else TURNS[0]
+    return TURNS[best] if errors[best] < _MAX_ERROR_RATIO * errors[0] else TURNS[0]
 
 
 def _cube_turns() -> list[Float[Floats, "3 3"]]:
-    """The 24 rotations of a cube onto itself, first the one that changes nothing."""
+    """The 24 rotations of a cube onto itself, the identity first."""
     signed = (
         np.diag(signs)[:, list(axes)] for axes in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)
     )
@@ -139,13 +146,13 @@ def _cube_turns() -> list[Float[Floats, "3 3"]]:
 TURNS = _cube_turns()
 
 
-def _axes(turn: Float[Floats, "3 3"]) -> str:
-    """Which axes of the file become x, y and z."""
+def _axes_text(turn: Float[Floats, "3 3"]) -> str:
+    """Text that says which axes of the file become x, y and z."""
     rows = ("-+"[int(row.sum() > 0)] + "xyz"[int(np.abs(row).argmax())] for row in turn)
     return ", ".join(f"{one} for {axis}" for one, axis in zip(rows, "xyz", strict=True))
 
 
-def _turned(rows: Float[torch.Tensor, "P 7"], turn: Float[Floats, "3 3"]) -> Float[torch.Tensor, "P 7"]:
+def _rotated(rows: Float[torch.Tensor, "P 7"], turn: Float[Floats, "3 3"]) -> Float[torch.Tensor, "P 7"]:
     R = torch.from_numpy(turn).to(rows)
     return torch.cat([rows[:, :3] @ R.T, rows[:, 3:4], rows[:, 4:] @ R.T], 1)
 
@@ -154,7 +161,7 @@ def _turned(rows: Float[torch.Tensor, "P 7"], turn: Float[Floats, "3 3"]) -> Flo
 def _errors(
     model: ImplicitModel, rows: Float[torch.Tensor, "P 7"], codes: Float[torch.Tensor, "S D"]
 ) -> Float[torch.Tensor, " S"]:
-    """Mean difference between the distances of samples and those by each of some codes."""
+    """Mean absolute error of the signed distances of samples, for each of several codes."""
     known = rows[rows[:, 3].isfinite()]
-    said = (model.network.distance(known[None, :, :3], code[None])[0][0] for code in codes)
-    return torch.stack([(each - known[:, 3]).abs().mean() for each in said])
+    predicted = (model.network.distance(known[None, :, :3], code[None])[0][0] for code in codes)
+    return torch.stack([(each - known[:, 3]).abs().mean() for each in predicted])

@@ -1,4 +1,4 @@
-"""A shape as an implicit model has it: its code, its place, and how well the model knows it."""
+"""The representation of a shape by an implicit model: code, frame, and quality."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.card import ImplicitCard
 from meshmatch.shapes.shape import Shape
 
-_FAIR, _POOR = 2.0, 5.0  # residuals above which a shape is so; set by hand
-_FAIR_SHARE, _POOR_SHARE = 0.03, 0.1  # shares without counterpart above which a shape is so; set by hand
-REACH = 4.0  # % of the longest side: what is further from the other surface has no counterpart; set by hand
+_FAIR, _POOR = 2.0, 5.0  # residuals above which the verdict is fair, or poor; set by hand
+_FAIR_SHARE, _POOR_SHARE = 0.03, 0.1  # shares without counterpart above which the verdict is fair, or poor; set by hand
+REACH = 4.0  # % of the longest side: points farther from the other surface have no counterpart; set by hand
 
 
 class Owner(Protocol):
-    """What a fit asks of its model."""
+    """Interface of a fit's model."""
 
     @property
     def card(self) -> ImplicitCard: ...
@@ -33,32 +33,32 @@ class Owner(Protocol):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ImplicitFit(Brief):
-    """A shape as a model has it.
+    """The representation of a shape by an implicit model.
 
     Attributes
     ----------
     name
-        Of the shape.
+        Name of the shape.
     code
-        (D,).
+        (D,) latent code.
     frame
         From the shape's file into the cube from -1 to 1.
     residual
-        Mean distance that the model gives points of the shape's surface, % of the longest side; NaN is not known.
+        Mean distance between the shape's surface and the model's, % of the longest side; NaN if not known.
     missed
-        Share of these points that the model's surface comes nowhere near.
+        Share of the shape's surface that is far from the model's.
     invented
-        Share of the model's surface that is nowhere near the shape.
+        Share of the model's surface that is far from the shape's.
     owner
-        The model whose code it is.
+        The model of the code.
     source
-        The shape itself; None if it is one of the training, or a blend.
+        The shape itself; None for a training shape or a blend.
     seed
-        Of its random numbers.
+        Seed of the fit's random numbers.
     seconds
         Wall time of the fit.
     notes
-        Whether and how the shape was turned.
+        Whether and how the shape was rotated.
 
     Examples
     --------
@@ -81,7 +81,7 @@ class ImplicitFit(Brief):
 
     @cached_property
     def shape(self) -> Shape:
-        """The template's surface on the shape, see `ImplicitModel.register`."""
+        """The template's surface registered to the shape, see `ImplicitModel.register`."""
         assert self.owner is not None
         return self.owner.register(self)
 
@@ -102,18 +102,18 @@ class ImplicitFit(Brief):
 
     @property
     def verdict(self) -> str:
-        """Good, fair or poor by the residual and both shares, whichever is worst."""
-        grades = [grade for grade, _ in self._graded]
+        """The worst of the grades (good, fair, poor) of the residual and of both shares; "unknown" if none is known."""
+        grades = [grade for grade, _ in self._grades]
         return ("good", "fair", "poor")[max(grades)] if grades else "unknown"
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why it is not good."""
-        return tuple(words for grade, words in self._graded if grade)
+        """Why the verdict is not good."""
+        return tuple(words for grade, words in self._grades if grade)
 
     @property
-    def _graded(self) -> list[tuple[int, str]]:
-        """What is known, from 0 (good) to 2 (poor), in words."""
+    def _grades(self) -> list[tuple[int, str]]:
+        """Grade, from 0 (good) to 2 (poor), and text, for each measure that is known."""
         reach = f"over {REACH:g} % of the longest side"
         away = f"the model's surface is {self.residual:.1f} % of the longest side away from {self.name}"
         missed = f"{self.missed:.0%} of {self.name} is {reach} from the model's surface"

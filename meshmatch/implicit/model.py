@@ -1,4 +1,4 @@
-"""A trained implicit model: its files, its surfaces, and the way between two shapes through the template."""
+"""Trained implicit models: load them, extract surfaces, and match shapes through the template."""
 
 from __future__ import annotations
 
@@ -29,26 +29,34 @@ from meshmatch.models.tensor_file import read_header
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
-_AT_ONCE = 8192  # points
-_DOUBTED = 0.2  # distance on the template, in the cube, from which a match has no confidence; set by hand
-_NORMAL = 0.2  # chosen among 0.05 to 0.2 on generated furniture
-_NEWTON, _ONTO, _STEP = 12, 3, 0.1  # steps back to a shape, steps onto its surface, and their longest
-_DAMPING = 1e-6  # of a step back, in the square of a stretch
-_COARSE = 48  # resolution of the surface that a fit is judged by
-_MOST = {"code": 1024, "width": 2048, "depth": 16, "inner": 512, "layers": 16, "maker": 4096}  # that a card may ask for
-_LONGEST = 100.0  # code at first
+_BATCH = 8192  # points per batch
+_MAX_DISTANCE = 0.2  # distance on the template, in the cube, at which confidence reaches 0; set by hand
+_NORMAL_WEIGHT = 0.2  # weight of normals in matching; chosen from 0.05 to 0.2 on generated furniture
+# Gauss-Newton steps that invert the deformation, steps that project onto the surface, maximum length of a step
+_NEWTON_STEPS, _PROJECTION_STEPS, _MAX_STEP = 12, 3, 0.1
+_DAMPING = 1e-6  # of the normal equations, in units of squared stretch
+_COARSE = 48  # resolution of the surface by which a fit is judged
+_MAX_SIZES = {
+    "code": 1024,
+    "width": 2048,
+    "depth": 16,
+    "inner": 512,
+    "layers": 16,
+    "maker": 4096,
+}  # bounds on the card's config
+_MAX_CODE_LENGTH = 100.0  # bound on the initial length of codes
 
 
 @dataclass(frozen=True, eq=False)
 class ImplicitModel:
-    """A category as one deformed template. Make one with `load_implicit` or `train_implicit`.
+    """A category as one deformed template. Load one with `load_implicit`, train one with `train_implicit`.
 
     Attributes
     ----------
     card
-        What the model is, and its hashes.
+        The model's metadata.
     network
-        Its networks and codes.
+        The networks, and the codes of the training shapes.
 
     Examples
     --------
@@ -61,12 +69,12 @@ class ImplicitModel:
     network: ImplicitNetwork
 
     def known(self, name: str) -> ImplicitFit:
-        """A shape of the training.
+        """Return a training shape.
 
         Parameters
         ----------
         name
-            Its name.
+            Name of the shape.
 
         Returns
         -------
@@ -76,7 +84,7 @@ class ImplicitModel:
         Raises
         ------
         OptionError
-            The training had no shape of that name.
+            There was no training shape of that name.
         """
         names = self.card.shapes
         if name not in names:
@@ -88,7 +96,7 @@ class ImplicitModel:
         return ImplicitFit(name, self.network.codes[number].detach(), frame, owner=self)
 
     def blend(self, a: ImplicitFit, b: ImplicitFit, time: float) -> ImplicitFit:
-        """The shape on the way from one to another.
+        """Interpolate between two shapes: their codes and frames.
 
         Parameters
         ----------
@@ -97,7 +105,7 @@ class ImplicitModel:
         b
             The shape at time 1.
         time
-            Before 0 and beyond 1 too.
+            Values below 0 and above 1 extrapolate.
 
         Returns
         -------
@@ -115,27 +123,27 @@ class ImplicitModel:
     def distance(
         self, points: Float[Floats, "P 3"], code: Float[torch.Tensor, " D"]
     ) -> tuple[Float[Floats, " P"], Float[Floats, "P 3"]]:
-        """Signed distances of points, and where each lies on the template.
+        """Signed distances of points, and the corresponding points on the template.
 
         Parameters
         ----------
         points
             (P, 3) in the cube from -1 to 1.
         code
-            (D,) of a shape.
+            (D,) code of a shape.
 
         Returns
         -------
         (P,), (P, 3)
-            Distances, negative inside, and points of the template, in the cube.
+            Distances, negative inside, and points in the template's cube.
         """
-        parts = torch.from_numpy(np.array(points, np.float32)).split(_AT_ONCE)
+        parts = torch.from_numpy(np.array(points, np.float32)).split(_BATCH)
         found = [self.network.distance(part[None], code[None]) for part in parts]
         values, places = (torch.cat(each, 1)[0].double().numpy() for each in zip(*found, strict=True))
         return values, places
 
     def to_template(self, points: Float[Floats, "P 3"], shape: ImplicitFit) -> Float[Floats, "P 3"]:
-        """Where points of a shape lie on the template.
+        """Map points of a shape to the template.
 
         Parameters
         ----------
@@ -152,10 +160,10 @@ class ImplicitModel:
         return self.distance(np.clip(shape.frame.apply(points), -1, 1), shape.code)[1]
 
     def match(self, a: ImplicitFit, b: ImplicitFit, source: Shape, target: Shape) -> VertexMap:
-        """Map each vertex of one shape to the vertex of another that lies nearest to it on the template.
+        """Map each vertex of one shape to the vertex of another that is nearest to it on the template.
 
-        Between meshes normals count too, so that the two sides of a thin board are not taken for each other. Confidence
-        falls with the distance; the verdict is the worse of the two.
+        Between meshes normals are compared too, so that the two sides of a thin board are not confused. Confidence
+        decreases with the distance; the verdict is the worse of the two fits'.
 
         Parameters
         ----------
@@ -164,9 +172,9 @@ class ImplicitModel:
         b
             The fit of the target.
         source
-            The source itself.
+            The source.
         target
-            The target itself.
+            The target.
 
         Returns
         -------
@@ -174,9 +182,7 @@ class ImplicitModel:
             From source to target.
         """
         places = [self.to_template(shape.verts, fit) for shape, fit in ((source, a), (target, b))]
-        signed = not (
-            source.is_cloud or target.is_cloud
-        )  # the normals of a cloud are estimated, and may face either way
+        signed = not (source.is_cloud or target.is_cloud)  # normals of clouds are estimated, up to sign
         normals = [
             shape.vertex_normals @ fit.frame.rotation.T if signed else np.zeros((shape.V, 3))
             for shape, fit in ((source, a), (target, b))
@@ -185,12 +191,12 @@ class ImplicitModel:
         apart = np.linalg.norm(places[0] - places[1][index], axis=1)
         grades = ("good", "unknown", "fair", "poor")
         verdict = grades[max(grades.index(each.verdict) for each in (a, b))]
-        trust = np.clip(1 - apart / _DOUBTED, 0, 1) * (0.5 if verdict == "poor" else 1.0)
+        trust = np.clip(1 - apart / _MAX_DISTANCE, 0, 1) * (0.5 if verdict == "poor" else 1.0)
         reasons = (*a.reasons, *b.reasons)
         return VertexMap.between(source, target, index, confidence=trust, verdict=verdict, reasons=reasons)
 
     def surface(self, shape: ImplicitFit, resolution: int = 64) -> Shape:
-        """The surface of a shape by marching cubes.
+        """Extract the surface of a shape by marching cubes.
 
         Parameters
         ----------
@@ -215,7 +221,7 @@ class ImplicitModel:
         return Shape(shape.frame.undo(found.verts), found.faces, shape.name)
 
     def template(self, resolution: int = 64) -> Shape:
-        """The template's own surface.
+        """Extract the template's surface by marching cubes.
 
         Parameters
         ----------
@@ -235,16 +241,16 @@ class ImplicitModel:
 
         @torch.no_grad()
         def distance(points: Float[Floats, "P 3"]) -> Float[Floats, " P"]:
-            parts = torch.from_numpy(points.astype(np.float32)).split(_AT_ONCE)
+            parts = torch.from_numpy(points.astype(np.float32)).split(_BATCH)
             return torch.cat([self.network.template(part[None])[0, :, 0] for part in parts]).double().numpy()
 
         return zero_surface(distance, resolution, "template")
 
     def register(self, shape: ImplicitFit, resolution: int = 64) -> Shape:
-        """The template's surface on a shape: for all shapes the same vertices and triangles in the same order.
+        """Register the template's surface to a shape: for all shapes the same vertices and triangles in the same order.
 
-        Each vertex goes where the deformation takes it from, and from there along the gradient of the distance to the
-        surface.
+        Each vertex is mapped by the inverse of the deformation, and then along the gradient of the distance onto the
+        shape's surface.
 
         Parameters
         ----------
@@ -265,44 +271,44 @@ class ImplicitModel:
         """
         rest = self.template(resolution)
         places = torch.from_numpy(rest.verts.astype(np.float32))
-        found = torch.cat([self._undeformed(part, shape.code) for part in places.split(_AT_ONCE)])
+        found = torch.cat([self._invert_deformation(part, shape.code) for part in places.split(_BATCH)])
         return Shape(shape.frame.undo(found.double().numpy()), rest.faces, shape.name)
 
     @torch.no_grad()
-    def _undeformed(
+    def _invert_deformation(
         self, places: Float[torch.Tensor, "P 3"], code: Float[torch.Tensor, " D"]
     ) -> Float[torch.Tensor, "P 3"]:
-        """Points of a shape's surface whose place on the template is given, as nearly as it can be."""
+        """Points of a shape's surface that the deformation maps to given places on the template, as nearly as possible."""
         at, network = places.clone(), self.network
-        for _ in range(_NEWTON):
+        for _ in range(_NEWTON_STEPS):
             off = network.distance(at[None], code[None])[1][0] - places
             F = network(at[None], code[None]).F[0]
-            # damped, for where the deformation folds; lstsq rounds the same numbers differently from call to call
+            # damped, in case the deformation folds; lstsq is not reproducible
             step = torch.linalg.solve(F.mT @ F + _DAMPING * torch.eye(3), F.mT @ off[..., None])
-            at = (at - _at_most(step[..., 0])).clamp(-1, 1)
-        for _ in range(_ONTO):
+            at = (at - _limit_step(step[..., 0])).clamp(-1, 1)
+        for _ in range(_PROJECTION_STEPS):
             found = network(at[None], code[None])
             slope = found.gradient[0]
             step = found.distance[0, :, None] * slope / slope.square().sum(1, keepdim=True).clamp_min(0.1)
-            at = (at - _at_most(step)).clamp(-1, 1)
+            at = (at - _limit_step(step)).clamp(-1, 1)
         return at.detach()
 
     def shares(self, shape: ImplicitFit, points: Float[Floats, "P 3"], seed: int = 0) -> tuple[float, float]:
-        """Shares of a shape's points and of the model's surface that are far from the other.
+        """Shares of a shape's points and of the model's surface that are far from each other.
 
         Parameters
         ----------
         shape
             The shape.
         points
-            (P, 3) of its surface, in the cube.
+            (P, 3) points of its surface, in the cube.
         seed
-            Of the points on the model's surface.
+            Seed for sampling the model's surface.
 
         Returns
         -------
         (float, float)
-            Missed and invented, see `ImplicitFit`.
+            ``missed`` and ``invented``, see `ImplicitFit`.
         """
         try:
             surface = sample_surface(self.surface(shape, _COARSE), len(points), np.random.default_rng(seed)).points
@@ -314,13 +320,13 @@ class ImplicitModel:
         return float(far[0].mean()), float(far[1].mean())
 
 
-def _at_most(step: Float[torch.Tensor, "P 3"]) -> Float[torch.Tensor, "P 3"]:
-    result: torch.Tensor = step * (_STEP / step.norm(dim=1, keepdim=True).clamp_min(_STEP))
+def _limit_step(step: Float[torch.Tensor, "P 3"]) -> Float[torch.Tensor, "P 3"]:
+    result: torch.Tensor = step * (_MAX_STEP / step.norm(dim=1, keepdim=True).clamp_min(_MAX_STEP))
     return result
 
 
 def zero_surface(distance: Callable[[Float[Floats, "P 3"]], Float[Floats, " P"]], resolution: int, name: str) -> Shape:
-    """Where distances in the cube are zero, by marching cubes; see `ImplicitModel.surface`."""
+    """Zero level set of distances in the cube, by marching cubes; see `ImplicitModel.surface`."""
     with needs("skimage", "implicit"):
         from skimage.measure import marching_cubes
 
@@ -329,10 +335,10 @@ def zero_surface(distance: Callable[[Float[Floats, "P 3"]], Float[Floats, " P"]]
     points: Floats = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     coarse = distance(points).reshape([len(ticks)] * 3)
     values = zoom(coarse, (resolution + 1) / len(ticks), order=1)
-    near = np.argwhere(np.abs(values) < 2 * step * math.sqrt(3))  # elsewhere the coarse grid says enough
+    near = np.argwhere(np.abs(values) < 2 * step * math.sqrt(3))  # elsewhere the coarse grid is sufficient
     if len(near):
         values[tuple(near.T)] = distance(np.asarray(near * step - 1, np.float64))
-    values = np.pad(values, 1, constant_values=1.0)  # closed where it meets the cube
+    values = np.pad(values, 1, constant_values=1.0)  # closes the surface at the cube's faces
     if not values.min() < 0:
         raise ModelError(f"the model has no surface for {name}", "train it longer")
     verts, faces, _, _ = marching_cubes(values, 0.0, allow_degenerate=False)
@@ -345,29 +351,29 @@ def nearest_on_template(
     normals: Float[Floats, "P 3"],
     others: Float[Floats, "Q 3"],
 ) -> Int[Ints, " P"]:
-    """For each place on the template the nearest of others, in six dimensions: position and a share of the normal."""
-    tree = cKDTree(np.concatenate([target, _NORMAL * others], 1))
-    return np.asarray(tree.query(np.concatenate([source, _NORMAL * normals], 1))[1])
+    """Index of the nearest target place for each source place, in six dimensions: position and weighted normal."""
+    tree = cKDTree(np.concatenate([target, _NORMAL_WEIGHT * others], 1))
+    return np.asarray(tree.query(np.concatenate([source, _NORMAL_WEIGHT * normals], 1))[1])
 
 
 def check_resolution(resolution: int) -> None:
-    """`OptionError` if marching cubes cannot have so many cells along a side."""
+    """Raise `OptionError` unless ``resolution`` is valid for marching cubes."""
     if not 8 <= resolution <= 512 or resolution % 2:
         raise OptionError(f"resolution must be even, from 8 to 512, not {resolution}")
 
 
 def percent_of_side(distance: float) -> float:
-    """A length in the cube, % of the longest side of what is in it."""
+    """Convert a length in the cube to % of the longest side of the shape's box."""
     return 100 * distance / (2 * FILLED)
 
 
 def load_implicit(folder: str | Path) -> ImplicitModel:
-    """A model that `train_implicit` wrote.
+    """Load a model that `train_implicit` wrote.
 
     Parameters
     ----------
     folder
-        Its folder, or its name in the registry.
+        Folder of the model, or its name in the registry.
 
     Returns
     -------
@@ -377,7 +383,7 @@ def load_implicit(folder: str | Path) -> ImplicitModel:
     Raises
     ------
     ModelError
-        There is none, or a file is damaged or of another model.
+        There is no such model, or a file is damaged or belongs to another model.
 
     Examples
     --------
@@ -390,11 +396,13 @@ def load_implicit(folder: str | Path) -> ImplicitModel:
     try:
         config = ImplicitConfig(**card.network)
         known = config.kernel in KERNELS and config.field in get_args(Deformation)
-        small = (type(getattr(config, key)) is int and 0 < getattr(config, key) <= most for key, most in _MOST.items())
-        if not (known and all(small) and 0 < config.length <= _LONGEST):
+        valid = (
+            type(getattr(config, key)) is int and 0 < getattr(config, key) <= most for key, most in _MAX_SIZES.items()
+        )
+        if not (known and all(valid) and 0 < config.length <= _MAX_CODE_LENGTH):
             raise ValueError("its network cannot be")
-        held = read_header(folder / WEIGHTS)
-        K = held["deformation.nodes"].shape[:1]
+        header = read_header(folder / WEIGHTS)
+        K = header["deformation.nodes"].shape[:1]
         with torch.device("meta"):
             network = ImplicitNetwork(config, len(card.shapes), torch.zeros(*K, 3), torch.zeros(K))
         for number in range(len(card.frames)):

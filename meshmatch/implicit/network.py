@@ -1,12 +1,12 @@
-"""Signed distances of a whole category: one template, and for every shape a code that deforms and corrects it.
+"""Networks for the signed distances of a category: one template, which the code of a shape deforms and corrects.
 
 After *Deformed Implicit Field* (Deng, Yang and Tong, CVPR 2021), in the cube from -1 to 1:
 
     f(x) = T(x + u(x)) + c(x)
 
-T is the template's signed distance, u the deformation and c the correction of the shape with code z. Codes are learned
-with the weights, one for each shape. There are two deformations, which answer the same questions: `PointwiseDeformation`
-is that paper's, a network whose weights a second one makes of z; `ReducedDeformation` is the field of control nodes
+T is the template's signed distance, u the deformation and c the correction of the shape with code z. Codes are trained
+with the weights, one for each shape. There are two deformations with the same interface: `PointwiseDeformation` is that
+paper's, a network whose weights a hypernetwork computes from z; `ReducedDeformation` is the field of control nodes
 (NeurIPS 2022 supplement, section 5), with auxiliary nodes on the cube.
 """
 
@@ -27,45 +27,42 @@ from meshmatch.geometry.kernels import Kernel
 from meshmatch.implicit.space import SpaceField
 
 Deformation = Literal["mls", "pointwise"]
-# Of decoded vectors: without it the correction, which learns faster, explains what the deformation should.
+# Factor on decoded vectors. Without it the correction, which learns faster, takes over the role of the deformation.
 _GAIN = 5.0
 
 
 @dataclass(frozen=True)
 class ImplicitConfig:
-    """Sizes: of codes, of the template's network, of the networks that a code makes (``inner`` wide, ``layers`` deep) and of
-    what makes them (``maker``); nodes near surfaces, their radius in mean distances to the next node, the frequency that
-    sines begin with, and how long a code is at first.
-    """
+    """Architecture of an implicit network; stored on the model card."""
 
     field: Deformation = "mls"
-    code: int = 64
-    width: int = 128
-    depth: int = 3
-    inner: int = 48
-    nodes: int = 240
-    reach: float = 1.7
-    frequency: float = 15.0
+    code: int = 64  # length D of a code
+    width: int = 128  # of the template's network
+    depth: int = 3  # of the template's network
+    inner: int = 48  # width of the networks whose weights are computed from a code
+    nodes: int = 240  # control nodes near surfaces
+    reach: float = 1.7  # radius of the nodes, in mean distances to the nearest other node
+    frequency: float = 15.0  # of the sine activations
     kernel: Kernel = "smooth"
-    layers: int = 2
-    maker: int = 128
-    length: float = 1.0
+    layers: int = 2  # depth of the networks whose weights are computed from a code
+    maker: int = 128  # width of the hypernetworks that compute these weights
+    length: float = 1.0  # expected norm of initial codes
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluated:
-    """What a network says of P points of each of B shapes; gradients are with respect to the points."""
+    """Outputs of a network at P points for each of B shapes; gradients are with respect to the points."""
 
     distance: Float[torch.Tensor, "B P"]
     gradient: Float[torch.Tensor, "B P 3"]
-    F: Float[torch.Tensor, "B P 3 3"]  # of the deformation
+    F: Float[torch.Tensor, "B P 3 3"]  # deformation gradient
     correction: Float[torch.Tensor, "B P"]
     template_gradient: Float[torch.Tensor, "B P 3"]
 
 
 class SineNetwork(nn.Module):
-    """Points to a number: layers of sines (Sitzmann et al., *Implicit Neural Representations with Periodic Activation
-    Functions*, NeurIPS 2020), first weights as that paper draws them.
+    """A scalar function of points with sine activations (Sitzmann et al., *Implicit Neural Representations with Periodic
+    Activation Functions*, NeurIPS 2020), initialized as in that paper.
     """
 
     def __init__(self, width: int, depth: int, frequency: float) -> None:
@@ -85,7 +82,7 @@ class SineNetwork(nn.Module):
 
 
 class HyperNetwork(nn.Module):
-    """A network of sines on points whose weights are made of a code by another network."""
+    """A sine network on points whose weights another network computes from a code."""
 
     def __init__(self, config: ImplicitConfig, outputs: int) -> None:
         super().__init__()
@@ -94,7 +91,7 @@ class HyperNetwork(nn.Module):
         last = nn.Linear(config.maker, sum(self.counts))
         self.maker = nn.Sequential(nn.Linear(config.code, config.maker), nn.ReLU(), last)
         bounds = np.repeat(_sine_bounds(self.sizes, self.frequency), 2)
-        bounds[-2:] *= 0.1  # hardly a deformation at first
+        bounds[-2:] *= 0.1  # a small initial deformation
         start = [float(bound) * (2 * torch.rand(n) - 1) for n, bound in zip(self.counts, bounds, strict=True)]
         last.weight.data.mul_(0.05)
         last.bias.data.copy_(torch.cat(start))
@@ -110,31 +107,31 @@ class HyperNetwork(nn.Module):
 
 
 def _sine_bounds(sizes: list[int], frequency: float) -> list[float]:
-    """Of uniform first weights, for each layer."""
+    """Bounds of the uniform distribution of initial weights, for each layer."""
     return [1 / sizes[0], *(math.sqrt(6 / size) / frequency for size in sizes[1:-1])]
 
 
 class PointwiseDeformation(nn.Module):
-    """DIF-Net's: a network at every point says displacement and correction. F takes a backward pass for each of them."""
+    """DIF-Net's deformation: a network of displacement and correction. F takes one backward pass for each output."""
 
     def __init__(self, config: ImplicitConfig, nodes: torch.Tensor, _: object) -> None:
         super().__init__()
-        self.nodes = nn.Buffer(nodes)  # not used, but known: a checkpoint of other shapes has others
+        self.nodes = nn.Buffer(nodes)  # unused, but stored to identify the training shapes of a checkpoint
         self.network = HyperNetwork(config, 4)
 
-    def forward(self, points: torch.Tensor, code: torch.Tensor, slopes: bool = True) -> tuple[torch.Tensor, ...]:
-        """u and c at points (B, P, 3); with ``slopes`` also their gradients."""
-        if not slopes:
-            answer = self.network(points, code)
-            return answer[..., :3], answer[..., 3]
-        answer, J = value_and_jacobian(self.network, points, code)
-        return answer[..., :3], answer[..., 3], J[..., :3, :], J[..., 3, :]
+    def forward(self, points: torch.Tensor, code: torch.Tensor, derivatives: bool = True) -> tuple[torch.Tensor, ...]:
+        """u and c at points (B, P, 3); with ``derivatives`` also their derivatives."""
+        if not derivatives:
+            output = self.network(points, code)
+            return output[..., :3], output[..., 3]
+        output, J = value_and_jacobian(self.network, points, code)
+        return output[..., :3], output[..., 3], J[..., :3, :], J[..., 3, :]
 
 
 class ReducedDeformation(nn.Module):
-    """Displacements of nodes are decoded from the code, and moving least squares carry them everywhere; F is a formula.
+    """Deformation by control nodes: displacements decoded from the code, interpolated by moving least squares.
 
-    The correction is a network whose weights are made of the code, as in the other.
+    F has a closed form. The correction is a network whose weights are computed from the code, as in `PointwiseDeformation`.
     """
 
     def __init__(self, config: ImplicitConfig, nodes: torch.Tensor, radii: torch.Tensor) -> None:
@@ -142,28 +139,28 @@ class ReducedDeformation(nn.Module):
         self.kernel = config.kernel
         self.nodes, self.radii = nn.Buffer(nodes), nn.Buffer(radii)
         last = nn.Linear(128, 3 * len(nodes))
-        last.weight.data.mul_(0.01)  # as above
+        last.weight.data.mul_(0.01)  # a small initial deformation
         last.bias.data.zero_()
         self.decoder = nn.Sequential(nn.Linear(config.code, 128), nn.ReLU(), last)
         self.network = HyperNetwork(config, 1)
 
     def at(self, points: Float[torch.Tensor, "B P 3"], gradient: bool = True) -> SpaceField:
-        """Shape functions at the points of all shapes."""
+        """Shape functions at points of all shapes; ``gradient``: with derivatives."""
         return SpaceField.at(points, self.nodes, self.radii, self.kernel, gradient)
 
     def vectors(self, code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B K 3"]:
-        """Where the nodes go, relative to where they are."""
+        """Decode displacements of the nodes."""
         result: torch.Tensor = _GAIN * self.decoder(code).unflatten(1, (-1, 3))
         return result
 
-    def forward(self, points: torch.Tensor, code: torch.Tensor, slopes: bool = True) -> tuple[torch.Tensor, ...]:
-        """u and c at points (B, P, 3); with ``slopes`` also their gradients."""
-        field, vectors = self.at(points, slopes), self.vectors(code)
+    def forward(self, points: torch.Tensor, code: torch.Tensor, derivatives: bool = True) -> tuple[torch.Tensor, ...]:
+        """u and c at points (B, P, 3); with ``derivatives`` also their derivatives."""
+        field, vectors = self.at(points, derivatives), self.vectors(code)
         u = field.displacement(vectors)
-        if not slopes:
+        if not derivatives:
             return u, self.network(points, code)[..., 0]
-        answer, slope = value_and_jacobian(self.network, points, code)
-        return u, answer[..., 0], field.jacobian(vectors), slope[..., 0, :]
+        output, slope = value_and_jacobian(self.network, points, code)
+        return u, output[..., 0], field.jacobian(vectors), slope[..., 0, :]
 
 
 class ImplicitNetwork(nn.Module):
@@ -178,16 +175,16 @@ class ImplicitNetwork(nn.Module):
         self.deformation = kind(config, nodes, radii)
 
     def forward(self, points: Float[torch.Tensor, "B P 3"], code: Float[torch.Tensor, "B D"]) -> Evaluated:
-        """Distances and gradients at points of the cube, for shapes with these codes."""
+        """Evaluate distances and gradients at points of the cube, for shapes with these codes."""
         u, correction, J, slope = self.deformation(points, code)
         F = J + torch.eye(3).to(J)
-        value, steep = value_and_jacobian(self.template, points + u, code)
-        gradient = (F.transpose(-1, -2) @ steep[..., 0, :, None])[..., 0] + slope
-        return Evaluated(value[..., 0] + correction, gradient, F, correction, steep[..., 0, :])
+        value, template_slope = value_and_jacobian(self.template, points + u, code)
+        gradient = (F.transpose(-1, -2) @ template_slope[..., 0, :, None])[..., 0] + slope
+        return Evaluated(value[..., 0] + correction, gradient, F, correction, template_slope[..., 0, :])
 
     def distance(
         self, points: Float[torch.Tensor, "B P 3"], code: Float[torch.Tensor, "B D"]
     ) -> tuple[Float[torch.Tensor, "B P"], Float[torch.Tensor, "B P 3"]]:
-        """Distances alone, and where the points lie on the template."""
+        """Evaluate distances only, and the corresponding points on the template."""
         u, correction = self.deformation(points, code, False)
         return self.template(points + u)[..., 0] + correction, points + u

@@ -1,4 +1,4 @@
-"""What a training of implicit surfaces minimises: DIF-Net's terms, and the energies of the reduced field."""
+"""Loss of implicit models: DIF-Net's terms, and the energies of the reduced field."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from meshmatch.implicit.samples import FAR
 from meshmatch.training.datasets import OnDevice
 from meshmatch.training.losses import Objective, Terms
 
-_BLENDED = 4  # every so many-th point for the energies between codes
-_CLAMPED = 0.5  # signed distances of ``published``
+_BLEND_STRIDE = 4  # stride through the points for the energies between codes
+_MAX_SDF = 0.5  # bound on signed distances with ``published``
 
 
 @dataclass(frozen=True, eq=False)
 class ImplicitBatch(OnDevice):
-    """Which B of the shapes, and samples of each."""
+    """Indices of B shapes, and samples of each."""
 
     shape: Int[torch.Tensor, " B"]
     rows: Float[torch.Tensor, "B P 7"]
@@ -28,10 +28,11 @@ class ImplicitBatch(OnDevice):
 
 @dataclass(frozen=True)
 class ImplicitLoss(Objective):
-    """DIF-Net's terms (docs/method.md); volume, arap and blend (L_Z) are of the reduced field alone, where they are added.
+    """Weights of DIF-Net's terms (docs/method.md); ``volume``, ``arap`` and ``blend`` (L_Z) are for the reduced field only.
 
-    Where a distance is not known (NaN), only ``off`` and ``eikonal`` act. ``published``: the terms as DIF-Net has them;
-    then distances are clamped, smoothness is the mean over rows, and of every second free point no distance is used.
+    At points without a distance (NaN), only ``off``, ``eikonal`` and the regularizers act. With ``published`` the terms are
+    exactly DIF-Net's: distances are clamped, smoothness is the mean over the rows of F - I, and the distance of every
+    second point off the surface is not used.
     """
 
     needs_correspondence: ClassVar[bool] = False
@@ -57,58 +58,70 @@ class ImplicitLoss(Objective):
         rows: Float[torch.Tensor, "B P 7"],
         generator: torch.Generator | None,
     ) -> Terms:
-        """The weighted terms for samples of shapes with these codes; their sum under ``total``."""
+        """Compute the weighted terms for samples of shapes with these codes, and their sum, ``total``."""
         at, distance, normals = rows.split((3, 1, 3), -1)
-        said = distance[..., 0].isfinite()
+        has_distance = distance[..., 0].isfinite()
         truth = distance[..., 0].nan_to_num(nan=1.0)
         found = model(at, code)
-        terms = (self._published if self.published else self._usual)(found, code, truth, said, normals)
+        terms = (self._published_terms if self.published else self._default_terms)(
+            found, code, truth, has_distance, normals
+        )
         if isinstance(model.deformation, ReducedDeformation):
             share = torch.rand(len(code), 1, generator=generator).to(code)
             between = model.deformation.vectors(share * code + (1 - share) * code.roll(1, 0))
-            F = torch.eye(3).to(rows) + model.deformation.at(at[:, ::_BLENDED]).jacobian(between)
+            F = torch.eye(3).to(rows) + model.deformation.at(at[:, ::_BLEND_STRIDE]).jacobian(between)
             terms |= self.rigidity(found.F)
             terms["blend"] = self.blend * (volume_energy(F).mean() + arap_energy(F).mean())
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
 
-    def _usual(
-        self, found: Evaluated, code: torch.Tensor, truth: torch.Tensor, said: torch.Tensor, normals: torch.Tensor
+    def _default_terms(
+        self,
+        found: Evaluated,
+        code: torch.Tensor,
+        truth: torch.Tensor,
+        has_distance: torch.Tensor,
+        normals: torch.Tensor,
     ) -> Terms:
         known = normals.square().sum(-1) > 0
         angles = (
             2 - sum(torch.cosine_similarity(g, normals, -1) for g in (found.gradient, found.template_gradient))
         ) * known
         far = (truth.abs() > FAR) * torch.exp(-100 * found.distance.abs())
-        turned = found.F - torch.eye(3).to(found.F)
+        deviation = found.F - torch.eye(3).to(found.F)
         return {
-            "sdf": self.sdf * ((found.distance - truth).abs() * said).sum() / said.sum().clamp_min(1),
+            "sdf": self.sdf * ((found.distance - truth).abs() * has_distance).sum() / has_distance.sum().clamp_min(1),
             "normal": self.normal * angles.sum() / known.sum().clamp_min(1),
             "eikonal": self.eikonal * ((found.gradient.square().sum(-1) + 1e-12).sqrt() - 1).abs().mean(),
             "off": self.off * far.mean(),
-            "smooth": self.smooth * (turned.square().sum((-1, -2)) + 1e-12).sqrt().mean(),
+            "smooth": self.smooth * (deviation.square().sum((-1, -2)) + 1e-12).sqrt().mean(),
             "correct": self.correct * found.correction.abs().mean(),
             "prior": self.prior * code.square().sum(-1).mean(),
         }
 
-    def _published(
-        self, found: Evaluated, code: torch.Tensor, truth: torch.Tensor, said: torch.Tensor, normals: torch.Tensor
+    def _published_terms(
+        self,
+        found: Evaluated,
+        code: torch.Tensor,
+        truth: torch.Tensor,
+        has_distance: torch.Tensor,
+        normals: torch.Tensor,
     ) -> Terms:
-        half = said.shape[1] // 2  # the first half lies on the surface
-        said = said.clone()
-        said[:, half::2] = False
-        near, goal = (each.clamp(-_CLAMPED, _CLAMPED) for each in (found.distance, truth))
+        half = has_distance.shape[1] // 2  # the first half lies on the surface
+        has_distance = has_distance.clone()
+        has_distance[:, half::2] = False
+        near, goal = (each.clamp(-_MAX_SDF, _MAX_SDF) for each in (found.distance, truth))
         angles = sum(1 - torch.cosine_similarity(g, normals, -1) for g in (found.gradient, found.template_gradient))
-        turned = found.F - torch.eye(3).to(found.F)
+        deviation = found.F - torch.eye(3).to(found.F)
         return {
-            "sdf": self.sdf * ((near - goal).abs() * said).mean(),
+            "sdf": self.sdf * ((near - goal).abs() * has_distance).mean(),
             "normal": self.normal * (angles * (normals.square().sum(-1) > 0)).mean(),
             "eikonal": self.eikonal * ((found.gradient.square().sum(-1) + 1e-12).sqrt() - 1).abs().mean(),
-            "off": self.off * (torch.exp(-100 * found.distance.abs()) * ~said).mean(),
-            "smooth": self.smooth * (turned.square().sum(-1) + 1e-12).sqrt().mean(),
+            "off": self.off * (torch.exp(-100 * found.distance.abs()) * ~has_distance).mean(),
+            "smooth": self.smooth * (deviation.square().sum(-1) + 1e-12).sqrt().mean(),
             "correct": self.correct * found.correction.abs().mean(),
             "prior": self.prior * code.square().mean(),
         }
 
 
 PUBLISHED = ImplicitLoss(off=0.5, prior=1e3, published=True)
-"""DIF-Net's terms and weights, relative to each other."""
+"""DIF-Net's terms and relative weights."""

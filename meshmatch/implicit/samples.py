@@ -1,8 +1,8 @@
-"""What an implicit model learns from: points of shapes with normals and signed distances, as far as these are known.
+"""Training samples of implicit models: points of shapes with normals and signed distances, where known.
 
-Watertight meshes know both; clouds their normals alone (a file's are estimated, `.npz` keeps true ones); `.npz` files with
-``points`` and ``distances`` the signed distances, negative inside. Each shape is centred and scaled by its box into the
-cube from -1 to 1; none is turned.
+Watertight meshes give both. Clouds give normals only (estimated for point files, exact in `.npz` files with ``normals``).
+`.npz` files with ``points`` and ``distances`` give signed distances, negative inside. Each shape is centered and scaled by
+its bounding box into the cube from -1 to 1, without a rotation.
 """
 
 from __future__ import annotations
@@ -25,19 +25,24 @@ from meshmatch.shapes.shape import Shape
 FILLED = 0.85
 """Half the longest side of a shape's box, in the cube of half side 1."""
 FAR = 0.05
-"""From the surface, in the cube: where a distance of zero is an error."""
+"""Distance from the surface, in the cube, beyond which a predicted distance of 0 is an error."""
 ARRAYS = ("points", "distances", "normals")
-_DENSE, _MOST, _ALL = 40_000, 16_384, 40_000_000  # surface points; samples of a shape, and of a folder
-_HUGE = 1e100  # whose square is a number
-_BEYOND = 1e30  # half sides of the cube, still a float32
-_NEAR = 0.05  # deviation of the free points that lie near a surface
-_KINDS = {*PLAIN_SUFFIXES, ".npz"} - {".npy"}  # arrays beside shapes are labels or landmarks
+_N_SURFACE, _MAX_PER_SHAPE, _MAX_TOTAL = (
+    40_000,
+    16_384,
+    40_000_000,
+)  # surface points; most samples per shape, per folder
+_MAX_NUMBER = 1e100  # bound on numbers in files; its square is finite
+_MAX_CUBE_NUMBER = 1e30  # bound on numbers in the cube; a float32
+_NEAR_DEVIATION = 0.05  # standard deviation of sample points near the surface
+_SUFFIXES = {*PLAIN_SUFFIXES, ".npz"} - {".npy"}  # .npy files in a folder of shapes are labels or landmarks
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ImplicitSamples(Brief):
-    """N samples of each of S shapes in the cube, the first half on the surface or nearest to it: point, signed distance (NaN
-    where only known to be off the surface), normal (0 where it is not known).
+    """N samples of each of S shapes in the cube; the first half is on the surface, or nearest to it.
+
+    A row is a point, its signed distance (NaN if it is only known to be off the surface), and its normal (0 if not known).
     """
 
     names: tuple[str, ...]
@@ -46,16 +51,16 @@ class ImplicitSamples(Brief):
 
 
 def read_implicit_samples(folder: str | Path, seed: int = 0) -> ImplicitSamples:
-    """Samples of all shapes of a folder, the same for a seed.
+    """Sample all shapes of a folder, reproducibly for a seed.
 
-    `InputError` if there are fewer than two, or one cannot be read or tells no inside: a mesh with holes.
+    `InputError` if there are fewer than two shapes, or one cannot be read or has no inside, such as a mesh with holes.
     """
-    files = sorted(file for file in Path(folder).glob("*") if suffix_of(file) in _KINDS)
+    files = sorted(file for file in Path(folder).glob("*") if suffix_of(file) in _SUFFIXES)
     names = tuple(file.stem for file in files)
     if len(files) < 2 or len(set(names)) < len(names):
-        hint = f"give a folder of watertight meshes, clouds or .npz ({', '.join(sorted(_KINDS))}), each once"
+        hint = f"give a folder of watertight meshes, clouds or .npz ({', '.join(sorted(_SUFFIXES))}), each once"
         raise InputError(f"{folder} has {len(set(names))} shapes of different names; two are needed", hint)
-    N = int(np.clip(_ALL // len(files), 1024, _MOST)) // 4 * 4
+    N = int(np.clip(_MAX_TOTAL // len(files), 1024, _MAX_PER_SHAPE)) // 4 * 4
     found = [samples_of(file, N, np.random.default_rng([seed, number])) for number, file in enumerate(files)]
     frames, rows = zip(*found, strict=True)
     return ImplicitSamples(names, frames, np.stack(rows))
@@ -63,26 +68,26 @@ def read_implicit_samples(folder: str | Path, seed: int = 0) -> ImplicitSamples:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SampledShape(Shape):
-    """The points of ``.npz`` samples as a cloud, in their order; with their distances, or normals of length 1."""
+    """The points of an ``.npz`` file as a cloud, in their order, with either distances or unit normals."""
 
     distances: Float[Floats, " N"] = field(kw_only=True)
     normals: Float[Floats, "N 3"] = field(kw_only=True)
 
 
 def load_source(file: str | Path) -> Shape:
-    """The shape of a file; of ``.npz`` samples a `SampledShape`."""
+    """Read the shape in a file; a `SampledShape` from an ``.npz`` file."""
     if Path(file).suffix.lower() != ".npz":
         return load_shape(file)
-    points, distances, normals = _arrays(Path(file))
+    points, distances, normals = _read_samples(Path(file))
     return SampledShape(points, np.empty((0, 3), np.int64), Path(file).name, distances=distances, normals=normals)
 
 
 def samples_of(
     source: Shape | str | Path, N: int, rng: np.random.Generator, closed: bool = True
 ) -> tuple[Frame, Float[Floats32, "N 7"]]:
-    """The frame of a shape or a file, and ``N`` samples (a multiple of 4) as in `ImplicitSamples`.
+    """Return the frame of a shape or a file, and ``N`` samples (a multiple of 4) as in `ImplicitSamples`.
 
-    Where it need not be ``closed``, a mesh with holes is taken as a cloud with normals. `InputError` as above.
+    Without ``closed``, a mesh with holes is treated as a cloud with normals. `InputError` as `read_implicit_samples`.
     """
     shape = source if isinstance(source, Shape) else load_source(source)
     if isinstance(shape, SampledShape):
@@ -94,7 +99,7 @@ def samples_of(
             raise InputError(
                 f"{shape.name} is not watertight: it has no inside", "close its holes, or give it as a point cloud"
             )
-        count = shape.V if shape.is_cloud else _DENSE
+        count = shape.V if shape.is_cloud else _N_SURFACE
         if solid or shape.invalid is None:
             drawn = sample_surface(shape, count, rng)
         else:
@@ -109,7 +114,7 @@ def samples_of(
     frame = Frame(float((high - low).max()) / (2 * FILLED), np.eye(3), (low + high) / 2)
     with np.errstate(over="ignore"):
         points, distances = frame.apply(points), distances / frame.scale
-    if not all((np.abs(each) < _BEYOND).all() for each in (points, distances)):
+    if not all((np.abs(each) < _MAX_CUBE_NUMBER).all() for each in (points, distances)):
         raise InputError(f"{shape.name or 'the shape'} has points far beyond the shape", "leave these points out")
     if len(distances):
         rows = _nearer_first(points, distances, N, rng)
@@ -118,16 +123,16 @@ def samples_of(
     return frame, rows.astype(np.float32)
 
 
-def _arrays(file: Path) -> tuple[Floats, Floats, Floats]:
-    """Points, and either their distances or their normals."""
-    held = read_npz(existing(file), ARRAYS)
-    points, distances, normals = (np.asarray(held.get(name, ())) for name in ARRAYS)
-    alike = distances.shape == points.shape[:1] or normals.shape == points.shape
-    if not (points.ndim == 2 and points.shape[1] == 3 and alike and len(points)):
+def _read_samples(file: Path) -> tuple[Floats, Floats, Floats]:
+    """Read points, and either distances or normals; the other array is empty."""
+    arrays = read_npz(existing(file), ARRAYS)
+    points, distances, normals = (np.asarray(arrays.get(name, ())) for name in ARRAYS)
+    matching = distances.shape == points.shape[:1] or normals.shape == points.shape
+    if not (points.ndim == 2 and points.shape[1] == 3 and matching and len(points)):
         what = f"{file.name} needs points (N, 3), and distances (N,) or normals (N, 3)"
         raise InputError(what, "see docs/formats.md")
     found = (points, distances, normals)
-    if any(each.dtype.kind not in "fiu" or not (np.abs(each.astype(np.float64)) < _HUGE).all() for each in found):
+    if any(each.dtype.kind not in "fiu" or not (np.abs(each.astype(np.float64)) < _MAX_NUMBER).all() for each in found):
         raise InputError(f"{file.name} holds numbers that are not finite, or huge", "leave these points out")
     points, distances, normals = (each.astype(np.float64) for each in found)
     if not len(distances):
@@ -138,14 +143,14 @@ def _arrays(file: Path) -> tuple[Floats, Floats, Floats]:
 def _nearer_first(
     points: Float[Floats, "P 3"], distances: Float[Floats, " P"], N: int, rng: np.random.Generator
 ) -> Float[Floats, "N 7"]:
-    """Given samples: half of the quarter that is nearest to the surface, half of all."""
+    """Draw N of given samples: half from the quarter that is nearest to the surface, half from all in the cube."""
     kept = np.flatnonzero((np.abs(points) <= 1).all(1))
     near = kept[np.argsort(np.abs(distances[kept]), kind="stable")[: max(1, len(kept) // 4)]]
     rows = np.concatenate([rng.choice(near, N // 2), rng.choice(kept, N // 2)])
     return np.column_stack([points[rows], distances[rows], np.zeros((N, 3))])
 
 
-def _surface(points: Floats, normals: Floats, count: int, rng: np.random.Generator) -> Float[Floats, "N 7"]:
+def _surface_rows(points: Floats, normals: Floats, count: int, rng: np.random.Generator) -> Float[Floats, "N 7"]:
     on = rng.choice(len(points), count, replace=len(points) < count)
     return np.column_stack([points[on], np.zeros(count), normals[on]])
 
@@ -153,26 +158,26 @@ def _surface(points: Floats, normals: Floats, count: int, rng: np.random.Generat
 def off_surface(
     points: Float[Floats, "P 3"], normals: Float[Floats, "P 3"], N: int, rng: np.random.Generator
 ) -> Float[Floats, "N 7"]:
-    """Half on the surface; half anywhere in the cube but near it, where no distance is said."""
+    """Draw N samples: half on the surface, half in the cube away from it, whose distances are unknown (NaN)."""
     free = rng.uniform(-1, 1, (8 * N, 3))
     free = free[cKDTree(points).query(free, distance_upper_bound=FAR)[0] > FAR][: N // 2]
     if len(free) < N // 2:
         raise InputError(f"{len(points)} points leave no room around them in the cube", "are they points of a surface?")
     unknown = np.column_stack([free, np.full(len(free), np.nan), np.zeros_like(free)])
-    return np.concatenate([_surface(points, normals, N // 2, rng), unknown])
+    return np.concatenate([_surface_rows(points, normals, N // 2, rng), unknown])
 
 
 def free_and_surface(
     points: Float[Floats, "P 3"], normals: Float[Floats, "P 3"], N: int, rng: np.random.Generator
 ) -> Float[Floats, "N 7"]:
-    """Half on the surface, a quarter near it, a quarter anywhere in the cube, with distances to the surface.
+    """Draw N samples: half on the surface, a quarter near it, a quarter in the whole cube, with signed distances.
 
-    The nearest points say how far it is, and the nearest eight together on which side.
+    The nearest surface point gives the distance; the nearest eight together give the sign.
     """
-    surface = _surface(points, normals, N // 2, rng)
+    surface = _surface_rows(points, normals, N // 2, rng)
     near = rng.choice(len(points), N // 4, replace=len(points) < N // 4)
-    beside = np.clip(points[near] + _NEAR * rng.standard_normal((N // 4, 3)), -1, 1)
-    free = np.concatenate([beside, rng.uniform(-1, 1, (N // 4, 3))])
+    near_points = np.clip(points[near] + _NEAR_DEVIATION * rng.standard_normal((N // 4, 3)), -1, 1)
+    free = np.concatenate([near_points, rng.uniform(-1, 1, (N // 4, 3))])
     far, index = cKDTree(points).query(free, min(8, len(points)))
     height = ((free[:, None] - points[index]) * normals[index]).sum(2)
     spacing = np.median(far[:, -1] - far[:, 0])

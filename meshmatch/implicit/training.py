@@ -1,4 +1,4 @@
-"""Training of implicit models: a folder of shapes that stand alike becomes one deformed template, with a code for each."""
+"""Train implicit models: learn one template and a code for each shape from a folder of shapes with a common orientation."""
 
 from __future__ import annotations
 
@@ -25,21 +25,22 @@ from meshmatch.training.alone import CHECKPOINT, alone
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.train import CardFacts
 
-_POINTS = 512  # of a shape in a step
+_POINTS = 512  # per shape and step
 TRAINING = TrainConfig(
     steps=1500, shapes=6, warm_up=50, decay=0.7, weight_decay=0.0, average=0.99, workers=0, loss=ImplicitLoss()
 )
-"""How an implicit model is trained unless said otherwise."""
+"""Default training of implicit models."""
 DIF_NET = ImplicitConfig("pointwise", 128, 128, 4, 128, frequency=30.0, layers=4, maker=256, length=0.01 * 128**0.5)
-"""The sizes that DIF-Net was published with, for either field; and its terms, weights and rate:"""
+"""DIF-Net's published sizes, for either field."""
 AS_PUBLISHED = replace(
     TRAINING, rate=1e-4, warm_up=0, decay=0.0, average=0.0, momentum=0.999, clip=None, loss=PUBLISHED
 )  # fmt: skip
+"""DIF-Net's published loss, weights and learning rate."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImplicitDataset(torch.utils.data.Dataset[ImplicitBatch]):
-    """Batch s of the samples depends on the seed and s alone."""
+    """Batches of samples; batch s depends on the seed and s only."""
 
     samples: ImplicitSamples
     config: TrainConfig
@@ -54,15 +55,15 @@ class ImplicitDataset(torch.utils.data.Dataset[ImplicitBatch]):
 
 
 def build_implicit(samples: ImplicitSamples, config: ImplicitConfig, seed: int) -> ImplicitNetwork:
-    """An untrained network: nodes spread over the surfaces of all shapes, and on the cube with a larger radius."""
+    """Build an untrained network, with nodes on the surfaces of all shapes, and on the cube with a larger radius."""
     rng = np.random.default_rng(seed)
     surface = samples.rows[:, : samples.rows.shape[1] // 2, :3].reshape(-1, 3).astype(np.float64)
-    some = surface[rng.choice(len(surface), min(20_000, len(surface)), replace=False)]
-    near, far = some[farthest_points(some, min(config.nodes, len(some)))], cube_nodes()
-    apart = float(cKDTree(near).query(near, 2)[0][:, 1].mean()) if len(near) > 1 else 0.0
-    radii = torch.tensor([min(config.reach * apart, CUBE_RADIUS)] * len(near) + [CUBE_RADIUS] * len(far))
+    chosen = surface[rng.choice(len(surface), min(20_000, len(surface)), replace=False)]
+    inner, outer = chosen[farthest_points(chosen, min(config.nodes, len(chosen)))], cube_nodes()
+    spacing = float(cKDTree(inner).query(inner, 2)[0][:, 1].mean()) if len(inner) > 1 else 0.0
+    radii = torch.tensor([min(config.reach * spacing, CUBE_RADIUS)] * len(inner) + [CUBE_RADIUS] * len(outer))
     torch.manual_seed(seed)
-    return ImplicitNetwork(config, len(samples.names), torch.from_numpy(np.concatenate([near, far])).float(), radii)
+    return ImplicitNetwork(config, len(samples.names), torch.from_numpy(np.concatenate([inner, outer])).float(), radii)
 
 
 @alone
@@ -77,7 +78,7 @@ def train_implicit(
     report: Callable[[StepReport], None] | None = None,
     progress: ProgressCallback | None = None,
 ) -> Path:
-    """Learn a folder of shapes as one deformed template (`ImplicitModel`), or go on from the checkpoint, exactly.
+    """Train an `ImplicitModel` on a folder of shapes, or resume from a checkpoint, exactly.
 
     Parameters
     ----------
@@ -85,16 +86,16 @@ def train_implicit(
         The model's folder.
     shapes
         A folder of watertight meshes, clouds or .npz samples (the page on formats) that share an orientation; they are
-        centred and scaled, not turned.
+        centered and scaled, not rotated.
     config
         The network; ``ImplicitConfig(field="pointwise")`` is DIF-Net's deformation, "mls" (the default) that of control
         nodes.
     training
         Steps, batches, learning rate and device.
     facts
-        What the card says of the model.
+        Entries of the model's card.
     resume
-        Go on from a checkpoint if there is one.
+        Resume from a checkpoint if there is one.
     report
         Called with losses and validation.
     progress
@@ -103,16 +104,16 @@ def train_implicit(
     Returns
     -------
     Path
-        The folder, with ``weights.safetensors`` and last ``implicit.json``.
+        The folder, with ``weights.safetensors`` and ``implicit.json``, which is written last.
 
     Raises
     ------
     InputError
-        The shapes cannot be learned from.
+        The shapes cannot be used for training.
     OptionError
-        A training in bfloat16.
+        Training in bfloat16 was requested.
     ModelError
-        The checkpoint is of another training.
+        The checkpoint is from another training.
     OutputError
         The folder cannot be written, or another training writes to it.
 
@@ -136,8 +137,8 @@ def train_implicit(
     trainer = Trainer(network, None, replace(training, shapes=min(training.shapes, len(shapes.names))))
     if resume and checkpoint.is_file():
         trainer.load(checkpoint)
-    told = Progress(progress, "training")
-    trainer.run(ImplicitDataset(shapes, trainer.config), checkpoint, report, progress=told)
+    reporter = Progress(progress, "training")
+    trainer.run(ImplicitDataset(shapes, trainer.config), checkpoint, report, progress=reporter)
     trainer.close()
     if trainer.rank == 0:
         (output / IMPLICIT).unlink(missing_ok=True)

@@ -1,7 +1,7 @@
-"""The network of a category: points in, the rows of the template's field out (node vectors; a code if pointwise).
+"""The network of a category in torch: from point sets to rows of the template's field (node vectors, or a code).
 
-Frames. ``scan frame``: centroid 0, surface area 1, any rotation. ``core frame``: the scan turned and shifted
-so that the fitted template's core (a body's torso; the whole shape elsewhere) lies on the template's own.
+Frames. ``scan frame``: centroid 0, surface area 1, any rotation. ``core frame``: the scan rotated and translated
+so that the fitted template's core (a body's torso, or the whole shape in other categories) lies on the template's own.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from meshmatch.fields.field import TURN_ROWS, PointField, PointwiseField
 from meshmatch.fields.shape_functions import has_nodes, shape_functions
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models import layers
-from meshmatch.models.network import NetworkConfig, naming
+from meshmatch.models.network import NetworkConfig, encoder_errors
 
 
 def rotation_from_six(six: Float[torch.Tensor, "B 6"]) -> Float[torch.Tensor, "B 3 3"]:
@@ -31,11 +31,11 @@ def rotation_from_six(six: Float[torch.Tensor, "B 6"]) -> Float[torch.Tensor, "B
 
 
 class Deformer(nn.Module):
-    """Aligner, encoder, decoder and correctors around one template's nodes.
+    """Aligner, encoder, decoder and corrector for the nodes of one template.
 
-    Nodes and anchors are in the template frame: anchors are where a correction looks at the scan, ``anchor_phi`` the
-    field's shape functions there, None where the field has no nodes. Basis points of encoder and aligner are ignored (may
-    be empty) where the config does not use them.
+    Nodes and anchors are in the template frame. Anchors are points at which corrections compare the deformed template with
+    the scan; ``anchor_phi`` are the field's shape functions there, None if the field has no nodes. Basis points of the
+    encoder and the aligner are ignored, and may be empty, if the config does not use them.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Deformer(nn.Module):
         self.register_buffer("anchor_phi", anchor_phi)
         self.encoder: layers.Encoder
         if isinstance(config.encoder, type):
-            with naming(config.encoder):
+            with encoder_errors(config.encoder):
                 self.encoder = config.encoder(basis, config.code)
         elif config.encoder == "basis":
             self.encoder = layers.BasisEncoder(basis, config.width, config.depth, config.code)
@@ -86,9 +86,9 @@ class Deformer(nn.Module):
         radius: float | Float[Floats, " K"],
         kernel: Kernel,
     ) -> PointField:
-        """The field that reads this network's rows, on points of the template's frame.
+        """The field on points of the template's frame that this network's rows parameterize.
 
-        ``nodes`` are the template's, in their own precision.
+        ``nodes`` are the template's, in full precision.
         """
         if isinstance(self.decoder, layers.PointDecoder):
             return self.pointwise_field(points)
@@ -102,14 +102,14 @@ class Deformer(nn.Module):
 
     def rotate_rows(self, vectors: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "R 3"]:
         if isinstance(self.decoder, layers.PointDecoder):
-            return fields.turned_rows(vectors, turn)
+            return fields.rotated_rows(vectors, turn)
         nodes = _array(self.nodes)  # as `NodeNetwork` does
         return (nodes + vectors) @ turn - nodes
 
     def align(
         self, features: Float[torch.Tensor, "B N 3"]
     ) -> tuple[Float[torch.Tensor, "B 3 3"], Float[torch.Tensor, "B 3"]]:
-        """Rotation R and center t of the core: scan = R core + t."""
+        """Predict rotation R and center t of the core: scan = R core + t."""
         assert self.aligner is not None
         out = self.aligner(features)
         return rotation_from_six(out[:, :6]), out[:, 6:]
@@ -117,7 +117,7 @@ class Deformer(nn.Module):
     def correct(
         self, vectors: Float[torch.Tensor, "B R 3"], points: Float[torch.Tensor, "B P 3"]
     ) -> Float[torch.Tensor, "B R 3"]:
-        """One learned registration step: better rows from rows and scan points, both in the core frame."""
+        """Apply one learned registration step to rows, given the scan's points; both in the core frame."""
         assert self.corrector is not None
         if isinstance(self.decoder, layers.PointDecoder):
             motion = self.decoder.displacement
@@ -125,18 +125,18 @@ class Deformer(nn.Module):
         else:
             assert self.anchor_phi is not None
             moved = fields.apply_shape_functions(self.anchor_phi, vectors)  # B A 3
-        seen = layers.two_way_offsets(self.anchors + moved, points)
-        features = torch.cat([seen[..., :6] * 10.0, seen[..., 6:], moved * 3.0], -1)
+        offsets = layers.two_way_offsets(self.anchors + moved, points)
+        features = torch.cat([offsets[..., :6] * 10.0, offsets[..., 6:], moved * 3.0], -1)
         change = 0.1 * self.corrector(features.flatten(1)).unflatten(-1, (-1, 3))
         if isinstance(self.decoder, layers.PointDecoder):
-            change = nn.functional.pad(change, (0, 0, 0, TURN_ROWS))  # the code alone is learned
+            change = nn.functional.pad(change, (0, 0, 0, TURN_ROWS))  # corrections change the code only
         result: torch.Tensor = vectors + change
         return result
 
     def forward(self, points: torch.Tensor) -> Float[torch.Tensor, "B R 3"]:
-        """The rows of scans (B, P, 3) in the core frame, in the network's precision; with nodes, these are their vectors.
+        """Predict the rows of scans (B, P, 3) in the core frame, in the network's precision; node vectors if it has nodes.
 
-        `InputError` if this is not what the points are.
+        `InputError` if ``points`` are not a tensor of this shape, or not finite.
         """
         if not isinstance(points, torch.Tensor):
             raise InputError(f"points must be a tensor, not {type(points).__name__}", "torch.as_tensor makes one")
@@ -154,14 +154,14 @@ class Deformer(nn.Module):
         return result
 
     def code_of(self, points: Float[torch.Tensor, "B P 3"]) -> Float[torch.Tensor, "B D"]:
-        """Codes of scans in the core frame; `ModelError` if an encoder of one's own fails, or gives something else."""
-        with naming(self.config.encoder):
+        """Encode scans in the core frame; `ModelError` if a custom encoder fails, or returns another shape."""
+        with encoder_errors(self.config.encoder):
             code: torch.Tensor = self.encoder(self.encoder.features(points))
             if tuple(code.shape) != (wanted := (len(points), self.config.code)):
                 raise ValueError(f"it gives {tuple(code.shape)} instead of {wanted}")
         return code
 
-    # The same questions in arrays, as `models.network.Network` has them: for fields that torch alone can evaluate.
+    # The interface `models.network.Network`, with arrays: for fits with networks that only torch can evaluate.
 
     @property
     def align_basis(self) -> Float[Floats32, "M 3"]:
@@ -190,7 +190,7 @@ class Deformer(nn.Module):
 
 
 def blank_deformer(config: NetworkConfig, K: int) -> Deformer:
-    """A network for K nodes whose weights and buffers have shapes but no memory: a card cannot ask for gigabytes."""
+    """A network for K nodes on the meta device: shapes of weights and buffers, without allocating what a card asks for."""
     with torch.device("meta"):
         nodes, anchors = torch.zeros(K, 3), torch.zeros(K, 3)
         phi = torch.zeros(K, K) if has_nodes(config.field) else None
@@ -199,13 +199,13 @@ def blank_deformer(config: NetworkConfig, K: int) -> Deformer:
 
 
 def with_weights(config: NetworkConfig, K: int, weights: Mapping[str, np.ndarray]) -> Deformer:
-    """A network for K nodes with given weights (`models.network.weight_shapes`), in evaluation mode."""
+    """Build a network for K nodes with given weights (`models.network.weight_shapes`), in evaluation mode."""
     network = blank_deformer(config, K)
-    # copies: weights that training changes are no one else's
+    # copies, because training changes weights in place
     network.load_state_dict({name: torch.from_numpy(np.array(w)) for name, w in weights.items()}, assign=True)
     return network.eval()
 
 
 def _array(tensor: torch.Tensor) -> Floats:
-    """In NumPy's precision, which only the CPU is asked for: a device may have no float64."""
+    """Convert to a float64 array, on the CPU because other devices may not support float64."""
     return tensor.cpu().double().numpy()

@@ -1,10 +1,8 @@
-"""Where a network is evaluated: in NumPy for matching (`NodeNetwork`), or in torch, for pointwise fields and on a GPU; and
-where it is trained.
+"""Load and evaluate networks: in NumPy for matching (`NodeNetwork`), or in torch for pointwise fields and on a GPU.
 
-The layers are few, dense and small: their weights are read from memory once for a batch, so that twenty clouds cost about
-as much as four. Fits of many shapes ask about few clouds each, and together (`meshmatch.gathering`); the answers are those
-that each would have alone, bit for bit. `models.deformer` is the same network in torch;
-a test holds both to the same answers.
+The layers are few, dense and small: their weights are read from memory once per batch, so that twenty clouds cost about
+as much as four. Fits of many shapes have few clouds each, and evaluate them in common batches (`meshmatch.gathering`);
+results are bitwise those of separate calls. `models.deformer` is the same network in torch; a test compares the two.
 """
 
 from __future__ import annotations
@@ -32,19 +30,18 @@ if TYPE_CHECKING:
     from meshmatch.models.deformer import Deformer
 
 _EPSILON = np.float32(1e-5)  # of layer and batch norms, as in torch
-_SINGLE_ROWS, _FEW_ROWS = 3, 32  # how many rows are multiplied one by one, and how many as columns
-# Fewer weights stay in the cache, and BLAS may add up the products of a small matrix in another order where there are more
-# rows: questions are then multiplied one by one.
+_SINGLE_ROWS, _FEW_ROWS = 3, 32  # up to these numbers, rows are multiplied one by one, or as columns
+# Requests are multiplied together only by matrices of at least this size. Smaller ones stay in the cache anyway, and BLAS
+# may sum their products in another order if there are more rows.
 _MIN_WEIGHTS = 2**18
 
 Clouds = Sequence[Float[Floats, "P 3"]]
 
 
 def load_network(path: str | Path, config: NetworkConfig, K: int) -> Network:
-    """A network for K nodes with the weights of a file, in evaluation mode. A pointwise one, and one with somebody's own
-    encoder, needs torch.
+    """Load a network for K nodes, in evaluation mode; one that is pointwise or has a custom encoder needs torch.
 
-    `ModelError` if the file is damaged, or holds the weights of another network.
+    `ModelError` if the file is damaged, or contains the weights of another network.
     """
     if not config.in_torch:
         return NodeNetwork(config, load_weights(path, weight_shapes(config, K)))
@@ -56,7 +53,7 @@ def load_network(path: str | Path, config: NetworkConfig, K: int) -> Network:
 
 
 def in_torch(network: Network, K: int, device: str = "cpu") -> Deformer:
-    """A network for K nodes as torch has it, on one of torch's devices such as "cuda"; `OptionError` if it is not there."""
+    """Convert a network for K nodes to torch, on a device such as "cuda"; `OptionError` if the device is not available."""
     with needs("torch", "train"):
         import torch
 
@@ -64,20 +61,21 @@ def in_torch(network: Network, K: int, device: str = "cpu") -> Deformer:
 
     if isinstance(network, NodeNetwork):
         found = with_weights(network.config, K, network.weights)
-    else:  # in torch already; others may use it on the CPU
+    else:  # in torch already; moved to a device as a copy, because others may use it on the CPU
         assert isinstance(network, Deformer)
         found = network if device == "cpu" else copy.deepcopy(network)
     try:
         return found.to(torch.device(device))
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        why = str(error).splitlines()[0][:80]  # or a list of all devices that torch has ever had
+        why = str(error).splitlines()[0][:80]  # torch may list all devices that it knows
         problem = f"device {device!r} cannot be used{'' if why.startswith('Expected one of') else f': {why}'}"
         raise OptionError(problem, "use cpu; cuda needs a GPU and a torch that was built for it") from error
 
 
 def training_device(rank: int = 0, wanted: str = "auto") -> torch.device:
-    """Where networks are trained: the GPU of this rank among the machine's, or the CPU where there is none; or what is
-    wanted, "cpu", "cuda" or "mps" (`OptionError` if it is not there).
+    """Device for training: the GPU with the number of this rank, or the CPU if there is no GPU.
+
+    ``wanted`` selects "cpu", "cuda" or "mps" instead; `OptionError` if that is not available.
     """
     import torch
 
@@ -91,7 +89,7 @@ def training_device(rank: int = 0, wanted: str = "auto") -> torch.device:
 
 
 class NodeNetwork:
-    """A network whose answers are node vectors; weights have the names of `models.deformer.Deformer`."""
+    """A network that predicts node vectors, in NumPy; weights have the names of `models.deformer.Deformer`."""
 
     def __init__(self, config: NetworkConfig, weights: Mapping[str, np.ndarray]) -> None:
         self.config, self.weights = config, weights
@@ -103,14 +101,14 @@ class NodeNetwork:
     def predict(self, clouds: Sequence[Float[Floats, "P 3"]]) -> Float[Floats, "B K 3"]:
         return gathered(self.predict_each, clouds)
 
-    def predict_each(self, questions: Sequence[Clouds]) -> list[Float[Floats, "B K 3"]]:
-        """What `predict` says of each of several questions.
+    def predict_each(self, requests: Sequence[Clouds]) -> list[Float[Floats, "B K 3"]]:
+        """Evaluate `predict` for several requests in one batch.
 
-        Each has the answer that it would have alone: bit for bit where a column of a matrix product does not depend on how
-        many columns there are, as with OpenBLAS; otherwise to the rounding of 32-bit numbers.
+        Results are those of separate calls: bitwise if a column of a matrix product does not depend on the number of
+        columns, as with OpenBLAS; otherwise up to float32 rounding.
         """
-        sizes = [len(clouds) for clouds in questions]
-        points = [np.asarray(cloud, np.float32) for clouds in questions for cloud in clouds]
+        sizes = [len(clouds) for clouds in requests]
+        points = [np.asarray(cloud, np.float32) for clouds in requests for cloud in clouds]
         vectors = self._decode(self._encode(points, sizes), sizes)
         trees = parallel_map(quick_tree, points) if self.config.corrections else []
         for _ in range(self.config.corrections):
@@ -131,15 +129,15 @@ class NodeNetwork:
 
     def rotate_rows(self, rows: Float[Floats, "K 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "K 3"]:
         nodes = self.weights["nodes"].astype(np.float64)
-        # A node at q moves to Q^T (q + u), so its vector in the turned frame is that minus q.
+        # A node at q moves to Q^T (q + u), so its vector in the rotated frame is that minus q.
         return (nodes + rows) @ turn - nodes
 
     def _encode(self, clouds: Sequence[Floats32], sizes: Sequence[int]) -> Float[Floats32, "B D"]:
         if self.config.encoder == "point":
             return np.stack([self._encode_points(cloud) for cloud in clouds])
         basis = self.weights["encoder.basis"]
-        seen = parallel_map(lambda cloud: 5 * (cloud[nearest(cloud, basis)] - basis), clouds)
-        return self._residual_mlp("encoder.network", np.stack(seen).reshape(len(clouds), -1), sizes)
+        offsets = parallel_map(lambda cloud: 5 * (cloud[nearest(cloud, basis)] - basis), clouds)
+        return self._residual_mlp("encoder.network", np.stack(offsets).reshape(len(clouds), -1), sizes)
 
     def _encode_points(self, cloud: Float[Floats32, "P 3"]) -> Float[Floats32, " D"]:
         frequencies = self.weights["encoder.frequencies"]
@@ -171,20 +169,20 @@ class NodeNetwork:
     ) -> Float[Floats32, "B K 3"]:
         """One learned registration step."""
         anchors, B = self.weights["anchors"], len(vectors)
-        moved = np.concatenate([self._moved_anchors(some) for some in np.split(vectors, np.cumsum(sizes)[:-1])])
-        seen = np.stack(parallel_map(_two_way_offsets, anchors + moved, clouds, trees))
-        features = np.concatenate([10 * seen[..., :6], seen[..., 6:], 3 * moved], -1)
+        moved = np.concatenate([self._moved_anchors(each) for each in np.split(vectors, np.cumsum(sizes)[:-1])])
+        offsets = np.stack(parallel_map(_two_way_offsets, anchors + moved, clouds, trees))
+        features = np.concatenate([10 * offsets[..., :6], offsets[..., 6:], 3 * moved], -1)
         change = self._residual_mlp("corrector", features.reshape(B, -1), sizes)
         return vectors + np.float32(0.1) * change.reshape(B, -1, 3)
 
     def _moved_anchors(self, vectors: Float[Floats32, "B K 3"]) -> Float[Floats32, "B A 3"]:
-        """How node vectors displace the anchors."""
+        """Displacements of the anchors by node vectors."""
         phi, (B, K, _) = self.weights["anchor_phi"], vectors.shape
         moved = phi @ vectors.transpose(1, 0, 2).reshape(K, -1)
         return np.asarray(moved.reshape(len(phi), B, 3).transpose(1, 0, 2))
 
     def _linear(self, name: str, x: Floats32, sizes: Sequence[int] | None = None) -> Floats32:
-        """Of rows ``x``; those of several questions have these ``sizes``."""
+        """Apply a linear layer to rows ``x``; ``sizes`` are the numbers of rows of each request."""
         weight = self.weights[f"{name}.weight"]
         out = _product(x, weight) if sizes is None else _products(x, weight, sizes)
         bias = self.weights.get(f"{name}.bias")
@@ -221,7 +219,7 @@ def rotation_from_six(six: Float[Floats, "B 6"]) -> Float[Floats, "B 3 3"]:
 
 
 def _product(x: Floats32, weight: Float[Floats32, "O I"]) -> Floats32:
-    """``x @ weight.T``; otherwise for few rows, where BLAS takes longer to copy the matrix than to multiply."""
+    """``x @ weight.T``, in other forms for few rows, where BLAS takes longer to copy the matrix than to multiply."""
     if x.ndim != 2 or len(x) > _FEW_ROWS:
         return np.asarray(x @ weight.T)
     if len(x) <= _SINGLE_ROWS:
@@ -230,7 +228,7 @@ def _product(x: Floats32, weight: Float[Floats32, "O I"]) -> Floats32:
 
 
 def _products(x: Floats32, weight: Float[Floats32, "O I"], sizes: Sequence[int]) -> Floats32:
-    """`_product` of each question, whose rows stand one after another; of all at once where that gives the same bits."""
+    """`_product` for each request, whose rows are concatenated; in one product where the result is bitwise the same."""
     if len(sizes) == 1:
         return _product(x, weight)
     rows = np.repeat(sizes, sizes)
@@ -249,7 +247,7 @@ def _gelu(x: Floats32) -> Floats32:
 
 
 def _two_way_offsets(anchors: Float[Floats32, "A 3"], points: Floats32, tree: cKDTree) -> Floats32:
-    """What a registration sees at its anchors (A, 7); see `models.layers.two_way_offsets`."""
+    """(A, 7) features of a correction; see `models.layers.two_way_offsets`."""
     A = len(anchors)
     forward = points[tree.query(anchors)[1]] - anchors
     owner = nearest(anchors, points)

@@ -1,7 +1,7 @@
-"""What the networks are built of, in torch: nearest neighbours, residual blocks, encoders and decoders.
+"""Building blocks of the networks in torch: nearest neighbors, residual blocks, encoders and decoders.
 
-Encoders take a point set to a shape code; they ignore the order and the number of the points. Decoders take a code to
-the rows that a field reads: one displacement vector per node, or the code itself.
+Encoders map a point set to a shape code, independent of the order and the number of the points. Decoders map a code to
+the rows that parameterize a field: one displacement vector per node, or the code itself.
 """
 
 from __future__ import annotations
@@ -21,15 +21,17 @@ from meshmatch.errors import InputError
 from meshmatch.fields.field import pack
 from meshmatch.geometry.oriented import quick_tree
 
-_MOST_PAIRS = 1 << 29  # that are compared at once: 2 GiB of distances
+_MAX_PAIRS = 1 << 29  # compared at once: 2 GiB of distances
 _FREQUENCY = 1.5  # standard deviation of the encoding's frequencies, in waves per sqrt(area); set by hand
 
 
 def nearest_index(
     queries: Float[torch.Tensor, "B Q D"], points: Float[torch.Tensor, "B P D"]
 ) -> Int[torch.Tensor, "B Q"]:
-    """Index of the nearest of ``points``: trees on a CPU, where comparing all pairs is far slower, and which `InputError`
-    tells if they are not finite."""
+    """Index of the point nearest to each query; `InputError` on a CPU if they are not finite.
+
+    Uses search trees on a CPU, where comparing all pairs is far slower.
+    """
     if queries.device.type != "cpu":
         return nearest_of_all(queries, points)
     pairs = zip(queries.detach().numpy(), points.detach().numpy(), strict=True)
@@ -43,12 +45,14 @@ def nearest_index(
 def nearest_of_all(
     queries: Float[torch.Tensor, "B Q D"], points: Float[torch.Tensor, "B P D"]
 ) -> Int[torch.Tensor, "B Q"]:
-    """`nearest_index` by comparing all pairs, some clouds at a time: squares of differences, coordinate by coordinate, which
-    no setting rounds as it may round products of matrices."""
+    """`nearest_index` by comparing all pairs, in chunks of clouds.
+
+    Squared differences are summed by coordinate, because settings may reduce the precision of matrix products.
+    """
     queries, points = queries.float(), points.float()
-    at_once = max(1, _MOST_PAIRS // max(1, queries.shape[1] * points.shape[1]))
+    chunk = max(1, _MAX_PAIRS // max(1, queries.shape[1] * points.shape[1]))
     found = []
-    for some, cloud in zip(queries.split(at_once), points.split(at_once), strict=True):
+    for some, cloud in zip(queries.split(chunk), points.split(chunk), strict=True):
         squared = (some[:, :, None, 0] - cloud[:, None, :, 0]).square()
         for k in range(1, some.shape[2]):
             squared = squared + (some[:, :, None, k] - cloud[:, None, :, k]).square()
@@ -59,7 +63,7 @@ def nearest_of_all(
 def nearest(
     queries: Float[torch.Tensor, "B Q 3"], points: Float[torch.Tensor, "B P 3"]
 ) -> tuple[Int[torch.Tensor, "B Q"], Float[torch.Tensor, "B Q 3"]]:
-    """Index of the nearest of ``points``, and its offset from the query, in the unit of the input."""
+    """Index of the point nearest to each query, and its offset from the query, in the unit of the input."""
     index = nearest_index(queries, points)
     return index, torch.gather(points, 1, index[..., None].expand(-1, -1, 3)) - queries
 
@@ -67,10 +71,10 @@ def nearest(
 def two_way_offsets(
     anchors: Float[torch.Tensor, "B A 3"], points: Float[torch.Tensor, "B P 3"]
 ) -> Float[torch.Tensor, "B A 7"]:
-    """What a registration sees at its anchors.
+    """Features of a correction step, at the anchors.
 
-    Columns 0..2: offset to the nearest point; 3..5: mean offset of the points whose nearest anchor this is
-    (0 if there is none); 6: log(1 + their share times A).
+    Columns 0..2: offset to the nearest point; 3..5: mean offset to the points whose nearest anchor this is
+    (0 if there are none); 6: log(1 + their share times A).
     """
     B, A, _ = anchors.shape
     forward = nearest(anchors, points)[1]
@@ -98,7 +102,7 @@ class ResidualBlock(nn.Module):
 
 
 class BatchNorm(nn.BatchNorm1d):
-    """Of the batches of all processes together, where several train: torch's own does so on GPUs alone."""
+    """Batch norm over the batches of all training processes; `torch.nn.SyncBatchNorm` works on GPUs only."""
 
     def forward(self, x: Float[torch.Tensor, "N C"]) -> Float[torch.Tensor, "N C"]:
         if not (self.training and dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1):
@@ -130,14 +134,14 @@ def residual_mlp(inputs: int, width: int, depth: int, outputs: int) -> nn.Sequen
 
 
 def _start_near_zero(last: nn.Module) -> None:
-    """An untrained deformer then leaves its template almost at rest."""
+    """Initialize an output layer such that an untrained deformer hardly moves its template."""
     assert isinstance(last, nn.Linear)
     nn.init.normal_(last.weight, std=2e-3)
     nn.init.zeros_(last.bias)
 
 
 def _shared_mlp(width: int, norm: Callable[[int], nn.Module]) -> nn.Sequential:
-    """What is left of an MLP shared over points after its first layer: three halving layers, three numbers."""
+    """An MLP shared over points, without its first layer: norm, two layers that halve the width, three outputs."""
     layers: list[nn.Module] = [norm(width), nn.ReLU()]
     for a, b in ((width, width // 2), (width // 2, width // 4)):
         layers += [nn.Linear(a, b), norm(b), nn.ReLU()]
@@ -145,18 +149,19 @@ def _shared_mlp(width: int, norm: Callable[[int], nn.Module]) -> nn.Sequential:
 
 
 class Encoder(nn.Module):
-    """What a network asks of its encoder.
+    """Base class of encoders.
 
-    One's own is made with basis points (M, 3), spread where the shapes of the category are, and the length D of a code.
-    Batches are drawn with `features`, by other processes or on a GPU, without a gradient; `forward` is what is trained.
+    Custom encoders are constructed with basis points (M, 3), spread over the region of the category's shapes, and the
+    length D of a code. `features` runs while batches are drawn, in other processes or on a GPU, without gradients;
+    `forward` is trained.
     """
 
     def features(self, points: Float[torch.Tensor, "B P 3"]) -> Float[torch.Tensor, "B ..."]:
-        """What is learned from, of point sets in the core frame."""
+        """Compute the input of `forward` from point sets in the core frame."""
         raise NotImplementedError
 
     def forward(self, features: Float[torch.Tensor, "B ..."]) -> Float[torch.Tensor, "B D"]:
-        """Codes."""
+        """Compute codes from features."""
         raise NotImplementedError
 
 
@@ -174,7 +179,7 @@ class BasisEncoder(Encoder):
         self.network = residual_mlp(3 * len(basis), width, depth, outputs)
 
     def features(self, points: Float[torch.Tensor, "B P 3"]) -> Float[torch.Tensor, "B M 3"]:
-        """Offsets from the basis, in units of about one standard deviation."""
+        """Offsets from the basis points, scaled to a standard deviation of about one."""
         offsets = nearest(self.basis.expand(len(points), -1, -1), points)[1]
         return offsets * 5.0
 
@@ -187,7 +192,7 @@ class PointEncoder(Encoder):
     """The paper's encoder: positional encoding on a hypersphere, shared MLP, max-pool, two linear layers.
 
     The encoding has Gaussian frequencies (Tancik et al., *Fourier Features Let Networks Learn High Frequency Functions in
-    Low Dimensional Domains*, NeurIPS 2020), and 128 numbers by default.
+    Low Dimensional Domains*, NeurIPS 2020), by default 64 of them, which give 128 numbers.
     """
 
     def __init__(self, outputs: int, latent: int = 1024, frequencies: int = 64, dropout: float = 0.3) -> None:
@@ -214,7 +219,7 @@ class PointEncoder(Encoder):
 
 
 class FlatDecoder(nn.Module):
-    """One residual MLP from the code to all node vectors at once."""
+    """A residual MLP from the code to all node vectors."""
 
     def __init__(self, code: int, width: int, depth: int, K: int) -> None:
         super().__init__()
@@ -229,8 +234,8 @@ class FlatDecoder(nn.Module):
 class NodeDecoder(nn.Module):
     """The paper's decoder: [q_i, code] -> MLP shared over nodes, 2 tanh at the end.
 
-    The code's part of the first layer is computed once per shape and broadcast over the nodes: the same
-    numbers for a fraction of the cost.
+    The code's part of the first layer is computed once per shape and broadcast over the nodes, which gives the same
+    result at a fraction of the cost.
     """
 
     def __init__(self, code: int, nodes: Float[torch.Tensor, "K 3"], width: int = 1024) -> None:
@@ -251,9 +256,9 @@ class NodeDecoder(nn.Module):
 class PointDecoder(nn.Module):
     """The decoder of *3D-CODED* (ECCV 2018): [x, code] -> MLP shared over all points, 2 tanh at the end.
 
-    Layers are normalised within a point where the original normalises over a batch of points: with that, a point's
-    displacement would depend on all others, and its derivative be no deformation gradient. The answer to a code is the
-    code, for a field with `displacement` in it.
+    Layer norms replace the batch norms of the original, with which a point's displacement would depend on all other
+    points, and its derivative would not be a deformation gradient. `forward` returns the code, as rows for a
+    `PointwiseField` with `displacement` as its motion.
     """
 
     def __init__(self, code: int, width: int = 1024) -> None:

@@ -1,4 +1,4 @@
-"""What a network is made of (`NetworkConfig`, the shapes of its weights), and what fitting asks of it (`Network`)."""
+"""Configuration of deformation networks, the shapes of their weights, and the interface that fitting uses (`Network`)."""
 
 from __future__ import annotations
 
@@ -12,22 +12,21 @@ from meshmatch.arrays import Float, Floats, Floats32
 from meshmatch.errors import MeshmatchError, ModelError
 from meshmatch.fields.shape_functions import FIELDS, FieldName, has_nodes
 
-POINT_SIZES = (128, 128, 256, 512, 1024)  # of the layers of `models.layers.PointEncoder`
-_MAX = {
+POINT_SIZES = (128, 128, 256, 512, 1024)  # widths of the layers of `models.layers.PointEncoder`
+_MAX_SIZES = {
     "code": 4096, "width": 8192, "depth": 64, "basis": 8192,
     "align_basis": 8192, "align_width": 8192, "corrections": 64, "correct_width": 8192,
 }  # fmt: skip
-_NEEDED = ("code", "width")  # nothing could pass through none
+_POSITIVE = ("code", "width")  # options that must be at least 1
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Sizes and choices of a deformer; saved in the model card (cards without ``field`` have moving least squares).
+    """Architecture of a deformer; stored on the model card (cards without ``field`` use moving least squares).
 
-    The defaults were chosen on generated bodies (docs/paper.md).
-
-    A pointwise field has a decoder of its own, whatever ``decoder`` says. ``encoder`` may also be a class of one's own
-    (docs/training.md): it is made with basis points (M, 3) and the length of a code, as `models.layers.Encoder` says.
+    The defaults were chosen on generated bodies (docs/paper.md). A pointwise field has its own decoder, independent of
+    ``decoder``. ``encoder`` may also be a custom class (docs/training.md), which is called with basis points (M, 3) and
+    the length of a code, see `models.layers.Encoder`.
     """
 
     encoder: Literal["basis", "point"] | type = "basis"
@@ -43,7 +42,7 @@ class NetworkConfig:
     field: FieldName = "mls"
 
     def __post_init__(self) -> None:
-        # A card may come from anywhere: bound what building the network allocates.
+        # Cards are untrusted: bound the memory that building the network takes.
         if not isinstance(self.encoder, str):
             _check_class(self.encoder)
         known = isinstance(self.encoder, type) or self.encoder in ("basis", "point")
@@ -51,20 +50,20 @@ class NetworkConfig:
             raise ModelError(f"unknown network: encoder {self.encoder!r}, decoder {self.decoder!r}", "update meshmatch")
         if self.field not in FIELDS:
             raise ModelError(f"unknown field {self.field!r}, only {', '.join(FIELDS)}", "update meshmatch")
-        for name, limit in _MAX.items():
+        for name, limit in _MAX_SIZES.items():
             value = getattr(self, name)
-            least = 1 if name in _NEEDED else 0
+            least = 1 if name in _POSITIVE else 0
             if type(value) is not int or not least <= value <= limit:
                 raise ModelError(f"network option {name} must be an integer from {least} to {limit}, not {value!r}")
 
     @property
     def in_torch(self) -> bool:
-        """Whether only torch can evaluate it: it has no nodes, or somebody's own encoder."""
+        """Whether only torch can evaluate it, because it has no nodes or a custom encoder."""
         return not has_nodes(self.field) or isinstance(self.encoder, type)
 
     @staticmethod
     def from_dict(values: dict[str, Any], encoder: type | None = None) -> NetworkConfig:
-        """The config of a card; ``encoder`` is the class that the card names, if it names one."""
+        """Parse the config on a card; ``encoder`` is the class that the card names, if the model has a custom encoder."""
         known = NetworkConfig.__dataclass_fields__
         unknown = sorted(set(values) - set(known))
         if unknown:
@@ -75,20 +74,20 @@ class NetworkConfig:
                 hint = "load it in Python: meshmatch.load_model(..., encoder=THE_CLASS)"
                 raise ModelError(f"the model has an encoder of its author's own, {named[:80]!r}", hint)
             _check_class(encoder)
-            if encoder.__name__ != named.rpartition(".")[2]:  # its module may be another now, or __main__ then
-                raise ModelError(f"the model's encoder is {named[:80]!r}, not {_name_of(encoder)!r}")
+            if encoder.__name__ != named.rpartition(".")[2]:  # its module may have been another, or __main__, then
+                raise ModelError(f"the model's encoder is {named[:80]!r}, not {_class_name(encoder)!r}")
             values = values | {"encoder": encoder}
         elif encoder is not None:
             raise ModelError(f"the model has meshmatch's own encoder {named!r}", "leave out encoder=")
         return NetworkConfig(**values)
 
     def to_dict(self) -> dict[str, Any]:
-        own = {"encoder": _name_of(self.encoder)} if isinstance(self.encoder, type) else {}
+        own = {"encoder": _class_name(self.encoder)} if isinstance(self.encoder, type) else {}
         return asdict(self) | own
 
 
 def _check_class(encoder: object) -> None:
-    """Refuse as an encoder what is no class with its methods (`ModelError`)."""
+    """Raise `ModelError` unless ``encoder`` is a class with the methods of an encoder."""
     if not isinstance(encoder, type) or not all(
         callable(getattr(encoder, name, None)) for name in ("features", "forward")
     ):
@@ -97,8 +96,8 @@ def _check_class(encoder: object) -> None:
 
 
 @contextmanager
-def naming(encoder: str | type) -> Iterator[None]:
-    """Around what an encoder does: an error in a class of one's own is said by a `ModelError` that names the class."""
+def encoder_errors(encoder: str | type) -> Iterator[None]:
+    """Convert exceptions from a custom encoder inside the block to a `ModelError` that names the class."""
     try:
         yield
     except MeshmatchError:
@@ -106,11 +105,11 @@ def naming(encoder: str | type) -> Iterator[None]:
     except Exception as error:
         if not isinstance(encoder, type):
             raise
-        what = f"the encoder {_name_of(encoder)} fails: {type(error).__name__}: {error}"
+        what = f"the encoder {_class_name(encoder)} fails: {type(error).__name__}: {error}"
         raise ModelError(what, "the error above says where") from error
 
 
-def _name_of(encoder: type) -> str:
+def _class_name(encoder: type) -> str:
     return f"{encoder.__module__}.{encoder.__qualname__}"
 
 
@@ -118,7 +117,7 @@ PAPER = NetworkConfig(encoder="point", decoder="node", width=1024, align_basis=0
 
 
 class Network(Protocol):
-    """What fitting asks of a network; rows are node vectors, or a code where the field is pointwise."""
+    """Interface of a network for fitting. Rows are node vectors, or contain a code if the field is pointwise."""
 
     @property
     def config(self) -> NetworkConfig: ...
@@ -128,23 +127,26 @@ class Network(Protocol):
         """Basis points of the aligner."""
 
     def predict(self, clouds: Sequence[Float[Floats, "P 3"]]) -> Float[Floats, "B R 3"]:
-        """Rows for several clouds, of any number of points each, in their core frames."""
+        """Predict rows for several clouds in their core frames, each with any number of points."""
 
     def read_frames(self, offsets: Float[Floats32, "B M 3"]) -> tuple[Float[Floats, "B 3 3"], Float[Floats, "B 3"]]:
-        """Rotations R and centers t of the core, scan = R core + t, from offsets of basis points to nearest points."""
+        """Predict rotations R and centers t of the core, scan = R core + t.
+
+        ``offsets`` are those from the basis points of the aligner to the nearest points of the scan.
+        """
 
     def encode(self, cloud: Float[Floats, "P 3"]) -> Float[Floats, " D"]:
-        """The code of a cloud in its core frame."""
+        """Encode a cloud in its core frame."""
 
     def decode(self, code: Float[Floats, " D"]) -> Float[Floats, "R 3"]:
-        """The rows of a code, without corrections."""
+        """Decode a code to rows, without corrections."""
 
     def rotate_rows(self, rows: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "R 3"]:
-        """Rows of the deformation whose moved points (rows) are those of ``rows`` times ``turn``."""
+        """Rows of the deformation followed by a rotation: its moved points (row vectors) are those of ``rows`` @ turn."""
 
 
 def weight_shapes(config: NetworkConfig, K: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of the weights and buffers of a network with K nodes, by name; not for those that only torch can evaluate."""
+    """Shapes of the weights and buffers of a network with K nodes, by name; not for networks that need torch."""
     found: dict[str, tuple[int, ...]] = {"nodes": (K, 3), "anchors": (K, 3), "anchor_phi": (K, K)}
 
     def linear(name: str, inputs: int, outputs: int) -> None:

@@ -1,4 +1,4 @@
-"""Where the template bundles, trained models and sample shapes that come with the package are."""
+"""Location of the template bundles, trained models and sample shapes that are part of the package."""
 
 from pathlib import Path
 
@@ -8,10 +8,10 @@ from meshmatch.errors import TemplateError
 def bundled_folder() -> Path:
     """The folder of bundled data: ``meshmatch/_templates`` of an installed wheel, ``templates/`` beside a checkout.
 
-    It holds ``human/`` (template bundles), ``models/NAME/`` (trained models), ``rigs/`` (what animals are made from),
-    ``measurements/`` (a body to measure by) and ``samples/`` (shapes to try).
-    The wheel's own copy wins, and of a checkout only one with its ``pyproject.toml``, so that an installed package
-    never reads a stranger's ``templates/``. `TemplateError` if there is neither.
+    It contains ``human/`` (template bundles), ``models/NAME/`` (trained models), ``rigs/`` (data for generated animals),
+    ``measurements/`` (the reference body of measurements) and ``samples/`` (example shapes).
+    The wheel's copy takes precedence; a checkout is only recognized by its ``pyproject.toml``, so that an installed package
+    never reads an unrelated ``templates/``. `TemplateError` if there is neither.
     """
     package = Path(__file__).resolve().parents[1]
     installed, beside = package / "_templates", package.parent / "templates"

@@ -1,9 +1,9 @@
-"""A template from one shape: two resolutions, control nodes, labels.
+"""Make a template from one shape: two resolutions, control nodes, labels.
 
-Nodes are chosen among candidates in the volume near the surface, by a rejection rule and farthest points. Rejection
-keeps a node from moving two pieces of surface that are close in space but not along the body (two thighs, an arm and a
-flank). Four rules, all measured by the paper: body ``parts``, ``spectral`` clusters, ``geodesic`` distance, and
-``uniform`` (no rejection).
+Nodes are chosen from candidates in the volume near the surface, by rejection and farthest point sampling. Rejection
+prevents a node from moving two pieces of surface that are close in space but not along the surface (two thighs, an arm
+and a flank). There are four rejection rules, all evaluated in the paper: body ``parts``, ``spectral`` clusters,
+``geodesic`` distance, and ``uniform`` (no rejection).
 """
 
 from __future__ import annotations
@@ -32,27 +32,25 @@ from meshmatch.templates.template import Template
 LOW_FACES = 10_000
 Strategy = Literal["parts", "spectral", "geodesic", "uniform"]
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
-# Of the diameter along the surface: how far apart what one node moves may be. Where parts lie so close that a vertex
-# is left without nodes, the next share is tried. Set by hand.
+# Maximum geodesic distance between two vertices that one node moves, as shares of the geodesic diameter. If parts are so
+# close that a vertex gets no nodes, the next share is tried. Set by hand.
 _GEODESIC_SHARES = (0.2, 0.3, 0.45, 1.0)
-_FUNCTIONS = 4  # eigenvectors that tell clusters apart, as in the paper
-_GROWN, _GROWTH, _MAX_GROWTHS = (
-    6,
-    1.05,
-    15,
-)  # nodes that grow around a vertex, by how much at a time, how often: twofold
-_MAX_PAIRED = 8000  # vertices, evenly spread, whose pairs the geodesic rule looks at
+_N_EIGENVECTORS = 4  # eigenvectors used for spectral clusters, as in the paper
+# nodes around a vertex whose radii grow, factor per step, maximum number of steps (twofold in all)
+_N_GROWING, _GROWTH_FACTOR, _MAX_GROWTH_STEPS = 6, 1.05, 15
+_MAX_PAIRED = 8000  # vertices, evenly spread, whose pairs the geodesic rule examines
 
 
 @dataclass(frozen=True)
 class NodeConfig:
     """How nodes are chosen. Lengths in units of sqrt(surface area).
 
-    radius 0.13 is 0.2 of half a standing body's height (0.65), about the radius of a sphere around it. The paper's 0.2 is of
-    the diameter, as its captions read: 0.27 to 0.29, by pose. Candidates lie up to ``depth`` below the surface;
-    ``spectral`` begins with so many ``clusters``. ``grow``: vertices that lack nodes widen those around them (the
-    supplement's other way, section 3.3) instead of getting more, or a milder strategy. `OptionError` for an unknown
-    strategy, fewer than 4 nodes, or a length or count that is not positive.
+    ``radius`` 0.13 is 0.2 times half a standing body's height (0.65), about the radius of its bounding sphere. According to
+    its captions, the paper's 0.2 is relative to the diameter, which makes 0.27 to 0.29, depending on the pose. Candidates
+    lie up to ``depth`` below the surface; ``clusters`` is the initial number for ``spectral``. With ``grow``, where
+    vertices lack nodes, the radii of the nodes around are increased (the supplement's alternative, section 3.3), instead
+    of adding nodes or relaxing the strategy. `OptionError` for an unknown strategy, fewer than 4 nodes, or a length or
+    count that is not positive.
     """
 
     strategy: Strategy = "parts"
@@ -79,9 +77,7 @@ class NodeConfig:
 def low_mesh(
     shape: Shape, faces: int = LOW_FACES, quality: Quality = "fast"
 ) -> tuple[Int[Ints, " V"], Int[Ints, "F 3"]]:
-    """Decimate onto some of the shape's own vertices, or triangulate a cloud: kept indices, by which all that belongs
-    to vertices is kept too, and faces.
-    """
+    """Decimate a mesh to a subset of its vertices, or triangulate a cloud; returns indices of the vertices, and faces."""
     if shape.is_cloud:
         return triangulate_cloud(shape, faces)
     if shape.F <= faces:
@@ -94,15 +90,17 @@ def low_mesh(
 
 
 def _own_vertices(small: Shape, shape: Shape) -> Int[Ints, " V"]:
-    """The vertex of a shape that is nearest to each one of the decimated shape, of the same connected part: the walls of
-    two chambers that touch must not become one."""
+    """Nearest vertex of a shape for each vertex of the decimated shape, within the same connected part.
+
+    Otherwise touching walls of two chambers could be merged.
+    """
     nearest = np.asarray(cKDTree(shape.verts).query(small.verts)[1], np.int64)
     own, parts = shape.vertex_parts, small.vertex_parts
     if own.max() == 0:
         return nearest
     (part, meant), votes = np.unique(np.stack([parts, own[nearest]]), axis=1, return_counts=True)
     order, most = np.argsort(votes, kind="stable"), np.zeros(parts.max() + 1, np.int64)
-    most[part[order]] = meant[order]  # the last one, which has most votes, stays
+    most[part[order]] = meant[order]  # the last one, with most votes, wins
     away = 2 * shape.diagonal
     tree = cKDTree(np.column_stack([shape.verts, away * own]))
     return np.asarray(tree.query(np.column_stack([small.verts, away * most[parts]]))[1], np.int64)
@@ -118,12 +116,11 @@ def make_template(
     core: Int[Ints, " C"] | None = None,
     low: tuple[Int[Ints, " V_low"], Int[Ints, "F_low 3"]] | None = None,
 ) -> Template:
-    """Template bundle of a shape of the resting category, in any unit.
+    """Make a template bundle from a shape in the rest pose, in any unit.
 
-    A mesh becomes the dense mesh, a cloud is triangulated. `labels` are the part of every vertex (a single part where
-    not given), `core` are vertices that fix the category's frame (all where not given), and `low` is a low resolution
-    made before (see `low_mesh`). `TemplateError` if nodes cannot support every vertex; `InputError` if a cloud's points
-    lie on no surface.
+    A mesh becomes the dense mesh; a cloud is triangulated. `labels` are the parts of the vertices (default: one part),
+    `core` are vertices that define the category's frame (default: all), and `low` is a precomputed low resolution (see
+    `low_mesh`). `TemplateError` if nodes cannot support every vertex; `InputError` if a cloud's points lie on no surface.
     """
     keep, faces = low_mesh(shape) if low is None else low
     small = Shape(shape.verts[keep], faces, name)
@@ -136,37 +133,38 @@ def make_template(
         raise TemplateError(f"{shape.name} has a label below 0: {parts.min()}", "count parts from 0")
     in_core = np.ones(shape.V, bool) if core is None else np.isin(np.arange(shape.V), core)
     dense = small if shape.is_cloud else Shape(frame.apply(shape.verts), shape.faces, name)
-    laid = lay_nodes(small, config, None if labels is None else parts[keep], noisy=shape.is_cloud)
-    words = tuple(label_names) or tuple(f"part {n}" for n in range(int(parts.max()) + 1))
+    placement = lay_nodes(small, config, None if labels is None else parts[keep], noisy=shape.is_cloud)
+    names = tuple(label_names) or tuple(f"part {n}" for n in range(int(parts.max()) + 1))
     core = np.flatnonzero(in_core[keep])
-    return Template(name, small, dense, laid.nodes, laid.radius, parts[keep], words, core)
+    return Template(name, small, dense, placement.nodes, placement.radius, parts[keep], names, core)
 
 
 @dataclass(frozen=True, eq=False)
-class Laid:
-    """Nodes, their support radius (one, or each its own), and which share of the candidates the strategy refuses."""
+class NodePlacement:
+    """Nodes, their support radius (one, or one for each), and the share of candidates that was rejected."""
 
     nodes: Float[Floats, "K 3"]
     radius: float | Float[Floats, " K"]
-    refused: float
-    taken: float  # the same of the rule that was taken: a milder one, where vertices went without nodes
+    refused: float  # share of the candidates that the strategy rejects
+    taken: float  # share that the rule in use rejects, which is milder if the strategy left vertices without nodes
 
 
 def choose_nodes(
     shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None = None, noisy: bool = False
 ) -> Float[Floats, "K 3"]:
-    """The nodes of `lay_nodes`."""
+    """Return the nodes of `lay_nodes`."""
     return lay_nodes(shape, config, labels, noisy).nodes
 
 
-def lay_nodes(shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None = None, noisy: bool = False) -> Laid:
-    """Nodes such that every vertex of a mesh in the template frame has four non-coplanar ones in reach: ``config.K`` (with
-    ``config.grow`` exactly, if there are as many candidates), or more where vertices that farthest points leave short
-    need them.
+def lay_nodes(
+    shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None = None, noisy: bool = False
+) -> NodePlacement:
+    """Place nodes such that every vertex of a mesh in the template frame has four non-coplanar ones in reach.
 
-    Strategy ``parts`` needs `labels`, the body parts. `noisy` candidates are the surface's points plus Gaussian noise of
-    ``config.depth``, as suits the mesh of a cloud, whose inside is uncertain. `TemplateError` names the vertices that
-    cannot be supported.
+    There are ``config.K`` nodes (exactly, with ``config.grow``, if there are as many candidates), and more where farthest
+    points do not support all vertices. Strategy ``parts`` needs `labels`, the body parts. With `noisy`, candidates are
+    points of the surface plus Gaussian noise of ``config.depth``; this is for meshes of clouds, whose inside is uncertain.
+    `TemplateError` names the vertices that cannot be supported.
     """
     if config.strategy == "parts" and labels is None and not shape.is_cloud:
         raise OptionError("node strategy 'parts' needs part labels", "use --strategy spectral or geodesic")
@@ -175,8 +173,8 @@ def lay_nodes(shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None =
     refused: float | None = None
     for allowed in _allowed(shape, config, candidates, labels, samples):
         chosen = candidates[allowed]
-        taken = 1 - float(allowed.mean())
-        refused = taken if refused is None else refused  # by the strategy itself; what follows are milder ones
+        rejected = 1 - float(allowed.mean())
+        refused = rejected if refused is None else refused  # by the strategy itself; the following rules are milder
         if len(chosen) < 4:
             problem = f"strategy {config.strategy!r} rejects all nodes: each moves vertices that do not belong together"
             failure = TemplateError(problem, "use a smaller radius or another strategy")
@@ -184,8 +182,8 @@ def lay_nodes(shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None =
         nodes = chosen[farthest_points(chosen, min(config.K, len(chosen)))]
         try:
             if config.grow:
-                return Laid(nodes, grown_radii(shape.verts, nodes, config.radius), refused, taken)
-            return Laid(_complete(shape, config, nodes, chosen), config.radius, refused, taken)
+                return NodePlacement(nodes, grow_radii(shape.verts, nodes, config.radius), refused, rejected)
+            return NodePlacement(_add_missing_nodes(shape, config, nodes, chosen), config.radius, refused, rejected)
         except TemplateError as error:
             failure = error
     assert failure is not None
@@ -195,14 +193,14 @@ def lay_nodes(shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None =
 def judged(
     shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None = None
 ) -> tuple[Float[Floats, "N 3"], Int[Ints, " N"], Bool[Bools, " N"]]:
-    """Where nodes of a mesh may be, the vertex that each place is next to, and which places the strategy itself keeps."""
+    """Candidates for nodes of a mesh, the nearest vertex of each, and which candidates the strategy itself keeps."""
     samples, candidates = _candidates(shape, config, noisy=False)
     own = shape.faces[samples.face, samples.barycentric.argmax(1)]
     return candidates, own, next(_allowed(shape, config, candidates, labels, samples))
 
 
 def _candidates(shape: Shape, config: NodeConfig, noisy: bool) -> tuple[Samples, Float[Floats, "N 3"]]:
-    """Samples of the surface, and where nodes may be: below them, or around them."""
+    """Samples of the surface, and candidates for nodes: below the samples, or around them if noisy."""
     rng = np.random.default_rng(config.seed)
     samples = sample_surface(shape, 30 * config.K, rng)
     if noisy:
@@ -210,28 +208,28 @@ def _candidates(shape: Shape, config: NodeConfig, noisy: bool) -> tuple[Samples,
     return samples, samples.points - samples.normals * rng.uniform(0, config.depth, (len(samples.points), 1))
 
 
-def grown_radii(
-    points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radius: float
-) -> float | Float[Floats, " K"]:
-    """Radii that begin at ``radius``, of which those of the nodes nearest to points without four non-coplanar nodes in
-    reach grow until there are none, at most twofold; one number where none has to. `TemplateError` where that is too little.
+def grow_radii(points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radius: float) -> float | Float[Floats, " K"]:
+    """Grow radii of nodes, from ``radius`` to at most twice that, until all points have four non-coplanar nodes in reach.
+
+    Only radii of the nodes nearest to unsupported points grow; if none has to, the result is one number. `TemplateError` if
+    points remain unsupported.
     """
     radii = np.full(len(nodes), radius)
     around = cKDTree(nodes)
-    for _ in range(_MAX_GROWTHS):
+    for _ in range(_MAX_GROWTH_STEPS):
         bad = poorly_supported(points, nodes, radii)
         if not len(bad):
             return radius if radii.max() == radius else radii
-        near = np.unique(around.query(points[bad], k=min(_GROWN, len(nodes)))[1])
-        radii[near] *= _GROWTH
+        near = np.unique(around.query(points[bad], k=min(_N_GROWING, len(nodes)))[1])
+        radii[near] *= _GROWTH_FACTOR
     problem = f"{len(bad)} vertices have fewer than four non-coplanar nodes within twice {radius:g}"
     raise TemplateError(problem, "use more nodes, a larger radius or another strategy")
 
 
-def _complete(
+def _add_missing_nodes(
     shape: Shape, config: NodeConfig, nodes: Float[Floats, "K 3"], candidates: Float[Floats, "N 3"]
 ) -> Float[Floats, "K2 3"]:
-    """Add the candidates that poorly supported vertices lack, nearest first, a few rounds."""
+    """Add candidates near poorly supported vertices, in a few rounds."""
     for _ in range(20):
         bad = poorly_supported(shape.verts, nodes, config.radius)
         if not len(bad):
@@ -250,7 +248,7 @@ def _complete(
 def _allowed(
     shape: Shape, config: NodeConfig, candidates: Float[Floats, "N 3"], labels: Int[Ints, " V"] | None, samples: Samples
 ) -> Iterator[Bool[Bools, " N"]]:
-    """Which candidates a strategy keeps; then those of milder rules, where narrow clusters (fingers, ears) keep none."""
+    """Yield which candidates a strategy keeps; then those of milder rules, in case narrow parts (fingers, ears) get none."""
     if config.strategy == "uniform" or shape.is_cloud:
         yield np.ones(len(candidates), bool)
         return
@@ -261,7 +259,7 @@ def _allowed(
     elif config.strategy == "geodesic":
         for share in _GEODESIC_SHARES:
             yield _geodesic_allowed(shape, config.radius, candidates, share)
-        if shape.vertex_parts.max() > 0:  # parts that touch everywhere, as the chambers of a heart do, move together
+        if shape.vertex_parts.max() > 0:  # parts that touch everywhere, such as chambers of a heart, move together
             yield np.ones(len(candidates), bool)
     else:
         clusters = config.clusters
@@ -276,7 +274,7 @@ def _allowed(
 def _parts_allowed(
     shape: Shape, parts: Int[Ints, " V"], candidates: Float[Floats, "N 3"], own: Int[Ints, " N"], radius: float
 ) -> Bool[Bools, " N"]:
-    """Drop candidates that touch a part which does not border on their own."""
+    """Reject candidates that reach a part not adjacent to their own."""
     count = int(parts.max()) + 1
     joined = np.eye(count, dtype=bool)
     joined[parts[shape.faces], parts[shape.faces[:, [1, 2, 0]]]] = True
@@ -290,10 +288,10 @@ def _parts_allowed(
 
 
 def _geodesic_allowed(shape: Shape, radius: float, candidates: Float[Floats, "N 3"], share: float) -> Bool[Bools, " N"]:
-    """Drop candidates that touch two vertices further apart than a share of the diameter, both along the surface."""
+    """Reject candidates that reach two vertices whose geodesic distance exceeds a share of the geodesic diameter."""
     some, near = _near_pairs(shape, share)
     tree, allowed = cKDTree(shape.verts[some]), np.zeros(len(candidates), bool)
-    for k, place in enumerate(candidates):  # one by one, for what wide nodes touch is long
+    for k, place in enumerate(candidates):  # one by one: wide nodes reach many vertices
         hits = tree.query_ball_point(place, radius)
         allowed[k] = np.unpackbits(np.bitwise_and.reduce(near[hits], axis=0))[hits].all()
     return allowed
@@ -301,7 +299,7 @@ def _geodesic_allowed(shape: Shape, radius: float, candidates: Float[Floats, "N 
 
 @derived
 def _near_pairs(shape: Shape, share: float) -> tuple[Int[Ints, " S"], UInt8[UInts8, "S bytes"]]:
-    """Vertices spread over a shape, and which of them lie within a share of the diameter, along the surface: as bits."""
+    """Vertices spread over a shape, and as bits which pairs lie within a share of the geodesic diameter."""
     graph = edge_graph(shape)
     some = farthest_points(shape.verts, min(shape.V, _MAX_PAIRED))
     far = dijkstra(graph, indices=some[:40])
@@ -319,12 +317,13 @@ def edge_graph(shape: Shape) -> csr_matrix:
 
 
 def spectral_clusters(shape: Shape, clusters: int, rng: np.random.Generator) -> Int[Ints, " V"]:
-    """Labels from 0, at most ``clusters`` and none without a vertex: k-means on the global point signature (Rustamov
-    2007) of Laplace-Beltrami eigenvectors.
+    """Cluster vertices by k-means on the global point signature (Rustamov 2007) of Laplace-Beltrami eigenvectors.
+
+    Labels count from 0; there are at most ``clusters``, each with at least one vertex.
     """
     stiffness, mass = robust_laplacian.mesh_laplacian(shape.verts, shape.faces)
-    count = min(_FUNCTIONS + 1, shape.V - 2)
-    # Not a constant start: that is an eigenvector already, and the search would go on from a random one.
+    count = min(_N_EIGENVECTORS + 1, shape.V - 2)
+    # A constant start is an eigenvector already, after which ARPACK would continue from a random one.
     values, vectors = eigsh(stiffness, count, mass, sigma=-1e-8, v0=rng.standard_normal(shape.V))
     signature = vectors[:, 1:] / np.sqrt(np.maximum(values[1:], 1e-9))
     centers = signature[farthest_points(signature, min(clusters, shape.V))]

@@ -1,8 +1,7 @@
-"""What a prepared folder holds for one template: samples of all shapes with the landmarks that are known on them, and
-registered shapes. Collected, written and read.
+"""Contents of a prepared folder for one template: samples and landmarks of all shapes, and registered shapes.
 
-Shapes are registered if every file has the vertices and triangles of the template's. Landmarks are points that are known
-on each of a folder's shapes, in one order.
+Shapes are registered if every file has the template's vertices and triangles in the same order. Landmarks are corresponding
+points on the shapes of a folder, in the same order.
 """
 
 from __future__ import annotations
@@ -33,43 +32,43 @@ from meshmatch.templates.template import SCALES, Scale, Template, template_radiu
 
 T = TypeVar("T")
 SMALL_DATA = 100
-"""Fewer registered shapes than this are learned by a network that finds no orientation: the card says it. Set by hand."""
+"""With fewer registered shapes than this, networks do not learn orientation, as their cards say. Set by hand."""
 MAX_RESIDUAL = 0.12
-"""Mean distance (units of sqrt(area), normals included) from which two aligned shapes differ in kind. Set by hand."""
-_MIN_SAMPLES, _MAX_SAMPLES = 1024, 4096  # of a shape
-_ALL_SAMPLES = 200_000  # of a folder
-_COMPARED = 40  # shapes among which the medoid is looked for
-_ALIKE = 30.0  # degrees: registered shapes that are turned less stand alike; set by hand
+"""Mean distance (units of sqrt(area), normals included) above which two aligned shapes differ in kind. Set by hand."""
+_MIN_SAMPLES, _MAX_SAMPLES = 1024, 4096  # per shape
+_ALL_SAMPLES = 200_000  # per folder
+_MAX_CANDIDATES = 40  # maximum number of candidates for the medoid
+_MAX_TILT = 30.0  # degrees: registered shapes rotated by less have the same orientation; set by hand
 _LANDMARKS_HINT = "either one vertex a line (-1: missing), or x, y and z of a point on each line"
 ARRAYS = ("points", "normals", "landmarks", "template_landmarks")
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeSamples:
-    """Samples of N shapes in the template's frame, and the landmarks that are known on them."""
+    """Samples of N shapes in the template's frame, and their landmarks."""
 
     points: Float[Floats32, "N P 3"]  # in random order
     normals: Float[Floats32, "N P 3"]
     landmarks: Float[Floats32, "N L 3"]  # NaN where a shape lacks one; L may be 0
     template_landmarks: Int[Ints, " L"]  # vertices of the template's low resolution
-    align: Align  # how every shape was brought to the template's frame
+    align: Align  # how every shape was aligned to the template
     scale: Scale
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RegisteredShapes(Brief):
-    """N shapes on the vertices of a template, which stand as it does: what fits found, of a trained model or of none.
+    """N shapes on the vertices of a template, in its orientation, from fits with or without a trained model.
 
-    ``orientation`` is how far fits without a model are turned, for the card of what is learned from them; ``mirror``
-    whether some of them were mirrored.
+    ``orientation`` is the range of rotations of fits without a model, and ``mirror`` whether some were mirrored; both are
+    for the card of a model that is trained on the shapes.
 
-    `InputError` for another number of vertices than the template's, or coordinates that are no finite numbers.
+    `InputError` if the number of vertices is not the template's, or coordinates are not finite.
     """
 
     template: Template
     verts: Float[Floats, "N V 3"]
-    name: str  # of them all
-    model: str  # its name or folder, or "none"
+    name: str  # of the collection
+    model: str  # name or folder of the model, or "none"
     orientation: Align | None = None
     mirror: bool = False
 
@@ -83,7 +82,7 @@ class RegisteredShapes(Brief):
 
 
 def same_faces(like: Repaired, found: list[Repaired]) -> bool:
-    """Whether all files have one file's vertex count and triangles."""
+    """Whether all shapes have the vertex count and triangles of one."""
     first = like.original
     return not first.is_cloud and all(
         clean.original.V == first.V and np.array_equal(clean.original.faces, first.faces) for clean in found
@@ -93,7 +92,10 @@ def same_faces(like: Repaired, found: list[Repaired]) -> bool:
 def registered_stack(
     first: Repaired, found: list[Repaired], vertices: Int[Ints, " V"], notes: list[str]
 ) -> Float[Floats32, "N V 3"]:
-    """Vertices of the shapes that share the first one's connectivity; N = 0 unless all of them do."""
+    """Stack the vertices of shapes that share the first one's connectivity; N = 0 unless all shapes do.
+
+    Shapes in which vertices lack a position are left out, with a note.
+    """
     complete = []
     for clean in found if same_faces(first, found) else ():
         invalid = clean.original.invalid
@@ -104,23 +106,29 @@ def registered_stack(
     if len(complete) < 2:
         return np.zeros((0, len(vertices), 3), np.float32)
     chosen = np.stack(complete)
-    # Centred before the numbers become short: a scan in a surveyor's coordinates would lose its digits.
+    # Centered before conversion to float32, in which coordinates far from the origin would lose precision.
     return np.asarray((chosen - chosen.mean(1, keepdims=True)).astype(np.float32))
 
 
 def rotation_range(stack: Float[Floats32, "N V 3"], like: Float[Floats, "V 3"]) -> Align:
-    """How far registered shapes are turned to the template's vertices; "none" of many, unasked."""
+    """How registered shapes have to be aligned with the template's vertices ``like``: "near" or "rigid".
+
+    For `SMALL_DATA` shapes or more "none", without a computation.
+    """
     if len(stack) >= SMALL_DATA:
         return "none"
     cosines = [(np.trace(kabsch(like, verts.astype(np.float64)).rotation) - 1) / 2 for verts in stack]
-    return "near" if min(cosines) > np.cos(np.radians(_ALIKE)) else "rigid"
+    return "near" if min(cosines) > np.cos(np.radians(_MAX_TILT)) else "rigid"
 
 
 def medoid(shapes: Sequence[Repaired], how: Align, scale: Scale, seed: int, either_side: bool = False) -> int:
-    """The shape, a mesh if there is one, with the smallest mean distance to all others, or of many to some of them; to their
-    mirror images where those lie nearer to the first, if either side may be meant."""
+    """Index of the shape with the smallest mean distance to the others, after alignment; a mesh, if there is one.
+
+    Of many shapes only some are compared. With ``either_side``, shapes are mirrored where that brings them nearer to the
+    first.
+    """
     pool = [k for k, one in enumerate(shapes) if not one.shape.is_cloud] or list(range(len(shapes)))
-    pool = [pool[k] for k in np.unique(np.linspace(0, len(pool) - 1, min(len(pool), _COMPARED)).astype(int))]
+    pool = [pool[k] for k in np.unique(np.linspace(0, len(pool) - 1, min(len(pool), _MAX_CANDIDATES)).astype(int))]
     aligned: list[OrientedPoints] = []
     for k in pool:
         shape = shapes[k].shape
@@ -148,9 +156,11 @@ def collect_samples(
     seed: int,
     progress: Progress,
 ) -> tuple[ShapeSamples, list[Frame], list[float]]:
-    """Every shape in the template's frame, sampled; the frame of each (file to template), and its residual against the
-    template. ``turns`` are rotations from files to the template, where they are known. A shape's landmarks are in its
-    file's frame, NaN where missing; the template's in the template's.
+    """Align all shapes to the template and sample them.
+
+    ``turns`` are rotations from files to the template, where known. Landmarks of shapes are in the frames of their files,
+    NaN where missing; those of the template are in its frame. Returns the samples, the frame of each shape (file to
+    template), and its residual against the template.
     """
     target, radius = template_samples(template), template_radius(template)
     P = int(np.clip(_ALL_SAMPLES // len(shapes), _MIN_SAMPLES, _MAX_SAMPLES))
@@ -185,12 +195,12 @@ class KnownPoints:
 
 
 def read_landmarks(file: Path, clean: Repaired) -> Float[Floats, "L 3"]:
-    """Landmarks of a shape, in its file's frame, NaN for a missing one; see `read_known_points`."""
+    """Read the landmarks of a shape, in its file's frame, NaN where missing; see `read_known_points`."""
     return read_known_points(file, clean).points
 
 
 def read_known_points(file: Path, clean: Repaired, space: Space = "") -> KnownPoints:
-    """Landmarks of a shape: vertices, points of faces, or positions, as in every format of landmarks.
+    """Read the landmarks of a shape: vertices, points of faces, or positions, in any supported format.
 
     Parameters
     ----------
@@ -204,7 +214,7 @@ def read_known_points(file: Path, clean: Repaired, space: Space = "") -> KnownPo
     Raises
     ------
     InputError
-        The file cannot be read, or names a vertex or face that is not there.
+        The file cannot be read, or names a vertex or face that does not exist.
     """
     readers = dict.fromkeys(LANDMARK_READERS, lambda path: read_landmark_file(path, clean.original.name, space))
     found = read_by_suffix(file, readers, "landmarks", _LANDMARKS_HINT)
@@ -227,8 +237,9 @@ def read_known_points(file: Path, clean: Repaired, space: Space = "") -> KnownPo
 
 
 def in_one_order(known: Sequence[KnownPoints | None]) -> list[Float[Floats, "L 3"] | None]:
-    """The landmarks of shapes by their names, in the order of the first shape, where all have names and share some; else
-    as they stand.
+    """Sort the landmarks of shapes by name, in the order of first occurrence, NaN where missing.
+
+    Unless all shapes with landmarks have unique names and share some, landmarks are returned in the order of their files.
     """
     named = [one for one in known if one is not None]
     together = set.intersection(*(set(one.names) for one in named)) if named else set()
@@ -244,7 +255,10 @@ def in_one_order(known: Sequence[KnownPoints | None]) -> list[Float[Floats, "L 3
 
 
 def find_landmarks(where: str | Path | None, folder: Path, files: Sequence[Path]) -> list[Path | None]:
-    """The landmark file of every shape, in a folder or beside it with a suffix; `OptionError` if none has one."""
+    """Find the landmark file of every shape: in the folder ``where``, or next to the shape with the suffix ``where``.
+
+    None where a shape has no such file; `OptionError` if no shape has one.
+    """
     if where is None:
         return [None] * len(files)
     place, suffixes = folder, [str(where)]
@@ -262,7 +276,7 @@ def find_landmarks(where: str | Path | None, folder: Path, files: Sequence[Path]
 
 
 def read_samples(folder: str | Path, template: Template) -> ShapeSamples:
-    """Samples of a prepared folder; `InputError` if it is none, or was prepared for another template."""
+    """Read the samples of a prepared folder; `InputError` if it is not one, or was prepared for another template."""
 
     def samples(arrays: dict[str, np.ndarray], words: dict[str, str]) -> ShapeSamples:
         found = ShapeSamples(
@@ -277,14 +291,15 @@ def read_samples(folder: str | Path, template: Template) -> ShapeSamples:
             raise KeyError("arrays that do not belong together")
         return found
 
-    return _read(as_path(folder), "points", template, samples)[1]
+    return _read_arrays(as_path(folder), "points", template, samples)[1]
 
 
 def read_registered(folder: str | Path, template: Template) -> Float[Floats32, "N V 3"]:
-    """Registered shapes of a prepared folder; `InputError` if it is none, was prepared for another template or scale, or
-    its shapes are not registered.
+    """Read the registered shapes of a prepared folder.
+
+    `InputError` if it is not one, was prepared for another template or scale, or its shapes are not registered.
     """
-    words, shapes = _read(as_path(folder), "shapes", template, lambda arrays, _: arrays["verts"])
+    words, shapes = _read_arrays(as_path(folder), "shapes", template, lambda arrays, _: arrays["verts"])
     if words.get("scale", "area") != "area":
         problem = (
             f"{folder} was prepared with --scale {words['scale']}, but registered shapes are learned at equal areas"
@@ -297,47 +312,49 @@ def read_registered(folder: str | Path, template: Template) -> Float[Floats32, "
 
 
 def check_prepared(folder: str | Path) -> None:
-    """`InputError` for a folder that `prepare` did not make."""
+    """Raise `InputError` unless `prepare` made the folder."""
     try:
-        _facts(as_path(folder))
+        _read_facts(as_path(folder))
     except (OSError, ValueError) as error:
         raise _not_prepared(folder) from error
 
 
 def is_registered(folder: str | Path) -> bool:
-    """Whether the shapes of a prepared folder share one connectivity; True where it is not such a folder."""
+    """Whether the shapes of a prepared folder share one connectivity; True if it is not a prepared folder."""
     try:
-        return _facts(folder).get("registered") is not False
+        return _read_facts(folder).get("registered") is not False
     except (OSError, ValueError):
-        return True  # whoever reads it as registered reports what is wrong with it
+        return True  # reading the registered shapes then reports the error
 
 
 def frame_of(folder: str | Path) -> dict[str, str] | None:
-    """What a card says of orientation and scale for a prepared folder of small data; None for all others, and for
-    shapes of equal radii, as registered shapes are learned at equal areas."""
+    """Card entry ``frame`` for models trained on a prepared folder with fewer than `SMALL_DATA` registered shapes.
+
+    None for all other folders, including those scaled to equal radii: registered shapes are learned at equal areas.
+    """
     try:
-        words = _facts(folder)
-        if not words["registered"] or words["scale"] != "area" or len(words["names"]) >= SMALL_DATA:
+        facts = _read_facts(folder)
+        if not facts["registered"] or facts["scale"] != "area" or len(facts["names"]) >= SMALL_DATA:
             return None
-        return {"orientation": str(words["align"]), "scale": "area"}
+        return {"orientation": str(facts["align"]), "scale": "area"}
     except (OSError, ValueError, KeyError, TypeError):
-        return None  # whoever reads its shapes reports what is wrong with the folder
+        return None  # reading the shapes then reports the error
 
 
 def has_sides(folder: str | Path) -> bool:
-    """Whether shapes of a prepared folder were mirrored, so that what they teach comes in two sides."""
+    """Whether shapes of a prepared folder were mirrored, so that shapes of the category have two sides."""
     try:
-        return bool(_facts(folder).get("mirrored"))
+        return bool(_read_facts(folder).get("mirrored"))
     except (OSError, ValueError):
-        return False  # whoever reads its shapes reports what is wrong with the folder
+        return False  # reading the shapes then reports the error
 
 
-def _read(
+def _read_arrays(
     folder: Path, name: str, template: Template, build: Callable[[dict[str, np.ndarray], dict[str, str]], T]
 ) -> tuple[dict[str, Any], T]:
-    """What ``prepared.json`` says, and what is built of the arrays and words of one of the folder's files."""
+    """Read ``prepared.json``, and build an object from the arrays and metadata of one of the folder's files."""
     try:
-        facts = _facts(folder)
+        facts = _read_facts(folder)
         with safe_open(str(folder / f"{name}.safetensors"), framework="np") as file:
             arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (it is no dictionary)
             found = build(arrays, file.metadata() or {})
@@ -352,12 +369,12 @@ def _not_prepared(folder: str | Path) -> InputError:
     return InputError(f"{folder} is not a prepared folder", "run `meshmatch prepare FOLDER -o OUT` first")
 
 
-def _facts(folder: str | Path) -> dict[str, Any]:
-    """What ``prepared.json`` says; `ValueError` if it is missing, or not a JSON object."""
+def _read_facts(folder: str | Path) -> dict[str, Any]:
+    """Read ``prepared.json``; `ValueError` if it is missing, or not a JSON object."""
     try:
-        words = read_json(Path(folder) / "prepared.json")
+        facts = read_json(Path(folder) / "prepared.json")
     except InputError as error:
         raise ValueError(error.message) from error
-    if not isinstance(words, dict):
+    if not isinstance(facts, dict):
         raise ValueError("not an object")
-    return words
+    return facts

@@ -1,4 +1,4 @@
-"""A template bundle: the mesh that is moved, its control nodes and its labels; and how a shape is brought to its size."""
+"""Template bundles: the mesh that is deformed, its control nodes and labels; and frames that scale shapes to its size."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ Scale = Literal["area", "sphere"]
 SCALES: tuple[Scale, ...] = get_args(Scale)
 SCHEMA = 2
 MAX_BYTES = 50_000_000
-"""A larger bundle is refused: a number of 8 bits takes 64, and more while it is checked."""
-_ONE_RADIUS = 1  # the schema of bundles whose nodes share one radius, which is in the words; later ones have an array
+"""Larger bundles are refused: 8-bit numbers take 64 bits in memory, and more while they are checked."""
+_ONE_RADIUS = 1  # schema of bundles whose nodes share one radius, stored in the metadata; others have an array
 _ARRAYS = ("verts", "faces", "dense_verts", "dense_faces", "nodes", "labels", "core")
 
 
-_WHOLE = ("faces", "dense_faces", "labels", "core")
+_INTEGER_ARRAYS = ("faces", "dense_faces", "labels", "core")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -41,15 +41,15 @@ class Template(Brief, Pickled):
 
     Frame: surface area 1, area-weighted centroid at 0; human templates stand y up, face +z, left hand at +x.
 
-    Its core are vertices that move together as nearly one rigid piece and fix the category's frame: a torso; every
-    vertex where a category has no such part.
+    The core are vertices that move almost as one rigid piece and define the category's frame, such as a torso; all vertices
+    if a category has no such part.
     """
 
     name: str
-    shape: Shape  # low resolution mesh: what fitting moves; V vertices
+    shape: Shape  # low resolution mesh, which fits deform; V vertices
     dense: Shape  # high resolution mesh of the same surface, for `register` and pictures
     nodes: Float[Floats, "K 3"]
-    radius: float | Float[Floats, " K"]  # of support: of every node, or of each where they differ
+    radius: float | Float[Floats, " K"]  # support radius of all nodes, or of each if they differ
     labels: Int[Ints, " V"]  # part of each vertex, an index into `label_names`
     label_names: tuple[str, ...]
     core: Int[Ints, " C"]
@@ -69,7 +69,7 @@ class Template(Brief, Pickled):
         radii = np.asarray(self.radius, np.float64)
         if not (radii > 0).all() or not np.isfinite(radii).all() or radii.shape not in ((), (self.K,)):
             raise TemplateError(f"template {self.name}: the radius must be positive, one number or one for each node")
-        if radii.min() == radii.max():  # one radius is one number, however it was given: its hash must not differ
+        if radii.min() == radii.max():  # equal radii become one number, so that the hash is the same
             object.__setattr__(self, "radius", float(radii.min()))
 
     @property
@@ -78,13 +78,15 @@ class Template(Brief, Pickled):
 
     @property
     def reach(self) -> float:
-        """The largest radius of a node."""
+        """The largest support radius."""
         return float(np.max(self.radius))
 
     @cached_property
     def hash(self) -> str:
-        """First 16 hex digits of the SHA-256 of all that a model depends on. Labels and dense mesh are left out: they
-        change neither what node vectors mean nor which fits go together.
+        """First 16 hex digits of the SHA-256 of all arrays that a model depends on.
+
+        Labels and the dense mesh are left out: they affect neither the meaning of node vectors nor the compatibility of
+        fits.
         """
         digest = hashlib.sha256()
         for array in (self.shape.verts, self.shape.faces, self.nodes, np.atleast_1d(self.radius), self.core):
@@ -93,29 +95,29 @@ class Template(Brief, Pickled):
 
 
 def save_template(template: Template, path: str | Path) -> None:
-    """Write a bundle as one safetensors file (arrays, and a JSON header for the words)."""
-    whole = {"faces": template.shape.faces, "dense_faces": template.dense.faces}
-    whole |= {"labels": template.labels, "core": template.core}
-    arrays: dict[str, np.ndarray] = {name: values.astype(np.int32) for name, values in whole.items()}
+    """Write a bundle as one safetensors file: arrays, and a JSON header with everything else."""
+    integers = {"faces": template.shape.faces, "dense_faces": template.dense.faces}
+    integers |= {"labels": template.labels, "core": template.core}
+    arrays: dict[str, np.ndarray] = {name: values.astype(np.int32) for name, values in integers.items()}
     arrays |= {"verts": template.shape.verts, "nodes": template.nodes}
     arrays["dense_verts"] = template.dense.verts.astype(np.float32)
     keys = ("name", "label_names", "pose", "source", "licence", "hash")
-    words = {key: getattr(template, key) for key in keys}
+    metadata = {key: getattr(template, key) for key in keys}
     if isinstance(template.radius, float):
-        words |= {"schema": _ONE_RADIUS, "radius": template.radius}
+        metadata |= {"schema": _ONE_RADIUS, "radius": template.radius}
     else:
-        words |= {"schema": SCHEMA}
+        metadata |= {"schema": SCHEMA}
         arrays["radii"] = template.radius
-    save_arrays(path, arrays, {"template": json.dumps(words)})
+    save_arrays(path, arrays, {"template": json.dumps(metadata)})
 
 
 def save_arrays(path: str | Path, arrays: dict[str, np.ndarray], words: dict[str, str] | None = None) -> None:
-    """Write one safetensors file."""
+    """Write one safetensors file, with ``metadata`` as metadata."""
     with replace_on_success(path) as temporary:
         save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, temporary, words)
 
 
-@np.errstate(invalid="ignore")  # of a nan that is cast; it is refused
+@np.errstate(invalid="ignore")  # casts of nan, which are refused
 def load_template(path: str | Path) -> Template:
     """Read a bundle; `TemplateError` if it is missing, damaged, of another schema, or does not match its hash."""
     path = Path(path)
@@ -125,42 +127,45 @@ def load_template(path: str | Path) -> Template:
         raise TemplateError(f"{path.name} is larger than a template may be: {MAX_BYTES // 10**6} MB", "make it smaller")
     try:
         with safe_open(str(path), framework="np") as file:
-            words = json.loads((file.metadata() or {})["template"])
-            if not isinstance(words, dict):
+            metadata = json.loads((file.metadata() or {})["template"])
+            if not isinstance(metadata, dict):
                 raise KeyError("words")
-            schema = words.get("schema")
+            schema = metadata.get("schema")
             expected = {*_ARRAYS, "radii"} if schema == SCHEMA else set(_ARRAYS)
             if schema in (_ONE_RADIUS, SCHEMA) and set(file.keys()) != expected:
                 raise KeyError("arrays")
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no dictionary)
-            if any(arrays[name].dtype.kind not in "iu" for name in _WHOLE if name in arrays):
+            if any(arrays[name].dtype.kind not in "iu" for name in _INTEGER_ARRAYS if name in arrays):
                 raise KeyError("whole numbers")
     except (SafetensorError, KeyError, ValueError, OSError, RecursionError) as error:
         raise TemplateError(f"{path.name} is not a template bundle", "make one with `meshmatch prepare`") from error
     if schema not in (_ONE_RADIUS, SCHEMA):
         raise TemplateError(f"{path.name} has template schema {schema}, not at most {SCHEMA}", "update meshmatch")
     try:
-        name = str(words["name"])
+        name = str(metadata["name"])
         template = Template(
             name=name,
             shape=Shape(arrays["verts"].astype(np.float64), arrays["faces"].astype(np.int64), name),
             dense=Shape(arrays["dense_verts"].astype(np.float64), arrays["dense_faces"].astype(np.int64), name),
             nodes=arrays["nodes"].astype(np.float64),
-            radius=arrays["radii"].astype(np.float64) if schema == SCHEMA else float(words["radius"]),
+            radius=arrays["radii"].astype(np.float64) if schema == SCHEMA else float(metadata["radius"]),
             labels=arrays["labels"].astype(np.int64),
-            label_names=tuple(words["label_names"]),
+            label_names=tuple(metadata["label_names"]),
             core=arrays["core"].astype(np.int64),
-            **{key: words[key] for key in ("pose", "source", "licence")},
+            **{key: metadata[key] for key in ("pose", "source", "licence")},
         )
     except (KeyError, TypeError, ValueError, IndexError, InputError) as error:
         raise TemplateError(f"{path.name} is not a template bundle: {error}", "make it again") from error
-    if template.hash != words.get("hash"):
+    if template.hash != metadata.get("hash"):
         raise TemplateError(f"{path.name} is damaged: its content does not match its hash", "make or fetch it again")
     return template
 
 
 def read_template(name: str | Path) -> Template:
-    """A template by file, or a built-in one by name (human-T, human-A, human-I, human-T-300); `TemplateError` as above."""
+    """Read a template by file, or a built-in one by name (human-T, human-A, human-I, human-T-300).
+
+    `TemplateError` as `load_template`.
+    """
     path = Path(name)
     if path.is_file():
         return load_template(path)
@@ -169,7 +174,10 @@ def read_template(name: str | Path) -> Template:
 
 
 def unit_frame(shape: Shape, scale: Scale, radius: float) -> Frame:
-    """A shape's frame before it is turned: area 1, or the template's `template_radius` around its centroid."""
+    """Frame that centers and scales a shape without rotating it: to area 1, or to ``radius`` around the centroid.
+
+    ``radius`` is the template's `template_radius`.
+    """
     if scale == "area":
         return sqrt_area_frame(shape)
     frame = unit_sphere_frame(shape)
@@ -177,10 +185,10 @@ def unit_frame(shape: Shape, scale: Scale, radius: float) -> Frame:
 
 
 def template_radius(template: Template) -> float:
-    """Distance of the furthest vertex from the template's centroid."""
+    """Largest distance of a vertex from the template's centroid."""
     return float(np.linalg.norm(template.shape.verts, axis=1).max())
 
 
 def template_samples(template: Template) -> OrientedPoints:
-    """What shapes are aligned to."""
+    """Samples of the template to which shapes are aligned."""
     return sample_surface(template.shape, 3000, np.random.default_rng(0))

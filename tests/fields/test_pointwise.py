@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from meshmatch.fields.field import PointwiseField, code_rows, pack, turned_rows, unpack, value_and_jacobian
+from meshmatch.fields.field import PointwiseField, code_rows, pack, rotated_rows, unpack, value_and_jacobian
 from meshmatch.models.layers import PointDecoder
 
 D = 7
@@ -80,10 +80,10 @@ def test_rows_turn_with_what_they_move(decoder, points, codes) -> None:
     field = PointwiseField(points, points, decoder.displacement, D)
     turn = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
     rows = pack(codes)[:1]
-    once = torch.from_numpy(turned_rows(rows[0].detach().numpy(), turn))[None]
+    once = torch.from_numpy(rotated_rows(rows[0].detach().numpy(), turn))[None]
     moved = points + field.displacement(rows)
     assert torch.allclose(points + field.displacement(once), moved @ torch.from_numpy(turn))
-    back = torch.from_numpy(turned_rows(once[0].numpy(), turn.T))[None]
+    back = torch.from_numpy(rotated_rows(once[0].numpy(), turn.T))[None]
     assert torch.allclose(back, rows)
 
 

@@ -175,7 +175,7 @@ def test_the_template_comes_onto_a_shape(model: ImplicitModel, monkeypatch: pyte
         away, _ = model.distance(shape.frame.apply(found.verts), shape.code)
         assert np.abs(away).mean() < 0.01  # on the surface
         with monkeypatch.context() as patch:
-            patch.setattr("meshmatch.implicit.model._ONTO", 0)
+            patch.setattr("meshmatch.implicit.model._PROJECTION_STEPS", 0)
             places = model.to_template(model.register(shape, 32).verts, shape)
         assert np.linalg.norm(places - rest.verts, axis=1)[inside].max() < 1e-3  # of the vertex's own place
 

@@ -21,7 +21,7 @@ from meshmatch.templates.make import (
     Strategy,
     choose_nodes,
     edge_graph,
-    grown_radii,
+    grow_radii,
     lay_nodes,
     spectral_clusters,
 )
@@ -278,7 +278,7 @@ def test_radii_grow_under_the_strategy_itself() -> None:
 def test_nodes_in_a_plane_cannot_grow_into_space() -> None:
     flat = np.concatenate([np.random.default_rng(0).random((30, 2)), np.zeros((30, 1))], 1)
     with pytest.raises(TemplateError, match=r"within twice 0\.1"):
-        grown_radii(flat[:5], flat, 0.1)
+        grow_radii(flat[:5], flat, 0.1)
 
 
 @pytest.mark.parametrize(

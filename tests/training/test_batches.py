@@ -137,7 +137,7 @@ def test_all_pairs_and_trees_find_the_same(D: int, monkeypatch: pytest.MonkeyPat
     a, b = torch.randn(5, 40, D, generator=generator), torch.randn(5, 90, D, generator=generator)
     wanted = nearest_index(a, b)
     assert torch.equal(nearest_of_all(a, b), wanted)
-    monkeypatch.setattr("meshmatch.models.layers._MOST_PAIRS", 40 * 90 * 2)  # three blocks
+    monkeypatch.setattr("meshmatch.models.layers._MAX_PAIRS", 40 * 90 * 2)  # three blocks
     assert torch.equal(nearest_of_all(a, b), wanted)
     assert torch.equal(
         nearest_of_all(a.bfloat16(), b.bfloat16()), nearest_index(a.bfloat16().float(), b.bfloat16().float())
