@@ -26,18 +26,13 @@ from meshmatch.models.card import ImplicitCard
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
 
-_N_SAMPLES, _STEP_SAMPLES, _INITIAL_SAMPLES = (
-    8192,
-    1024,
-    512,
-)  # samples of the shape, in one step, and to choose the initial code
+# samples of the shape, in one step, and to choose the initial code
+_N_SAMPLES, _STEP_SAMPLES, _INITIAL_SAMPLES = 8192, 1024, 512
 _RATE = 1e-2  # learning rate of codes of length 1
 _TURN_CODES, _TURN_SAMPLES = 32, 256  # training codes, and samples, that are used to choose a rotation
 _MAX_ERROR_RATIO = 0.6  # a shape is rotated if that reduces the error below this share; set by hand
-_SURFACE_DISTANCE, _MIN_SURFACE_POINTS = (
-    0.02,
-    100,
-)  # samples nearer than this count as surface points; minimum number of them
+# samples nearer than this count as surface points; minimum number of them
+_SURFACE_DISTANCE, _MIN_SURFACE_POINTS = 0.02, 100
 
 
 def fit_implicit(

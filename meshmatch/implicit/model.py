@@ -36,14 +36,8 @@ _NORMAL_WEIGHT = 0.2  # weight of normals in matching; chosen from 0.05 to 0.2 o
 _NEWTON_STEPS, _PROJECTION_STEPS, _MAX_STEP = 12, 3, 0.1
 _DAMPING = 1e-6  # of the normal equations, in units of squared stretch
 _COARSE = 48  # resolution of the surface by which a fit is judged
-_MAX_SIZES = {
-    "code": 1024,
-    "width": 2048,
-    "depth": 16,
-    "inner": 512,
-    "layers": 16,
-    "maker": 4096,
-}  # bounds on the card's config
+# bounds on the sizes on a card
+_MAX_SIZES = {"code": 1024, "width": 2048, "depth": 16, "inner": 512, "layers": 16, "maker": 4096}
 _MAX_CODE_LENGTH = 100.0  # bound on the initial length of codes
 
 

@@ -33,20 +33,44 @@ _GAIN = 5.0
 
 @dataclass(frozen=True)
 class ImplicitConfig:
-    """Architecture of an implicit network; stored on the model card."""
+    """Architecture of an implicit network; stored on the model card.
+
+    Attributes
+    ----------
+    field
+        Deformation: "mls" (control nodes) or "pointwise" (DIF-Net).
+    code
+        Length D of a code.
+    width, depth
+        Width and depth of the template's network.
+    inner, layers
+        Width and depth of the networks whose weights are computed from a code.
+    nodes
+        Number of control nodes near surfaces.
+    reach
+        Radius of these nodes, in mean distances to the nearest other node.
+    frequency
+        Frequency of the sine activations.
+    kernel
+        Kernel of moving least squares.
+    maker
+        Width of the hypernetworks, which compute weights from codes.
+    length
+        Root mean square norm of initial codes.
+    """
 
     field: Deformation = "mls"
-    code: int = 64  # length D of a code
-    width: int = 128  # of the template's network
-    depth: int = 3  # of the template's network
-    inner: int = 48  # width of the networks whose weights are computed from a code
-    nodes: int = 240  # control nodes near surfaces
-    reach: float = 1.7  # radius of the nodes, in mean distances to the nearest other node
-    frequency: float = 15.0  # of the sine activations
+    code: int = 64
+    width: int = 128
+    depth: int = 3
+    inner: int = 48
+    nodes: int = 240
+    reach: float = 1.7
+    frequency: float = 15.0
     kernel: Kernel = "smooth"
-    layers: int = 2  # depth of the networks whose weights are computed from a code
-    maker: int = 128  # width of the hypernetworks that compute these weights
-    length: float = 1.0  # expected norm of initial codes
+    layers: int = 2
+    maker: int = 128
+    length: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

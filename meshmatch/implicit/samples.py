@@ -27,11 +27,8 @@ FILLED = 0.85
 FAR = 0.05
 """Distance from the surface, in the cube, beyond which a predicted distance of 0 is an error."""
 ARRAYS = ("points", "distances", "normals")
-_N_SURFACE, _MAX_PER_SHAPE, _MAX_TOTAL = (
-    40_000,
-    16_384,
-    40_000_000,
-)  # surface points; most samples per shape, per folder
+# surface points per mesh; maximum numbers of samples, per shape and per folder
+_N_SURFACE, _MAX_PER_SHAPE, _MAX_TOTAL = 40_000, 16_384, 40_000_000
 _MAX_NUMBER = 1e100  # bound on numbers in files; its square is finite
 _MAX_CUBE_NUMBER = 1e30  # bound on numbers in the cube; a float32
 _NEAR_DEVIATION = 0.05  # standard deviation of sample points near the surface

@@ -178,9 +178,8 @@ class MappedMesh:
                     asking = asking[np.maximum(distance[:, -1] - largest, 0.0) ** 2 <= best[asking]]
                     done, ask = ask, min(3 * ask, len(which), _MAX_TRIED)
 
-        order = np.argsort(
-            best, kind="stable"
-        )  # points near the image first, in common chunks: their searches are shorter
+        # points near the image first, in common chunks: their searches are shorter
+        order = np.argsort(best, kind="stable")
         size = min(_CHUNK, max(_MIN_CHUNK, -(-N // (4 * workers)))) if workers > 1 else _CHUNK
         parallel_map(search, [order[low : low + size] for low in range(0, N, size)], threads=workers)
         return item, weights

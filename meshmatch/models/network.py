@@ -24,9 +24,27 @@ _POSITIVE = ("code", "width")  # options that must be at least 1
 class NetworkConfig:
     """Architecture of a deformer; stored on the model card (cards without ``field`` use moving least squares).
 
-    The defaults were chosen on generated bodies (docs/paper.md). A pointwise field has its own decoder, independent of
-    ``decoder``. ``encoder`` may also be a custom class (docs/training.md), which is called with basis points (M, 3) and
-    the length of a code, see `models.layers.Encoder`.
+    The defaults were chosen on generated bodies (docs/paper.md).
+
+    Attributes
+    ----------
+    encoder
+        "basis" (basis point set), "point" (the paper's), or a custom class (docs/training.md), which is called with basis
+        points (M, 3) and the length of a code, see `models.layers.Encoder`.
+    decoder
+        "flat" (one MLP for all nodes) or "node" (the paper's); a pointwise field has its own decoder.
+    code
+        Length of a code.
+    width, depth
+        Width of the basis encoder and of the decoder, and number of residual blocks of the basis encoder.
+    basis
+        Number of basis points of the encoder.
+    align_basis, align_width
+        Number of basis points and width of the aligner; without basis points there is no aligner.
+    corrections, correct_width
+        Number of learned registration steps, and width of their network.
+    field
+        "mls" (moving least squares), "rbf" (radial basis functions) or "pointwise".
     """
 
     encoder: Literal["basis", "point"] | type = "basis"

@@ -287,7 +287,8 @@ def test_what_would_be_torn_from_its_surroundings_stays(monkeypatch: pytest.Monk
     assert Folds.of(unfolded(found, disc, disc), disc, disc).crushed < Folds.of(found, disc, disc).crushed
     for name in ("_SMOOTHING_RINGS", "_FLATTENING_RINGS", "_FINAL_RINGS"):
         monkeypatch.setattr(f"meshmatch.maps.unfold.{name}", ())
-    monkeypatch.setattr(_Images, "_solve_poisson", lambda *each: solved(*each) - [0.4, 0, 0])  # without a fold, but far away
+    # without a fold, but far away
+    monkeypatch.setattr(_Images, "_solve_poisson", lambda *each: solved(*each) - [0.4, 0, 0])
     np.testing.assert_array_equal(unfolded(found, disc, disc).points(disc), found.points(disc))
 
 
