@@ -83,7 +83,7 @@ def fit_implicit(
     notes: tuple[str, ...] = ()
     if not np.array_equal(turn, np.eye(3)):
         frame, rows = Frame(frame.scale, turn, frame.center), _rotated(rows, turn)
-        notes = (f"{name}: turned, it stands otherwise than the shapes of the training: {_axes_text(turn)}",)
+        notes = (f"{name}: rotated, since its orientation is not that of the training shapes: {_axes_text(turn)}",)
     network, loss, rate = model.network, loss_of(model.card), _RATE * model.network.config.length
     generator = torch.Generator().manual_seed(seed)
     code = nearest_code(model, rows[:: _N_SAMPLES // _INITIAL_SAMPLES]).clone().requires_grad_(True)

@@ -394,7 +394,7 @@ def load_implicit(folder: str | Path) -> ImplicitModel:
             type(getattr(config, key)) is int and 0 < getattr(config, key) <= most for key, most in _MAX_SIZES.items()
         )
         if not (known and all(valid) and 0 < config.length <= _MAX_CODE_LENGTH):
-            raise ValueError("its network cannot be")
+            raise ValueError("its network is invalid")
         header = read_header(folder / WEIGHTS)
         K = header["deformation.nodes"].shape[:1]
         with torch.device("meta"):

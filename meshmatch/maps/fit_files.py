@@ -142,7 +142,7 @@ def read_fit(path: str | Path, template: Template) -> StoredFit:
             **{name: about[name] for name in _FIT_FIELDS},
         )
         if not (1 / LARGEST < fit.frame.scale < LARGEST and (np.abs(fit.frame.center) < LARGEST).all()):
-            raise ValueError("its frame cannot be")
+            raise ValueError("its frame is invalid")
         places = _places(arrays, about, fit)
         fit = fit if places is None else PlacedFit.of(fit, places)
         return StoredFit(fit, _samples(arrays, about), _shape(arrays, about), more)
@@ -153,7 +153,7 @@ def read_fit(path: str | Path, template: Template) -> StoredFit:
 def _part_numbers(values: Any) -> tuple[int, ...]:
     """The numbers of the parts that were left out, counted from 1; `ValueError` if they are anything else."""
     if not isinstance(values, list) or not all(type(each) is int and each > 0 for each in values):
-        raise ValueError("its parts cannot be")
+        raise ValueError("its parts are invalid")
     return tuple(values)
 
 
@@ -167,7 +167,7 @@ def regularity_of(about: Words) -> Regularity | None:
     found = Regularity(*(about["regularity"][field.name] for field in fields(Regularity)))
     numbers = found.inverted, found.volume
     if {*map(type, numbers)} != {float} or not (0 <= found.inverted <= 1 and 0 <= found.volume < math.inf):
-        raise ValueError("its regularity cannot be")
+        raise ValueError("its regularity is invalid")
     return found
 
 
@@ -205,7 +205,7 @@ def _shape(arrays: dict[str, np.ndarray], about: Words) -> Shape | None:
         return None
     known: Words = {name: arrays[_SHAPE_PREFIX + name] for name in _SHAPE_ARRAYS if _SHAPE_PREFIX + name in arrays}
     if not (np.abs(known["verts"]) < LARGEST).all():
-        raise ValueError("its shape has vertices that cannot be")
+        raise ValueError("its shape has invalid vertices")
     made_of = tuple(map(str, about["made_of"]))
     return Shape(name=str(about["shape"]), upright=about["upright"] is True, made_of=made_of, **known)
 
@@ -215,5 +215,5 @@ def _checked_array(arrays: dict[str, np.ndarray], name: str, kind: Any, shape: t
     if array.dtype != kind or array.shape != shape:
         raise ValueError(f"{name} is an array of {array.shape} {array.dtype}, not of {shape} {np.dtype(kind)}")
     if array.dtype.kind == "f" and not (np.abs(array) < _MAX_VALUE).all():
-        raise ValueError(f"{name} has numbers that cannot be")
+        raise ValueError(f"{name} has invalid numbers")
     return array

@@ -197,7 +197,7 @@ class _Images:
         return _Images(invert_map(self.map, source, target, self.workers), target, source, self.workers)
 
     def repeat(self, move: Callable[[int, float], bool], rounds: tuple[int, ...], least: float = CRUSHED_RATIO) -> None:
-        """Apply ``move`` around folds (faces of area ratio up to ``least``) with each of these widths, as long as it can."""
+        """Apply ``move`` around folds (faces of area ratio up to ``least``), once for each width, until there are none."""
         for rings in rounds:
             if not move(rings, least):
                 break

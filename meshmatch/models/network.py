@@ -90,13 +90,13 @@ class NetworkConfig:
         if isinstance(named, str) and "." in named:
             if encoder is None:
                 hint = "load it in Python: meshmatch.load_model(..., encoder=THE_CLASS)"
-                raise ModelError(f"the model has an encoder of its author's own, {named[:80]!r}", hint)
+                raise ModelError(f"the model has a custom encoder, {named[:80]!r}", hint)
             _check_class(encoder)
             if encoder.__name__ != named.rpartition(".")[2]:  # its module may have been another, or __main__, then
                 raise ModelError(f"the model's encoder is {named[:80]!r}, not {_class_name(encoder)!r}")
             values = values | {"encoder": encoder}
         elif encoder is not None:
-            raise ModelError(f"the model has meshmatch's own encoder {named!r}", "leave out encoder=")
+            raise ModelError(f"the model has the built-in encoder {named!r}", "leave out encoder=")
         return NetworkConfig(**values)
 
     def to_dict(self) -> dict[str, Any]:
@@ -109,7 +109,7 @@ def _check_class(encoder: object) -> None:
     if not isinstance(encoder, type) or not all(
         callable(getattr(encoder, name, None)) for name in ("features", "forward")
     ):
-        what = f"an encoder of one's own is a class with features and forward, not {repr(encoder)[:80]}"
+        what = f"a custom encoder must be a class with features and forward, not {repr(encoder)[:80]}"
         raise ModelError(what, "derive one from meshmatch.models.layers.Encoder, and give the class itself")
 
 

@@ -129,7 +129,7 @@ def find_model(name: str | Path) -> tuple[Path, ModelCard]:
     """
     folder = locate_model(name)
     if is_implicit(folder):
-        hint = "it goes with `match`, `register` and `interpolate`, or in Python with `load_implicit`"
+        hint = "use it with `match`, `register` and `interpolate`, or `load_implicit` in Python"
         raise ModelError(f"{folder.name} is an implicit model, which has no template of vertices", hint)
     card = read_card(folder / CARD)
     for part in (TEMPLATE, WEIGHTS):

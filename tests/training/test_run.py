@@ -302,7 +302,7 @@ def test_an_encoder_of_ones_own_is_trained_kept_and_asked_for(prepared: Path, tm
     own = replace(SMALL, network=replace(NETWORK, encoder=Pooled))
     folder = trained(prepared, tmp_path / "pooled", own)
     name = f"{Pooled.__module__}.Pooled"
-    with pytest.raises(ModelError, match=f"an encoder of its author's own, '{name}'") as caught:
+    with pytest.raises(ModelError, match=f"a custom encoder, '{name}'") as caught:
         load_model(folder)
     assert "encoder=" in caught.value.hint
     with pytest.raises(ModelError, match=r"not 'meshmatch\.models\.layers\.Encoder"):
@@ -331,7 +331,7 @@ def test_an_encoder_of_ones_own_is_trained_kept_and_asked_for(prepared: Path, tm
     with pytest.warns(MeshmatchWarning, match="other settings"):
         assert load_model(trained(prepared, folder, longer), encoder=Pooled).card.steps == 6
     ours = trained(prepared, tmp_path / "ours")
-    with pytest.raises(ModelError, match="meshmatch's own encoder"):
+    with pytest.raises(ModelError, match="the built-in encoder"):
         load_model(ours, encoder=Pooled)
 
 
