@@ -90,7 +90,7 @@ class LocalFits:
         return xp.stack(columns, 1)
 
     @property
-    def second(self) -> Any:
+    def second_derivative(self) -> Any:
         """(N, 3, 3) d2Phi_i / dx_k dx_l at the points.
 
         With M a = p(x) and Phi_i = w_i p(q_i)^T a, in a basis that is centered on the point and fixed.

@@ -206,7 +206,7 @@ class NodeField:
     @cached_property
     def _seconds(self) -> Any:
         """(N, 9) their second derivatives."""
-        return _concatenate([fit.second.reshape(-1, 9) for _, fit in self.pieces])
+        return _concatenate([fit.second_derivative.reshape(-1, 9) for _, fit in self.pieces])
 
     def _applied(self, values: Any, vectors: Any) -> Any:
         """(..., P, C, D) sums over nodes of pair values (N, D) times vectors (..., K, C)."""
@@ -270,7 +270,7 @@ class NearestNodes:
         ]
 
     @property
-    def second(self) -> Any:
+    def second_derivative(self) -> Any:
         w, o = self.weight[:, None, None], self.offset
         weight_hessian = 8 * w**3 * o[:, :, None] * o[:, None] - 2 * w**2 * alike(np.eye(3), o)
         total = self._total(-2 * (self.weight**2)[:, None] * o)

@@ -95,7 +95,7 @@ class Footpoints:
         return replace(self, **arrays)
 
 
-def joined(parts: Sequence[Footpoints]) -> Footpoints:
+def concatenated(parts: Sequence[Footpoints]) -> Footpoints:
     """Concatenate footpoints."""
     names = [field.name for field in fields(Footpoints)]
     return Footpoints(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))

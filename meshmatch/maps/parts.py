@@ -15,7 +15,7 @@ from scipy.sparse import csr_array
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import face_parts, vertex_areas
-from meshmatch.maps.footpoints import Footpoints, joined
+from meshmatch.maps.footpoints import Footpoints, concatenated
 from meshmatch.maps.places import Places
 
 # Set by hand, on generated robots and soldiers. A shape is multipart if it has at least this many parts of at least this
@@ -61,7 +61,7 @@ def kept_together(source: Places, target: Places, found: Footpoints, workers: in
         faces = np.sort(np.concatenate([fitted[faces_of(part)] for part in _row(counterparts, same[0]).tolist()]))
         rows.append(astray[np.sort(np.concatenate([rows_of(part) for part in same]))])
         again.append(target.nearest(source.resting[rows[-1]], workers, faces))
-    return found.updated(np.concatenate(rows), joined(again))
+    return found.updated(np.concatenate(rows), concatenated(again))
 
 
 def _member_lookup(part: Int[Ints, " N"], count: int) -> Callable[[int], Int[Ints, " M"]]:
