@@ -73,7 +73,7 @@ def fit_implicit(
     """
     if steps < 1:
         raise OptionError(f"a latent code cannot be found in {steps} steps", "200 are usual")
-    began = time.monotonic()
+    start = time.monotonic()
     source = load_source(shape) if isinstance(shape, str | Path) else as_shape(shape)
     name = source.name or "shape"
     rng = np.random.default_rng(seed)
@@ -92,22 +92,22 @@ def fit_implicit(
         for group in descent.param_groups:
             group["lr"] = rate * (1 - step / steps)
         drawn = rng.integers(half, size=(2, _STEP_SAMPLES // 2))
-        some = rows[np.concatenate([drawn[0], drawn[1] + half])]
-        total = loss.of(network, code[None], some[None], generator)["total"]
+        batch = rows[np.concatenate([drawn[0], drawn[1] + half])]
+        total = loss.of(network, code[None], batch[None], generator)["total"]
         (code.grad,) = torch.autograd.grad(total, [code])
         descent.step()
         if progress is not None:
             progress("code", name, (step + 1) / steps)
     with torch.no_grad():
-        on = rows[:half]
-        away = network.distance(on[None, :, :3], code[None])[0][0] - on[:, 3]
-    fit = ImplicitFit(name, code.detach(), frame, percent_of_side(float(away.abs().mean())))
+        surface_half = rows[:half]
+        errors = network.distance(surface_half[None, :, :3], code[None])[0][0] - surface_half[:, 3]
+    fit = ImplicitFit(name, code.detach(), frame, percent_of_side(float(errors.abs().mean())))
     fit = replace(fit, owner=model, source=source, seed=seed, notes=notes)
-    surface = on[on[:, 3].abs() < _SURFACE_DISTANCE, :3].double().numpy()
+    surface = surface_half[surface_half[:, 3].abs() < _SURFACE_DISTANCE, :3].double().numpy()
     if len(surface) >= _MIN_SURFACE_POINTS:
         missed, invented = model.shares(fit, surface, seed)
         fit = replace(fit, missed=missed, invented=invented)
-    return replace(fit, seconds=time.monotonic() - began)
+    return replace(fit, seconds=time.monotonic() - start)
 
 
 def loss_of(card: ImplicitCard) -> ImplicitLoss:

@@ -160,8 +160,8 @@ def off_surface(
     free = free[cKDTree(points).query(free, distance_upper_bound=FAR)[0] > FAR][: N // 2]
     if len(free) < N // 2:
         raise InputError(f"{len(points)} points leave no room around them in the cube", "are they points of a surface?")
-    unknown = np.column_stack([free, np.full(len(free), np.nan), np.zeros_like(free)])
-    return np.concatenate([_surface_rows(points, normals, N // 2, rng), unknown])
+    free_rows = np.column_stack([free, np.full(len(free), np.nan), np.zeros_like(free)])
+    return np.concatenate([_surface_rows(points, normals, N // 2, rng), free_rows])
 
 
 def free_and_surface(

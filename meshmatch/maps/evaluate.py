@@ -439,7 +439,7 @@ def evaluate_map(
     ground truth is given and the target is a cloud.
     """
     vertex_map = vertex_map.for_shapes(source, target)
-    geodesics_target = errors = stretched = folds = energy = bijectivity_error = None
+    geodesics_target = errors = distances_change = folds = energy = bijectivity_error = None
     backward = None if backward is None else backward.for_shapes(target, source, "the map back")
     report = Progress(progress, target.name).stage("measuring errors")
     if target_points is not None:
@@ -447,10 +447,10 @@ def evaluate_map(
         geodesics_target, pairs = GeodesicDistances(target), placed_pairs(source_points, target_points, source, target)
         errors = map_errors(vertex_map.index, *pairs, geodesics_target, report)
     if not source.is_cloud and not target.is_cloud:
-        both = GeodesicDistances(source), geodesics_target or GeodesicDistances(target)
-        stretched = distortion(vertex_map.index, *both, rng or np.random.default_rng(0))
+        geodesics = GeodesicDistances(source), geodesics_target or GeodesicDistances(target)
+        distances_change = distortion(vertex_map.index, *geodesics, rng or np.random.default_rng(0))
         folds, energy = Folds.of(vertex_map, source, target), dirichlet_energy(vertex_map, source, target)
     if backward is not None and not source.is_cloud:
         bijectivity_error = round_trip(vertex_map, backward, GeodesicDistances(source))
     measured: dict[str, Any] = {"dirichlet": energy, "bijectivity": bijectivity_error}
-    return Evaluation(coverage(vertex_map.index, target), stretched, folds, errors, unit, **measured)
+    return Evaluation(coverage(vertex_map.index, target), distances_change, folds, errors, unit, **measured)

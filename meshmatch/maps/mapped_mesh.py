@@ -75,18 +75,18 @@ class MappedMesh:
         self.normals = normals_at(source_to_target, target)
         self._target, self._index = target, source_to_target.index
         kept = np.flatnonzero(~discontinuous_faces(source_to_target, source, target) & source.valid_faces)
-        lone = source.valid
-        lone[source.faces[kept].ravel()] = False
+        in_no_face = source.valid
+        in_no_face[source.faces[kept].ravel()] = False
         self._source_unit = length_of(source)
         self._source = source.verts / self._source_unit
-        single = np.flatnonzero(lone)
+        loose = np.flatnonzero(in_no_face)
         # Triangles, then the vertices that are in no kept triangle: those of a cloud, or between discontinuities.
-        self.corners = np.concatenate([source.faces[kept], np.repeat(single[:, None], 3, axis=1)])
-        self.face = np.concatenate([kept, np.full(len(single), -1)])
-        held = self.points[self.corners]
-        self._center = held.mean(axis=1)
+        self.corners = np.concatenate([source.faces[kept], np.repeat(loose[:, None], 3, axis=1)])
+        self.face = np.concatenate([kept, np.full(len(loose), -1)])
+        corner_points = self.points[self.corners]
+        self._center = corner_points.mean(axis=1)
         # For balls of each size class: a tree of their centers, the items they cover, their radii, and the largest.
-        item, center, radius = covering_balls(held)
+        item, center, radius = covering_balls(corner_points)
         largest = float(radius.max()) or 1.0
         size = np.floor(np.log2(np.maximum(radius / largest, 0.5**_CLASSES)))
         groups = [np.flatnonzero(size == k) for k in np.unique(size)]
@@ -163,20 +163,20 @@ class MappedMesh:
 
         def search(rows: Ints) -> None:
             for tree, which, radius, largest in self._trees:
-                asking, done, ask = rows, 0, min(_FIRST_TRIED, len(which))
-                while len(asking):
-                    reach = (np.sqrt(best[asking].max()) + largest) * (1 + 1e-9)
-                    found = tree.query(points[asking], ask, distance_upper_bound=reach)
-                    distance, close = (each.reshape(len(asking), -1) for each in found)
-                    row, column = np.nonzero(np.isfinite(distance[:, done:]))
-                    ball = close[row, column + done]
-                    lower = np.maximum(distance[row, column + done] - radius[ball], 0.0)
-                    worth = lower**2 <= best[asking[row]]
-                    attempt(asking[row[worth]], which[ball[worth]])
-                    if ask >= min(len(which), _MAX_TRIED):
+                pending, n_done, count = rows, 0, min(_FIRST_TRIED, len(which))
+                while len(pending):
+                    reach = (np.sqrt(best[pending].max()) + largest) * (1 + 1e-9)
+                    found = tree.query(points[pending], count, distance_upper_bound=reach)
+                    distance, close = (each.reshape(len(pending), -1) for each in found)
+                    row, column = np.nonzero(np.isfinite(distance[:, n_done:]))
+                    ball = close[row, column + n_done]
+                    lower = np.maximum(distance[row, column + n_done] - radius[ball], 0.0)
+                    worth = lower**2 <= best[pending[row]]
+                    attempt(pending[row[worth]], which[ball[worth]])
+                    if count >= min(len(which), _MAX_TRIED):
                         break
-                    asking = asking[np.maximum(distance[:, -1] - largest, 0.0) ** 2 <= best[asking]]
-                    done, ask = ask, min(3 * ask, len(which), _MAX_TRIED)
+                    pending = pending[np.maximum(distance[:, -1] - largest, 0.0) ** 2 <= best[pending]]
+                    n_done, count = count, min(3 * count, len(which), _MAX_TRIED)
 
         # points near the image first, in common chunks: their searches are shorter
         order = np.argsort(best, kind="stable")

@@ -227,7 +227,7 @@ def _displacement_on_rest(before: Fit, after: Fit) -> Float[Floats, "V 3"]:
     gram = edges @ edges.transpose(0, 2, 1)
     gram += 1e-9 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(2) + 1e-30 * np.eye(2)
     along = np.linalg.solve(gram, (edges @ slid[..., None]))[..., 0]
-    moves = np.clip((along[:, None] @ resting)[:, 0], -1.0, 1.0)  # where a triangle is crushed to nothing
+    moves = np.clip((along[:, None] @ resting)[:, 0], -1.0, 1.0)  # bounds the moves of degenerate triangles
     area = triangle_areas(after.resting, faces)
     total = share_areas(area, faces, len(after.points))
     sums = np.stack([share_areas(area * column, faces, len(after.points)) for column in moves.T], 1)

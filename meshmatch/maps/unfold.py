@@ -88,18 +88,18 @@ def unfolded_both_ways(
     if theirs.order < own.order:
         backward, forward = unfolded_both_ways(opposite, found, target, source, workers)
         return forward, backward
-    there = _Images(_between_welded(found, own, theirs), own.shape, theirs.shape, workers)
-    there.repeat(there.reconstruct, _POISSON_RINGS)
-    there.repeat(there.smooth, _SMOOTHING_RINGS)
-    there.repeat(there.flatten, _FLATTENING_RINGS)
-    back = there.inverse()
-    back.repeat(back.reconstruct, _POISSON_RINGS)
-    back.repeat(back.flatten, _FLATTENING_RINGS)
-    there = back.inverse()
-    there.opposite, back.opposite = back, there
-    for each in (there, back):
+    images = _Images(_between_welded(found, own, theirs), own.shape, theirs.shape, workers)
+    images.repeat(images.reconstruct, _POISSON_RINGS)
+    images.repeat(images.smooth, _SMOOTHING_RINGS)
+    images.repeat(images.flatten, _FLATTENING_RINGS)
+    images_back = images.inverse()
+    images_back.repeat(images_back.reconstruct, _POISSON_RINGS)
+    images_back.repeat(images_back.flatten, _FLATTENING_RINGS)
+    images = images_back.inverse()
+    images.opposite, images_back.opposite = images_back, images
+    for each in (images, images_back):
         each.repeat(each.flatten, _FINAL_RINGS, 0.0)
-    return _between_files(there.map, found, own, target), _between_files(back.map, opposite, theirs, source)
+    return _between_files(images.map, found, own, target), _between_files(images_back.map, opposite, theirs, source)
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,12 +79,12 @@ def training_device(rank: int = 0, wanted: str = "auto") -> torch.device:
     """
     import torch
 
-    there = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
     if wanted == "auto":
-        wanted = "cuda" if there["cuda"] else "cpu"
-    if not there.get(wanted, False):
-        have = ", ".join(name for name in there if there[name])
-        raise OptionError(f"there is no device {wanted!r} to train on", f"this machine and its torch have: {have}")
+        wanted = "cuda" if available["cuda"] else "cpu"
+    if not available.get(wanted, False):
+        names = ", ".join(name for name in available if available[name])
+        raise OptionError(f"there is no device {wanted!r} to train on", f"this machine and its torch have: {names}")
     return torch.device("cuda", rank) if wanted == "cuda" else torch.device(wanted)
 
 

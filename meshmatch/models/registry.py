@@ -193,7 +193,7 @@ def load_once(name: str | Path, encoder: type | None = None) -> TrainedModel:
     try:
         changed = max(os.stat(folder / name).st_mtime_ns for name in (WEIGHTS, CARD))
     except OSError:
-        changed = 0  # the reader says what is missing
+        changed = 0  # loading reports what is missing
     with _loading:
         return _loaded(folder.resolve(), changed, encoder)
 

@@ -95,15 +95,15 @@ def _own_vertices(small: Shape, shape: Shape) -> Int[Ints, " V"]:
     Otherwise touching walls of two chambers could be merged.
     """
     nearest = np.asarray(cKDTree(shape.verts).query(small.verts)[1], np.int64)
-    own, parts = shape.vertex_parts, small.vertex_parts
-    if own.max() == 0:
+    shape_parts, parts = shape.vertex_parts, small.vertex_parts
+    if shape_parts.max() == 0:
         return nearest
-    (part, meant), votes = np.unique(np.stack([parts, own[nearest]]), axis=1, return_counts=True)
-    order, most = np.argsort(votes, kind="stable"), np.zeros(parts.max() + 1, np.int64)
-    most[part[order]] = meant[order]  # the last one, with most votes, wins
-    away = 2 * shape.diagonal
-    tree = cKDTree(np.column_stack([shape.verts, away * own]))
-    return np.asarray(tree.query(np.column_stack([small.verts, away * most[parts]]))[1], np.int64)
+    (part, shape_part), votes = np.unique(np.stack([parts, shape_parts[nearest]]), axis=1, return_counts=True)
+    order, matched_part = np.argsort(votes, kind="stable"), np.zeros(parts.max() + 1, np.int64)
+    matched_part[part[order]] = shape_part[order]  # the last one, with most votes, wins
+    separation = 2 * shape.diagonal
+    tree = cKDTree(np.column_stack([shape.verts, separation * shape_parts]))
+    return np.asarray(tree.query(np.column_stack([small.verts, separation * matched_part[parts]]))[1], np.int64)
 
 
 def make_template(
