@@ -18,7 +18,7 @@ from meshmatch.errors import InputError
 from meshmatch.fitting.direct import CLEARLY, MIRROR, DirectMatch, match_directly
 from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fitter import cap_verdict, judged_of_kind, may_show_part, with_side
+from meshmatch.fitting.fitter import cap_verdict, judge_unsupervised, may_show_part, with_mirror_note
 from meshmatch.fitting.judge.reasons import SIDE_IN_DOUBT, Reason
 from meshmatch.fitting.kind_templates import finest, template_of, viscous_system, with_more_nodes
 from meshmatch.fitting.one_way import DirectConfig
@@ -159,12 +159,12 @@ def finer(
         near, moved = fit_otherwise(with_more_nodes(model.template, viscous), shape, found, viscous)
         if moved:
             near = replace(near, points=found.points)
-    made = cap_verdict(judged_of_kind(card, _as_of(model, near)), doubts)
+    made = cap_verdict(judge_unsupervised(card, _as_of(model, near)), doubts)
     if near.points is fit.points:  # it may yet agree with others
         made = replace(made, vectors=fit.vectors)
     if poor:
         made = replace(made, verdict="poor", reasons=fit.reasons, trust=min(fit.trust, made.trust))
-    notes = with_side(fit.notes, shape.name, card, made.frame.mirrored)
+    notes = with_mirror_note(fit.notes, shape.name, card, made.frame.mirrored)
     return replace(made, repaired=fit.repaired, left_out=fit.left_out, notes=notes)
 
 

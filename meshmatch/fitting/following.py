@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import get_args
 
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fitter import Fitter, as_fit
+from meshmatch.fitting.fitter import Fitter, fit_of_registration
 from meshmatch.fitting.judge.reasons import Verdict
 from meshmatch.fitting.search.predictor import Candidate, two_way_residual
 from meshmatch.fitting.search.refinement import REFINEMENTS
@@ -52,7 +52,7 @@ def follow(fitter: Fitter, shape: Shape, last: Fit) -> Fit:
     tried: list[Fit] = []
     for candidates in (asked, held):
         best = REFINEMENTS[task.config.refine].whole(task, candidates())
-        tried.append(as_fit(Registration(task.on_visible_samples, best), False, began))
+        tried.append(fit_of_registration(Registration(task.on_visible_samples, best), False, began))
         if tried[-1].verdict != "poor" and tried[-1].residual <= _LOST * last.residual:
             return tried[-1]
     tried.append(fitter.fit(shape))

@@ -17,7 +17,7 @@ from meshmatch.fitting.search.refinement import (
     CandidateScorer,
     PartComparison,
     WholeComparison,
-    averaged,
+    average_similar,
     choose,
     differ,
     has_common_axes,
@@ -127,7 +127,7 @@ def test_how_a_file_stands_is_tried_however_badly_it_begins(
     model = egg_model()
     task = FitTask.of(model, FitConfig(), replace(model.template.shape, upright=upright))
     odd = np.eye(3)[[1, 2, 0]]
-    monkeypatch.setattr(frames, "own_axes", lambda _: RigidPose.identity())
+    monkeypatch.setattr(frames, "principal_pose", lambda _: RigidPose.identity())
     monkeypatch.setattr(frames, "propose", lambda *_: [RigidPose(odd, np.zeros(3))])
     monkeypatch.setattr(frames, "with_flips", lambda poses: poses * 5)
     asked: list[list[RigidPose]] = []
@@ -141,7 +141,7 @@ def test_how_a_file_stands_is_tried_however_badly_it_begins(
     _, found = candidates_of_whole(task)
     assert [len(poses) for poses in asked] == [5 + upright, careful, 1]
     assert [bool((each.pose.rotation == odd).all()) for each in found] == [True] * 3 + [False] * upright
-    assert candidates.of_file(task, found) == found[3:]  # it will be refined, too
+    assert candidates.upright_candidate(task, found) == found[3:]  # it will be refined, too
 
 
 def test_another_orientation_than_the_files_costs_a_little(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -239,9 +239,9 @@ def test_interpretations_that_say_the_same_are_averaged_and_others_are_not(syste
     near = [replace(still(system), vectors=np.full((system.K, 3), size)) for size in (0.0, 0.01, 0.02)]
     elsewhere = replace(near[1], pose=RigidPose.identity())  # another frame, though an equal one
     far = folded(system)
-    mean = averaged(system, near[0], [*near, elsewhere, far])
+    mean = average_similar(system, near[0], [*near, elsewhere, far])
     assert np.allclose(mean.vectors, 0.01)
-    assert averaged(system, far, near) is far
+    assert average_similar(system, far, near) is far
 
 
 def test_of_a_rough_cloud_positions_alone_are_scorerd_and_squares(system: NodeSystem, scan: OrientedPoints) -> None:
@@ -280,7 +280,7 @@ def test_of_interpretations_that_tie_the_network_chooses(
     task = FitTask.of(model, FitConfig(), model.template.shape)
     comparison = WholeComparison(task, [])
     here, there = still(comparison.task.system), folded(comparison.task.system)
-    monkeypatch.setattr(refinement, "reads_alike", lambda _: reads)
+    monkeypatch.setattr(refinement, "is_tilt_consistent", lambda _: reads)
     monkeypatch.setattr(Predictor, "spread", lambda self, local, vectors, at: spread if vectors.any() else 0.01)
     doubt = comparison.doubt(there) - comparison.doubt(here)
     assert (doubt > 0) is told and doubt <= 0.3 * 0.02 + 1e-9  # beyond a usual spread it is no more

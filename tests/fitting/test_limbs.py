@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.api.inputs import as_model
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.search import refinement
-from meshmatch.fitting.search.limbs import Limbs, bare_places, limbs_of
+from meshmatch.fitting.search.limbs import Limbs, limbs_of, uncovered_regions
 from meshmatch.fitting.search.predictor import Candidate, mirror_of
 from meshmatch.fitting.search.refinement import WholeComparison, with_limb_bent
 from meshmatch.fitting.search.task import FitTask
@@ -57,12 +57,12 @@ def test_bare_places_are_found_the_largest_first() -> None:
     balls = [ball(3000, 0.0), ball(100, 1.0), ball(200, 2.0), ball(10, 3.0)]
     points, normals = (np.concatenate([getattr(each, name) for each in balls]) for name in ("points", "normals"))
     samples, surface = OrientedPoints(points, normals), ball(2000, 0.0)
-    found = bare_places(samples, surface)
+    found = uncovered_regions(samples, surface)
     assert np.allclose(found, [[2, 0, 0], [1, 0, 0]], atol=0.03)
     hidden = replace(samples, weights=np.where(np.abs(points[:, 0] - 2) < 0.2, 0.0, 1.0))
-    assert np.allclose(bare_places(hidden, surface), [[1, 0, 0]], atol=0.03)
-    assert bare_places(replace(samples, weights=np.zeros(len(points))), surface) == []
-    assert bare_places(balls[0], surface) == []
+    assert np.allclose(uncovered_regions(hidden, surface), [[1, 0, 0]], atol=0.03)
+    assert uncovered_regions(replace(samples, weights=np.zeros(len(points))), surface) == []
+    assert uncovered_regions(balls[0], surface) == []
 
 
 def test_limbs_hang_on_a_template_by_its_labels(human: TrainedModel) -> None:
@@ -120,7 +120,7 @@ def test_the_limb_that_belongs_to_a_bare_place_is_bent(human: TrainedModel, kick
     limbs, system = limbs_of(human), node_system(human)
     samples = scan_of(shape_of(system, kicking), 2048)
     still = np.zeros((system.K, 3))
-    place = bare_places(samples, system.surface(still))[0]
+    place = uncovered_regions(samples, system.surface(still))[0]
     found = limbs.reaching(samples, still, place)
     assert found is not None
     truth = system.moved(kicking)
@@ -162,7 +162,7 @@ def test_a_fit_that_leaves_nothing_bare_or_too_much_is_kept(
     mirror = mirror_of(human)
     assert mirror is not None
     task, still = task_for(human, legs / 2 * (kicking + mirror.vectors(kicking)))
-    places = bare_places(task.coarse, task.system.surface(still.vectors))
+    places = uncovered_regions(task.coarse, task.system.surface(still.vectors))
     assert len(places) == legs
     monkeypatch.setattr(Limbs, "reaching", lambda *_: pytest.fail("looked for a limb"))
     comparison = WholeComparison(task, [still])

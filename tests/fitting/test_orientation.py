@@ -15,10 +15,10 @@ from meshmatch.fitting.search.frames import (
     forced_frames,
     frames_anywhere,
     frames_to_try,
-    own_axes,
+    principal_pose,
     propose,
+    random_rotations,
     standing_grid,
-    turned_copies,
     with_flips,
 )
 from meshmatch.geometry.frames import RigidPose
@@ -44,15 +44,15 @@ def rotations(guesses: list[RigidPose]) -> np.ndarray:
 
 
 def test_turned_copies_are_rotations_of_one_seed_and_begin_as_they_are() -> None:
-    turns = turned_copies(12, 3)
+    turns = random_rotations(12, 3)
     check_rotations(turns)
     assert np.array_equal(turns[0], np.eye(3))
-    assert np.array_equal(turns, turned_copies(12, 3))
-    assert not np.allclose(turns[1:], turned_copies(12, 4)[1:])
+    assert np.array_equal(turns, random_rotations(12, 3))
+    assert not np.allclose(turns[1:], random_rotations(12, 4)[1:])
 
 
 def test_asking_about_turned_copies_is_turning_the_points_and_asking(model: TrainedModel, points: np.ndarray) -> None:
-    turns = turned_copies(5, 0)
+    turns = random_rotations(5, 0)
     R, t = ask_aligner(model.network, points, turns)
     aligner = model.network.aligner
     assert aligner is not None
@@ -68,7 +68,7 @@ def test_asking_about_turned_copies_is_turning_the_points_and_asking(model: Trai
 
 def test_frames_move_along_with_the_scan(model: TrainedModel, points: np.ndarray) -> None:
     Q, shift = Rotation.from_rotvec([0.5, 1.0, -0.4]).as_matrix(), np.array([1.0, -2, 0.5])
-    turns = turned_copies(4, 1)
+    turns = random_rotations(4, 1)
     R, t = ask_aligner(model.network, points, turns @ Q)
     moved_R, moved_t = ask_aligner(model.network, points @ Q.T + shift, turns)
     assert np.allclose(moved_R, Q @ R, atol=1e-4)
@@ -91,9 +91,9 @@ def test_own_axes_turn_with_what_is_flat_or_mirrored() -> None:
     rng = np.random.default_rng(0)
     cloud = rng.gamma(2.0, size=(500, 3)) * [3, 2, 1]
     for points in (cloud * [1, 1, 0], np.concatenate([cloud, cloud * [1, 1, -1]])):
-        own = own_axes(points)
+        own = principal_pose(points)
         for Q in Rotation.random(10, random_state=1).as_matrix():
-            turned = own_axes(points @ Q.T)
+            turned = principal_pose(points @ Q.T)
             check_rotations(turned.rotation[None])
             np.testing.assert_allclose(turned.to_local(points @ Q.T), own.to_local(points), atol=1e-9)
 

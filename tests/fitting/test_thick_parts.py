@@ -59,8 +59,8 @@ class Unrefined:
 def test_a_contraction_is_undone() -> None:
     points = np.random.default_rng(0).normal(size=(500, 3))
     contraction = Contraction(np.array([0.2, 0.0, -0.1]), 0.7, 0.4)
-    drawn = contraction.drawn(points)
-    assert np.allclose(contraction.back(drawn), points, atol=1e-12)
+    drawn = contraction.apply(points)
+    assert np.allclose(contraction.invert(drawn), points, atol=1e-12)
     before, after = (np.linalg.norm(each - contraction.middle, axis=1) for each in (points, drawn))
     assert (np.diff(after[np.argsort(before)]) > 0).all()
     assert np.allclose(after[before < 0.7], 0.4 * before[before < 0.7])
@@ -132,7 +132,7 @@ def test_the_smaller_shape_keeps_landmarks_and_side(human: TrainedModel, monkeyp
 
     monkeypatch.setattr(FitTask, "of", of)
     with pytest.raises(InterruptedError):
-        thick_parts._read_through(task, Contraction(np.zeros(3), 0.3, 0.5))
+        thick_parts._fit_contracted(task, Contraction(np.zeros(3), 0.3, 0.5))
     ((other, places, mirrored),) = asked
     assert mirrored is task.frame.mirrored
     assert np.allclose(places, other.verts[[7]]) and not np.allclose(places, shape.verts[[7]])

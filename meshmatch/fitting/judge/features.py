@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.fitting.judge.calibration import CALIBRATION, Calibration
 from meshmatch.fitting.search.discontinuities import discontinuous_share, neighbours
-from meshmatch.fitting.search.predictor import USUAL_SPREAD, two_way_residual, weighted_mean
+from meshmatch.fitting.search.predictor import TYPICAL_SPREAD, two_way_residual, weighted_mean
 from meshmatch.fitting.search.visibility import area_share, visible_vertices
 from meshmatch.fitting.solve.agreement import log_stretch
 from meshmatch.fitting.solve.system import NodeSystem
@@ -90,7 +90,7 @@ class FitFeatures:
     astray: float = 0.0
     uncut: float = 0.0
     forward: float = 0.0
-    spread: float = USUAL_SPREAD
+    spread: float = TYPICAL_SPREAD
     inverted: float = 0.0
 
     def values(self) -> tuple[float, ...]:
@@ -153,7 +153,7 @@ def compute_features(
         partial=partial,
         hidden=1 - area_share(system, shown) if partial else 0.0,
         astray=astray_share(connected, gap, local.weights) if partial and connected is not None else 0.0,
-        spread=USUAL_SPREAD if spread_at is None or not shown.any() else spread_at(shown),
+        spread=TYPICAL_SPREAD if spread_at is None or not shown.any() else spread_at(shown),
         inverted=system.regularity(vectors).inverted,
     )
 

@@ -19,7 +19,7 @@ from meshmatch.fitting.judge.features import (
 )
 from meshmatch.fitting.judge.joints import knees_forward
 from meshmatch.fitting.judge.reasons import Reason, ReasonCode, Verdict
-from meshmatch.fitting.search.predictor import reads_alike
+from meshmatch.fitting.search.predictor import is_tilt_consistent
 from meshmatch.fitting.search.task import Registration, without_interior
 from meshmatch.fitting.search.visibility import visible_vertices
 from meshmatch.fitting.solve.regularity import Regularity
@@ -93,7 +93,7 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
     def spread_at(vertices: Bool[Bools, " V"]) -> float:
         return task.predictor.spread(found.local, vectors, vertices)
 
-    predicted = task.model.has_nodes and reads_alike(task.model)
+    predicted = task.model.has_nodes and is_tilt_consistent(task.model)
     features = compute_features(
         task.system,
         vectors,

@@ -1,15 +1,15 @@
-"""The network's candidates for a shape that is taken for complete, or for a part.
+"""The network's candidates for a shape that is assumed to be complete, or to be a part.
 
-The area of a cloud is only estimated, too small where points are few and noisy, and outliers look like surface. The
-network's own fit knows better: its template has the area of a body, and a point far from it, with few others around, is
-not on its surface.
+Clouds: their area is only an estimate, which is too small where points are few and noisy and too large where outliers look
+like surface. The network's own fit gives a better scale, as its template has the area of a body; isolated points far from
+it are outliers.
 
-A part does not say how large the whole is, so its share of the surface is one more thing to try. What the samples show
-must lie on the template; what the template has besides is left to the network and to the prior on its gradient.
+Parts: the size of the whole is unknown, so several shares of the surface are tried. The samples must lie on the template;
+the rest of the template is left to the network and to the prior on its gradient.
 
-The network was mostly shown complete shapes. Where samples show a part, the template's fitted surface stands in for
-what is missing, and the network is asked again about both together. The refinement then holds what is not visible where
-the network wants it, and nothing beyond a cut is pulled onto its edge.
+The network was mostly trained on complete shapes. For a part, the fitted template therefore fills in what is missing, and
+the network predicts again from both together. Refinement then holds hidden template where the network predicts it, and
+nothing beyond a cut is pulled onto the border of the cut.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map
 
 STAGE = "fitting as a part"
-_ABOUT = np.array([-1.0, 1.0, -1.0])  # of the columns of a rotation: half a turn about its own y axis
+_HALF_TURN = np.array([-1.0, 1.0, -1.0])  # signs of a rotation's columns after half a turn about its own y axis
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,29 +53,29 @@ class CandidateSettings:
 
     Attributes
     ----------
-    scale_rounds : how often the scale and the outliers of a cloud are estimated anew
-    max_scale_change : factor by which the scale may change in all: more is a wrong fit, not a wrong area
-    outlier_distance : isolated points further than this from the fitted template are outliers
-    isolation : a point is isolated whose neighbours reach so many times as far as the median of the cloud
-    neighbours : how many neighbours those are
-    scale_tolerance : relative change of the scale that ends the search
-    scale_margin : candidates whose residual is more than this times the best one say nothing about a cloud's scale
-    unusual_residual : a shape that the network's fits miss by more may stand as nothing that the aligner knows
-    careful_if_unusual : of the frames that are then tried, how many are fitted with care
-    about_margin : residual, as a multiple of the best one, up to which this is refined the other way round as well
+    scale_rounds : how often the scale and the outliers of a cloud are estimated
+    max_scale_change : largest total change of scale, as a factor; more indicates a wrong fit rather than a wrong area
+    outlier_distance : isolated points farther than this from the fitted template are outliers
+    isolation : a point is isolated if its neighbors reach this many times as far as the cloud's median
+    neighbours : number of neighbors for this
+    scale_tolerance : relative change of the scale below which the estimate has converged
+    scale_margin : candidates with a residual up to this multiple of the best one's estimate a cloud's scale
+    unusual_residual : if all candidates have a larger residual, the aligner may not know the shape's pose
+    careful_if_unusual : how many of the frames that are then tried are fitted on all samples
+    about_margin : the best candidate turned by half a turn is kept if its residual is below this multiple
     shares : shares of the surface that a part may show
-    min_share : the smallest share that a shape is taken to show
-    lost : residual from which on the candidates of a narrow search are not worth refining: of parts of people that are found
-        it is 0.020 to 0.030
+    min_share : the smallest share that a shape is assumed to show
+    lost : if all residuals exceed this, the candidates of a narrow search are not worth refining: those of people's parts
+        that were fitted right are 0.020 to 0.030
     wide_shares : shares for which a wide search tries all frames
-    wide_kept : one in so many of these, the best, is tried for the other shares
-    ranking_samples, ranking_samples_if_wide : samples by which frames are ranked
-    careful : candidates of each share that are fitted with care
-    worth_if_wide : multiple of the best residual up to which they are worth it in a wide search
-    completed : candidates that are completed and fitted again: so many once, of these so many twice, and so many three times
-    varied : candidates of which variants are sought
-    coarse_samples : samples by which variants are compared, and visible vertices found
-    max_added : points that complete the samples, for each of them, at most
+    wide_kept : one in this many of these frames, the best, is tried for the other shares
+    ranking_samples, ranking_samples_if_wide : number of samples for ranking frames
+    careful : candidates per share that are fitted on all samples
+    worth_if_wide : in a wide search, the multiple of the best residual up to which they are
+    completed : how many candidates are completed and fitted again in each of the rounds
+    varied : candidates for which variants are sought
+    coarse_samples : number of samples for comparing variants and for finding visible vertices
+    max_added : maximum number of points per sample that complete the samples
     """
 
     scale_rounds: int = 3
@@ -107,76 +107,78 @@ SETTINGS = CandidateSettings()
 
 
 def candidates_of_whole(task: FitTask) -> tuple[FitTask, list[Candidate]]:
-    """The network's fits of a shape that is taken for complete, best first; and the task, a cloud's in the scale, and
-    without the outliers, that the best fit tells.
+    """The network's candidates for a shape that is assumed to be complete, best first; and the task.
+
+    For a cloud, the task has the scale that the best candidate gives, without the outliers that it shows.
     """
     orientation = task.progress.stage("orientation")
     orientation(0.0)
-    # A cloud's residual says little before its core frame is found; a second round finds it.
-    care = 2 if task.shape.is_cloud else 1
+    # The residual of a cloud is unreliable until its core frame is found, which takes a second round.
+    repeats = 2 if task.shape.is_cloud else 1
     starts = [(task.coarse, pose) for pose in frames_to_try(task.model, task.samples, task.config, task.shape.upright)]
-    candidates = best_first(task.predictor.fit_all(starts, rounds=care, draws=care))
+    candidates = best_first(task.predictor.fit_all(starts, rounds=repeats, draws=repeats))
     orientation(0.6)
     if task.shape.is_cloud:
         task, candidates = _rescaled(task, candidates)
     chosen = candidates[: task.config.careful]
-    chosen += [each for each in of_file(task, candidates) if each not in chosen]
+    chosen += [each for each in upright_candidate(task, candidates) if each not in chosen]
     best = best_first(task.predictor.fit_all([(task.samples, each.pose) for each in chosen]))
     orientation(0.8)
     unusual = best[0].residual > SETTINGS.unusual_residual and not task.shape.is_cloud
-    if unusual and task.config.partial != "yes" and not task.config.again:  # else it is asked again
-        best = best_first([*best, *_turned_anywhere(task)])
-    best += _about_face(task, best[0])
+    if unusual and task.config.partial != "yes" and not task.config.again:  # which fits it once more
+        best = best_first([*best, *_candidates_from_all_rotations(task)])
+    best += _half_turned(task, best[0])
     orientation(1.0)
     return task, best_first(best)
 
 
-def _turned_anywhere(task: FitTask) -> list[Candidate]:
-    """Fits from the best of many frames, of a shape whose core frame the aligner does not know.
+def _candidates_from_all_rotations(task: FitTask) -> list[Candidate]:
+    """Candidates from the best of many evenly spread frames, for a shape whose core frame the aligner does not find.
 
-    People who fold forward, do the splits or wear a large head are read well by the network once their core is found.
+    The network predicts people who fold forward, do the splits or have a large head well once their core is found.
     """
     frames = frames_anywhere(task.model, task.samples, task.config)
-    if not frames:  # the orientation of this category is not searched
+    if not frames:  # this category has a fixed orientation
         return []
     rough = task.predictor.fit_all([(task.coarse, pose) for pose in frames], draws=1, measure=ranking_residual)
     careful = SETTINGS.careful_if_unusual
     return task.predictor.fit_all([(task.samples, each.pose) for each in best_first(rough)[:careful]])
 
 
-def _about_face(task: FitTask, best: Candidate) -> list[Candidate]:
-    """The best candidate turned about by its own up axis, where that fits about as well, and nobody says where the front is.
+def _half_turned(task: FitTask, best: Candidate) -> list[Candidate]:
+    """The best candidate after half a turn about its up axis, if that fits about as well and the user does not give the
+    front.
 
-    The turned votes are ranked by single predictions, which are wrong where a vote is far from the core frame: people who
-    make a bridge were taken to stand on all fours.
+    Flipped votes are ranked by single predictions, which are wrong if a vote is far from the core frame: people in a bridge
+    were read as being on all fours.
     """
     if task.config.front is not None or task.model.card.frame["orientation"] in ALIGNS:
         return []
-    predictor = replace(task.predictor, rng=np.random.default_rng(task.config.seed))  # others draw what they would
-    turned = predictor.fit_all([(task.samples, RigidPose(best.pose.rotation * _ABOUT, best.pose.center))])
+    predictor = replace(
+        task.predictor, rng=np.random.default_rng(task.config.seed)
+    )  # so that later steps draw the same numbers
+    turned = predictor.fit_all([(task.samples, RigidPose(best.pose.rotation * _HALF_TURN, best.pose.center))])
     return [each for each in turned if each.residual < SETTINGS.about_margin * best.residual]
 
 
-def of_file(task: FitTask, candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Of a shape whose file says how it stands, the best candidate that stands so, where the best of all (the first) does
-    not: it is to be tried too.
-    """
+def upright_candidate(task: FitTask, candidates: Sequence[Candidate]) -> list[Candidate]:
+    """For an upright file: the best upright candidate, as a list, if the best of all is not upright; otherwise empty."""
     if not task.shape.upright or stands_upright(candidates[0].pose):
         return []
     return [each for each in candidates if stands_upright(each.pose)][:1]
 
 
 def _rescaled(task: FitTask, candidates: list[Candidate]) -> tuple[FitTask, list[Candidate]]:
-    """The task and the best candidates of a cloud in the scale, and without the outliers, that the best fit tells."""
+    """The task and its best candidates for a cloud, in the scale that the best fit gives and without its outliers."""
 
     def fit_again(samples: OrientedPoints, pose: RigidPose) -> Candidate:
         return task.predictor.fit(samples, pose, draws=1, measure=lambda *_: 0.0)
 
-    near = SETTINGS.scale_margin * candidates[0].residual
-    best = [each for each in candidates[: task.config.careful] if each.residual <= near]
+    max_residual = SETTINGS.scale_margin * candidates[0].residual
+    best = [each for each in candidates[: task.config.careful] if each.residual <= max_residual]
     isolated = isolated_points(task.samples.points)
     found = [estimate_scale(task.system, task.samples, isolated, candidate, fit_again) for candidate in best]
-    # the last fits alone need their residuals
+    # only the final fits need residuals
     residuals = [two_way_residual(task.system, left.to_local(fit.pose), fit.vectors) for _, left, fit in found]
     scale, samples, first = found[int(np.argmin(residuals))]
     first = replace(first, residual=min(residuals))
@@ -193,12 +195,10 @@ def estimate_scale(
     candidate: Candidate,
     fit_again: Callable[[OrientedPoints, RigidPose], Candidate],
 ) -> tuple[float, OrientedPoints, Candidate]:
-    """Rescale samples of a cloud (area 1 by estimate) by the network's fit, drop outliers, fit again, a few times.
+    """Rescale samples of a cloud (estimated area 1) by the network's fit, drop outliers and fit again, in a few rounds.
 
-    Outliers are those of the ``isolated`` samples, see `isolated_points`, that lie far from the fit.
-
-    Returns the scale, by which lengths of the old frame are to be divided; the samples that are left, in the new frame;
-    and their fit.
+    Outliers are ``isolated`` samples (see `isolated_points`) that are far from the fit. Returns the scale by which lengths
+    of the old frame are to be divided, the remaining samples in the new frame, and their fit.
     """
     resting = vertex_areas(system.verts, system.faces).sum()
     total = 1.0
@@ -218,21 +218,22 @@ def estimate_scale(
 
 
 def isolated_points(points: Float[Floats, "P 3"]) -> Bool[Bools, " P"]:
-    """Whether the nearest few points lie further away than is usual on the cloud.
+    """Whether the nearest few neighbors of each point (P,) are farther away than is usual for the cloud.
 
-    Samples of a small cloud repeat its points; copies of a point do not count as its neighbours.
+    Samples of a small cloud repeat its points; copies of a point are not its neighbors.
     """
-    own, which = np.unique(points, axis=0, return_inverse=True)
-    reach = cKDTree(own).query(own, min(SETTINGS.neighbours + 1, len(own)))[0][:, -1]
-    return np.asarray((reach > SETTINGS.isolation * np.median(reach))[which.reshape(-1)])
+    unique_points, index = np.unique(points, axis=0, return_inverse=True)
+    reach = cKDTree(unique_points).query(unique_points, min(SETTINGS.neighbours + 1, len(unique_points)))[0][:, -1]
+    return np.asarray((reach > SETTINGS.isolation * np.median(reach))[index.reshape(-1)])
 
 
 def candidates_of_part(task: FitTask, wide: bool = False) -> tuple[FitTask, list[Candidate]]:
-    """The network's fits of a shape that may show only a part, best first, each with the share that it shows; and the task,
-    whose predictor draws from its seed anew: each search draws the same random numbers.
+    """The network's candidates for a shape that may show only a part, best first, each with the share that it shows; and
+    the task.
 
-    A ``wide`` search starts from more orientations; another one has no candidates where none is near, except for clouds,
-    whose residuals are as large as their noise. Residuals are from the samples to the template only.
+    The task's predictor restarts from its seed, so every search draws the same random numbers. A ``wide`` search tries more
+    orientations. Any other search returns no candidates if none is near, except for clouds, whose residuals are as large as
+    their noise. Residuals are from the samples to the template only.
     """
     config = task.config
     if wide:
@@ -244,11 +245,11 @@ def candidates_of_part(task: FitTask, wide: bool = False) -> tuple[FitTask, list
     if not (wide or task.shape.is_cloud) and min(each.residual for each in candidates) > SETTINGS.lost:
         return task, []
     for number, count in enumerate(SETTINGS.completed):
-        candidates = _fitted_again(task, best_first(candidates)[:count])
+        candidates = _refit_completed(task, best_first(candidates)[:count])
         progress(0.4 + 0.2 * (number + 1) / len(SETTINGS.completed))
     candidates = best_first(candidates)
     for candidate in candidates[: SETTINGS.varied]:
-        # other interpretations of the completed samples
+        # further candidates from the completed samples
         local, config = candidate.local(task.samples), task.config
         whole = completed(task.system, local, candidate.vectors, candidate.share, task.predictor.rng)
         near = local.first(SETTINGS.coarse_samples)
@@ -259,57 +260,57 @@ def candidates_of_part(task: FitTask, wide: bool = False) -> tuple[FitTask, list
 
 
 def _careful(task: FitTask, wide: bool, progress: Progress) -> list[Candidate]:
-    """Fits from the best frames if the samples show each of the shares.
+    """Candidates from the best frames, for each share of the surface that the samples may show.
 
-    A wide search tries all its frames for some of the shares, and the best of these frames for the others.
+    A wide search tries all its frames for some of the shares, and the best of them for the other shares.
     """
     found: list[Candidate] = []
-    best: dict[int, float] = {}  # residuals of the frames that all shares have in common
+    best: dict[int, float] = {}  # residuals, by index, of the frames that are common to all shares
     order = sorted(SETTINGS.shares, key=lambda share: wide and share not in SETTINGS.wide_shares)
     for number, share in enumerate(order):
         samples = scaled_to_area(task.samples, share)
         frames, others = frames_of_part(task.model, samples, task.config, wide, task.shape.upright)
-        tried = list(range(len(others)))
+        frame_numbers = list(range(len(others)))
         if wide and number >= len(SETTINGS.wide_shares):
-            tried = sorted(best, key=lambda frame: best[frame])[: len(others) // SETTINGS.wide_kept]
-        thin = samples.first(SETTINGS.ranking_samples_if_wide if wide else SETTINGS.ranking_samples)
-        starts = [(thin, pose) for pose in [*(others[k] for k in tried), *frames]]
-        rough = task.predictor.fit_all(starts, 1, 1, ranking_residual if wide else one_way_residual)
-        for k, candidate in zip(tried, rough, strict=False):
+            frame_numbers = sorted(best, key=lambda frame: best[frame])[: len(others) // SETTINGS.wide_kept]
+        ranking = samples.first(SETTINGS.ranking_samples_if_wide if wide else SETTINGS.ranking_samples)
+        starts = [(ranking, pose) for pose in [*(others[k] for k in frame_numbers), *frames]]
+        ranked = task.predictor.fit_all(starts, 1, 1, ranking_residual if wide else one_way_residual)
+        for k, candidate in zip(frame_numbers, ranked, strict=False):
             best[k] = min(candidate.residual, best.get(k, np.inf))
-        rough.sort(key=lambda candidate: candidate.residual)
-        limit = SETTINGS.worth_if_wide * rough[0].residual if wide else np.inf
-        careful = [(samples, each.pose) for each in rough[: SETTINGS.careful] if each.residual <= limit]
+        ranked.sort(key=lambda candidate: candidate.residual)
+        limit = SETTINGS.worth_if_wide * ranked[0].residual if wide else np.inf
+        careful = [(samples, each.pose) for each in ranked[: SETTINGS.careful] if each.residual <= limit]
         found += [replace(fit, share=share) for fit in task.predictor.fit_all(careful, measure=one_way_residual)]
         progress((number + 1) / len(order))
     return found
 
 
-def _fitted_again(task: FitTask, candidates: Sequence[Candidate]) -> list[Candidate]:
-    """New fits of the samples, completed by the last fits; how much of these was visible is the new share."""
+def _refit_completed(task: FitTask, candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Fit the samples again, completed by the last fits; the visible share of these becomes the new share."""
     system, starts, shares = task.system, [], []
-    placed = [candidate.local(task.samples) for candidate in candidates]
-    shown = parallel_map(
+    local_samples = [candidate.local(task.samples) for candidate in candidates]
+    visible_of_each = parallel_map(
         lambda local, each: visible_vertices(system, local.first(SETTINGS.coarse_samples), each.vectors),
-        placed,
+        local_samples,
         candidates,
     )
-    for candidate, local, visible in zip(candidates, placed, shown, strict=True):
+    for candidate, local, visible in zip(candidates, local_samples, visible_of_each, strict=True):
         vectors = candidate.vectors
         shares.append(float(np.clip(area_share(system, visible), SETTINGS.min_share, 1.0)))
         whole = completed(system, local, vectors, candidate.share, task.predictor.rng, visible)
         growth = np.sqrt(shares[-1] / candidate.share)
         starts.append((replace(whole, points=whole.points * growth), RigidPose.identity()))
-    # unmeasured: the residual is that of other samples, once these are placed
-    again = task.predictor.fit_all(starts, measure=lambda *_: 0.0)
+    # The residual is measured below, on the original samples.
+    refitted = task.predictor.fit_all(starts, measure=lambda *_: 0.0)
 
     def measured(candidate: Candidate, fit: Candidate, share: float) -> Candidate:
-        last = candidate.pose
-        pose = RigidPose(last.rotation, np.sqrt(share / candidate.share) * last.center) @ fit.pose
+        last_pose = candidate.pose
+        pose = RigidPose(last_pose.rotation, np.sqrt(share / candidate.share) * last_pose.center) @ fit.pose
         moved = replace(fit, pose=pose, share=share)
         return replace(moved, residual=one_way_residual(system, moved.local(task.samples), fit.vectors))
 
-    return parallel_map(measured, candidates, again, shares)
+    return parallel_map(measured, candidates, refitted, shares)
 
 
 def completed(
@@ -320,9 +321,10 @@ def completed(
     rng: np.random.Generator,
     visible: Bool[Bools, " V"] | None = None,
 ) -> OrientedPoints:
-    """Samples (core frame) of a ``share`` of the surface, with points of the fitted template where they show nothing.
+    """Samples (core frame) of a ``share`` of the surface, completed by points of the fitted template where they show
+    nothing.
 
-    ``visible`` says where they do, if that is known: `visible_vertices` of as many samples as are asked.
+    ``visible`` are the `visible_vertices` of the template, computed from the samples if not given.
     """
     surface = system.surface(vectors)
     if visible is None:

@@ -1,4 +1,4 @@
-"""Where a map is torn: points that are neighbours on the shape, and belong far apart on the template."""
+"""Discontinuities of a map: points that are neighbours on the shape, but correspond to distant points of the template."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import is_discontinuous
 
 Pairs = tuple[Ints, Ints]
-"""Numbers of samples that are neighbours, normals included: two touching limbs face each other, and are none."""
+"""Indices of neighbouring samples. Normals count, so that touching limbs, which face each other, are not neighbours."""
 # Set by hand.
-_NEIGHBOURS = 6  # of a sample
-_IN_PIECES = 0.5  # share of neighbours on the same connected part up to which parts say nothing
+_NEIGHBOURS = 6  # number of neighbours of each sample
+_IN_PIECES = 0.5  # if no more than this share of neighbours is on the same connected part, parts are ignored
 
 
 def neighbours(samples: OrientedPoints, part: Int[Ints, " P"] | None = None) -> Pairs:
-    """Every sample with the few that are nearest to it; of a shape whose connected ``part`` is known for each sample, only
-    those on the same one, unless the shape is in pieces."""
+    """Pair every sample with the few nearest ones.
+
+    If the connected ``part`` of each sample is given, pairs on different parts are dropped, unless the shape is in pieces.
+    """
     count = min(_NEIGHBOURS + 1, len(samples.points))
     index = samples.tree.query(samples.tree.data, count)[1]
     start, end = np.repeat(np.arange(len(index)), index.shape[1] - 1), index[:, 1:].reshape(-1)
@@ -35,19 +37,19 @@ def discontinuous_share(
     vectors: Float[Floats, "K 3"],
     shortened: Float[Floats, " V"] | None = None,
 ) -> float:
-    """Share (0..1) of pairs of samples (core frame) that belong far apart on the resting template.
+    """Share (0..1) of pairs of samples (core frame) whose template points are far apart on the rest template.
 
-    ``shortened`` says of each of its vertices to which share of their length lines through it shrink: neighbours on a limb
-    that is a third as long as the template's belong three times as far apart without a tear.
+    ``shortened`` is, for each template vertex, the smallest factor by which lines through it are shortened: neighbours on a
+    limb with a third of the template's length may be three times as far apart there without a discontinuity.
     """
     surface = system.surface(vectors)
     local = local.facing(surface)
-    foot = surface.tree.query(local.features)[1]
-    home = system.verts[foot]
+    nearest = surface.tree.query(local.features)[1]
+    rest_points = system.verts[nearest]
     start, end = pairs
     length = np.linalg.norm(local.points[start] - local.points[end], axis=1)
     if shortened is not None:
-        length = length / np.minimum(shortened[foot[start]], shortened[foot[end]])
-    apart = is_discontinuous(np.linalg.norm(home[start] - home[end], axis=1), length)
+        length = length / np.minimum(shortened[nearest[start]], shortened[nearest[end]])
+    apart = is_discontinuous(np.linalg.norm(rest_points[start] - rest_points[end], axis=1), length)
     weights = None if local.weights is None else local.weights[start] * local.weights[end]
     return float(weighted_mean(apart, weights))

@@ -1,8 +1,7 @@
-"""The network's own fits: core frame, code and learned corrections, for a pose to start from; and their residual.
+"""Fits predicted by the network (core frame, code and learned corrections) from a given pose, and their residual.
 
-The network has no symmetry built in, so it may see a raised left arm and miss a right one. Where a category's template is
-symmetric, so is every question about a shape: asked about the mirrored samples, its answer mirrored back is another
-interpretation of the same pose.
+The network has no built-in symmetry, so it may see a raised left arm and miss a right one. If a category's template is
+symmetric, predicting from the mirrored samples and mirroring the prediction back gives another candidate for the same pose.
 """
 
 from __future__ import annotations
@@ -27,50 +26,50 @@ from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.threads import parallel_map
 
-# How many points the network sees of tilted copies, in turn: thin samples tip it either way where it is in doubt.
+# Numbers of points of tilted copies, alternating: with few points, the network decides doubtful cases either way.
 _VARIANT_POINTS = (700, 1400)
-_PREDICT_POINTS = 2048  # it sees of other samples
-_SPREAD_READINGS, _SPREAD_SEED = 6, 5  # tilts by which it is found out how sure the network is
+_PREDICT_POINTS = 2048  # number of points of all other samples
+_SPREAD_COPIES, _SPREAD_SEED = 6, 5  # number and random seed of the tilted copies that give the spread
 _SPREAD_TILT = 15.0  # degrees, see `Predictor.variants`
-USUAL_SPREAD = 0.03  # of fits that no network predicts (units of sqrt(area)), see `Predictor.spread`
-# If predictions for tilted copies of the resting template deviate more than this (units of sqrt(area)), the network was not
+TYPICAL_SPREAD = 0.03  # assumed for fits that no network predicts (units of sqrt(area)), see `Predictor.spread`
+# If predictions for tilted copies of the rest template deviate more than this (units of sqrt(area)), the network was not
 # trained on tilted input, and `spread` is ignored; models that ship have 0.008 at most.
-_READS_ALIKE = 0.02
-_BATCH = 24  # clouds that it is asked about together: more save nothing, and take memory
-# Residual that a share of 0 has to be better by than one of 1: rather the whole than a part. Set by hand.
+_MAX_TILT_DEVIATION = 0.02
+_BATCH = 24  # clouds per call of the network: larger batches are no faster, and take memory
+# Cost of a share near 0 over a share of 1, which favors the whole over a part. Set by hand.
 _SHARE_COST = 0.004
-# Left and right are exchanged in the template frame, where bodies face along z and stand along y.
+# Exchanges left and right in the template frame, where bodies face along z and stand along y.
 _FLIP = np.array([-1.0, 1.0, 1.0])
-# Every mirrored vertex of a symmetric template is this near to another one (units of sqrt(area)). Set by hand.
-_SYMMETRIC = 0.01
+# A template is symmetric if every mirrored vertex is this near to another one (units of sqrt(area)). Set by hand.
+_MAX_ASYMMETRY = 0.01
 _RANKING_STRIDE = 4  # see `ranking_residual`
-_RIDGE = 1e-6  # of the least squares, against the mean diagonal
+_RIDGE = 1e-6  # regularization of the least squares, relative to the mean diagonal
 
-# Of samples in the core frame and node vectors (K, 3).
 Residual = Callable[[NodeSystem, OrientedPoints, Float[Floats, "K 3"]], float]
+"""Residual of samples in the core frame and node vectors (K, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One way to fit the template to samples, taken to show the whole surface or a share of it."""
+    """One interpretation of the samples: a pose and node vectors; the samples show all of the surface or a share of it."""
 
-    pose: RigidPose  # the core frame (local) in the frame of the samples, once they have the size of their share
+    pose: RigidPose  # the core frame in the frame of the samples, after these are scaled to their share
     vectors: Float[Floats, "K 3"]  # node vectors, core frame
-    residual: float  # mean distance, normals included, of template and samples (units of sqrt(area))
-    share: float = 1.0  # of the whole surface (0..1) that the samples are taken to show
+    residual: float  # mean distance between template and samples, normals included (units of sqrt(area))
+    share: float = 1.0  # share (0..1) of the whole surface that the samples are assumed to show
 
     def local(self, samples: OrientedPoints) -> OrientedPoints:
-        """Samples of area 1 as large as their share, in the core frame."""
+        """Scale samples of area 1 to the candidate's share and transform them to its core frame."""
         return scaled_to_area(samples, self.share).to_local(self.pose)
 
     @property
     def cost(self) -> float:
-        """The residual, and a little for what is not visible: the smaller the part, the easier it lies on a template."""
+        """The residual plus a small cost for what is not visible: small parts lie on a template more easily."""
         return self.residual + _SHARE_COST * (1 - self.share)
 
 
 def best_first(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Candidates by their cost."""
+    """Sort candidates by cost."""
     return sorted(candidates, key=lambda candidate: candidate.cost)
 
 
@@ -83,36 +82,36 @@ def scaled_to_area(samples: OrientedPoints, share: float) -> OrientedPoints:
 class Mirror:
     """The plane x = 0 of a symmetric template."""
 
-    # Takes node vectors to those that move the template as these move its mirror image, up to the flip.
+    # Maps node vectors to those that move the template as the given ones move its mirror image, up to the flip.
     exchange: Float[Floats, "K K"]
 
     def points(self, points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
-        """Points of the mirrored shape, in the core frame."""
+        """Mirror points, in the core frame."""
         return np.asarray(points * _FLIP)
 
     def vectors(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "K 3"]:
-        """Node vectors of the mirrored deformation: x moves to M f(M x) where f moved it before."""
+        """Node vectors of the mirrored deformation x -> M f(M x), where f is the given one and M the reflection."""
         return np.asarray(self.exchange @ vectors * _FLIP)
 
 
 @derived
 def mirror_of(model: TrainedModel) -> Mirror | None:
-    """The mirror of a model's template; None where it is not symmetric, or its field has no nodes."""
+    """The mirror plane of a model's template; None if the template is not symmetric or its field has no nodes."""
     template = model.template
     verts = np.asarray(template.shape.verts)
     distance = cKDTree(np.asarray(template.dense.verts)).query(verts * _FLIP)[0]
-    if not model.has_nodes or distance.max() > _SYMMETRIC:
+    if not model.has_nodes or distance.max() > _MAX_ASYMMETRY:
         return None
     try:
-        there = model.field(verts * _FLIP)
-    except TemplateError:  # the mirrored side has too few nodes
+        mirrored_field = model.field(verts * _FLIP)
+    except TemplateError:  # mirrored points have too few nodes in reach
         return None
     here = node_system(model).field
-    assert isinstance(here, ShapeFunctions) and isinstance(there, ShapeFunctions)
-    phi, across = (field.phi.astype(np.float64) for field in (here, there))
+    assert isinstance(here, ShapeFunctions) and isinstance(mirrored_field, ShapeFunctions)
+    phi, mirrored_phi = (field.phi.astype(np.float64) for field in (here, mirrored_field))
     square = _dense(phi.T @ phi)
     square += _RIDGE * np.trace(square) / len(square) * np.eye(len(square))
-    return Mirror(np.asarray(np.linalg.solve(square, _dense(phi.T @ across))))
+    return Mirror(np.asarray(np.linalg.solve(square, _dense(phi.T @ mirrored_phi))))
 
 
 def _dense(matrix: Any) -> Floats:
@@ -121,17 +120,17 @@ def _dense(matrix: Any) -> Floats:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Predictor:
-    """The network, and what its answers move; draws its points with ``rng``."""
+    """Runs the network and evaluates its predictions; points are sampled with ``rng``."""
 
     network: Network
     system: NodeSystem
-    core: Ints  # vertices of the template by which the core frame is read off a fit
-    mirror: Mirror | None  # of a symmetric template: interpretations are then sought in the mirror too
+    core: Ints  # template vertices that define the core frame of a prediction
+    mirror: Mirror | None  # of a symmetric template; mirrored samples then give further candidates
     rng: np.random.Generator
 
     @classmethod
     def of(cls, model: TrainedModel, rng: np.random.Generator, device: str = "cpu", mirrored: bool = True) -> Predictor:
-        """The predictor of a trained model; the mirror takes time to build, and serves `variants` alone."""
+        """Create the predictor of a trained model. The mirror takes time to build and is used by `variants` only."""
         mirror = mirror_of(model) if mirrored else None
         return cls(
             network=model.on(device), system=node_system(model), core=model.template.core, mirror=mirror, rng=rng
@@ -144,23 +143,23 @@ class Predictor:
         draws: int = 2,
         measure: Residual | None = None,
     ) -> list[Candidate]:
-        """For each start: predict, move the core frame to where the prediction puts the core, predict again.
+        """For each start: predict, move the core frame to where the prediction puts the core, and predict again.
 
-        A start is samples, and where their core frame is looked for first. All are asked for together, for the
-        network's weights are then read from memory once. Each of ``rounds`` predictions is the mean of ``draws`` of the
-        samples. ``measure`` gives the residual; `two_way_residual` if there is none.
+        A start is samples and the first guess of their core frame. All starts are evaluated together, as the network's
+        weights are then read from memory only once. Each of ``rounds`` predictions is the mean over ``draws`` random
+        subsets of the samples. ``measure`` computes the residual (default: `two_way_residual`).
         """
         measure, poses = measure or two_way_residual, [pose for _, pose in starts]
-        for turn in range(rounds):
+        for round_number in range(rounds):
             clouds = [
                 pose.to_local(samples.drawn(_PREDICT_POINTS, self.rng))
                 for (samples, _), pose in zip(starts, poses, strict=True)
                 for _ in range(draws)
             ]
-            answers = [self.network.predict(clouds[k : k + _BATCH]) for k in range(0, len(clouds), _BATCH)]
-            rows = np.concatenate(answers)
+            batches = [self.network.predict(clouds[k : k + _BATCH]) for k in range(0, len(clouds), _BATCH)]
+            rows = np.concatenate(batches)
             means = rows.reshape(len(poses), draws, *rows.shape[1:]).mean(1)
-            if turn < rounds - 1:
+            if round_number < rounds - 1:
                 resting = self.system.verts[self.core]
                 moved = [self.system.moved(vectors)[self.core] for vectors in means]
                 poses = [pose @ kabsch(resting, core) for pose, core in zip(poses, moved, strict=True)]
@@ -173,40 +172,42 @@ class Predictor:
     def fit(
         self, samples: OrientedPoints, pose: RigidPose, rounds: int = 2, draws: int = 2, measure: Residual | None = None
     ) -> Candidate:
-        """`fit_all` of one start."""
+        """`fit_all` for one start."""
         return self.fit_all([(samples, pose)], rounds, draws, measure)[0]
 
     def variants(
         self, local: OrientedPoints, coarse: OrientedPoints, pose: RigidPose, count: int, degrees: float
     ) -> list[Candidate]:
-        """Other interpretations of a hard pose: predictions from randomly tilted core frames, turned back.
+        """Further candidates for a difficult pose: predictions from randomly tilted core frames, rotated back.
 
-        Where a limb could be one or the other, tilts and thinner samples tip the network either way, and the residual
-        tells which interpretation is right. With a mirror, as many again are of the mirrored samples.
+        Where one limb could be taken for another, tilts and fewer samples make the network decide either way, and the
+        residual tells which candidate is right. With a mirror, the mirrored samples give as many again.
 
-        It is predicted from the samples ``local``, and ``coarse`` ones give the residual; both are in the core frame,
-        which is ``pose``. There are ``count`` tilts with a standard deviation of ``degrees`` about each axis.
+        Predictions are made from the samples ``local`` and their residuals from ``coarse``, both in the core frame, which
+        is ``pose``. There are ``count`` tilts with a standard deviation of ``degrees`` about each axis.
         """
-        found = self.readings(local, count, degrees)
+        found = self.predict_tilted(local, count, degrees)
         return parallel_map(
             lambda vectors: Candidate(pose, vectors, two_way_residual(self.system, coarse, vectors)), found
         )
 
     def spread(self, local: OrientedPoints, vectors: Float[Floats, "K 3"], at: Bool[Bools, " V"]) -> float:
-        """How far a fit lies from what the network reads in tilted copies of the samples: the mean over some vertices of
-        the template, and of the readings the median (units of sqrt(area)).
+        """Distance between a fit and the network's predictions for tilted copies of the samples (units of sqrt(area)).
 
-        Of a shape that the network knows, all readings are much the same.
+        It is the mean over the template vertices ``at``, and the median over the predictions. For a shape that the network
+        knows, all predictions are nearly the same.
         """
-        asked = replace(self, rng=np.random.default_rng(_SPREAD_SEED))
-        here = self.system.moved(vectors)[at]
-        readings = asked.readings(local, _SPREAD_READINGS, _SPREAD_TILT)
+        seeded = replace(self, rng=np.random.default_rng(_SPREAD_SEED))
+        fitted = self.system.moved(vectors)[at]
+        predictions = seeded.predict_tilted(local, _SPREAD_COPIES, _SPREAD_TILT)
         return float(
-            np.median([np.linalg.norm(self.system.moved(each)[at] - here, axis=1).mean() for each in readings])
+            np.median([np.linalg.norm(self.system.moved(each)[at] - fitted, axis=1).mean() for each in predictions])
         )
 
-    def readings(self, local: OrientedPoints, count: int, degrees: float) -> list[Floats]:
-        """Node vectors (K, 3) read in tilted copies of samples, and as many in those of their mirror image."""
+    def predict_tilted(self, local: OrientedPoints, count: int, degrees: float) -> list[Floats]:
+        """Node vectors (K, 3) predicted for tilted copies of samples, and as many for their mirror image if there is a
+        mirror.
+        """
         tilts = Rotation.from_rotvec(np.radians(degrees) * self.rng.standard_normal((count, 3))).as_matrix()
         sides = [local]
         if self.mirror is not None:
@@ -222,21 +223,24 @@ class Predictor:
 
 
 @derived
-def reads_alike(model: TrainedModel) -> bool:
-    """Whether a model reads copies of its resting template much the same; if not, a spread says nothing of a fit."""
+def is_tilt_consistent(model: TrainedModel) -> bool:
+    """Return whether a model's predictions for tilted copies of its rest template agree; otherwise `spread` is
+    meaningless.
+    """
     predictor = Predictor.of(model, np.random.default_rng(_SPREAD_SEED))
     system = predictor.system
     samples = sample_surface(model.template.shape, _PREDICT_POINTS, predictor.rng)
     still = np.zeros((system.K, 3))
-    return predictor.spread(samples, still, np.ones(len(system.verts), bool)) <= _READS_ALIKE
+    return predictor.spread(samples, still, np.ones(len(system.verts), bool)) <= _MAX_TILT_DEVIATION
 
 
 def two_way_residual(
     system: NodeSystem, samples: OrientedPoints, vectors: Float[Floats, "K 3"], stride: int = 2, cap: float = 0.1
 ) -> float:
-    """Mean of the capped 6-D nearest-neighbour distances, template to samples and back (units of sqrt(area)).
+    """Mean of the capped 6-D nearest-neighbor distances, template to samples and back (units of sqrt(area)).
 
-    Every ``stride``-th point of both is asked for its neighbour. Distances to and from samples count by their weights.
+    Only every ``stride``-th point of either side is queried. Distances from and to samples are weighted by the samples'
+    weights.
     """
     surface = system.surface(vectors)
     moved, normals = surface.points[::stride], surface.normals[::stride]
@@ -249,13 +253,16 @@ def two_way_residual(
 def one_way_residual(
     system: NodeSystem, samples: OrientedPoints, vectors: Float[Floats, "K 3"], stride: int = 2, cap: float = 0.1
 ) -> float:
-    """Mean of the capped 6-D distances from every ``stride``-th sample to the template, by the samples' weights."""
+    """Weighted mean of the capped 6-D distances from every ``stride``-th sample to the template."""
     return float(_back_residual(system.surface(vectors), samples, stride, cap))
 
 
 def part_residual(system: NodeSystem, samples: OrientedPoints, vectors: Float[Floats, "K 3"], beyond: float) -> float:
-    """As `one_way_residual`; but samples that belong to the rim of the template, and so lie beyond it, count as ``beyond``,
-    however far they are, unless they are more than half of all."""
+    """`one_way_residual` for a template that may be cut, too.
+
+    Samples nearest to the template's rim lie beyond its end; each counts as ``beyond``, however far away it is, unless more
+    than half of all samples do.
+    """
     if not system.rim.any():
         return one_way_residual(system, samples, vectors)
     surface, some = system.surface(vectors), samples.rows(slice(None, None, 2))
@@ -267,7 +274,7 @@ def part_residual(system: NodeSystem, samples: OrientedPoints, vectors: Float[Fl
 
 
 def ranking_residual(system: NodeSystem, samples: OrientedPoints, vectors: Float[Floats, "K 3"]) -> float:
-    """About `one_way_residual`, of few samples: to every fourth vertex of the template, for its tree takes longest."""
+    """Fast approximation of `one_way_residual` for few samples: distances to every fourth template vertex."""
     few = system.surface(vectors).rows(slice(None, None, _RANKING_STRIDE))
     return float(_back_residual(few, samples, stride=1, cap=0.1))
 
@@ -281,9 +288,9 @@ def _back_residual(surface: OrientedPoints, samples: OrientedPoints, stride: int
 def _capped_distances(
     tree: cKDTree, points: Float[Floats, "N 3"], normals: Float[Floats, "N 3"], signed: bool, cap: float
 ) -> tuple[Floats, Ints]:
-    """Capped 6-D distances (N,) to the nearest, and which that is (N,), ``tree.n`` beyond the cap.
+    """Capped 6-D distances (N,) to the nearest point, and its index (N,), which is ``tree.n`` beyond the cap.
 
-    Normals without a sure sign are turned to the nearer side.
+    Normals without a known sign are flipped to the nearer side.
     """
     # A search without a bound visits every point of a tree that is far away.
     if signed:
@@ -294,6 +301,6 @@ def _capped_distances(
 
 
 def weighted_mean(values: np.ndarray, weights: Float[Floats, " N"] | None) -> np.floating:
-    """Mean of N values by weights that are not negative; without them, all count the same."""
+    """Mean of N values with nonnegative weights, or with equal weights if there are none."""
     mean: np.floating = values.mean() if weights is None else weights @ values / max(weights.sum(), 1e-300)
     return mean

@@ -1,11 +1,12 @@
-"""From the network's candidates to the surface: the refinements that a user can choose, in one table.
+"""Refinement of the network's candidates: the methods that a user can choose, in one table.
 
-A new refinement is a line of `REFINEMENTS`, and its name in `meshmatch.fitting.fit_config`.
+To add a method, add a line to `REFINEMENTS` and its name to `meshmatch.fitting.fit_config`.
 
-The surface alone hardly tells which of several interpretations of a pose is right: a crossed arm taken for the other one
-lies on it as well as the right one does. But points that are neighbours on the shape then belong far apart on the
-template: the map is discontinuous. Interpretations that differ are each refined in full, and judged by both; where they tie,
-as front and back of a robot do, by what the network reads in copies of the shape, and by how files usually stand.
+The distance to the surface hardly tells which of several candidates is right: a crossed arm taken for the other one lies on
+the surface as well as the right one does. But then neighbouring points of the shape correspond to distant points of the
+template, so the map is discontinuous. Candidates that differ are therefore each refined in full and scored by residual and
+discontinuity. Ties, such as front and back of a robot, are decided by the network's predictions for tilted copies of the
+shape, and by the orientation that files usually have.
 """
 
 from __future__ import annotations
@@ -19,16 +20,22 @@ import numpy as np
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import needs
 from meshmatch.fitting import fit_config
-from meshmatch.fitting.search.candidates import STAGE, candidates_of_part, candidates_of_whole, completed, of_file
+from meshmatch.fitting.search.candidates import (
+    STAGE,
+    candidates_of_part,
+    candidates_of_whole,
+    completed,
+    upright_candidate,
+)
 from meshmatch.fitting.search.discontinuities import Pairs, discontinuous_share, neighbours
-from meshmatch.fitting.search.frames import USUAL, stands_upright
-from meshmatch.fitting.search.limbs import bare_places, limbs_of
+from meshmatch.fitting.search.frames import MIN_AXIS_COSINE, stands_upright
+from meshmatch.fitting.search.limbs import limbs_of, uncovered_regions
 from meshmatch.fitting.search.predictor import (
-    USUAL_SPREAD,
+    TYPICAL_SPREAD,
     Candidate,
     best_first,
+    is_tilt_consistent,
     one_way_residual,
-    reads_alike,
     scaled_to_area,
     two_way_residual,
     weighted_mean,
@@ -45,25 +52,26 @@ from meshmatch.threads import parallel_map
 
 @dataclass(frozen=True, kw_only=True)
 class RefinementSettings:
-    """How interpretations are compared and refined. All set by hand; lengths and residuals are in units of sqrt(area).
+    """How candidates are compared and refined. All set by hand; lengths and residuals are in units of sqrt(area).
 
     Attributes
     ----------
-    discontinuity_cost : residual that a map discontinuous everywhere is worse by
-    cap : a distance beyond this says no more
-    different_share, different_distance : interpretations differ where this share of the template's vertices lies that far
-        apart
-    same_distance, max_averaged : interpretations closer than that are the same, and so many of these at most are averaged
-    pool : among how many of the best those that are unlike each other are looked for
-    screening_margin : an interpretation whose score is more than this times the best one's after a few steps is left: on 78
-        bodies of SCAPE, FAUST and SHREC'19 the best after a few steps was the best at the end
-    unusual_axes_cost : margin by which an orientation must win that is rare in files, or not that which the file states
-    spread_cost : residual for each unit that the network's predictions for tilted copies lie from an interpretation, up to
-        the usual spread, beyond which they tell no more: on robots of seeds 0 and 1 they tell front from back in 15 of 15
-        ties
-    part_finalists : interpretations of a part that get a few steps each
-    screening_samples : samples that are enough to tell interpretations apart
-    bent_margin : a fit with a limb bent is taken if its score is less than this times the score of that without
+    discontinuity_cost : added to the residual of a map that is discontinuous everywhere
+    cap : maximum distance that counts
+    different_share, different_distance : two candidates differ if at least this share of the template's vertices is at
+        least this far apart
+    same_distance, max_averaged : candidates closer than this distance are averaged, at most this many
+    pool : how many of the best candidates are searched for ones that differ
+    screening_margin : after screening, a candidate is dropped if its score exceeds this multiple of the best one's: on 78
+        bodies of SCAPE, FAUST and SHREC'19 the best after screening was the best at the end
+    unusual_axes_cost : margin by which an orientation must win that is rare in files, or differs from the one that the file
+        states
+    spread_cost : cost per unit of the distance between a candidate and the network's predictions for tilted copies, up to
+        the typical spread; beyond that the distance is uninformative. On robots of seeds 0 and 1 it tells front from back
+        in 15 of 15 ties
+    part_finalists : candidates of a part that are screened
+    screening_samples : samples that suffice to compare candidates
+    bent_margin : a fit with a bent limb is accepted if its score is below this multiple of the original one's
     """
 
     discontinuity_cost: float = 0.1
@@ -85,20 +93,19 @@ SETTINGS = RefinementSettings()
 
 
 Refine = Callable[[FitTask, list[Candidate]], Candidate]
-"""From a task's candidates, best first, to the fit."""
+"""Turns a task's candidates, best first, into the fit."""
 
 
 def fit_whole(task: FitTask) -> Registration:
-    """Fit the template to a shape that is taken for complete."""
+    """Fit the template to a shape that is assumed to be complete."""
     task, candidates = candidates_of_whole(task)
     return Registration(task.on_visible_samples, REFINEMENTS[task.config.refine].whole(task, candidates))
 
 
 def fit_part(task: FitTask, wide: bool = False) -> Registration | None:
-    """Fit the template to a shape that may show only a part, from more orientations if the search is to be ``wide``; None
-    where another search finds nothing near.
+    """Fit the template to a shape that may show only a part. The residual is from the samples to the template only.
 
-    The residual is from the samples to the template only.
+    A ``wide`` search tries more orientations; any other search returns None if no candidate comes near.
     """
     task, candidates = candidates_of_part(task, wide)
     if not candidates:
@@ -110,9 +117,9 @@ def fit_part(task: FitTask, wide: bool = False) -> Registration | None:
 
 @dataclass(frozen=True)
 class Refinement:
-    """What makes one fit of the network's candidates, for `fit_whole` and for `fit_part`.
+    """How candidates become one fit, for `fit_whole` and for `fit_part`.
 
-    ``tries_parts``: quick enough to find out whether a shape is a part where the user does not say.
+    ``tries_parts``: fast enough to try a fit as a part without being asked.
     """
 
     whole: Refine
@@ -124,8 +131,8 @@ def _first(task: FitTask, candidates: list[Candidate]) -> Candidate:
     return candidates[0]
 
 
-def _search_code(task: FitTask, candidates: list[Candidate]) -> Candidate:
-    """The best candidate, refined by the paper's search over codes."""
+def _refine_code(task: FitTask, candidates: list[Candidate]) -> Candidate:
+    """Refine the best candidate by the paper's search over codes."""
     with needs("torch", "train"):
         from meshmatch.fitting.search.latent import refine_code
 
@@ -139,30 +146,30 @@ def _search_code(task: FitTask, candidates: list[Candidate]) -> Candidate:
 
 
 def _fit_nodes(task: FitTask, candidates: list[Candidate]) -> Candidate:
-    """The best of the candidates and of variants of the best one, refined by least squares on the nodes."""
+    """Refine the best of the candidates and their variants by least squares on the nodes."""
     config, coarse = task.config, task.coarse
     pool: list[Candidate] = []
-    for pose in (each.pose for each in (candidates[0], *of_file(task, candidates))):
+    for pose in (each.pose for each in (candidates[0], *upright_candidate(task, candidates))):
         local = task.samples.to_local(pose)
         pool += task.predictor.variants(local, coarse.to_local(pose), pose, config.variants, config.tilt)
     for each in candidates:
         residual = two_way_residual(task.system, coarse.to_local(each.pose), each.vectors)
         pool.append(replace(each, residual=residual))
-    found = best_first(pool)
-    comparison = WholeComparison(task.on_visible_samples, found)
+    ranked = best_first(pool)
+    comparison = WholeComparison(task.on_visible_samples, ranked)
     progress = task.progress.stage("refinement")
-    chosen, fit = choose([*of_file(task, found), *found], config.finalists, comparison, progress)
+    chosen, fit = choose([*upright_candidate(task, ranked), *ranked], config.finalists, comparison, progress)
     return with_limb_bent(comparison, chosen, fit)
 
 
 def _fit_nodes_to_part(task: FitTask, candidates: list[Candidate]) -> Candidate:
-    """The best of several interpretations of a part, refined by least squares on the nodes."""
+    """Refine the best of several candidates of a part by least squares on the nodes."""
     return choose(candidates, SETTINGS.part_finalists, PartComparison(task), task.progress.stage(STAGE, 0.6, 1.0))[1]
 
 
 REFINEMENTS: dict[fit_config.Refine, Refinement] = {
     "none": Refinement(_first, _first),
-    "latent": Refinement(_search_code, _first, tries_parts=False),
+    "latent": Refinement(_refine_code, _first, tries_parts=False),
     "nodes": Refinement(_fit_nodes, _fit_nodes_to_part),
 }
 
@@ -170,8 +177,9 @@ REFINEMENTS: dict[fit_config.Refine, Refinement] = {
 def choose(
     candidates: Sequence[Candidate], count: int, comparison: WholeComparison, progress: Progress
 ) -> tuple[Candidate, Candidate]:
-    """The best of several interpretations (best first), as it came and refined; at most ``count`` that are unlike each
-    other are tried.
+    """Return the best of several candidates (given best first): as it was given, and refined.
+
+    At most ``count`` candidates that differ from each other are tried.
     """
     finalists: list[Candidate] = []
     known: list[Floats] = []
@@ -181,7 +189,7 @@ def choose(
             finalists.append(candidate)
             known.append(verts)
     if len(finalists) > 1:
-        finalists = _screened(finalists, comparison, progress)
+        finalists = _screen(finalists, comparison, progress)
     progress(0.6)
     refined = parallel_map(lambda candidate: comparison.refined(candidate, in_full=True), finalists)
     progress(1.0)
@@ -190,62 +198,66 @@ def choose(
 
 
 def with_limb_bent(comparison: WholeComparison, chosen: Candidate, fit: Candidate) -> Candidate:
-    """A fit with a limb bent to the one place that it leaves bare, if that is better and leaves nothing bare; ``chosen`` was
-    refined to it.
+    """Return the fit with one limb bent to a region that it leaves uncovered, if that is better and leaves none.
 
-    That is what is bent and refined anew, for a limb in a wrong place is deformed there by the fit. Where several places
-    are bare several limbs are wrong: of two people each limb that was moved let another one go astray. What is bare of a
-    cloud its noise hides.
+    ``chosen`` is the candidate from which ``fit`` was refined. The limb is bent in it, and the result is refined again,
+    because the refined fit has already deformed a limb that is in the wrong place. Fits with several uncovered regions are
+    left alone, as several limbs are wrong: on two people, each limb that was moved let another one go astray. So are
+    clouds, whose noise hides uncovered regions.
     """
     task, limbs = comparison.task, limbs_of(comparison.task.model)
     if not limbs.bends or not task.samples.signed:
         return fit
     local = task.coarse.to_local(fit.pose)
-    places = bare_places(local, task.system.surface(fit.vectors))
-    if len(places) != 1:
+    regions = uncovered_regions(local, task.system.surface(fit.vectors))
+    if len(regions) != 1:
         return fit
-    reaching = limbs.reaching(local, comparison.averaged(chosen).vectors, places[0])
+    reaching = limbs.reaching(local, comparison.averaged(chosen).vectors, regions[0])
     if reaching is None:
         return fit
     bent = comparison.refined(replace(chosen, vectors=reaching), in_full=True)
     better = comparison.score(bent, False) < SETTINGS.bent_margin * comparison.score(fit, False)
-    return bent if better and not bare_places(local, task.system.surface(bent.vectors)) else fit
+    return bent if better and not uncovered_regions(local, task.system.surface(bent.vectors)) else fit
 
 
-def _screened(candidates: list[Candidate], comparison: WholeComparison, progress: Progress) -> list[Candidate]:
-    """Those of several interpretations that a few steps neither bring together nor leave far behind, best first."""
+def _screen(candidates: list[Candidate], comparison: WholeComparison, progress: Progress) -> list[Candidate]:
+    """Drop candidates that become equal to a better one after a few steps, or fall far behind; return the rest, best
+    first.
+    """
 
-    def tried(candidate: Candidate) -> tuple[float, Candidate, Floats]:
-        found = comparison.refined(candidate, in_full=False)
-        return comparison.score(found, False), candidate, comparison.vertices(found)
+    def screen(candidate: Candidate) -> tuple[float, Candidate, Floats]:
+        refined = comparison.refined(candidate, in_full=False)
+        return comparison.score(refined, False), candidate, comparison.vertices(refined)
 
     progress(0.0)
-    rough = sorted(parallel_map(tried, candidates), key=lambda entry: entry[0])
+    scored = sorted(parallel_map(screen, candidates), key=lambda entry: entry[0])
     kept: list[tuple[Candidate, Floats]] = []
-    for score, candidate, verts in rough:
-        if score <= SETTINGS.screening_margin * rough[0][0] and all(differ(verts, other) for _, other in kept):
+    for score, candidate, verts in scored:
+        if score <= SETTINGS.screening_margin * scored[0][0] and all(differ(verts, other) for _, other in kept):
             kept.append((candidate, verts))
     return [candidate for candidate, _ in kept]
 
 
 class WholeComparison:
-    """How interpretations of a whole are refined and told apart: ``in_full`` by all steps, or by a few that screen them."""
+    """Refines and scores candidates of a whole shape: ``in_full`` with all steps, otherwise with the few steps of
+    screening.
+    """
 
     def __init__(self, task: FitTask, candidates: list[Candidate], roughness: float | None = None) -> None:
         self.task, self._candidates = task, candidates
         roughness = task.roughness if roughness is None else roughness
-        few = task.samples.first(SETTINGS.screening_samples)
-        # by whether an interpretation is refined in full
+        screening = task.samples.first(SETTINGS.screening_samples)
+        # keyed by ``in_full``
         self.scorers = {
             in_full: CandidateScorer(task.system, samples, roughness)
-            for in_full, samples in ((True, task.samples), (False, few))
+            for in_full, samples in ((True, task.samples), (False, screening))
         }
         self._landmarks = None
         if task.landmarks is not None:
             self._landmarks = task.landmarks[0], task.frame.apply(task.landmarks[1])
 
     def refined(self, candidate: Candidate, in_full: bool) -> Candidate:
-        """An interpretation after its refinement."""
+        """Return a candidate after refinement."""
         task = self.task
         if in_full:
             candidate = self.averaged(candidate)
@@ -258,43 +270,43 @@ class WholeComparison:
         return replace(candidate, vectors=vectors, residual=two_way_residual(task.system, local, vectors))
 
     def averaged(self, candidate: Candidate) -> Candidate:
-        """An interpretation with the mean node vectors of those that agree with it, see `averaged`."""
-        return averaged(self.task.system, candidate, self._candidates)
+        """Return a candidate with the mean node vectors of those that agree with it, see `average_similar`."""
+        return average_similar(self.task.system, candidate, self._candidates)
 
     def schedule(self, in_full: bool) -> fit_config.NodeRefineConfig:
-        """All steps, or a few of the same schedule: they tell which interpretations the surface agrees with."""
+        """The configuration with all steps, or with the steps of screening, which suffice to rank candidates."""
         config = self.task.config
         if in_full:
             return config.nodes
         return replace(config.nodes, schedule=replace(config.nodes.schedule, steps=config.screening))
 
     def score(self, candidate: Candidate, in_full: bool) -> float:
-        """How well a refined interpretation fits; lower is better."""
+        """Cost of a refined candidate; lower is better."""
         scorer = self.scorers[in_full]
         residual = scorer.score(candidate.local(scorer.samples), candidate)
         cost = replace(candidate, residual=residual).cost
         if not in_full:
             return cost
-        usual = stands_upright if self.task.shape.upright else has_common_axes
-        return cost + (0.0 if usual(candidate.pose) else SETTINGS.unusual_axes_cost) + self.doubt(candidate)
+        is_expected = stands_upright if self.task.shape.upright else has_common_axes
+        return cost + (0.0 if is_expected(candidate.pose) else SETTINGS.unusual_axes_cost) + self.doubt(candidate)
 
     def doubt(self, candidate: Candidate) -> float:
-        """What is added to the residual of an interpretation that the network reads less surely."""
+        """Cost of a candidate that differs from the network's predictions for tilted copies of the samples."""
         task = self.task
-        if not reads_alike(task.model):
+        if not is_tilt_consistent(task.model):
             return 0.0
         everywhere = np.ones(len(task.system.verts), bool)
         spread = task.predictor.spread(candidate.local(task.samples), candidate.vectors, everywhere)
-        return SETTINGS.spread_cost * min(spread, USUAL_SPREAD)
+        return SETTINGS.spread_cost * min(spread, TYPICAL_SPREAD)
 
     def vertices(self, candidate: Candidate) -> Float[Floats, "V 3"]:
-        """Where an interpretation has the template's vertices, in one frame for all."""
+        """Positions (V, 3) of the template's vertices under a candidate, in one frame for all candidates."""
         moved = self.task.system.moved(candidate.vectors)
         return np.asarray(candidate.pose.to_world(moved) / np.sqrt(candidate.share))
 
 
 class PartComparison(WholeComparison):
-    """The same for interpretations of a part: what it does not show is held where the fit has it."""
+    """Refines and scores candidates of a part; template that the part does not show is held where the fit has it."""
 
     def __init__(self, task: FitTask) -> None:
         super().__init__(task, [], roughness=0.0)
@@ -307,15 +319,15 @@ class PartComparison(WholeComparison):
         return replace(candidate, vectors=vectors, residual=one_way_residual(system, local, vectors))
 
     def doubt(self, candidate: Candidate) -> float:
-        """None: of what a part does not show, the network's readings say nothing."""
+        """Zero: the network's predictions say nothing about what a part does not show."""
         return 0.0
 
 
 class CandidateScorer:
-    """Scores candidates for one set of samples, in any frame and size: the lower the better.
+    """Scores candidates against one set of samples, in any frame and size; lower is better.
 
-    ``roughness`` is that of a cloud (0..1, see `Shape.roughness`): normals estimated from noise say little, and squares
-    tell a limb that lies beside its points from one whose points scatter about it.
+    ``roughness`` is that of a cloud (0..1, see `Shape.roughness`). Normals that are estimated from noise say little, so
+    squared distances replace them: they separate a limb next to its points from one among its scattered points.
     """
 
     def __init__(self, system: NodeSystem, samples: OrientedPoints, roughness: float = 0.0) -> None:
@@ -326,16 +338,16 @@ class CandidateScorer:
         return neighbours(self.samples)
 
     def score(self, local: OrientedPoints, candidate: Candidate) -> float:
-        """Residual of a candidate and a cost for discontinuities; ``local``: the same samples in its core frame."""
-        residual, rough = candidate.residual, self._roughness
-        if rough > 0:
-            residual += rough * (self.scatter(local, candidate.vectors) - residual)
+        """Residual of a candidate plus a cost for discontinuities; ``local`` are the same samples in its core frame."""
+        residual, roughness = candidate.residual, self._roughness
+        if roughness > 0:
+            residual += roughness * (self.scatter(local, candidate.vectors) - residual)
         return residual + SETTINGS.discontinuity_cost * discontinuous_share(
             self._system, self._pairs, local, candidate.vectors
         )
 
     def scatter(self, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> float:
-        """Root of the mean squared distance of nearest points, both ways, normals left out (units of sqrt(area))."""
+        """Root mean square distance of nearest points, both ways, without normals (units of sqrt(area))."""
         moved = self._system.moved(vectors)
         forward = cKDTree(local.points).query(moved, distance_upper_bound=SETTINGS.cap)[0]
         back = cKDTree(moved).query(local.points, distance_upper_bound=SETTINGS.cap)[0]
@@ -344,27 +356,25 @@ class CandidateScorer:
 
 
 def has_common_axes(pose: RigidPose) -> bool:
-    """Whether a core frame stands as shapes do in most files: up along y and front along z, or up along z and front
-    along -y.
-    """
+    """Return whether a core frame has an orientation that most files have: y up and z front, or z up and -y front."""
     up, front = pose.rotation[:, 1], pose.rotation[:, 2]
-    return bool(min(up[1], front[2]) > USUAL or min(up[2], -front[1]) > USUAL)
+    return bool(min(up[1], front[2]) > MIN_AXIS_COSINE or min(up[2], -front[1]) > MIN_AXIS_COSINE)
 
 
 def differ(here: Float[Floats, "V 3"], there: Float[Floats, "V 3"], far: float = SETTINGS.different_distance) -> bool:
-    """Whether two interpretations have parts of the template in different places."""
+    """Return whether two candidates place parts of the template differently."""
     return bool((np.linalg.norm(here - there, axis=1) > far).mean() > SETTINGS.different_share)
 
 
-def averaged(system: NodeSystem, chosen: Candidate, candidates: Sequence[Candidate]) -> Candidate:
-    """A candidate with the mean node vectors of those that agree with it in the same core frame; best first.
+def average_similar(system: NodeSystem, chosen: Candidate, candidates: Sequence[Candidate]) -> Candidate:
+    """Replace a candidate's node vectors by the mean over those that agree with it in the same core frame (best first).
 
-    Each prediction errs in its own way, and its stretch is what the refinement holds on to.
+    Each prediction has its own error, and refinement keeps the stretch of the prediction that it starts from.
     """
-    here = system.moved(chosen.vectors)
-    alike = [
+    verts = system.moved(chosen.vectors)
+    similar = [
         other.vectors
         for other in candidates
-        if other.pose is chosen.pose and not differ(here, system.moved(other.vectors), SETTINGS.same_distance)
+        if other.pose is chosen.pose and not differ(verts, system.moved(other.vectors), SETTINGS.same_distance)
     ]
-    return replace(chosen, vectors=np.mean(alike[: SETTINGS.max_averaged], axis=0)) if alike else chosen
+    return replace(chosen, vectors=np.mean(similar[: SETTINGS.max_averaged], axis=0)) if similar else chosen

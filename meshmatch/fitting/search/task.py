@@ -1,4 +1,4 @@
-"""What a fit in progress is about, samples above all, and what it has found."""
+"""A fit in progress: its inputs, above all the samples, and its result."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from meshmatch.shapes.outside import without_hidden
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
-# How much further than its neighbours from theirs an outlier is from its own, see `outlier_points`. Set by hand.
+# An outlier is this many times as far from its neighbours as these are from theirs, see `outlier_points`. Set by hand.
 _OUTLIER_RATIO = 1.3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FitTask:
-    """One shape that is to be fitted."""
+    """One shape that is to be fitted, with everything that the fit needs."""
 
     model: TrainedModel
     config: FitConfig  # for this model and the noise of this shape
-    predictor: Predictor  # the model's network, with the random numbers of this task
+    predictor: Predictor  # runs the model's network, with this task's random generator
     shape: Shape  # repaired, in its file's frame
     roughness: float  # of the shape without outliers (0..1, see `Shape.roughness`)
     frame: Frame  # from the file to the frame of the samples: area about 1, centroid 0
-    samples: OrientedPoints  # of the shape without outliers, for the network, which knows what may be hidden in shapes
-    visible_samples: OrientedPoints  # the same, or of what can be seen from outside, for all else
+    samples: OrientedPoints  # of the shape without outliers, for the network, which was trained on hidden surface
+    visible_samples: OrientedPoints  # of what is visible from outside, for everything but the network
     landmarks: Landmarks | None  # template vertices (N,), positions (N, 3) in the file
     progress: Progress
 
@@ -52,7 +52,7 @@ class FitTask:
         progress: Progress | None = None,
         mirrored: bool = False,
     ) -> FitTask:
-        """The task for a repaired shape, or its mirror image, sampled in the frame in which the model knows shapes."""
+        """Create the task for a repaired shape or its mirror image, sampled in the frame that the model expects."""
         config = config.for_noise(shape.roughness)
         rng = np.random.default_rng(config.seed)
         clean = without_outliers(shape)
@@ -82,16 +82,18 @@ class FitTask:
 
     @property
     def coarse(self) -> OrientedPoints:
-        """The first samples, for screening."""
+        """The first few samples, for screening."""
         return self.samples.first(self.config.coarse_samples)
 
     @property
     def on_visible_samples(self) -> FitTask:
-        """The same task with samples of what can be seen alone."""
+        """The same task with the visible samples in place of all."""
         return replace(self, samples=self.visible_samples)
 
     def rescaled(self, scale: float, samples: OrientedPoints | None = None) -> FitTask:
-        """The same task with lengths divided by ``scale``; where samples were left out, with those that are left."""
+        """The same task with lengths divided by ``scale``, and with ``samples`` (already in the new scale) if they are
+        given.
+        """
         frame = self.frame.compose(Frame(scale, np.eye(3), np.zeros(3)))
         if samples is not None:
             return replace(self, frame=frame, samples=samples, visible_samples=samples)
@@ -103,14 +105,14 @@ class FitTask:
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """A candidate that a task, with frame and samples in the size that was found, ended with."""
+    """The candidate that a task ended with; the task's frame and samples have the scale that the search found."""
 
     task: FitTask
     candidate: Candidate
 
     @cached_property
     def core_frame(self) -> Frame:
-        """From the file to the core frame."""
+        """Frame from the shape's file to the core frame."""
         return self.task.frame.compose(self.candidate.pose.frame)
 
     @cached_property
@@ -120,15 +122,15 @@ class Registration:
 
     @cached_property
     def surface(self) -> OrientedPoints:
-        """The template's vertices and normals as fitted, core frame."""
+        """Vertices and normals of the fitted template, core frame."""
         return self.task.system.surface(self.candidate.vectors)
 
 
 @derived
 def without_outliers(shape: Shape) -> Shape:
-    """A cloud without the points that lie apart from their neighbours; any other shape as it is.
+    """A cloud without its outliers; other shapes are returned unchanged.
 
-    An outlier among neighbours bends their normals and turns the signs of whole regions, and it counts as surface.
+    An outlier distorts the normals of its neighbours and can flip the signs of whole regions, and it counts as surface.
     """
     if not shape.is_cloud:
         return shape
@@ -138,16 +140,16 @@ def without_outliers(shape: Shape) -> Shape:
 
 
 def without_interior(shape: Shape, system: NodeSystem) -> Shape:
-    """A mesh without what cannot be seen from outside, where the template has nothing of the kind."""
+    """A mesh without faces that are hidden from outside, unless the template has hidden surface itself."""
     return without_hidden(shape) if system.shows_all else shape
 
 
 def take_samples(
     shape: Shape, P: int, rng: np.random.Generator, frame: Frame | None = None
 ) -> tuple[Frame, OrientedPoints]:
-    """A frame from a shape's file (by default to area 1, centroid 0), and P samples of the shape in that frame.
+    """Return a frame from a shape's file (by default to area 1, centroid 0), and P samples of the shape in that frame.
 
-    The outliers of a cloud are not drawn; the normals of a cloud are not signed.
+    Outliers of a cloud are not sampled; the normals of a cloud have no sign.
     """
     frame = sqrt_area_frame(shape) if frame is None else frame
     return frame, sample_surface(without_outliers(shape), P, rng).in_frame(frame)

@@ -1,8 +1,8 @@
-"""A part much thicker than any of an ordinary body, such as the head of a cartoon, read as if it were smaller.
+"""Fits of shapes with a part much thicker than any of an ordinary body, such as the head of a cartoon character.
 
-The network takes a head that is larger than all the rest for a trunk that bends over. So the largest ball inside a shape is
-looked for, what lies around it is drawn together, and that shape is fitted. What was found is carried back, and refined on
-the shape as it is.
+The network mistakes a head that is larger than all the rest for a trunk that bends over. So the largest ball inside the
+shape is found, its surroundings are contracted, and the contracted shape is fitted. The fit is mapped back and refined on
+the original shape.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ class ThicknessSettings:
 
     Attributes
     ----------
-    thick : a part that holds a ball so many times as large as the resting template does is thick: trunks of SCAPE and FAUST
-        hold 1.0 to 1.14 times its ball, heads of stylised people that are read wrongly 1.17 to 2
-    factors : by which it is drawn together, in turn
-    around : so many radii around the middle of the ball are drawn together evenly
-    balls : samples at which balls that touch the surface are looked for
-    margin : the fit is taken if its score is less than this times that of the fit before
+    thick : a part is thick if it contains a ball this many times as large as the rest template does: trunks of SCAPE and
+        FAUST contain 1.0 to 1.14 times its ball, misread heads of stylised people 1.17 to 2
+    factors : contraction factors to try, in order
+    around : the contraction is uniform within this many radii of the ball's center
+    balls : number of samples at which balls touching the surface are tried
+    margin : the fit is accepted if its score is below this multiple of the original fit's
     """
 
     thick: float = 1.1
@@ -45,38 +45,39 @@ class ThicknessSettings:
 
 
 SETTINGS = ThicknessSettings()
-_SAMPLES = 8192  # of the template
-_STEPS = 40  # in which a ball is made smaller at most
-_TOUCHES = 0.02  # of its radius by which a sample may lie inside a ball
-# How far directions from the middle of a ball inside to samples around may agree, and how far normals must agree with them.
-_ONE_SIDED, _OUTWARD = 0.6, 0.3
+_SAMPLES = 8192  # number of samples of the template
+_MAX_SHRINKS = 40  # maximum number of times that a ball is shrunk
+_MAX_DEPTH = 0.02  # depth, as a share of the radius, at which a sample may lie inside a ball
+# A ball is inside the shape if the mean direction from its center to nearby samples is shorter than the first number (they
+# are on all sides), and the mean cosine between these directions and the samples' normals exceeds the second.
+_MAX_MEAN_DIRECTION, _MIN_OUTWARD_COSINE = 0.6, 0.3
 
 
 def with_thick_part_smaller(found: Registration) -> Registration | None:
-    """A fit of a whole by way of the same shape with its thickest part drawn together, where it has one, and where that is
+    """Fit a whole shape by way of a copy with its thickest part contracted; None if it has no thick part or that is no
     better.
     """
     task, best = found.task, found.candidate
     if not (task.samples.signed and task.system.linear):
         return None
-    usual, ball = usual_ball(task.model), largest_ball(task.samples, SETTINGS.balls)
-    if usual is None or ball is None or ball[1] < SETTINGS.thick * usual:
+    template_radius, ball = template_ball_radius(task.model), largest_ball(task.samples, SETTINGS.balls)
+    if template_radius is None or ball is None or ball[1] < SETTINGS.thick * template_radius:
         return None
     comparison = WholeComparison(task, [])
 
-    def through(factor: float) -> Candidate:
+    def fit_with(factor: float) -> Candidate:
         contraction = Contraction(ball[0], SETTINGS.around * ball[1], factor)
-        return comparison.refined(_read_through(task, contraction), in_full=True)
+        return comparison.refined(_fit_contracted(task, contraction), in_full=True)
 
-    refined = parallel_map(through, SETTINGS.factors)
+    refined = parallel_map(fit_with, SETTINGS.factors)
     scores = [comparison.score(each, False) for each in refined]
     better = min(scores) < SETTINGS.margin * comparison.score(best, False)
     return replace(found, candidate=refined[int(np.argmin(scores))]) if better else None
 
 
 @derived
-def usual_ball(model: TrainedModel) -> float | None:
-    """Radius of the largest ball inside a model's resting template (units of sqrt(area))."""
+def template_ball_radius(model: TrainedModel) -> float | None:
+    """Radius of the largest ball inside a model's rest template (units of sqrt(area))."""
     samples = take_samples(model.template.shape, _SAMPLES, np.random.default_rng(0))[1]
     ball = largest_ball(samples, SETTINGS.balls)
     return None if ball is None else ball[1]
@@ -84,20 +85,20 @@ def usual_ball(model: TrainedModel) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class Contraction:
-    """Draws what lies within ``reach`` of a middle together by a ``factor``; all else follows towards the middle."""
+    """Scales everything within ``reach`` of ``middle`` by ``factor``, and moves the rest towards the middle accordingly."""
 
     middle: Float[Floats, " 3"]
     reach: float
     factor: float
 
-    def drawn(self, points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
+    def apply(self, points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
         """Points after the contraction."""
         away, distance = self._from_middle(points)
         nearer = 1 - self.reach * (1 - self.factor) / np.maximum(distance, self.reach)
         return self.middle + away * np.where(distance < self.reach, self.factor, nearer)
 
-    def back(self, points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
-        """Points before the contraction."""
+    def invert(self, points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
+        """The inverse: points before the contraction."""
         away, distance = self._from_middle(points)
         inner = self.reach * self.factor
         farther = 1 + (self.reach - inner) / np.maximum(distance, inner)
@@ -108,34 +109,36 @@ class Contraction:
         return away, np.linalg.norm(away, axis=1, keepdims=True)
 
 
-def _read_through(task: FitTask, contraction: Contraction) -> Candidate:
-    """The candidate that a fit of the contracted shape (contraction: frame of the samples) gives for the shape itself."""
+def _fit_contracted(task: FitTask, contraction: Contraction) -> Candidate:
+    """Fit a contracted copy of the shape (contraction in the frame of the samples), and map the result back to a
+    candidate.
+    """
     frame, shape, system = task.frame, task.shape, task.system
 
     def contracted(points: Floats) -> Floats:
-        return np.asarray(frame.undo(contraction.drawn(frame.apply(points))))
+        return np.asarray(frame.undo(contraction.apply(frame.apply(points))))
 
     landmarks = None if task.landmarks is None else (task.landmarks[0], contracted(task.landmarks[1]))
     other = replace(shape, verts=contracted(shape.verts))
     config = replace(task.config, finalists=1)
     read = fit_whole(FitTask.of(task.model, config, other, landmarks, mirrored=frame.mirrored))
     placed = frame.apply(read.core_frame.undo(system.moved(read.candidate.vectors)))
-    moved = contraction.back(placed)
+    moved = contraction.invert(placed)
     core = task.model.template.core
     pose: RigidPose = kabsch(system.verts[core], moved[core])
     return Candidate(pose, system.vectors_to(pose.to_local(moved)), 0.0)
 
 
 def largest_ball(samples: OrientedPoints, count: int) -> tuple[Float[Floats, " 3"], float] | None:
-    """Middle and radius of the largest of ``count`` balls inside a surface; None where there are none.
+    """Center and radius of the largest of ``count`` balls inside a surface; None if there are none.
 
-    Each touches the surface in a sample, and is made smaller until no other sample lies inside it.
+    Each ball touches the surface at a sample and is shrunk until it contains no other sample.
     """
     points, normals, tree = samples.points, samples.normals, cKDTree(samples.points)
     touched = np.linspace(0, len(points) - 1, min(count, len(points))).astype(np.int64)
     at, out = points[touched], normals[touched]
     radius = np.full(len(at), float(np.ptp(points, axis=0).max()))
-    for _ in range(_STEPS):
+    for _ in range(_MAX_SHRINKS):
         distance, nearest = tree.query(at - radius[:, None] * out)
         across = at - points[nearest]
         along = 2 * np.einsum("nd,nd->n", across, out)
@@ -145,12 +148,12 @@ def largest_ball(samples: OrientedPoints, count: int) -> tuple[Float[Floats, " 3
             break
         radius = np.where(inside, np.minimum(smaller, radius), radius)
     middles = at - radius[:, None] * out
-    empty = tree.query(middles)[0] > radius * (1 - _TOUCHES)
+    empty = tree.query(middles)[0] > radius * (1 - _MAX_DEPTH)
     for k in sorted(np.flatnonzero(empty), key=lambda k: -radius[k]):
         around = tree.query_ball_point(middles[k], 1.5 * radius[k])
         towards = points[around] - middles[k]
         towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
         outward = np.einsum("nd,nd->n", towards, normals[around]).mean()
-        if np.linalg.norm(towards.mean(0)) < _ONE_SIDED and outward > _OUTWARD:
+        if np.linalg.norm(towards.mean(0)) < _MAX_MEAN_DIRECTION and outward > _MIN_OUTWARD_COSINE:
             return middles[k], float(radius[k])
     return None
