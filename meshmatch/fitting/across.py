@@ -1,4 +1,4 @@
-"""A shape that is nearly symmetric, matched to its own mirror image: what lies across from what."""
+"""Self-symmetry: a nearly symmetric shape is matched to its own mirror image."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
-_PLANES = 5  # that are tried
+_PLANES = 5  # maximum number of mirror planes to try
 _SAMPLES = 1500
 
 
@@ -32,21 +32,21 @@ def match_across(
     shape
         A mesh.
     config
-        The seed.
+        Provides the seed.
     progress
-        As of `match_directly`.
+        As for `match_directly`.
 
     Returns
     -------
     MirrorPlane
-        A plane near which the shape is symmetric, in the coordinates of its file.
+        A plane of approximate symmetry, in the coordinates of the shape's file.
     DirectMatch
-        Of the shape, and of its image in that plane (`image_in`).
+        The match of the shape to its image in that plane (`image_in`).
 
     Raises
     ------
     InputError
-        A cloud of points.
+        The shape is a point cloud.
     """
     if shape.is_cloud:
         hint = "reconstruct a surface first"
@@ -59,16 +59,16 @@ def match_across(
     report(1.0)
     images = [image_in(plane, shape) for plane in planes]
     number, found = match_where_it_lies(shape, images, DirectConfig(seed=config.seed, from_source=True), progress)
-    how = replace(config, mirror="no", partial="no")
-    return planes[number], match_alike(shape, images[number], found, how, progress, turned=False)
+    alike_config = replace(config, mirror="no", partial="no")
+    return planes[number], match_alike(shape, images[number], found, alike_config, progress, turned=False)
 
 
 def image_in(plane: MirrorPlane, shape: Shape) -> Shape:
-    """The mirror image of a shape, facing out."""
+    """The mirror image of a shape, with faces oriented outwards."""
     return replace(shape, verts=plane.reflect(shape.verts), faces=shape.faces[:, ::-1])
 
 
 def _in_file(plane: MirrorPlane, frame: Frame) -> MirrorPlane:
-    """A plane of a frame without rotation in the coordinates of the file."""
+    """Transform a plane from a frame without rotation to the coordinates of the file."""
     origin = frame.undo(np.outer([plane.offset], plane.normal))[0]
     return replace(plane, offset=float(plane.normal @ origin))

@@ -1,4 +1,4 @@
-"""Fits of several shapes that agree on how the template stretches: what slides along one surface is held by the others."""
+"""Agreement of fits: several fits are refined together, so that each keeps the others from sliding along the surface."""
 
 from __future__ import annotations
 
@@ -31,12 +31,13 @@ def agreed_fits(
     how: AgreeConfig | None = None,
     threads: int = 1,
 ) -> list[Fit]:
-    """Let the fits of several repaired shapes agree on how the template stretches; by default as the card says how much.
+    """Refine the fits of several repaired shapes together, so that they agree on how the template stretches.
 
-    ``landmarks`` are template vertices (N,) and positions (N, 3) in the shape's file frame, for each shape. Node vectors,
-    points and vertex distances of the result are new; residual and verdict stay those that each fit had alone. The fits
-    are as given if one of them is poor, for it has nothing to say about the others, or if nodes are not refined (a
-    pointwise model has none).
+    ``landmarks`` are, for each shape, template vertices (N,) and positions (N, 3) in its file frame; ``how`` defaults to
+    the settings in the model's card. Node vectors, points and vertex distances of the result are new; residual, trust and
+    verdict are those of each fit alone, except that folds may lower the verdict (see `with_vectors`). The fits are returned
+    unchanged if one of them is poor, as it would mislead the others, or if nodes are not refined (a pointwise model has
+    none).
     """
     config = (config or FitConfig()).for_model(model)
     if any(fit.verdict == "poor" for fit in fits) or not config.moves_nodes:
@@ -60,7 +61,7 @@ def agreed_fits(
 def member_of(
     system: NodeSystem, shape: Shape, fit: Fit, config: FitConfig, how: AgreeConfig, landmarks: Landmarks | None = None
 ) -> Member:
-    """What agreement needs of a repaired shape and its fit; landmarks are in the shape's file frame."""
+    """Prepare a repaired shape and its fit for agreement; landmarks are in the shape's file frame."""
     local = None if landmarks is None else (landmarks[0], fit.frame.apply(landmarks[1]))
     own = config.for_noise(shape.roughness)
     frame, samples = take_samples(without_interior(shape, system), own.samples, np.random.default_rng(own.seed))
@@ -77,10 +78,10 @@ def member_of(
 
 
 def with_vectors(system: NodeSystem, fit: Fit, vectors: Float[Floats, "K 3"]) -> Fit:
-    """The same fit with other node vectors, such as agreement finds.
+    """Replace the node vectors of a fit, for example by those that agreement finds.
 
-    Residual, trust and verdict stay those that it had, but a deformation that folds more than right ones do, or clearly more
-    than before, is not good.
+    Residual, trust and verdict are kept, but a good fit becomes fair if its deformation folds more than right ones do, or
+    clearly more than before.
     """
     regularity = system.regularity(vectors)
     moved = replace(fit, vectors=vectors, points=system.moved(vectors), regularity=regularity)

@@ -1,6 +1,6 @@
-"""A curve through several fits of one template and beyond them, and how far its poses are from what they should be.
+"""Interpolation: a curve through several fits of one template and beyond them, and the deviation of its poses.
 
-What the field does at every point is blended (`meshmatch.fitting.solve.blend`), or the codes that the network has.
+Either the deformations themselves are blended (`meshmatch.fitting.solve.blend`), or the network's latent codes.
 """
 
 from __future__ import annotations
@@ -26,18 +26,19 @@ from meshmatch.shapes.shape import Shape
 Way = Literal["field", "codes"]
 """What is blended between fits, see `Blend`."""
 WAYS: tuple[Way, ...] = get_args(Way)
-_SAMPLES = 2048  # of which a shape's code is read
-# From the weights of the n key shapes to node vectors.
-Path = Callable[[Float[Floats, " n"]], Float[Floats, "K 3"]]
+_SAMPLES = 2048  # samples from which a shape's code is computed
+BlendPath = Callable[[Float[Floats, " n"]], Float[Floats, "K 3"]]
+"""From weights of the n key shapes to node vectors."""
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far a pose is from the stretch that it should have, and from the resting template; means over the surface.
+    """Differences between a pose and the stretch that it should have, and between it and the rest template; means over the
+    surface.
 
-    ``volume``: |det F - det S|, and ``arap``: |F^T F - S^T S| (Frobenius), S the stretch of the fits blended by
-    logarithms: 0 at the fits. ``template_volume`` and ``template_arap``: the same for S = I, the paper's energies
-    (without the square); they hold the shapes' own difference from the template.
+    With S the log-Euclidean blend of the fits' stretches, ``volume`` is |det F - det S| and ``arap`` is |F^T F - S^T S|
+    (Frobenius); both are 0 at the fits. ``template_volume`` and ``template_arap`` are the same for S = I: the paper's
+    energies, without the square. They include the shapes' own difference from the template.
     """
 
     volume: float
@@ -49,21 +50,22 @@ class Deviation:
 class Blend:
     """A curve through several fits of one template.
 
-    Each quantity is blended with the same weights of the fits: linear between two fits, a natural cubic spline
-    through more; straight on beyond the ends. The fits are met exactly: what the path lacks at them is
-    blended and added. A path of codes lacks much, which is therefore blended in the frames of the parts that it moves,
-    and turns with them.
+    All quantities are blended with the same weights of the fits: linearly between two fits, by a natural cubic spline
+    through more, and linearly beyond the ends. The curve passes through the fits exactly: the difference between path and
+    fits is blended and added. For a path of codes this difference is large; it is blended in local frames that rotate with
+    the deformation.
 
     Parameters
     ----------
-    model : whose template it is; or, without a model, what moves the template, and blends the "field" alone
+    model : the model of the fits; or, without a model, the system that deforms the template, which can blend the "field"
+        only
     fits : at least two, of one template
-    times : (n,) increasing: when each fit is met; evenly from 0 to 1 by default
-    shapes : the repaired shapes, for the way "codes" alone
-    way : blend what the "field" does, or the "codes" that the network has for the shapes
+    times : (n,) increasing times of the fits; by default evenly spaced from 0 to 1
+    shapes : the repaired shapes; for "codes" only
+    way : blend the deformation "field", or the latent "codes" of the shapes
 
-    `OptionError` for fewer than two fits, fits of another template, times that do not increase, an unknown way, or the
-    way "field" for a model without nodes.
+    Raises `OptionError` for fewer than two fits, fits of another template, times that do not increase, an unknown ``way``,
+    or "field" for a model without nodes.
     """
 
     def __init__(
@@ -93,7 +95,7 @@ class Blend:
                     "blend codes instead (--blend codes), or use a model of another field",
                 )
             core = np.arange(len(self._system.verts)) if trained is None else trained.template.core
-            self._path: Path = FieldPath(self._system, list(self._keys), core)
+            self._path: BlendPath = FieldPath(self._system, list(self._keys), core)
         elif way == "codes":
             if trained is None:
                 raise OptionError("without a model there are no codes", "blend the field instead")
@@ -102,21 +104,21 @@ class Blend:
             self._path = _code_path(trained, shapes, fits)
         else:
             raise OptionError(f"unknown way to blend {way!r}", f"choose one of {', '.join(WAYS)}")
-        met = [self._path(row) for row in np.eye(len(fits))]
-        self._correction = self._keys - np.stack(met)
+        at_keys = [self._path(row) for row in np.eye(len(fits))]
+        self._correction = self._keys - np.stack(at_keys)
         self._node_field = None
         if way == "codes" and trained is not None and trained.has_nodes:
-            # At the template vertex beside each node the field is sure to have nodes enough around it.
+            # Template vertices, unlike nodes, are certain to have enough nodes in reach: use the one nearest to each node.
             verts = trained.template.shape.verts
             self._node_field = trained.field(verts[cKDTree(verts).query(trained.template.nodes)[1]])
-            turns = np.stack([polar(self._node_field.deformation_gradient_at(vectors))[0] for vectors in met])
-            self._correction = np.einsum("nkij,nki->nkj", turns, self._correction)
+            rotations = np.stack([polar(self._node_field.deformation_gradient_at(vectors))[0] for vectors in at_keys])
+            self._correction = np.einsum("nkij,nki->nkj", rotations, self._correction)
         self._turns = RotationBlend([fit.frame.turn[None] for fit in fits])
         self._scales = np.array([fit.frame.scale for fit in fits])
         self._centers = np.stack([fit.frame.center for fit in fits])
 
     def weights(self, time: float) -> Float[Floats, " n"]:
-        """Weights of the n fits at a time; they sum to one."""
+        """Weights (n,) of the fits at a time; they sum to one."""
         inside = float(np.clip(time, self.times[0], self.times[-1]))
         near = self._curve(inside)
         if time == inside:
@@ -129,41 +131,43 @@ class Blend:
         weights = self.weights(time)
         if weights.max() == 1.0:  # a fit itself
             return np.asarray(self._keys[weights.argmax()])
-        there, correction = self._path(weights), np.tensordot(weights, self._correction, 1)
+        on_path, correction = self._path(weights), np.tensordot(weights, self._correction, 1)
         if self._node_field is not None:
-            correction = np.einsum("kij,kj->ki", polar(self._node_field.deformation_gradient_at(there))[0], correction)
-        return there + correction
+            correction = np.einsum(
+                "kij,kj->ki", polar(self._node_field.deformation_gradient_at(on_path))[0], correction
+            )
+        return on_path + correction
 
     def points(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3"]:
         """Template vertices of a pose, core frame."""
         return self._system.moved(vectors)
 
     def turns(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3 3"]:
-        """Rotations by which the field of a pose turns each template vertex."""
+        """Rotations of the deformation at each template vertex."""
         return polar(self._system.field.deformation_gradient_at(vectors))[0]
 
     def frame(self, time: float) -> Frame:
-        """Between the frames of the fits: it turns, moves and grows from one to the next."""
+        """The fits' frames, blended: rotation, position and scale."""
         weights = self.weights(time)
         scale = float(np.exp(weights @ np.log(self._scales)))
         return Frame(scale, self._turns.at(weights)[0], weights @ self._centers)
 
     def deviation(self, time: float, vectors: Float[Floats, "K 3"]) -> Deviation:
-        """How far a pose is from what it should be at a time."""
+        """Deviation of a pose at a time."""
         F = self._system.deformation_gradient(vectors)
         S = self._stretches.at(self.weights(time))
         return Deviation(*_energies(F, S), *_energies(F, np.eye(3)[None]))
 
 
 def _energies(F: Float[Floats, "G 3 3"], S: Float[Floats, "... 3 3"]) -> tuple[float, float]:
-    """Means of |det F - det S| and of |F^T F - S^T S|."""
+    """Means of |det F - det S| and |F^T F - S^T S|."""
     volume = np.abs(np.linalg.det(F) - np.linalg.det(S)).mean()
-    squares = F.transpose(0, 2, 1) @ F - S.transpose(0, 2, 1) @ S
-    return float(volume), float(np.linalg.norm(squares, axis=(1, 2)).mean())
+    difference = F.transpose(0, 2, 1) @ F - S.transpose(0, 2, 1) @ S
+    return float(volume), float(np.linalg.norm(difference, axis=(1, 2)).mean())
 
 
-def _code_path(model: TrainedModel, shapes: Sequence[Shape], fits: Sequence[Fit]) -> Path:
-    """Node vectors of blended codes; each code is that of samples of a shape in the core frame of its fit."""
+def _code_path(model: TrainedModel, shapes: Sequence[Shape], fits: Sequence[Fit]) -> BlendPath:
+    """A path of blended codes; each code is computed from samples of a shape in the core frame of its fit."""
     network = model.inference
     codes = []
     for shape, fit in zip(shapes, fits, strict=True):

@@ -1,4 +1,4 @@
-"""Whether a shape is of a model's category, by a full fit where the residual of the prediction is inconclusive."""
+"""Classification of a shape: by the residual of a model's prediction, and by a full fit where that is inconclusive."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from meshmatch.shapes.shape import Shape
 def classify(
     model: TrainedModel, shape: Shape, residual: float, config: FitConfig, progress: ProgressCallback | None
 ) -> tuple[bool, Fit | None]:
-    """Whether a repaired shape is of a model's category, and the fit that had to decide, if any.
+    """Return whether a repaired shape is of a model's category, and the fit that decided this, if one was needed.
 
-    ``residual`` is the shape's `category_residual`. The fit is made as ``config`` says, with refined nodes.
+    ``residual`` is the shape's `category_residual`. A fit is made according to ``config``, with refined nodes.
     """
     fit = Fitter(model, replace(config, refine="nodes"), progress).fit(shape) if needs_a_fit(residual) else None
     return is_of_category(model, shape, residual, fit), fit

@@ -24,17 +24,17 @@ from meshmatch.fitting.judge.direct import LIKELY, DirectFeatures, judge_direct
 from meshmatch.fitting.judge.reasons import SIDE_IN_DOUBT, Reason, Verdict
 from meshmatch.fitting.one_way import (
     DirectConfig,
+    DirectFit,
     KnownPairs,
-    Side,
-    Tried,
-    carried,
+    ShapeData,
+    decimate_if_large,
     distinct,
-    finish,
-    fitted,
-    glide,
-    lightened,
+    fit_fine,
+    fit_one_way,
+    interpolate,
+    slide,
 )
-from meshmatch.fitting.search.intrinsic import ThinMesh
+from meshmatch.fitting.search.intrinsic import DecimatedMesh
 from meshmatch.fitting.search.motions import turns_onto_itself
 from meshmatch.fitting.search.proposals import Proposal, differ
 from meshmatch.fitting.solve.regularity import Regularity
@@ -55,7 +55,7 @@ _SAME = 0.1
 # How much nearer a mirror image must lie, after rigid motions, to be tried (0.2 to 0.3 of femurs, up to 0.12 of creatures in
 # other poses), or to be tried where the relief is as little alike as of a palm and the back of a hand (0.6 to 0.71; 0.8 of
 # two hands of one side). What share of the energy its fit may have at most: 0.64 to 0.97 of hands, 1 of symmetric shapes;
-# and, of shapes that a rigid motion brings no nearer than so, what share of the relief may be unlike: 0.24 to 0.92 of
+# and, of shapes that a rigid motion brings no nearer than so, what share of the relief may be min_difference: 0.24 to 0.92 of
 # hands, mostly less than 0.6, and 0.5 to 1 of animals, mostly more than 0.75.
 _MIRRORED, _MAYBE_MIRRORED, _UNLIKE, _SHARE = 0.15, 0.03, 0.75, 0.93
 _POSED, _SHARE_UNLIKE = 0.07, 0.6
@@ -69,8 +69,8 @@ _NORMALS = 0.1  # of unit normals beside positions, where vertices look for what
 class _BothWays:
     """One correspondence: the source fitted to the target, and the target to the source."""
 
-    there: Tried
-    back: Tried
+    there: DirectFit
+    back: DirectFit
 
     @property
     def proposal(self) -> Proposal:
@@ -220,32 +220,32 @@ def match_where_it_lies(
     at = own.frame.undo(own.fine_mesh.verts)
     places = [Proposal("guess", side.frame.apply(at)) for side in sides]
 
-    def number_of(found: Tried) -> int:
+    def number_of(found: DirectFit) -> int:
         return next(k for k, place in enumerate(places) if place is found.proposal)
 
-    def as_of_first(found: Tried) -> Tried:
+    def as_of_first(found: DirectFit) -> DirectFit:
         """A fit as if the target were the first one."""
         number = number_of(found)
         back = kabsch(targets[number].verts, targets[0].verts)
         there = sides[number].frame.undo(own.fine.system.moved(found.vectors))
         return replace(found, moved=sides[0].frame.apply(back.to_world(there)))
 
-    def fit(place: Proposal, side: Side) -> Tried:
-        return as_of_first(finish(own, side, place, place.points))
+    def fit(place: Proposal, side: ShapeData) -> DirectFit:
+        return as_of_first(fit_fine(own, side, place, place.points))
 
-    def go_on(found: Tried) -> Tried:
-        return as_of_first(glide(own, sides[number_of(found)], found))
+    def go_on(found: DirectFit) -> DirectFit:
+        return as_of_first(slide(own, sides[number_of(found)], found))
 
     _ = own.fine  # once, and not by each thread
     report(0.0)
     tried = parallel_map(fit, places, sides)
     report(0.6)
-    best = distinct(tried, config.gliding, config.unlike)
+    best = distinct(tried, config.n_slid, config.min_difference)
     rest = [each for each in tried if each not in best]
     found = sorted([*parallel_map(go_on, best), *rest], key=attrgetter("energy"))
     chosen = number_of(found[0])
-    turns = turns_onto_itself(own.thin)
-    match = replace(searches[chosen], source=own)._match(_Judged(found, config.unlike, DIRECT, turns))
+    turns = turns_onto_itself(own.coarse_mesh)
+    match = replace(searches[chosen], source=own)._match(_Judged(found, config.min_difference, DIRECT, turns))
     report(1.0)
     first, second = (replace(each, seconds=time.monotonic() - began) for each in (match.source, match.target))
     return chosen, replace(match, source=first, target=second)
@@ -281,8 +281,8 @@ def _of_mirror_image(found: DirectMatch, target: Shape) -> DirectMatch:
 class _Search:
     """Two shapes, and what another method says of where positions on the first belong on the second."""
 
-    source: Side
-    target: Side
+    source: ShapeData
+    target: ShapeData
     guess: KnownPairs | None
 
     @classmethod
@@ -294,11 +294,11 @@ class _Search:
         shapes = [
             Shape(frame.apply(each.verts), each.faces) for frame, each in zip(frames, (source, target), strict=True)
         ]
-        light = parallel_map(lightened, shapes)
-        thin = parallel_map(ThinMesh.of, light, [config.coarse] * 2)
+        light = parallel_map(decimate_if_large, shapes)
+        thin = parallel_map(DecimatedMesh.of, light, [config.coarse] * 2)
         known, guess = (pairs and (frames[0].apply(pairs[0]), frames[1].apply(pairs[1])) for pairs in (known, guess))
-        first = Side(source, frames[0], shapes[0], light[0], thin[0], known, config)
-        second = Side(target, frames[1], shapes[1], light[1], thin[1], known and known[::-1], config)
+        first = ShapeData(source, frames[0], shapes[0], light[0], thin[0], known, config)
+        second = ShapeData(target, frames[1], shapes[1], light[1], thin[1], known and known[::-1], config)
         return cls(first, second, guess)
 
     @cached_property
@@ -306,11 +306,11 @@ class _Search:
         """How far apart a rigid motion leaves the shapes, and the source and the mirror image of the target."""
         return apart(self.source.original, self.target.original, self.source.config.seed)
 
-    def one_way(self, report: Progress, meanwhile: Sequence[Callable[[], object]] = ()) -> list[Tried]:
+    def one_way(self, report: Progress, meanwhile: Sequence[Callable[[], object]] = ()) -> list[DirectFit]:
         """The best fits of the source to the target, best first; see `fitted`."""
-        return fitted(self.source, self.target, self.guess, report, meanwhile)
+        return fit_one_way(self.source, self.target, self.guess, report, meanwhile)
 
-    def both_ways(self, there: list[Tried], report: Progress) -> list[_BothWays]:
+    def both_ways(self, there: list[DirectFit], report: Progress) -> list[_BothWays]:
         """The best fits of the source to the target, and of the target to the source, each continued the other way; best
         first."""
         reverse = _Search(self.target, self.source, self.guess and self.guess[::-1])
@@ -322,35 +322,35 @@ class _Search:
         ways_back = zip(returned[len(there) :], back, strict=True)
         found = [_BothWays(*each) for each in (*ways, *ways_back)]
         report(0.9)
-        best = distinct(found, self.source.config.gliding, _SAME)
+        best = distinct(found, self.source.config.n_slid, _SAME)
         sides = (self.source, self.target), (self.target, self.source)
-        tasks = [partial(glide, *sides[back], (each.there, each.back)[back]) for back in (0, 1) for each in best]
+        tasks = [partial(slide, *sides[back], (each.there, each.back)[back]) for back in (0, 1) for each in best]
         moved = parallel_calls(tasks)
         report(1.0)
         further = [_BothWays(*each) for each in zip(moved[: len(best)], moved[len(best) :], strict=True)]
         return sorted([*further, *(each for each in found if each not in best)], key=attrgetter("energy"))
 
-    def _best(self, tried: list[Tried]) -> list[Tried]:
+    def _best(self, tried: list[DirectFit]) -> list[DirectFit]:
         """The best few that differ, and the guess, whose energy is asked for."""
-        best = distinct(tried, self.source.config.returned, self.source.config.unlike)
+        best = distinct(tried, self.source.config.n_returned, self.source.config.min_difference)
         return best + [each for each in tried if each.proposal.kind == "guess" and each not in best]
 
-    def _returned(self, tried: Sequence[Tried]) -> list[Callable[[], Tried]]:
+    def _returned(self, tried: Sequence[DirectFit]) -> list[Callable[[], DirectFit]]:
         """What fits the target to the source by what takes the source to the target."""
         own, other = self.source.fine, self.target.fine
         at = with_normals(other.mesh.verts, vertex_normals(other.mesh.verts, other.system.faces), _NORMALS)
-        tasks: list[Callable[[], Tried]] = []
+        tasks: list[Callable[[], DirectFit]] = []
         for each in tried:
             moved = with_normals(each.moved, vertex_normals(each.moved, own.system.faces), _NORMALS)
-            goals = carried(at, moved, own.mesh.verts)
-            tasks.append(partial(finish, self.target, self.source, each.proposal, goals))
+            goals = interpolate(at, moved, own.mesh.verts)
+            tasks.append(partial(fit_fine, self.target, self.source, each.proposal, goals))
         return tasks
 
-    def matched(self, there: list[Tried], report: Progress, began: float) -> DirectMatch:
+    def matched(self, there: list[DirectFit], report: Progress, began: float) -> DirectMatch:
         """The best of the fits as a match; of both ways, if one way leaves doubt."""
         how, source, target = self.source.config.both_ways, self.source, self.target
-        turns = max(turns_onto_itself(each.thin, each.known and each.known[0]) for each in (source, target))
-        found = _Judged(there, self.source.config.unlike, DIRECT, turns)
+        turns = max(turns_onto_itself(each.coarse_mesh, each.known and each.known[0]) for each in (source, target))
+        found = _Judged(there, self.source.config.min_difference, DIRECT, turns)
         if how == "always" or (how == "in doubt" and not found.clear):
             both = self.both_ways(there, report.stage("", 0.6, 0.95))
             found = _Judged(both, _SAME, DIRECT_BOTH_WAYS, turns, found)
@@ -380,11 +380,11 @@ class _Search:
             judged.turns,
         )
 
-    def _over_guess(self, found: Sequence[Tried | _BothWays]) -> float:
+    def _over_guess(self, found: Sequence[DirectFit | _BothWays]) -> float:
         """How much lower the energy of the best fit is than that of the guess."""
         if self.guess is None:
             return np.inf
-        if differ(found[0].moved, carried(self.source.fine.mesh.verts, *self.guess)) < _SAME:
+        if differ(found[0].moved, interpolate(self.source.fine.mesh.verts, *self.guess)) < _SAME:
             return 0.0
         guessed = [each.energy for each in found if each.proposal.kind == "guess"]
         return min(guessed, default=np.inf) - found[0].energy
@@ -392,11 +392,11 @@ class _Search:
 
 @dataclass(frozen=True, eq=False)
 class _Judged:
-    """Fits, the best one first, and what is said of it; those are alike that differ at ``unlike`` of the vertices, and
+    """Fits, the best one first, and what is said of it; those are alike that differ at ``min_difference`` of the vertices, and
     the ``earlier`` ones, of one direction, left doubt."""
 
-    found: Sequence[Tried | _BothWays]
-    unlike: float
+    found: Sequence[DirectFit | _BothWays]
+    min_difference: float
     calibration: DirectCalibration
     turns: int
     earlier: _Judged | None = None
@@ -405,7 +405,9 @@ class _Judged:
     def leads(self) -> tuple[float, ...]:
         """How much higher the energies of those are that differ from the first one, which has the lowest."""
         best, *others = self.found
-        return tuple(each.energy - best.energy for each in others if differ(each.moved, best.moved) > self.unlike)
+        return tuple(
+            each.energy - best.energy for each in others if differ(each.moved, best.moved) > self.min_difference
+        )
 
     @property
     def judged(self) -> tuple[Verdict, float, tuple[Reason, ...]]:
@@ -418,8 +420,8 @@ class _Judged:
 
 
 def _fits(
-    own: Side,
-    other: Side,
+    own: ShapeData,
+    other: ShapeData,
     vectors: Float[Floats, "K 3"],
     residual: float,
     judged: tuple[Verdict, float, tuple[Reason, ...]],

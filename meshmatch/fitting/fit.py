@@ -1,4 +1,4 @@
-"""The result of this room: a template fitted to one shape."""
+"""The result of a fit: a template fitted to one shape."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Fit(Pickled):
     Attributes
     ----------
     template_hash
-        Hash of the template; fits of two templates cannot be joined.
+        Hash of the template; fits of different templates cannot be combined.
     frame
         From the shape's file to the core frame (the template's orientation, area about 1).
     points
@@ -41,29 +41,29 @@ class Fit(Pickled):
     vectors
         (K, 3) node vectors, core frame.
     resting
-        (V, 3) the same vertices on the resting template, template frame.
+        (V, 3) the same vertices on the rest template, template frame.
     faces
         (F, 3) the template's triangles.
     residual
-        Mean distance, normals included, between template and shape, both ways, in units of sqrt(area).
+        Mean distance between template and shape, both ways, normals included (units of sqrt(area)).
     verts
         (N, 3) vertices of the shape, in the frame and unit of its file.
     verdict
         "good", "fair" or "poor".
     reasons
-        Why it is not good.
+        Why the verdict is not good.
     up
-        The axis of the file that the fit took for up, such as "+y"; empty where the model does not know what is up.
+        The axis of the file that is up according to the fit, such as "+y"; empty if the model has no up axis.
     front
-        The axis of the file that the fit took for front, such as "-z"; empty likewise.
+        The axis of the file that is the front according to the fit, such as "-z"; empty likewise.
     seconds
         Wall time of the fit.
     seed
-        Of its random numbers.
+        Seed of its random numbers.
     partial
-        The shape was taken for a part; the residual is from the shape to the template only.
+        Whether the shape was fitted as a part; the residual is then from the shape to the template only.
     repaired
-        The shape itself, with the way back to the vertices of its file.
+        The repaired shape, with the correspondence to the vertices of its file.
     notes
         What was changed in the shape before fitting, and which choices were replaced.
     model
@@ -71,15 +71,15 @@ class Fit(Pickled):
     trust
         Probability (0..1) that the fit is right: on a person, to 8 cm on average.
     signs
-        The measurements by which it was judged; None if it was read from a file.
+        The features by which it was judged; None if it was read from a file.
     left_out
-        Numbers of the shape's parts that were left out, where a fit of the whole failed; see `meshmatch info`.
+        Numbers of the shape's parts that were left out because a fit of the whole failed; see `meshmatch info`.
     regularity
-        Share of template vertices where the deformation folds (det F <= 0), and mean change of volume, of these node
-        vectors; None if it was read from a file that does not say.
+        Share of template vertices where the deformation folds (det F <= 0), and mean change of volume, under these node
+        vectors; None if it was read from a file without them.
     side
-        Logarithm of how many times as much the template must stretch for the other side, the mirror image or the shape as
-        it is; 0 where it was not tried.
+        Log ratio of the template's stretch for the other side (the mirror image, or the shape itself) to that for this one;
+        0 if the other side was not tried.
 
     Examples
     --------
@@ -114,7 +114,7 @@ class Fit(Pickled):
 
     @property
     def shape_name(self) -> str:
-        """Name of the fitted shape; empty where it is not known."""
+        """Name of the fitted shape; empty if it is unknown."""
         return self.repaired.original.name if self.repaired else ""
 
     def __repr__(self) -> str:
@@ -135,12 +135,12 @@ class Fit(Pickled):
 
     @property
     def axes(self) -> str:
-        """Up and front in words; empty where the model does not know them."""
+        """Up and front axes as text; empty if the model has none."""
         return f"up {self.up}, front {self.front}" if self.up else ""
 
     @cached_property
     def vertex_distance(self) -> Floats:
-        """(N,) distance of every vertex of the shape to the nearest template vertex, in units of sqrt(area)."""
+        """(N,) distance from every vertex of the shape to the nearest template vertex (units of sqrt(area))."""
         return np.asarray(cKDTree(self.points).query(self.frame.apply(self.verts))[0])
 
     @property
@@ -164,17 +164,17 @@ class Fit(Pickled):
         return self.shape.to_trimesh()
 
     def check_template(self, expected: str) -> None:
-        """Refuse a fit of another template.
+        """Raise an error if the fit is not of the expected template.
 
         Parameters
         ----------
         expected
-            Hash of the template that the fit should be of.
+            Hash of the template.
 
         Raises
         ------
         OptionError
-            It is of another one.
+            The fit is of another template.
         """
         if self.template_hash != expected:
             raise OptionError(
@@ -184,21 +184,22 @@ class Fit(Pickled):
 
 
 def check_fit(fit: object) -> None:
-    """Refuse what is no `Fit` (`InputError`)."""
+    """Raise `InputError` if an object is not a `Fit`."""
     if not isinstance(fit, Fit):
         raise InputError(f"{type(fit).__name__} is not a fit", "register and Matcher.fit make one")
 
 
 def judged_fit(
-    judged: Judgement,
+    judgement: Judgement,
     system: NodeSystem,
     frame: Frame,
     vectors: Float[Floats, "K 3"],
     upright: bool = True,
     **about: Any,
 ) -> Fit:
-    """The fit that has these node vectors in the core ``frame``, as it is judged; the other attributes as `Fit`. Whether the
-    template is known to stand ``upright`` decides whether the fit says what is up.
+    """Build a `Fit` from node vectors in the core ``frame`` and their judgement; ``about`` are its other attributes.
+
+    ``upright``: the template has a known up axis, so the fit states up and front.
     """
     up, front = (axis_name(frame.rotation[row]) if upright else "" for row in (1, 2))
     return Fit(
@@ -207,10 +208,10 @@ def judged_fit(
         vectors=vectors,
         resting=system.verts,
         faces=system.faces,
-        verdict=judged.verdict,
-        reasons=judged.reasons,
-        trust=judged.trust,
-        signs=judged.features,
+        verdict=judgement.verdict,
+        reasons=judgement.reasons,
+        trust=judgement.trust,
+        signs=judgement.features,
         regularity=system.regularity(vectors),
         up=up,
         front=front,
@@ -219,20 +220,20 @@ def judged_fit(
 
 
 def facing_out(faces: Int[Ints, "F 3"], frame: Frame) -> Int[Ints, "F 3"]:
-    """Triangles of the template as they face out in the file of a shape, where a mirrored one is the other way round."""
+    """Triangles of the template, oriented outwards on the shape; reversed if the shape was fitted as a mirror image."""
     return faces[:, ::-1] if frame.mirrored else faces
 
 
 def axis_name(direction: Float[Floats, " 3"]) -> str:
-    """The signed axis nearest to a direction, such as "+y"."""
+    """Name of the signed axis nearest to a direction, such as "+y"."""
     axis = int(np.abs(direction).argmax())
     return ("+" if direction[axis] > 0 else "-") + "xyz"[axis]
 
 
 def dense_shape(model: TrainedModel, fit: Fit) -> Shape:
-    """The dense mesh of a model's template under a fit's node vectors, in the frame and unit of the shape's file.
+    """The dense mesh of a model's template, deformed by a fit, in the frame and unit of the shape's file.
 
-    `OptionError` if the fit is of another template, `TemplateError` if a vertex has too few nodes in reach.
+    Raises `OptionError` if the fit is of another template, and `TemplateError` if a vertex has too few nodes in reach.
     """
     template = model.template
     fit.check_template(template.hash)

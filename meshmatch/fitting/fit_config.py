@@ -1,6 +1,6 @@
-"""How hard a fit looks for the right pose, and how it is refined: the user's choices, apart from what carries them out.
+"""Settings of a fit: how thoroughly it searches, and how it is refined.
 
-Standard library alone, so that a command line can list them without loading more.
+Uses the standard library only, so that the command line can list the settings without importing more.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ Refine = Literal["none", "latent", "nodes"]
 Partial = Literal["auto", "yes", "no"]
 """Whether a shape may be a part of a whole, such as a scan from one side."""
 ON_NODES: tuple[Refine, ...] = ("nodes",)
-"""Refinements that move node vectors themselves: the model's field must have nodes; landmarks hold and fits agree."""
+"""Refinements that move the node vectors themselves. They need a field with nodes; only they use landmarks and agreement."""
 REFINE_NAMES: tuple[Refine, ...] = get_args(Refine)
 PARTIALS: tuple[Partial, ...] = get_args(Partial)
 
-_LEAST = {"seed": 0, "variants": 0, "screening": 0} | dict.fromkeys(
+# Smallest value of each count.
+_MINIMUMS = {"seed": 0, "variants": 0, "screening": 0} | dict.fromkeys(
     ("samples", "coarse_samples", "copies", "hypotheses", "careful", "finalists"), 1
 )
 
@@ -37,15 +38,15 @@ _QUICK_STEPS = 8
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """How the weights of a least-squares fit change from its first step to its last; lengths in units of sqrt(area).
+    """How the weights of a least-squares fit change from the first step to the last; lengths in units of sqrt(area).
 
     Attributes
     ----------
-    steps : how many linear systems are solved
+    steps : number of linear systems that are solved
     prior : weight of the prior in the first step and in the last, geometric in between
-    scale : the same for the scale of the robust weight
-    damping : weight of the present node vectors, for those that nothing else holds
-    momentum : how far each step continues along the last one
+    scale : scale of the robust weight, likewise
+    damping : weight of the current node vectors, for those that nothing else determines
+    momentum : share of the last step that is added to the starting point of the next one
     """
 
     steps: int
@@ -62,10 +63,13 @@ class Schedule:
         """Scale of the robust weight in a step, counted from 0."""
         return geometric_between(*self.scale, self._share(step))
 
-    def grown(
+    def scaled_by(
         self, share: float, *, prior: tuple[float, float] = (1, 1), scale: tuple[float, float] = (1, 1)
     ) -> Schedule:
-        """The same at a ``share`` (0..1) of the way to so many times the first and last ``prior`` and ``scale``."""
+        """Return a schedule with ``prior`` and ``scale`` multiplied by the given (first, last) factors.
+
+        A ``share`` (0..1) below 1 applies that much of the factors, geometrically.
+        """
         priors = zip(self.prior, prior, strict=True)
         scales = zip(self.scale, scale, strict=True)
         first, last = (geometric_between(value, times * value, share) for value, times in priors)
@@ -80,16 +84,16 @@ class Schedule:
 class Pairing:
     """How template vertices and samples are paired; lengths in units of sqrt(area). Set by hand."""
 
-    point_share: float = 0.3  # how much a pair pulls along the surface, against 1 across it
-    # How far a normal that points the other way (2 units) pushes a neighbour away: little, for sheets are apart by then, and
-    # a normal that bends a little more must not drag its point along the surface.
+    point_share: float = 0.3  # weight of a pair's distance along the surface, relative to 1 across it
+    # Weight of unit normals against positions in the nearest-neighbour search. It is small: sheets are apart by then, and a
+    # normal that bends a little more must not drag its point along the surface.
     pair_normals: float = 0.06
-    normal_cosine: float = 0.2  # pairs whose normals differ more do not count
-    back_points: int = 4000  # about how many samples look for their template vertex
-    # How much (0..1) samples pull at all of the template within about ``spread`` instead of at the nearest of it.
+    normal_cosine: float = 0.2  # pairs with a smaller cosine between their normals are ignored
+    back_points: int = 4000  # approximate number of samples that are paired with their nearest template vertex
+    # How much (0..1) samples pull on all of the template within about ``spread``, instead of on the nearest vertex.
     shared: float = 0.0
     spread: float = 0.016
-    landmark_weight: float = 0.05  # of each landmark; all other pairs together have about 1
+    landmark_weight: float = 0.05  # per landmark; the weights of all other pairs sum to about 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,15 +103,15 @@ class NodeRefineConfig(Pairing):
     schedule: Schedule = field(default=Schedule(steps=10, prior=(0.003, 0.0001), scale=(0.1, 0.03)))
 
     def for_noise(self, roughness: float) -> NodeRefineConfig:
-        """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`).
+        """The configuration for a cloud with the given ``roughness`` (0..1, see `Shape.roughness`).
 
-        Noise does not tell across from along, and asks for the mean of many points rather than for the nearest: a wider
-        robust scale, a stiffer template, more points, shared pairs. Tuned on 14 hard pairs of SCAPE with noise of 1 % of
-        the diagonal.
+        Noise has no preferred direction, and calls for the mean of many points rather than the nearest: a wider robust
+        scale, a stiffer template, more points, and shared pairs. Tuned on 14 hard pairs of SCAPE with noise of 1 % of the
+        diagonal.
         """
         return replace(
             self,
-            schedule=self.schedule.grown(roughness, prior=(1, 10), scale=(1, 2)),
+            schedule=self.schedule.scaled_by(roughness, prior=(1, 10), scale=(1, 2)),
             point_share=geometric_between(self.point_share, max(self.point_share, 1.0), roughness),
             back_points=round(geometric_between(self.back_points, 5 * self.back_points, roughness)),
             shared=max(self.shared, roughness),
@@ -115,13 +119,13 @@ class NodeRefineConfig(Pairing):
 
 
 def geometric_between(low: float, high: float, share: float) -> float:
-    """The number at a ``share`` (0..1) of the way from one to another, by ratio."""
+    """Interpolate geometrically from ``low`` (share 0) to ``high`` (share 1)."""
     return low if low <= 0 or low == high else low ** (1 - share) * high**share
 
 
 @dataclass(frozen=True, kw_only=True)
 class LatentRefineConfig:
-    """The paper's test-time weights L1..L3, steps and rate."""
+    """The paper's weights L1 to L3, steps and learning rate for the search over codes."""
 
     steps: int = 2000
     rate: float = 1e-3
@@ -133,49 +137,50 @@ class LatentRefineConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class FitConfig:
-    """How hard a fit searches, and how it is refined.
+    """How thoroughly a fit searches, and how it is refined.
 
     Attributes
     ----------
     refine
-        "none": the network alone; "latent": the paper's search over codes; "nodes": the node vectors are refined.
+        "none": use the network's prediction; "latent": search over codes, as in the paper; "nodes": refine the node
+        vectors.
     seed
-        Of all random numbers.
+        Seed of all random numbers.
     up
         Up axis of the file, such as "y" or "-z"; searched if not given.
     front
         Axis of the file that the shape faces; searched if not given.
     partial
-        Whether the shape may be a part: "auto" tries it where a fit of the whole leaves template without surface, "yes"
-        always, except where a fit of the whole is good and leaves nothing bare, "no" never.
+        Whether the shape may be a part. "auto" tries it where a fit of the whole leaves template without surface; "yes"
+        tries it always, except where a fit of the whole is good and leaves none; "no" never does.
     mirror
-        Whether the shape may be the mirror image of what the model knows, such as the other hand: "auto" fits both and
-        keeps the better, "no" never; by default as the model's card says.
+        Whether the shape may be the mirror image of what the model knows, such as the other hand. "auto" fits both and
+        keeps the better one; "no" does not; by default the model's card decides.
     try_harder
-        Where a fit is poor, search for longer: for a part from more orientations, and for separate
-        parts of the file that are the shape and that the network alone does not recognise.
+        If a fit is poor, search longer: for a part, from more orientations; and for separate parts of the file that are the
+        shape and that the network alone does not recognise.
     again
-        Where something in particular speaks against a fit, make it again with all of the search.
+        If there is a specific reason against a fit, repeat it with the full search.
     samples
-        Points drawn on the surface.
+        Points sampled on the surface.
     coarse_samples
-        How many of them screen orientations.
+        How many of these screen orientations.
     copies
-        Turned copies of the samples that vote on the orientation.
+        Rotated copies of the samples that vote on the orientation.
     hypotheses
-        Voted orientations that are tried, each with its flips.
+        Voted orientations to try, each with its flips.
     careful
         How many of the best of these are fitted again with all samples.
     variants
-        Further interpretations of the best of these: predictions from frames tilted at random.
+        Further candidates for the best of these: predictions from randomly tilted frames.
     tilt
         Typical tilt of these frames, in degrees.
     finalists
-        Interpretations that are refined by a few node steps before the best one gets all steps.
+        Candidates that are refined by a few node steps before the best one gets all steps.
     screening
-        How many steps these few are.
+        Number of these few steps.
     device
-        Where the network is evaluated and codes are searched: "cpu", or one of torch's, such as "cuda" (needs the extra
+        Where the network is evaluated and codes are searched: "cpu", or a device of torch, such as "cuda" (needs the extra
         ``train``).
     nodes
         How node vectors are refined.
@@ -185,7 +190,7 @@ class FitConfig:
     Raises
     ------
     OptionError
-        An unknown refinement, axis or word for ``partial``; up and front along the same axis; a count that is too small or
+        An unknown refinement, axis or value of ``partial``; up and front along the same axis; a count that is too small or
         not an integer; or a value of another type.
 
     Examples
@@ -223,7 +228,7 @@ class FitConfig:
             raise OptionError(f"partial cannot be {self.partial!r}", f"choose one of {', '.join(PARTIALS)}")
         if self.mirror not in (None, *MIRRORINGS):
             raise OptionError(f"mirror cannot be {self.mirror!r}", f"choose one of {', '.join(MIRRORINGS)}")
-        for name, least in _LEAST.items():
+        for name, least in _MINIMUMS.items():
             value = getattr(self, name)
             if not isinstance(value, Integral) or value < least:
                 raise OptionError(f"{name} cannot be {value!r}", f"give an integer of {least} or more, or leave it out")
@@ -240,49 +245,49 @@ class FitConfig:
 
     @classmethod
     def quick(cls, **settings: Any) -> FitConfig:
-        """Less search, for thousands of shapes that are whole and not strange; maps are a little less accurate.
+        """Search less, for thousands of shapes that are complete and ordinary; maps are a little less accurate.
 
         Parameters
         ----------
         settings
-            Attributes that are to be otherwise.
+            Other attributes to set.
 
         Returns
         -------
         FitConfig
-            With fewer orientations, interpretations, samples and steps; where anything speaks against a fit, it is made
-            `again`.
+            With fewer orientations, candidates, samples and steps; a fit with a specific reason against it is repeated
+            (`again`).
 
         Examples
         --------
         >>> matcher = meshmatch.Matcher("human", meshmatch.FitConfig.quick())
         >>> found = matcher.fit_all(["templates/samples/climber.ply", "templates/samples/dancer.ply"], errors="return")
         """
-        usual = NodeRefineConfig()
-        nodes = replace(usual, schedule=replace(usual.schedule, steps=_QUICK_STEPS))
-        less: dict[str, Any] = {"again": True, "nodes": nodes, **_QUICK}
-        return cls(**less | settings)
+        default = NodeRefineConfig()
+        nodes = replace(default, schedule=replace(default.schedule, steps=_QUICK_STEPS))
+        reduced: dict[str, Any] = {"again": True, "nodes": nodes, **_QUICK}
+        return cls(**reduced | settings)
 
     def with_all_of_the_search(self) -> FitConfig:
-        """The same without what `quick` leaves out.
+        """The same configuration with the full search that `quick` reduces.
 
         Returns
         -------
         FitConfig
-            With as many orientations, interpretations, samples and steps as there are by default, or more.
+            With at least the default number of orientations, candidates, samples and steps.
         """
-        usual, own = FitConfig(), self.nodes.schedule
-        most = {name: max(getattr(self, name), getattr(usual, name)) for name in _QUICK}
-        schedule = replace(own, steps=max(own.steps, usual.nodes.schedule.steps))
+        default, own = FitConfig(), self.nodes.schedule
+        most = {name: max(getattr(self, name), getattr(default, name)) for name in _QUICK}
+        schedule = replace(own, steps=max(own.steps, default.nodes.schedule.steps))
         return replace(self, again=False, nodes=replace(self.nodes, schedule=schedule), **most)
 
     @property
     def moves_nodes(self) -> bool:
-        """Whether node vectors themselves are refined: only then landmarks hold and fits agree."""
+        """Whether the node vectors themselves are refined; landmarks and agreement of fits need this."""
         return self.refine in ON_NODES
 
     def for_model(self, model: TrainedModel) -> FitConfig:
-        """The same for a model: where there are no nodes to refine (pointwise), the code is refined instead.
+        """Adapt the configuration to a model: without nodes to refine (pointwise), the code is refined instead.
 
         Parameters
         ----------
@@ -292,12 +297,12 @@ class FitConfig:
         Returns
         -------
         FitConfig
-            Itself where nothing changes.
+            The same object if nothing changes.
         """
         return replace(self, refine="latent") if self.moves_nodes and not model.has_nodes else self
 
     def for_noise(self, roughness: float) -> FitConfig:
-        """The same for a noisy cloud: more samples, refined more stiffly.
+        """Adapt the configuration to a noisy cloud: more samples and a stiffer refinement.
 
         Parameters
         ----------
@@ -307,7 +312,7 @@ class FitConfig:
         Returns
         -------
         FitConfig
-            Itself where nothing changes.
+            The same object if nothing changes.
         """
         if roughness <= 0:
             return self
@@ -315,7 +320,7 @@ class FitConfig:
 
 
 def axis_of(name: str) -> tuple[int, float]:
-    """Number and sign of an axis such as "y", "+y" or "-z"; any other name is an `OptionError`."""
+    """Index and sign of an axis such as "y", "+y" or "-z"; raises `OptionError` for any other name."""
     word = str(name)
     axis = word.lstrip("+-").lower()
     if axis not in ("x", "y", "z") or len(word) > 2:

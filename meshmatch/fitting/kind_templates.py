@@ -1,4 +1,4 @@
-"""Templates of a kind that no model knows: one of its shapes, or their mean, with nodes for fits without a model."""
+"""Templates for shapes without a model: one of the shapes, or their mean, with nodes for fits without a model."""
 
 from __future__ import annotations
 
@@ -18,26 +18,29 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, low_mesh, make_template
 from meshmatch.templates.template import Template
 
-_SHRUNK = 0.93  # area of a mean of shapes that are posed, against theirs: 0.997 of femurs, 0.87 of ants
+# If the plain mean has less than this share of the fits' mean area, poses differ: 0.997 for femurs, 0.87 for ants.
+_MIN_MEAN_AREA = 0.93
 
 
 def template_of(shape: Shape, name: str, config: ViscousConfig) -> Template:
-    """A template of one shape, with nodes anywhere near its surface."""
+    """Make a template of one shape, with nodes anywhere near its surface."""
     nodes = NodeConfig("uniform", config.nodes, config.radius, 0.01, seed=config.seed)
     return make_template(shape, name, nodes, low=low_mesh(shape, config.faces))
 
 
 @derived
 def with_more_nodes(template: Template, config: ViscousConfig) -> Template:
-    """The same vertices, with nodes as fits without a model have them."""
+    """The same template vertices with the nodes that fits without a model use."""
     shape = template.shape
     nodes = NodeConfig("uniform", config.nodes, config.radius, 0.01, seed=config.seed)
     return make_template(shape, template.name, nodes, low=(np.arange(shape.V), np.asarray(shape.faces)))
 
 
 def finest(template: Template, config: ViscousConfig) -> Template:
-    """The same vertices for the last fits of shapes that stand alike. On leaves and other sheets, which glide along
-    themselves, more nodes are worse (0.67 to 1.86 mm)."""
+    """The same template vertices with more nodes, for the final fits of shapes in the same pose.
+
+    Sheets such as leaves keep their nodes: they slide along themselves, and more nodes made them worse (0.67 to 1.86 mm).
+    """
     return template if viscous_system(template).is_sheet else with_more_nodes(template, config.finest())
 
 
@@ -49,16 +52,16 @@ def viscous_system(template: Template) -> NodeSystem:
 
 
 def mean_shape(template: Template, fits: Sequence[Fit]) -> Float[Floats, "V 3"]:
-    """The template's vertices in the middle of its fits: their mean, after rotation and translation to the first mean,
-    twice.
+    """Mean of a template's vertices (V, 3) over several fits.
 
-    Where shapes are posed, that would shrink what turns. The mean is then of what the field does.
+    This is the mean after rigid alignment to the mean so far, in two rounds. If poses differ, that mean would shrink
+    whatever is rotated; the mean of the deformation fields is used instead (`FieldPath`).
     """
     mean = np.asarray(template.shape.verts)
     for _ in range(2):
         mean = np.mean([kabsch(fit.points, mean).to_world(fit.points) for fit in fits], axis=0)
     faces = template.shape.faces
-    if Shape(mean, faces).area > _SHRUNK * np.mean([Shape(fit.points, faces).area for fit in fits]):
+    if Shape(mean, faces).area > _MIN_MEAN_AREA * np.mean([Shape(fit.points, faces).area for fit in fits]):
         return np.asarray(mean)
     path = FieldPath(viscous_system(template), [fit.vectors for fit in fits], template.core)
     return viscous_system(template).moved(path(np.full(len(fits), 1 / len(fits))))

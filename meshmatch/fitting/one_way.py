@@ -1,7 +1,7 @@
-"""One shape fitted to another without a model: guesses of where its vertices belong, fitted coarse to fine.
+"""Fit one shape to another without a model, in one direction, coarse to fine.
 
-Proposals (`meshmatch.fitting.search.proposals`) are fitted on few nodes, all for a few steps, then those that look better,
-and the best of these on more nodes. Their energies say which is right.
+Proposals of where the source's vertices belong (`meshmatch.fitting.search.proposals`) are each fitted with few nodes for a
+few steps; the better ones for more steps; and the best of these with more nodes. The energy of the fits decides.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fitting.fit_config import NodeRefineConfig, Schedule
 from meshmatch.fitting.judge.direct import DirectFeatures
 from meshmatch.fitting.search.discontinuities import Pairs, neighbours
-from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh
+from meshmatch.fitting.search.intrinsic import DecimatedMesh, Intrinsic
 from meshmatch.fitting.search.proposals import (
     Proposal,
     differ,
@@ -39,13 +39,14 @@ from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_calls, parallel_map
 
-_HEAVY, _LIGHT = 60_000, 24_000  # triangles: a mesh with more is thinned to so many at once, which takes long
+# A mesh with more triangles than the first number is decimated once to the second, as decimation of large meshes is slow.
+_HEAVY, _LIGHT = 60_000, 24_000
 KnownPairs = tuple[Float[Floats, "N 3"], Float[Floats, "N 3"]]
-"""Positions on the source and on the target that belong together."""
+"""Corresponding positions on the source and on the target."""
 BothWays = Literal["no", "in doubt", "always"]
-_KNOWN_WEIGHT = 0.05  # of each known pair; all other pairs together have about 1
-_BEGUN = "features.energy_begun"
-_NEAR = 3  # vertices of the coarse mesh by which one of the fine mesh moves
+_KNOWN_WEIGHT = 0.05  # per known pair; the weights of all other pairs sum to about 1
+_EARLY_ENERGY = "features.early_energy"
+_NEIGHBOURS = 3  # number of vertices of the coarse mesh from which a vertex of the fine mesh is interpolated
 
 
 def _pairs(
@@ -67,42 +68,44 @@ _FINE_NODES = SurfaceNodes(K=320, radius=0.13)
 @dataclass(frozen=True, kw_only=True)
 class DirectConfig:
     """How two shapes are matched without a model; lengths in units of sqrt(area). Set by hand on 30 pairs of 15 kinds;
-    ``third``, ``along`` and ``gliding`` on these and six pairs of FAUST.
+    ``third``, ``slide`` and ``n_slid`` on these and six pairs of FAUST.
 
     Attributes
     ----------
-    coarse, fine : triangles of the thinned meshes that are fitted first and last
-    samples, few, fewer : points of the target: for the last fits, for the better coarse ones, and for all
-    coarse_nodes, fine_nodes : nodes of both meshes
-    first, second, third, last : least squares of all proposals, of the better ones, of the best on the fine mesh, of which
-        the energies decide, and of the one that is taken, which may stretch more
-    along : least squares that go on from the third of those with the lowest energies, and are kept where they lower it:
-        samples hold vertices across the surface only, so that a limb glides along itself until its end is at an end
-    better, best, gliding, returned : how many proposals are fitted a second, and a third time, and glide, of one way and of
-        both, and how many of each direction are continued in the other one
-    unlike : share of vertices by which these differ at least
-    both_ways : when the target is fitted to the source as well; "in doubt" is where one way alone is not likely to be right
-    from_source : whether the source is to be the template both ways too, and not the one that fits the other better
-    seed : of all random numbers
+    coarse, fine : triangles of the coarse and of the fine mesh
+    samples, few, fewer : samples of the target for the fine fits, for the better coarse fits, and for the first coarse fits
+    coarse_nodes, fine_nodes : nodes on the two meshes
+    first, second : least squares for all proposals, and for the better ones, on the coarse mesh
+    third : for the best ones, on the fine mesh; their energies decide
+    along : for the best of these, if it lowers their energy: samples hold vertices across the surface only, so that a limb
+        slides along itself until the ends meet
+    last : for the chosen fit, which may then stretch more
+    better, best, gliding : how many proposals get the second and third least squares, and ``slide``, in one direction or
+        both
+    returned : how many fits of each direction are continued in the other one
+    min_difference : share of vertices by which these differ at least
+    both_ways : when to fit the target to the source too; "in doubt" is if one direction is probably wrong
+    from_source : always use the source as the template, not whichever shape fits the other better
+    seed : seed of all random numbers
     """
 
     coarse: int = 2400
     fine: int = 6000
     samples: int = 8000
-    few: int = 2500
-    fewer: int = 1200
+    second_samples: int = 2500
+    first_samples: int = 1200
     coarse_nodes: SurfaceNodes = _COARSE_NODES
     fine_nodes: SurfaceNodes = _FINE_NODES
     first: NodeRefineConfig = field(default_factory=lambda: _pairs(4, (3e-3, 1e-3), (0.12, 0.07), 1200))
     second: NodeRefineConfig = field(default_factory=lambda: _pairs(8, (1e-3, 1e-4), (0.1, 0.03), 1500))
     third: NodeRefineConfig = field(default_factory=lambda: _pairs(8, (3e-4, 1e-4), (0.06, 0.02), 4000, 0.1, 0.6))
-    along: NodeRefineConfig = field(default_factory=lambda: _pairs(24, (3e-4, 1e-4), (0.06, 0.02), 4000, 0.02, 0.8))
+    slide: NodeRefineConfig = field(default_factory=lambda: _pairs(24, (3e-4, 1e-4), (0.06, 0.02), 4000, 0.02, 0.8))
     last: NodeRefineConfig = field(default_factory=lambda: _pairs(6, (1e-4, 3e-5), (0.03, 0.02), 4000))
-    better: int = 16
-    best: int = 6
-    gliding: int = 2
-    returned: int = 3
-    unlike: float = 0.03
+    n_second: int = 16
+    n_third: int = 6
+    n_slid: int = 2
+    n_returned: int = 3
+    min_difference: float = 0.03
     both_ways: BothWays = "in doubt"
     from_source: bool = False
     seed: int = 0
@@ -110,15 +113,15 @@ class DirectConfig:
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """A thinned shape, its least squares, and the prior by which its parts may stretch."""
+    """A decimated shape at one resolution, its least-squares system, and the prior under which its parts may stretch."""
 
-    mesh: ThinMesh
+    mesh: DecimatedMesh
     system: NodeSystem
     viscous: ViscousGradient
     known: tuple[LandmarkTerm, ...]
 
     @classmethod
-    def of(cls, mesh: ThinMesh, nodes: SurfaceNodes, known: KnownPairs | None, seed: int) -> Level:
+    def of(cls, mesh: DecimatedMesh, nodes: SurfaceNodes, known: KnownPairs | None, seed: int) -> Level:
         terms: tuple[LandmarkTerm, ...] = ()
         if known is not None:
             nearest = np.asarray(cKDTree(mesh.verts).query(known[0])[1])
@@ -126,36 +129,36 @@ class Level:
         return cls(mesh, *nodes.system(mesh.shape, mesh.graph, seed), terms)
 
     def features(
-        self, onto: ThinMesh, samples: OrientedPoints, vectors: Float[Floats, "K 3"], pairs: Pairs | None = None
+        self, onto: DecimatedMesh, samples: OrientedPoints, vectors: Float[Floats, "K 3"], pairs: Pairs | None = None
     ) -> DirectFeatures:
-        """Of node vectors; how far known pairs are missed counts as a residual."""
+        """Features of node vectors; the mean distance of known pairs is added to the residual."""
         found = DirectFeatures.of(self.system, samples, vectors, pairs)
         found = replace(found, likeness=self.mesh.likeness(onto, self.system.surface(vectors)))
         for term in self.known:
             at, goal = term.landmarks
-            off = np.linalg.norm(self.system.moved(vectors)[at] - goal, axis=1).mean()
-            found = replace(found, residual=found.residual + float(off))
+            distance = np.linalg.norm(self.system.moved(vectors)[at] - goal, axis=1).mean()
+            found = replace(found, residual=found.residual + float(distance))
         return found
 
     @property
     def rigid(self) -> Prior:
-        """As rigid as possible, about the shape as it is."""
+        """As-rigid-as-possible prior about the undeformed shape."""
         return RotatedReference(np.tile(np.eye(3), (len(self.system.gradient_points), 1, 1)))
 
-    def limbs_onto(self, at: Int[Ints, " N"], goals: Float[Floats, "N 3"]) -> Float[Floats, "K 3"]:
-        """Node vectors that bring some vertices to their goals, from the rigid motion that does it best."""
+    def vectors_reaching(self, at: Int[Ints, " N"], goals: Float[Floats, "N 3"]) -> Float[Floats, "K 3"]:
+        """Node vectors that move some vertices to their goals, starting from the best rigid motion."""
         start = self.system.vectors_to(kabsch(self.mesh.verts[at], goals).to_world(self.mesh.verts))
         terms = [LandmarkTerm((at, goals), 1 / len(at)), *self.known]
-        return minimise(Problem(system=self.system, terms=terms, schedule=_LIMBS_ONTO), self.rigid, start)
+        return minimise(Problem(system=self.system, terms=terms, schedule=_REACHING_SCHEDULE), self.rigid, start)
 
-    def begun(self, proposal: Proposal) -> Float[Floats, "K 3"]:
-        """Near a proposal; limbs may be longer or shorter than its own."""
+    def initial_vectors(self, proposal: Proposal) -> Float[Floats, "K 3"]:
+        """Node vectors close to a proposal; the lengths of limbs may change."""
         if proposal.at is not None:
-            return self.limbs_onto(proposal.at, proposal.points)
+            return self.vectors_reaching(proposal.at, proposal.points)
         if proposal.kind in ("rigid", "affine"):
             return self.system.vectors_to(proposal.points)
         terms: list[Term] = [GoalTerm(proposal.points), *self.known]
-        problem = Problem(system=self.system, terms=terms, schedule=_ONTO)
+        problem = Problem(system=self.system, terms=terms, schedule=_GOAL_SCHEDULE)
         return minimise(problem, self.viscous, np.zeros((self.system.K, 3)))
 
     def refined(
@@ -165,40 +168,40 @@ class Level:
         config: NodeRefineConfig,
         prior: Prior | None = None,
     ) -> Float[Floats, "K 3"]:
-        """Node vectors after pairing with the samples of the target."""
+        """Node vectors after least squares against samples of the target."""
         facing = samples.facing(self.system.surface(vectors))
         terms: list[Term] = [PairTerm(facing, config), *self.known]
         problem = Problem(system=self.system, terms=terms, schedule=config.schedule)
         return minimise(problem, prior or self.rigid, vectors)
 
-    def tried(
+    def fit_proposal(
         self,
-        onto: ThinMesh,
+        onto: DecimatedMesh,
         samples: OrientedPoints,
         proposal: Proposal,
         vectors: Float[Floats, "K 3"],
         how: NodeRefineConfig,
         pairs: Pairs | None = None,
-    ) -> Tried:
-        """A proposal, refined from node vectors, and how well that fits."""
+    ) -> DirectFit:
+        """Refine a proposal from the given node vectors and evaluate the fit."""
         vectors = self.refined(samples, vectors, how)
         features = self.features(onto, samples, vectors, pairs)
-        return Tried(proposal, vectors, self.system.moved(vectors), features)
+        return DirectFit(proposal, vectors, self.system.moved(vectors), features)
 
 
-_ONTO = Schedule(steps=6, prior=(3e-2, 1e-3), scale=(1.0, 0.3), damping=1e-6)
-_LIMBS_ONTO = Schedule(steps=8, prior=(3e-2, 3e-3), damping=1e-6)
+_GOAL_SCHEDULE = Schedule(steps=6, prior=(3e-2, 1e-3), scale=(1.0, 0.3), damping=1e-6)
+_REACHING_SCHEDULE = Schedule(steps=8, prior=(3e-2, 3e-3), damping=1e-6)
 
 
 @dataclass(frozen=True, eq=False)
-class Tried:
-    """Node vectors of one proposal, where they take the vertices, and how well; whether they went on along the surface."""
+class DirectFit:
+    """A fitted proposal: node vectors, deformed vertices and features; ``slid`` after the fit along the surface."""
 
     proposal: Proposal
     vectors: Float[Floats, "K 3"]
     moved: Float[Floats, "V 3"]
     features: DirectFeatures
-    glided: bool = False
+    slid: bool = False
 
     @property
     def energy(self) -> float:
@@ -206,29 +209,29 @@ class Tried:
 
 
 @dataclass(frozen=True, eq=False)
-class Side:
-    """One of two shapes; what it needs to be fitted to the other one, and the other one to it.
+class ShapeData:
+    """One of two shapes, with what is needed to fit it to the other one and the other one to it.
 
-    ``frame`` is that of its file; all else is in units of sqrt(area). ``light`` is the shape, or one with fewer triangles
-    from which those that are fitted are thinned, ``thin`` the coarse one, and ``known`` are positions (N, 3) on it, and
-    (N, 3) on the other one.
+    ``frame`` is that of its file; everything else is in units of sqrt(area). ``base_mesh`` is the shape, decimated if it is
+    large, from which coarse and fine meshes are made; ``coarse_mesh`` is the coarse mesh; ``known`` are corresponding positions
+    (N, 3) on this shape and on the other one.
     """
 
     original: Shape
     frame: Frame
     shape: Shape
-    light: Shape
-    thin: ThinMesh
+    base_mesh: Shape
+    coarse_mesh: DecimatedMesh
     known: KnownPairs | None
     config: DirectConfig
 
     @cached_property
     def coarse(self) -> Level:
-        return Level.of(self.thin, self.config.coarse_nodes, self.known, self.config.seed)
+        return Level.of(self.coarse_mesh, self.config.coarse_nodes, self.known, self.config.seed)
 
     @cached_property
-    def fine_mesh(self) -> ThinMesh:
-        return ThinMesh.of(self.light, self.config.fine)
+    def fine_mesh(self) -> DecimatedMesh:
+        return DecimatedMesh.of(self.base_mesh, self.config.fine)
 
     @cached_property
     def fine(self) -> Level:
@@ -236,7 +239,7 @@ class Side:
 
     @cached_property
     def intrinsic(self) -> Intrinsic:
-        return Intrinsic(self.thin)
+        return Intrinsic(self.coarse_mesh)
 
     @cached_property
     def samples(self) -> OrientedPoints:
@@ -247,119 +250,139 @@ class Side:
         return neighbours(self.samples)
 
 
-def lightened(shape: Shape) -> Shape:
-    """The shape, or one that is thinned faster."""
-    return ThinMesh.of(shape, _LIGHT).shape if shape.F > _HEAVY else shape
+def decimate_if_large(shape: Shape) -> Shape:
+    """The shape, decimated once if it is large."""
+    return DecimatedMesh.of(shape, _LIGHT).shape if shape.F > _HEAVY else shape
 
 
-def finished(
-    own: Side, onto: Side, begun: Sequence[tuple[Proposal, Float[Floats, "V 3"]]], report: Progress
-) -> list[Tried]:
-    """The fine mesh of one shape fitted to another from where its vertices (V, 3) may belong, for each proposal."""
+def fit_all_fine(
+    own: ShapeData, onto: ShapeData, proposals: Sequence[tuple[Proposal, Float[Floats, "V 3"]]], report: Progress
+) -> list[DirectFit]:
+    """Fine fits of one shape to another, from proposals with the positions (V, 3) where its vertices may belong."""
     report(0.0)
-    _ = own.fine, onto.neighbours, onto.fine_mesh.relief, onto.fine_mesh.tree  # once, and not by each thread
-    found = parallel_map(lambda each: finish(own, onto, *each), begun)
+    _ = own.fine, onto.neighbours, onto.fine_mesh.relief, onto.fine_mesh.tree  # compute once, before threads start
+    found = parallel_map(lambda each: fit_fine(own, onto, *each), proposals)
     report(1.0)
     return found
 
 
-def finish(own: Side, onto: Side, proposal: Proposal, goals: Float[Floats, "V 3"]) -> Tried:
-    """One of these fits."""
-    return _fine(own, onto, proposal, own.fine.system.vectors_to(goals), own.config.third)
+def fit_fine(own: ShapeData, onto: ShapeData, proposal: Proposal, goals: Float[Floats, "V 3"]) -> DirectFit:
+    """One fine fit."""
+    return _fit_on_fine_mesh(own, onto, proposal, own.fine.system.vectors_to(goals), own.config.third)
 
 
-def glided(own: Side, onto: Side, tried: Sequence[Tried], report: Progress) -> list[Tried]:
-    """Fine fits that go on along the surface, if they have not; each as it was where that does not lower its energy."""
-    report(0.0)
-    found = parallel_map(lambda each: glide(own, onto, each), tried)
-    report(1.0)
-    return found
-
-
-def glide(own: Side, onto: Side, tried: Tried) -> Tried:
-    """One of these fits."""
-    if tried.glided:
-        return tried
-    found = _fine(own, onto, tried.proposal, tried.vectors, own.config.along)
-    return replace(min(tried, found, key=attrgetter("energy")), glided=True)
-
-
-def _fine(own: Side, onto: Side, proposal: Proposal, vectors: Float[Floats, "K 3"], how: NodeRefineConfig) -> Tried:
-    return own.fine.tried(onto.fine_mesh, onto.samples, proposal, vectors, how, onto.neighbours)
-
-
-def fitted(
-    own: Side, onto: Side, guess: KnownPairs | None, report: Progress, meanwhile: Sequence[Callable[[], object]] = ()
-) -> list[Tried]:
-    """The best fits of one shape to another, best first; ``guess`` is one more proposal. What is to be done ``meanwhile`` is
-    called where a thread would wait."""
-    config, rested = own.config, own.thin.verts
-    guesses = [] if guess is None else [Proposal("guess", carried(rested, *guess))]
-    begun = _begun(own, onto, guesses, report.named("guesses without a model").between(0.0, 0.6), meanwhile)
-    tried = _better(own, onto, begun, report.named("fits of the better guesses").between(0.6, 0.8))
-    verts = own.fine.mesh.verts
-    goals = [(each.proposal, verts + carried(verts, rested, each.moved - rested)) for each in tried]
-    for each in guesses:  # its energy is asked for
-        if all(other.proposal is not each for other in tried):
-            goals.append((each, verts + carried(verts, rested, each.points - rested)))
-    report = report.named("fits of the best guesses").between(0.8, 1.0)
-    found = finished(own, onto, goals, report.between(0.0, 0.6))
-    best = distinct(found, config.gliding, config.unlike)
-    rest = [each for each in found if each not in best]
-    return sorted([*glided(own, onto, best, report.between(0.6, 1.0)), *rest], key=attrgetter("energy"))
-
-
-def _begun(
-    own: Side, onto: Side, guesses: list[Proposal], report: Progress, meanwhile: Sequence[Callable[[], object]]
-) -> list[Tried]:
-    """Guesses of all kinds, fitted on few nodes for a few steps.
-
-    To know lengths along the surface takes long, and keeps Python's lock. So the rigid guesses and their fits, what later
-    fits need, and what else is to be done are done beside that.
+def slide_all(own: ShapeData, onto: ShapeData, tried: Sequence[DirectFit], report: Progress) -> list[DirectFit]:
+    """Continue fine fits along the surface, unless that was done; each is kept as it was if its energy does not
+    decrease.
     """
-    level, samples = own.coarse, onto.samples.first(own.config.fewer)
-    _ = onto.thin.relief, onto.thin.tree, own.thin.normals  # once, and not by each thread
+    report(0.0)
+    found = parallel_map(lambda each: slide(own, onto, each), tried)
+    report(1.0)
+    return found
 
-    def tried(proposal: Proposal) -> Tried:
-        return level.tried(onto.thin, samples, proposal, level.begun(proposal), own.config.first)
 
-    def bent() -> list[Proposal]:
+def slide(own: ShapeData, onto: ShapeData, tried: DirectFit) -> DirectFit:
+    """Continue one fine fit along the surface."""
+    if tried.slid:
+        return tried
+    found = _fit_on_fine_mesh(own, onto, tried.proposal, tried.vectors, own.config.slide)
+    return replace(min(tried, found, key=attrgetter("energy")), slid=True)
+
+
+def _fit_on_fine_mesh(
+    own: ShapeData, onto: ShapeData, proposal: Proposal, vectors: Float[Floats, "K 3"], how: NodeRefineConfig
+) -> DirectFit:
+    return own.fine.fit_proposal(onto.fine_mesh, onto.samples, proposal, vectors, how, onto.neighbours)
+
+
+def fit_one_way(
+    own: ShapeData,
+    onto: ShapeData,
+    guess: KnownPairs | None,
+    report: Progress,
+    meanwhile: Sequence[Callable[[], object]] = (),
+) -> list[DirectFit]:
+    """The best fits of one shape to another, best first.
+
+    ``guess`` is one more proposal. The calls in ``meanwhile`` run where a thread would otherwise wait.
+    """
+    config, coarse_verts = own.config, own.coarse_mesh.verts
+    guesses = [] if guess is None else [Proposal("guess", interpolate(coarse_verts, *guess))]
+    first_fits = _fit_all_proposals(
+        own, onto, guesses, report.named("guesses without a model").between(0.0, 0.6), meanwhile
+    )
+    better_fits = _refit_better(own, onto, first_fits, report.named("fits of the better guesses").between(0.6, 0.8))
+    verts = own.fine.mesh.verts
+    goals = [
+        (each.proposal, verts + interpolate(verts, coarse_verts, each.moved - coarse_verts)) for each in better_fits
+    ]
+    for each in guesses:  # always fitted, as its energy is reported
+        if all(other.proposal is not each for other in better_fits):
+            goals.append((each, verts + interpolate(verts, coarse_verts, each.points - coarse_verts)))
+    report = report.named("fits of the best guesses").between(0.8, 1.0)
+    found = fit_all_fine(own, onto, goals, report.between(0.0, 0.6))
+    best = distinct(found, config.n_slid, config.min_difference)
+    rest = [each for each in found if each not in best]
+    return sorted([*slide_all(own, onto, best, report.between(0.6, 1.0)), *rest], key=attrgetter("energy"))
+
+
+def _fit_all_proposals(
+    own: ShapeData,
+    onto: ShapeData,
+    guesses: list[Proposal],
+    report: Progress,
+    meanwhile: Sequence[Callable[[], object]],
+) -> list[DirectFit]:
+    """Proposals of all kinds, fitted on the coarse mesh for a few steps.
+
+    Distances along the surface are slow and hold Python's lock. The rigid proposals with their fits, whatever later fits
+    need, and ``meanwhile`` are therefore computed in parallel.
+    """
+    level, samples = own.coarse, onto.samples.first(own.config.first_samples)
+    _ = onto.coarse_mesh.relief, onto.coarse_mesh.tree, own.coarse_mesh.normals  # compute once, before threads start
+
+    def fit(proposal: Proposal) -> DirectFit:
+        return level.fit_proposal(
+            onto.coarse_mesh, samples, proposal, level.initial_vectors(proposal), own.config.first
+        )
+
+    def intrinsic_proposals() -> list[Proposal]:
         pair = own.intrinsic, onto.intrinsic
         return [*extremity_proposals(*pair), *spectral_proposals(*pair)]
 
-    def rigid() -> list[Tried]:
-        return [tried(each) for each in rigid_proposals(own.thin, onto.thin)]
+    def rigid_fits() -> list[DirectFit]:
+        return [fit(each) for each in rigid_proposals(own.coarse_mesh, onto.coarse_mesh)]
 
     def next_level() -> None:
         _ = onto.neighbours, onto.fine_mesh.relief, onto.fine_mesh.tree
 
     report(0.0)
-    others, found, *_ = parallel_calls((bent, rigid, lambda: own.fine, *meanwhile, next_level))
+    proposals, found, *_ = parallel_calls((intrinsic_proposals, rigid_fits, lambda: own.fine, *meanwhile, next_level))
     report(0.6)
-    found = [*found, *parallel_map(tried, [*others, *guesses])]
+    found = [*found, *parallel_map(fit, [*proposals, *guesses])]
     report(1.0)
     return found
 
 
-def _better(own: Side, onto: Side, begun: list[Tried], report: Progress) -> list[Tried]:
-    """Those that look better, fitted on few nodes for more steps; the best, no two alike."""
-    config, samples = own.config, onto.samples.first(own.config.few)
+def _refit_better(own: ShapeData, onto: ShapeData, first_fits: list[DirectFit], report: Progress) -> list[DirectFit]:
+    """The better proposals, fitted on the coarse mesh for more steps; the best of these that differ from each other."""
+    config, samples = own.config, onto.samples.first(own.config.second_samples)
     pairs = neighbours(samples)
 
-    def tried(each: Tried) -> Tried:
-        return own.coarse.tried(onto.thin, samples, each.proposal, each.vectors, config.second, pairs)
+    def refit(each: DirectFit) -> DirectFit:
+        return own.coarse.fit_proposal(onto.coarse_mesh, samples, each.proposal, each.vectors, config.second, pairs)
 
     report(0.0)
-    found = parallel_map(tried, distinct(begun, config.better, config.unlike, _BEGUN))
+    found = parallel_map(refit, distinct(first_fits, config.n_second, config.min_difference, _EARLY_ENERGY))
     report(1.0)
-    return distinct(found, config.best, config.unlike, _BEGUN)
+    return distinct(found, config.n_third, config.min_difference, _EARLY_ENERGY)
 
 
-def carried(
+def interpolate(
     points: Float[Floats, "V D"], at: Float[Floats, "T D"], values: Float[Floats, "T 3"]
 ) -> Float[Floats, "V 3"]:
-    """Values at some points carried to others, from the nearest ones."""
-    distance, near = cKDTree(at).query(points, _NEAR)
+    """Interpolate values (T, 3) at some points to other points, by inverse distance weights of the nearest few."""
+    distance, near = cKDTree(at).query(points, _NEIGHBOURS)
     weights = 1 / (np.asarray(distance) + 1e-3)
     return np.asarray((weights[..., None] * values[near]).sum(1) / weights.sum(1, keepdims=True))
 
@@ -375,10 +398,12 @@ class _Fitted(Protocol):
 F = TypeVar("F", bound=_Fitted)
 
 
-def distinct(tried: Sequence[F], count: int, unlike: float, by: str = "energy") -> list[F]:
-    """The best of the fits, no two of which are alike."""
+def distinct(tried: Sequence[F], count: int, min_difference: float, by: str = "energy") -> list[F]:
+    """The best ``count`` fits, by the attribute ``by``, that differ from each other at more than ``min_difference`` of the
+    vertices.
+    """
     kept: list[F] = []
     for each in sorted(tried, key=attrgetter(by)):
-        if len(kept) < count and all(differ(each.moved, other.moved) > unlike for other in kept):
+        if len(kept) < count and all(differ(each.moved, other.moved) > min_difference for other in kept):
             kept.append(each)
     return kept

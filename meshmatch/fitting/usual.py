@@ -1,8 +1,9 @@
-"""How far a fit is to be trusted, by what is usual of its kind.
+"""Trust in fits without known correspondence, by comparison with other fits of the same kind.
 
-Where no model learned what corresponds, a fit that lies close may be wrong. The template is then stretched as no other
-shape of its kind stretches it: upside down, over the edge of a cut, or onto something else. What is usual, the others of its
-collection say, or those that a model learned from (its card); it costs nothing, and is in no unit.
+If no model learned correspondence, a fit that lies close to the shape may still be wrong: upside down, across the edge of a
+cut, or onto something else. But then the template is stretched as on no other shape of its kind. Typical values come from
+the other fits of the collection, or from the shapes that a model was trained on (its card). The comparison costs nothing
+and has no units.
 """
 
 from __future__ import annotations
@@ -18,29 +19,31 @@ from meshmatch.fitting.judge.verdict import LIMITS
 from meshmatch.models.card import ModelCard
 
 USUAL = "usual"
-"""Among the metrics of a card: what `Usual` has of fits of the shapes that the model learned from."""
+"""Key in a card's metrics for the medians over fits of the training shapes, see `Usual`."""
 FEWEST = 5
-"""Fits, of which less say nothing about what is usual."""
+"""Minimum number of fits from which typical values are computed."""
 FAIR = 0.5
-"""Trust from which a fit is fair, as of two shapes without a model."""
-_GOOD = 0.9
-_ALONE = ("unsupervised", "doubt", "residual", "outlier")  # reasons of fits that no others, or fewer, are known of
-_WORSE = 0.1  # what is so much worse than its mirror image may be wrong, see `Fit.side`
-_STANDS_OUT = 1.5  # so many times what is usual is told
-# Shapes have sides where so many of them have one that is clear, see `Fit.side`: 0.19 and more of molars, 0.17 of cut
-# femurs; of birds, which have none, up to 0.01, and of leaves half have less.
-_CLEAR, _MOST = 0.15, 0.8
+"""Least trust of a fair fit, as for two shapes without a model."""
+_GOOD_TRUST = 0.9
+_SUPERSEDED_REASONS = ("unsupervised", "doubt", "residual", "outlier")  # dropped, as the comparison judges these anew
+_DOUBTFUL_SIDE = 0.1  # a fit is doubtful if its mirror image fits better by this much, see `Fit.side`
+_OUTLIER_RATIO = 1.5  # multiple of the typical value from which on a fit is reported as an outlier
+# A kind has sides if at least a share of `_MIN_CLEAR_SHARE` of its shapes has |`Fit.side`| above `_CLEAR_SIDE`. Molars have
+# 0.19 and more, cut femurs 0.17. Birds, which have no sides, have up to 0.01, and half of the leaves less than the limit.
+_CLEAR_SIDE, _MIN_CLEAR_SHARE = 0.15, 0.8
 
 
 def have_sides(leads: Sequence[float]) -> bool:
-    """Whether shapes of a kind have sides, as bones have: nearly all are clearly unlike their mirror images. A lead is the
-    `Fit.side` of one of them.
+    """Return whether shapes of a kind have a left and a right form, as bones do: nearly all clearly differ from their
+    mirror images.
+
+    ``leads`` are the `Fit.side` of the shapes.
     """
-    return len(leads) >= FEWEST and bool((np.abs(leads) > _CLEAR).mean() >= _MOST)
+    return len(leads) >= FEWEST and bool((np.abs(leads) > _CLEAR_SIDE).mean() >= _MIN_CLEAR_SHARE)
 
 
 def believed(fits: Sequence[Fit]) -> list[Fit]:
-    """Those of fits of one kind, without a model, that are not poor, alone and among the others."""
+    """Filter fits of one kind without a model: keep those that are not poor, neither alone nor compared with the others."""
     usual = Usual.of([(fit.signs.stretch, fit.residual) for fit in fits if fit.signs is not None])
     if usual is not None:
         fits = [usual.judged(fit, fit.trust, fit.signs.stretch, fit.residual) for fit in fits if fit.signs is not None]
@@ -49,8 +52,11 @@ def believed(fits: Sequence[Fit]) -> list[Fit]:
 
 @dataclass(frozen=True)
 class Weights:
-    """The logit of a right fit: ``offset``, less what the logarithms of stretch and residual over what is usual cost, and of
-    the share of folded vertices over what a good fit may have."""
+    """Weights of the logit of a right fit.
+
+    From ``offset`` are subtracted, weighted, the logarithms of stretch and residual relative to typical values, and the
+    logarithm of the share of folded vertices relative to what a good fit may have; each only if it is positive.
+    """
 
     offset: float
     stretch: float
@@ -59,15 +65,17 @@ class Weights:
 
 
 WEIGHTS = Weights(offset=3.1, stretch=2.4, residual=3.0)
-"""Set by hand, between right and wrong fits of three collections of femurs, some cut, warped, or other shapes in their
-place: right ones were stretched up to 2.5 times as much as usual, wrong ones 4.9 times and more. Folds: 12 to 23 % of the
-vertices of busts that were fitted wrongly, of which all were stretched alike; up to 5 % of fish and chairs."""
+"""Set by hand, to separate right from wrong fits of three collections of femurs, some of them cut, warped or replaced by
+other shapes: right ones were stretched up to 2.5 times as much as is typical, wrong ones at least 4.9 times. Folds: 12 to
+23 % of the vertices of wrongly fitted busts, all of which were stretched alike; up to 5 % of fish and chairs."""
 
 
 @dataclass(frozen=True)
 class Usual:
-    """Medians of fits: how much the template is stretched, see `FitFeatures`, and how far it stays from the shapes (units of
-    sqrt(area)); and of ``whom`` they are.
+    """Typical values of fits of one kind.
+
+    ``stretch`` is the median stretch of the template (see `FitFeatures`), ``residual`` the median distance to the shapes
+    (units of sqrt(area)), and ``whom`` names the fits in messages.
     """
 
     stretch: float
@@ -77,7 +85,7 @@ class Usual:
 
     @classmethod
     def of_card(cls, card: ModelCard) -> Usual | None:
-        """Of the shapes that a model learned from, where its card says it."""
+        """Values for the shapes that a model was trained on; None if its card does not have them."""
         known = card.metrics.get(USUAL, {})
         stretch, residual = (known.get(name) for name in ("stretch", "residual"))
         if not all(isinstance(each, float | int) and 0 < each < np.inf for each in (stretch, residual)):
@@ -85,46 +93,46 @@ class Usual:
         return cls(float(stretch), float(residual), whom=f"what {card.name} learned from")
 
     @classmethod
-    def of(cls, signs: Sequence[tuple[float, float]], weights: Weights = WEIGHTS) -> Usual | None:
-        """Of the stretches and residuals of fits; None of few."""
-        if len(signs) < FEWEST:
+    def of(cls, features: Sequence[tuple[float, float]], weights: Weights = WEIGHTS) -> Usual | None:
+        """Medians over (stretch, residual) of fits; None if there are too few."""
+        if len(features) < FEWEST:
             return None
-        stretch, residual = np.median(signs, axis=0).tolist()
+        stretch, residual = np.median(features, axis=0).tolist()
         return cls(stretch, residual, weights)
 
     def trust(self, likely: float, stretch: float, residual: float, inverted: float = 0.0) -> float:
-        """Probability (0..1) that a fit is right, which alone is so ``likely``."""
+        """Probability (0..1) that a fit is right, given its probability ``likely`` without this comparison."""
         own, (further, apart) = self.weights, self.signs(stretch, residual)
         folded = float(np.log(np.fmax(inverted / LIMITS.folded, 1.0)))
         against = own.stretch * further + own.residual * apart + own.folded * folded - own.offset
         return float(likely / (1 + np.exp(against)))
 
     def signs(self, stretch: float, residual: float) -> tuple[float, float]:
-        """What is weighed: logarithms of how many times as much as usual both are, if it is more."""
+        """Logarithms of stretch and residual relative to the typical values; 0 if they are not larger."""
         further, apart = np.log(np.maximum([stretch / self.stretch, residual / self.residual], 1.0)).tolist()
         return further, apart
 
     def stands_out(self, stretch: float) -> bool:
-        """Whether the template had to stretch much more than usual."""
-        return stretch > _STANDS_OUT * self.stretch
+        """Return whether the template is stretched much more than is typical."""
+        return stretch > _OUTLIER_RATIO * self.stretch
 
     def judged(self, fit: Fit, likely: float, stretch: float, residual: float) -> Fit:
-        """A fit with verdict, reasons and trust beside what is usual."""
+        """A fit with verdict, reasons and trust from the comparison with typical values."""
         trust = self.trust(likely, stretch, residual, 0.0 if fit.regularity is None else fit.regularity.inverted)
-        reasons = [reason for reason in fit.reasons if reason.code not in _ALONE]
+        reasons = [reason for reason in fit.reasons if reason.code not in _SUPERSEDED_REASONS]
         if self.stands_out(stretch):
             much = f"stretched or compressed {np.exp(stretch):.1f}-fold, {np.exp(self.stretch):.1f}-fold is usual"
-            reasons = [reason for reason in reasons if reason.code != "crushed"]  # said already
+            reasons = [reason for reason in reasons if reason.code != "crushed"]  # the outlier reason replaces it
             reasons.insert(0, Reason("outlier", f"stands out of {self.whom}: the template had to be {much}"))
-        elif residual > _STANDS_OUT * self.residual:
+        elif residual > _OUTLIER_RATIO * self.residual:
             apart = f"{100 * residual:.1f} % of sqrt(area) apart, {100 * self.residual:.1f} % is usual"
             reasons.insert(0, Reason("outlier", f"stands out of {self.whom}: template and shape stay {apart}"))
-        if fit.side < -_WORSE:
+        if fit.side < -_DOUBTFUL_SIDE:
             reasons.append(Reason("side", SIDE_IN_DOUBT))
         verdict: Verdict = "good"
         if fit.verdict == "poor" or trust < FAIR:
             verdict = "poor"
-        elif trust < _GOOD or reasons:
+        elif trust < _GOOD_TRUST or reasons:
             verdict = "fair"
         if verdict != "good" and not reasons:
             reasons = [Reason("doubt", f"{int(100 * trust)} % likely to be right, beside {self.whom}")]

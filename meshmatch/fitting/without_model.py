@@ -1,8 +1,10 @@
-"""A template fitted without a network, to a shape of its kind: in any pose and orientation, or mirrored.
+"""Fit a template to a shape of its kind without a network; the shape may have any pose and orientation, or be mirrored.
 
-Surfaces are brought together by least squares alone (`meshmatch.fitting.solve.viscous`), which finds what lies near. A
-shape that stands as the template does, once it is turned, needs no more. For others the template is first registered to
-the shape as two shapes of no kind are (`meshmatch.fitting.direct`), and begins there.
+Surfaces are brought together by least squares alone (`meshmatch.fitting.solve.viscous`), which finds what is nearby. That
+suffices for a shape in the template's pose, after rotation. For other poses the template is first registered to the shape
+as two arbitrary shapes are (`meshmatch.fitting.direct`), and least squares start from there.
+
+"Alike" below means that a shape has the template's pose, up to a rigid motion.
 """
 
 from __future__ import annotations
@@ -45,48 +47,54 @@ from meshmatch.templates.sides import mirrored
 from meshmatch.templates.template import Template
 from meshmatch.threads import parallel_calls, parallel_map
 
-_ALIGNED_BY = 2400  # samples
-# Where the template roughly belongs is all that is asked of a search.
-_ROUGHLY = DirectConfig(coarse=1200, fine=2400, samples=3000, few=1200, fewer=700, better=8, best=3, both_ways="no")
-_ONTO = Schedule(steps=6, prior=(1e-2, 1e-3), scale=(1.0, 1.0), damping=1e-6)
-# Set by hand, on femurs, hearts, ants and four-legged animals: a shape to which the template comes so near, and stretches so
-# little (0.6 for hearts, 0.8 and more for ants in other poses), stands as the template does;
-_NEAR, _STRETCH = 0.045, 0.7
-# a pose that was searched, and is not believed, must have so much less than the shape as it is: 0.73 of it for an ant in
-# another pose, 0.95 for one whose legs were exchanged; and so must one that stands otherwise than the axes of the files
-# say, or is mirrored: 0.66 of mirrored femurs, 0.97 of ants, 0.88 of eggs that were turned wrongly.
-_SEARCHED, _TURNED = 0.9, 0.85
-_AS_IT_STANDS = np.radians(40)  # a smaller turn is none: the axes of two files may be meant to be the same
-_PART = 0.85  # so much of a whole's energy a part must have; 0.3 of a cut femur
-# Of a whole that stands as the template does: 0.36 to 0.55 of cut femurs, 0.56 and more of leaves of another size.
-_PART_OF_ALIKE = 0.55
-# As how far it counts, in units of sqrt(area), that a template, which is cut too, ends before the part.
-_BEYOND = 0.02
-_TURNS = 2  # of a part, and of its mirror image, that are tried
-_OTHER_SIDE = 0.86  # so much of the stretch a mirror image may need, to be meant: 0.48 to 0.83 of molars, 0.99 of birds
-_ANEW = 0.95  # so much of the energy another turn than a model's may have: 0.5 to 0.9 of leaves
-_FEW, _FEW_STEPS = 4000, 12  # samples and steps by which poses are chosen in less time
-# Of a whole: up to so many turns are fitted, whose samples stay up to so many times as far apart as those of the best one.
-# Ends of leaves are told by their fits alone (1.0 to 1.2); of femurs all others are 2 and more, of knees 1.3.
-_ALIKE_TURNS, _NEARLY = 4, 1.35
-_RIM_STEP = 0.01  # between points of a rim
-_LOST = 0.5  # trust of a search whose result is not believed
-_NOTHING = 0.01  # a smaller stretch is none
-_STRETCHED = 0.03  # weight of the stretch in an energy, beside the residual
-# Stretch beyond which a fit folds: of busts 1.2 to 1.9, of which 11 to 24 % of the vertices were folded, and 1 to 8 % of a
-# stiffer fit with the same errors; of all other kinds up to 0.8.
-_FAR = 1.0
+_ALIGN_SAMPLES = 2400  # samples for rigid alignment
+# A search need only find roughly where the template belongs.
+_SEARCH_CONFIG = DirectConfig(
+    coarse=1200, fine=2400, samples=3000, second_samples=1200, first_samples=700, n_second=8, n_third=3, both_ways="no"
+)
+_DEFORM_SCHEDULE = Schedule(steps=6, prior=(1e-2, 1e-3), scale=(1.0, 1.0), damping=1e-6)
+# All below are set by hand, on femurs, hearts, ants, four-legged animals and others. Energies are those of `_Fitted.energy`.
+# Largest residual (units of sqrt(area)) and stretch of a shape that has the template's pose. Stretches are 0.6 for hearts,
+# and 0.8 and more for ants in other poses.
+_MAX_ALIKE_RESIDUAL, _MAX_ALIKE_STRETCH = 0.045, 0.7
+# A fit replaces the current best one only if its energy is below this multiple of the best one's. First for fits from a
+# search that is not trusted: 0.73 for an ant in another pose, 0.95 for one with exchanged legs. Second for fits in another
+# orientation than the axes of the files suggest, or of the mirror image: 0.66 for mirrored femurs, 0.97 for ants, 0.88 for
+# eggs in a wrong rotation.
+_SEARCHED_RATIO, _TURNED_RATIO = 0.9, 0.85
+_MIN_TURN = np.radians(40)  # two files with a smaller rotation between them may be meant to have the same axes
+_PART_RATIO = 0.85  # the same for a fit as a part against one of the whole; 0.3 for a cut femur
+# And against a whole that has the template's pose: 0.36 to 0.55 for cut femurs, 0.56 and more for leaves of another size.
+_PART_RATIO_IF_ALIKE = 0.55
+# Residual (units of sqrt(area)) of a sample beyond the end of a template that is cut as well.
+_BEYOND_RIM_RESIDUAL = 0.02
+_PART_TURNS = 2  # rotations to try for a part, and for its mirror image
+# Share of the stretch below which the mirror image is meant: 0.48 to 0.83 for molars, 0.99 for birds.
+_MIRROR_STRETCH_RATIO = 0.86
+_NEW_TURN_RATIO = 0.95  # share of the energy for a rotation other than the model's: 0.5 to 0.9 for leaves
+_QUICK_SAMPLES, _QUICK_STEPS = 4000, 12  # samples and steps for choosing among poses
+# For a whole, at most this many rotations are fitted, with residuals after alignment up to this multiple of the best one's.
+# The two ends of a leaf are distinguished by the fits alone (1.0 to 1.2); other rotations have 2 and more for femurs, 1.3
+# for knees.
+_MAX_TURNS, _TURN_TOLERANCE = 4, 1.35
+_RIM_STEP = 0.01  # spacing of the points on a rim
+_MIN_TRUST = 0.5  # a search with less trust is not believed
+_MIN_STRETCH = 0.01  # smaller stretches are raised to this
+_STRETCH_WEIGHT = 0.03  # weight of the stretch in an energy, relative to the residual
+# Stretch above which a fit folds. Busts have 1.2 to 1.9, and 11 to 24 % of their vertices were folded, but only 1 to 8 % of
+# those of a stiffer fit with the same errors. All other kinds have up to 0.8.
+_FOLDING_STRETCH = 1.0
 
 
 def stand_alike(residual: float, stretch: float) -> bool:
-    """Whether a shape stands as the template does, by how its fit went."""
-    return residual < _NEAR and stretch < _STRETCH
+    """Return whether a shape has the template's pose, given the residual and stretch of its fit."""
+    return residual < _MAX_ALIKE_RESIDUAL and stretch < _MAX_ALIKE_STRETCH
 
 
 @dataclass(frozen=True, eq=False)
-class _Begin:
-    """From where least squares begin: the core frame, and node vectors there; ``trust`` and ``doubts`` of the search that
-    found it, if there was one.
+class _Start:
+    """Starting point of least squares: the core frame, and node vectors in it; ``trust`` and ``doubts`` are those of the
+    search that found it, if any.
     """
 
     frame: Frame
@@ -97,29 +105,31 @@ class _Begin:
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
-    """Where least squares ended, and the samples of the shape in the core frame."""
+    """Result of least squares, with the samples of the shape in the core frame."""
 
-    begin: _Begin
+    initial: _Start
     samples: OrientedPoints
     vectors: Float[Floats, "K 3"]
     features: DirectFeatures
 
     @property
     def energy(self) -> float:
-        """Low for right fits, as `DirectFeatures.energy`: specimens of one kind differ in proportions more than in pose."""
-        return self.features.residual + _STRETCHED * self.features.stretch
+        """Low for right fits; weighs stretch less than `DirectFeatures.energy`, as shapes of one kind differ more in
+        proportions.
+        """
+        return self.features.residual + _STRETCH_WEIGHT * self.features.stretch
 
     @property
     def alike(self) -> bool:
-        """Whether the shape stands as the template does."""
+        """Whether the shape has the template's pose."""
         return stand_alike(self.features.residual, self.features.stretch)
 
 
 class _Task:
-    """One shape, and the template that is fitted to it."""
+    """A template and the shape to which it is fitted."""
 
     def __init__(self, template: Template, shape: Shape, config: ViscousConfig, size: float | None = None) -> None:
-        """``size`` is that of the whole of which the shape is a part: the unit of its core frame, in that of its file."""
+        """``size``, for a part, is the sqrt(area) of its whole: the unit of its core frame, in that of its file."""
         self.template, self.shape, self.config, self.partial = template, shape, config, size is not None
         self.system = viscous_system(template)
         whole = None if size is None else replace(sqrt_area_frame(shape), scale=size)
@@ -127,103 +137,114 @@ class _Task:
         self._own, self._samples = take_samples(shape, config.samples, rng, whole)
         sheets = not self.partial and self.system.is_sheet and is_sheet(shape)
         self._rim = RimPoints.of(shape, _RIM_STEP) if sheets else None
-        self._resting = sample_surface(template.shape, _ALIGNED_BY, np.random.default_rng(config.seed))
+        self._resting = sample_surface(template.shape, _ALIGN_SAMPLES, np.random.default_rng(config.seed))
 
-    def fitted(self, begin: _Begin) -> _Fitted:
-        points = begin.frame.apply(self._own.undo(self._samples.points))
-        normals = self._samples.normals @ self._own.rotation @ begin.frame.rotation.T
-        samples = replace(self._samples, points=points, normals=normals).facing(self.system.surface(begin.vectors))
-        rim = None if self._rim is None else self._rim.in_frame(begin.frame)
-        vectors = viscous_vectors(self.system, samples, self.config, begin.vectors, self.partial, rim)
+    def fitted(self, initial: _Start) -> _Fitted:
+        """Fit by least squares from a starting point."""
+        points = initial.frame.apply(self._own.undo(self._samples.points))
+        normals = self._samples.normals @ self._own.rotation @ initial.frame.rotation.T
+        samples = replace(self._samples, points=points, normals=normals).facing(self.system.surface(initial.vectors))
+        rim = None if self._rim is None else self._rim.in_frame(initial.frame)
+        vectors = viscous_vectors(self.system, samples, self.config, initial.vectors, self.partial, rim)
         features = DirectFeatures.of(self.system, samples, vectors)
         if self.partial:
-            features = replace(features, residual=part_residual(self.system, samples, vectors, _BEYOND))
-        return _Fitted(begin, samples, vectors, features)
+            features = replace(features, residual=part_residual(self.system, samples, vectors, _BEYOND_RIM_RESIDUAL))
+        return _Fitted(initial, samples, vectors, features)
 
-    def turns(self, side: Frame | None, how: Align = "rigid", keep: int = 1, most: float = np.inf) -> list[_Begin]:
-        """The template as it rests, on the shape, or on its mirror image, turned in some ways, or near its file's axes: the
-        best way first, and others that lie up to ``most`` times as far off.
+    def aligned_starts(
+        self, side: Frame | None, how: Align = "rigid", keep: int = 1, most: float = np.inf
+    ) -> list[_Start]:
+        """Starts with the undeformed template, rigidly aligned to the shape, or to its mirror image if ``side`` is given.
+
+        ``how`` is the kind of alignment. At most ``keep`` starts are returned, the best first, with residuals up to
+        ``most`` times that of the best.
         """
         outer = self._own if side is None else self._own.compose(side)
         normals = self._samples.normals if side is None else self._samples.normals @ side.rotation.T
         points = self._samples.points if side is None else side.apply(self._samples.points)
-        samples = replace(self._samples, points=points, normals=normals).first(_ALIGNED_BY)
+        samples = replace(self._samples, points=points, normals=normals).first(_ALIGN_SAMPLES)
         found = align(samples, self._resting, how, keep)
         frames = [outer.compose(each.pose.frame) for each in found if each.residual <= most * found[0].residual]
-        return [_Begin(frame, np.zeros((self.system.K, 3))) for frame in frames]
+        return [_Start(frame, np.zeros((self.system.K, 3))) for frame in frames]
 
-    def searched(self, side: Frame | None) -> list[_Begin]:
-        """Where the template belongs on the shape, or on its mirror image, in another pose; none of what is no surface."""
+    def search(self, side: Frame | None) -> list[_Start]:
+        """Starts from a search for other poses on the shape, or on its mirror image; none if the shape is not a surface."""
         image = self.shape if side is None else mirrored(self.shape)
         try:
-            found = match_directly(self.template.shape, image, replace(_ROUGHLY, seed=self.config.seed))
+            found = match_directly(self.template.shape, image, replace(_SEARCH_CONFIG, seed=self.config.seed))
         except InputError:
             return []
         at = np.asarray(cKDTree(self.system.verts).query(found.source.frame.undo(found.source.points))[1], np.int64)
-        vectors = self.onto(at, found.target.points)
+        vectors = self.deformed_to(at, found.target.points)
         frame = found.target.frame if side is None else side.compose(found.target.frame)
-        return [_Begin(frame, vectors, found.target.trust, found.target.reasons)]
+        return [_Start(frame, vectors, found.target.trust, found.target.reasons)]
 
-    def onto(self, at: Int[Ints, " N"], points: Float[Floats, "N 3"]) -> Float[Floats, "K 3"]:
-        """Node vectors that take some vertices of the template to points, as rigidly as possible."""
+    def deformed_to(self, at: Int[Ints, " N"], points: Float[Floats, "N 3"]) -> Float[Floats, "K 3"]:
+        """Node vectors that move some template vertices to points, as rigidly as possible."""
         prior = RotatedReference(np.tile(np.eye(3), (len(self.system.gradient_points), 1, 1)))
-        problem = Problem(system=self.system, terms=[LandmarkTerm((at, points), 1 / len(at))], schedule=_ONTO)
+        problem = Problem(
+            system=self.system, terms=[LandmarkTerm((at, points), 1 / len(at))], schedule=_DEFORM_SCHEDULE
+        )
         return minimise(problem, prior, np.zeros((self.system.K, 3)))
 
-    def near(self, frame: Frame) -> _Begin:
-        """The template as it rests, near to where another template of the same vertices had its shape, in its frame."""
-        samples = self._samples.first(_ALIGNED_BY)
+    def start_near(self, frame: Frame) -> _Start:
+        """Start with the undeformed template, aligned near the frame in which another template with the same vertices
+        was fitted.
+        """
+        samples = self._samples.first(_ALIGN_SAMPLES)
         points = frame.apply(self._own.undo(samples.points))
         normals = samples.normals @ self._own.rotation @ frame.rotation.T
         pose: RigidPose = align(replace(samples, points=points, normals=normals), self._resting, "near")[0].pose
-        return _Begin(frame.compose(pose.frame), np.zeros((self.system.K, 3)))
+        return _Start(frame.compose(pose.frame), np.zeros((self.system.K, 3)))
 
     def best(self, sides: Sequence[Frame | None]) -> tuple[_Fitted, float]:
-        """The best fit of the shape; or of its mirror image, if that fits clearly better. And its `Fit.side`."""
+        """The best fit of the shape or, if that is clearly better, of its mirror image; and its `Fit.side`."""
         found = [self.best_turn(side) for side in sides]
         if sides[0] is None:
-            near = self.turns(None, "near")[0]
-            if np.trace(near.frame.rotation) > 1 + 2 * np.cos(_AS_IT_STANDS):
-                found[0] = _clearly_better(found[0], self.fitted(near), _TURNED)
+            near_axes = self.aligned_starts(None, "near")[0]
+            if np.trace(near_axes.frame.rotation) > 1 + 2 * np.cos(_MIN_TURN):
+                found[0] = _clearly_better(found[0], self.fitted(near_axes), _TURNED_RATIO)
         if not any(each.alike for each in found):
             for number, side in enumerate(sides):
-                for begin in self.searched(side):
-                    factor = 1.0 if begin.trust >= _LOST else _SEARCHED
-                    found[number] = _clearly_better(self.fitted(begin), found[number], factor)
+                for initial in self.search(side):
+                    factor = 1.0 if initial.trust >= _MIN_TRUST else _SEARCHED_RATIO
+                    found[number] = _clearly_better(self.fitted(initial), found[number], factor)
         if len(found) == 1:
             return found[0], 0.0
         plain, other = found
-        best = _clearly_better(other, plain, _TURNED)
-        stretches = [max(each.features.stretch, _NOTHING) for each in (plain if best is other else other, best)]
+        best = _clearly_better(other, plain, _TURNED_RATIO)
+        stretches = [max(each.features.stretch, _MIN_STRETCH) for each in (plain if best is other else other, best)]
         return best, float(np.log(stretches[0] / stretches[1]))
 
     def best_turn(self, side: Frame | None) -> _Fitted:
-        """The best fit of the shape, or of its mirror image, where the template is only turned. Far from its own form its
-        stretch says little: the turn that lies closest is then as good a guess as any.
+        """The best fit of the shape, or of its mirror image, from rigid starts.
+
+        If the shape is far from the template's pose, stretch says little; another rotation must then be clearly better than
+        the closest one.
         """
-        closest, *others = parallel_map(self.fitted, self.turns(side, keep=_ALIKE_TURNS, most=_NEARLY))
+        closest, *others = parallel_map(self.fitted, self.aligned_starts(side, keep=_MAX_TURNS, most=_TURN_TOLERANCE))
         for other in others:
-            closest = _clearly_better(other, closest, 1.0 if other.alike else _TURNED)
+            closest = _clearly_better(other, closest, 1.0 if other.alike else _TURNED_RATIO)
         return closest
 
     def best_part(self, sides: Sequence[Frame | None]) -> _Fitted:
-        """The best fit of a part, of either side."""
-        begins = [begin for side in sides for begin in self.turns(side, keep=_TURNS)]
-        return min(parallel_map(self.fitted, begins), key=attrgetter("energy"))
+        """The best fit of a part, over both sides."""
+        starts = [initial for side in sides for initial in self.aligned_starts(side, keep=_PART_TURNS)]
+        return min(parallel_map(self.fitted, starts), key=attrgetter("energy"))
 
     def best_from(self, start: Fit) -> _Fitted:
-        """The best fit from where another template of the same vertices was fitted."""
-        found = self.fitted(self.near(start.frame))
+        """The best fit starting from a fit of another template with the same vertices."""
+        found = self.fitted(self.start_near(start.frame))
         if found.alike:
             return found
         ambiguous = tuple(reason for reason in start.reasons if reason.code == "ambiguous")
-        vectors = self.onto(np.arange(len(start.points)), start.points)
-        moved = self.fitted(_Begin(start.frame, vectors, start.trust, ambiguous))
-        return _clearly_better(moved, found, _SEARCHED)
+        vectors = self.deformed_to(np.arange(len(start.points)), start.points)
+        moved = self.fitted(_Start(start.frame, vectors, start.trust, ambiguous))
+        return _clearly_better(moved, found, _SEARCHED_RATIO)
 
 
 def _clearly_better(one: _Fitted, other: _Fitted, factor: float) -> _Fitted:
-    """One fit if it has so much less energy than the other; else the other."""
+    """Return ``one`` if its energy is below ``factor`` times that of ``other``, else ``other``."""
     return one if one.energy < factor * other.energy else other
 
 
@@ -236,34 +257,33 @@ def fit_without_model(
     other_side: bool = False,
     whole: float | None = None,
 ) -> Fit:
-    """Fit a template to a repaired shape; a mesh, or a cloud. Such a fit is fair at best, for nothing was learned of what
-    corresponds.
+    """Fit a template to a repaired mesh or cloud. The fit is at most fair, as no correspondence was learned.
 
-    ``start`` is a fit of another template of the same vertices to this shape, from which this one begins. With ``mirror``
-    the shape may be the mirror image of what the template shows; with ``other_side`` it is the one that ``start`` is not.
-    Where ``whole`` is given, the sqrt(area) of a whole shape in the unit of the file, it may also be cut.
+    ``start`` is a fit of another template with the same vertices to this shape, from which this one starts. ``mirror``
+    allows the shape to be the mirror image of the template; ``other_side`` fits the side that ``start`` is not. If
+    ``whole`` is given, the sqrt(area) of a whole shape in the unit of the file, the shape may also be a part.
     """
     began, rough = time.monotonic(), config or ViscousConfig.choosing()
     config = config or ViscousConfig()
     task, stiff = _Task(template, shape, config), _Task(template, shape, rough)
     stiffest = stiff if rough is config else _Task(template, shape, ViscousConfig.folding())
     if start is None:
-        found, lead = stiff.best((None, MIRROR) if mirror else (None,))
+        found, log_ratio = stiff.best((None, MIRROR) if mirror else (None,))
         if rough is not config:
-            found = (stiffest if found.features.stretch > _FAR else task).fitted(found.begin)
+            found = (stiffest if found.features.stretch > _FOLDING_STRETCH else task).fitted(found.initial)
     elif other_side:
-        found, lead = task.best((None if start.frame.mirrored else MIRROR,))[0], -start.side
+        found, log_ratio = task.best((None if start.frame.mirrored else MIRROR,))[0], -start.side
     else:
-        found, lead = task.best_from(start), start.side
-        if found.features.stretch > _FAR:
+        found, log_ratio = task.best_from(start), start.side
+        if found.features.stretch > _FOLDING_STRETCH:
             found = stiffest.best_from(start)
     as_whole = _Judged.of(task, found)
     if whole is None:
-        return as_whole.fit(lead, began)
+        return as_whole.fit(log_ratio, began)
     part_task = _Task(template, shape, config, whole)
     part = part_task.best_part((None, MIRROR) if mirror else (None,))
-    clearly = 1.0 if as_whole.judgement.verdict == "poor" else _PART
-    return (_Judged.of(part_task, part) if part.energy < clearly * found.energy else as_whole).fit(lead, began)
+    clearly = 1.0 if as_whole.judgement.verdict == "poor" else _PART_RATIO
+    return (_Judged.of(part_task, part) if part.energy < clearly * found.energy else as_whole).fit(log_ratio, began)
 
 
 def fit_near(
@@ -275,63 +295,63 @@ def fit_near(
     mirror: bool = False,
     sided: bool = False,
 ) -> Fit | None:
-    """Fit a template to a repaired shape that stands as it does.
+    """Fit a template to a repaired shape in the template's pose.
 
     Parameters
     ----------
     start
-        A fit of another template of the same vertices, from whose pose this one begins.
+        A fit of another template with the same vertices, from whose pose this one starts.
     turned, mirror
-        Whether other turns are tried, and those of the mirror image.
+        Whether to try other rotations, and those of the mirror image.
     sided
-        Whether shapes are known to have sides: the one is meant for which the template stretches less.
+        Whether shapes of the kind are known to have sides; the side for which the template stretches less is then chosen.
 
     Returns
     -------
     Fit
-        None where the shape stands otherwise.
+        None if the shape has another pose.
     """
     began, quick = time.monotonic(), _Task(template, shape, _quick(config.seed))
-    own = MIRROR if start.frame.mirrored else None
-    best, lead = quick.fitted(quick.near(start.frame)), 0.0
+    own_side = MIRROR if start.frame.mirrored else None
+    best, log_ratio = quick.fitted(quick.start_near(start.frame)), 0.0
     if turned:
-        best = _clearly_better(quick.best_turn(own), best, _ANEW)
+        best = _clearly_better(quick.best_turn(own_side), best, _NEW_TURN_RATIO)
     if turned and mirror:
-        other = quick.best_turn(None if own is MIRROR else MIRROR)
-        lead = float(np.log(max(other.features.stretch, _NOTHING) / max(best.features.stretch, _NOTHING)))
+        other = quick.best_turn(None if own_side is MIRROR else MIRROR)
+        log_ratio = float(np.log(max(other.features.stretch, _MIN_STRETCH) / max(best.features.stretch, _MIN_STRETCH)))
         certain = sided and best.alike and other.alike
-        if lead < 0 if certain else _clearly_better(other, best, _TURNED) is other:
-            best, lead = other, -lead
+        if log_ratio < 0 if certain else _clearly_better(other, best, _TURNED_RATIO) is other:
+            best, log_ratio = other, -log_ratio
     task = _Task(finest(template, config) if best.alike else template, shape, config)
-    found = task.fitted(replace(best.begin, vectors=np.zeros((task.system.K, 3))))
-    return _Judged.of(task, found).fit(lead, began) if found.alike else None
+    found = task.fitted(replace(best.initial, vectors=np.zeros((task.system.K, 3))))
+    return _Judged.of(task, found).fit(log_ratio, began) if found.alike else None
 
 
 def fit_otherwise(template: Template, shape: Shape, start: Fit, config: ViscousConfig) -> tuple[Fit, bool]:
-    """Fit a template to a repaired shape that stands otherwise than it does.
+    """Fit a template to a repaired shape that has another pose.
 
     Parameters
     ----------
     start
-        Another template of the same vertices, where they belong on the shape, or may.
+        Positions of another template with the same vertices on the shape, which may be wrong.
 
     Returns
     -------
     Fit
-        From there; or of the template that is only turned, if that has less energy.
+        From there; or from the undeformed template, rigidly aligned, if that has less energy.
     bool
         Whether it is the former.
     """
     began, quick = time.monotonic(), _Task(template, shape, _quick(config.seed))
     ambiguous = tuple(reason for reason in start.reasons if reason.code == "ambiguous")
-    vectors = quick.onto(np.arange(len(start.points)), start.points)
-    moved = quick.fitted(_Begin(start.frame, vectors, start.trust, ambiguous))
+    vectors = quick.deformed_to(np.arange(len(start.points)), start.points)
+    moved = quick.fitted(_Start(start.frame, vectors, start.trust, ambiguous))
     turned = quick.best_turn(MIRROR if start.frame.mirrored else None)
-    best = _clearly_better(moved, turned, 1.0 if start.trust >= _LOST else _SEARCHED)
-    if best.features.stretch > _FAR:
+    best = _clearly_better(moved, turned, 1.0 if start.trust >= _MIN_TRUST else _SEARCHED_RATIO)
+    if best.features.stretch > _FOLDING_STRETCH:
         config = replace(ViscousConfig.choosing(), seed=config.seed)
     task = _Task(template, shape, config)
-    return _Judged.of(task, task.fitted(best.begin)).fit(0.0, began), best is moved
+    return _Judged.of(task, task.fitted(best.initial)).fit(0.0, began), best is moved
 
 
 def fit_alike(
@@ -343,54 +363,60 @@ def fit_alike(
     whole: float | None = None,
     turned: bool = True,
 ) -> tuple[Fit, bool] | None:
-    """Fit a template to a repaired shape that may stand as it does, or be a part of it, and has been matched to it.
+    """Fit a template to a repaired shape that was matched to it, if the shape has the template's pose or is a part of it.
 
     Parameters
     ----------
     begun
-        Positions (N, 3) on the resting template, and a fit whose points (N, 3) say where a search found them to belong.
+        Positions (N, 3) on the rest template, and a fit whose points (N, 3) are their counterparts according to a search.
     mirror, whole
-        As of `fit_without_model`.
+        As for `fit_without_model`.
     turned
-        Whether the template is also only turned, in any way.
+        Whether to try rigid starts as well, in all rotations.
 
     Returns
     -------
     Fit
-        Of more nodes, and more samples, than those of a search.
+        With more nodes and samples than the search.
     bool
-        Whether it began where the search ended; else where the template is only turned, which is clearly better.
+        Whether it started from the search's result; otherwise a rigid start was clearly better.
 
-    None where the shape stands otherwise than the template.
+    None if the shape has another pose than the template.
     """
     began, config = time.monotonic(), config or ViscousConfig()
-    few, sides = _quick(config.seed), (None, MIRROR) if mirror else (None,)
-    task, (resting, start) = _Task(template, shape, few), begun
+    quick, sides = _quick(config.seed), (None, MIRROR) if mirror else (None,)
+    task, (resting, start) = _Task(template, shape, quick), begun
     at = np.asarray(cKDTree(task.system.verts).query(resting)[1], np.int64)
-    as_found = partial(task.fitted, _Begin(start.frame, task.onto(at, start.points)))
-    others = [partial(task.best_turn, side) for side in sides] if turned else []
-    first, *turns = parallel_calls((as_found, *others))
+    search_call = partial(task.fitted, _Start(start.frame, task.deformed_to(at, start.points)))
+    turn_calls = [partial(task.best_turn, side) for side in sides] if turned else []
+    first, *turn_fits = parallel_calls((search_call, *turn_calls))
     best = first
-    for turn in turns:
-        other = turn.begin.frame.mirrored != best.begin.frame.mirrored
-        relaxed = whole is None and other and turn.alike and turn.features.stretch < _OTHER_SIDE * best.features.stretch
-        best = turn if relaxed else _clearly_better(turn, best, _TURNED)
+    for turn in turn_fits:
+        other = turn.initial.frame.mirrored != best.initial.frame.mirrored
+        relaxed = (
+            whole is None
+            and other
+            and turn.alike
+            and turn.features.stretch < _MIRROR_STRETCH_RATIO * best.features.stretch
+        )
+        best = turn if relaxed else _clearly_better(turn, best, _TURNED_RATIO)
     if whole is not None:
-        part = _Task(template, shape, few, whole).best_part(sides)
+        part = _Task(template, shape, quick, whole).best_part(sides)
         poor = _Judged.of(task, best).judgement.verdict == "poor"
-        if part.energy < (1.0 if poor else _PART_OF_ALIKE if best.alike else _PART) * best.energy:
+        if part.energy < (1.0 if poor else _PART_RATIO_IF_ALIKE if best.alike else _PART_RATIO) * best.energy:
             task = _Task(template, shape, config, whole)
-            return _Judged.of(task, task.fitted(part.begin)).fit(0.0, began), False
+            return _Judged.of(task, task.fitted(part.initial)).fit(0.0, began), False
     if not best.alike:
         return None
     task = _Task(template, shape, config)
-    return _Judged.of(task, task.fitted(best.begin)).fit(0.0, began), best is first
+    return _Judged.of(task, task.fitted(best.initial)).fit(0.0, began), best is first
 
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """A shape beside a template that is only turned: the frame from its file to the template, how much that has to stretch,
-    and whether the shape stands as it does."""
+    """A shape relative to a rigidly aligned template: the frame from the shape's file to the template, the template's
+    stretch, and whether the shape has the template's pose.
+    """
 
     frame: Frame
     stretch: float
@@ -398,36 +424,40 @@ class Standing:
 
 
 def standing(template: Template, shape: Shape, seed: int) -> Standing:
-    """How a repaired shape stands to a template, by fits of those turns of it that lie near."""
+    """Align a template to a repaired shape by fits from the best few rotations."""
     best = _Task(template, shape, _quick(seed)).best_turn(None)
-    return Standing(best.begin.frame, max(best.features.stretch, _NOTHING), best.alike)
+    return Standing(best.initial.frame, max(best.features.stretch, _MIN_STRETCH), best.alike)
 
 
 def fit_from(template: Template, shape: Shape, start: Fit, config: ViscousConfig) -> Fit | None:
-    """Fit a template to a repaired shape from the pose of a fit of another template with the same vertices; None where the
-    shape stands otherwise."""
+    """Fit a template to a repaired shape, starting from the pose of a fit of another template with the same vertices.
+
+    None if the shape has another pose.
+    """
     began, task = time.monotonic(), _Task(template, shape, config)
-    found = task.fitted(task.near(start.frame))
+    found = task.fitted(task.start_near(start.frame))
     return _Judged.of(task, found).fit(0.0, began) if found.alike else None
 
 
 def fit_turned(template: Template, shape: Shape, turn: Float[Floats, "3 3"], config: ViscousConfig) -> Fit:
-    """Fit a template to a repaired shape that stands as it does, turned by a rotation from its file to the template."""
+    """Fit a template to a repaired shape in the template's pose, given the rotation from the shape's file to the
+    template.
+    """
     began, task = time.monotonic(), _Task(template, shape, config)
-    begin = task.near(replace(sqrt_area_frame(shape), rotation=turn))
-    return _Judged.of(task, task.fitted(begin)).fit(0.0, began)
+    initial = task.start_near(replace(sqrt_area_frame(shape), rotation=turn))
+    return _Judged.of(task, task.fitted(initial)).fit(0.0, began)
 
 
 def _quick(seed: int) -> ViscousConfig:
-    """To choose among poses in less time."""
+    """Settings for choosing among poses in less time."""
     stiff = ViscousConfig.choosing()
-    schedule = replace(stiff.schedule, steps=_FEW_STEPS)
-    return replace(stiff, samples=_FEW, back_points=_FEW, schedule=schedule, seed=seed)
+    schedule = replace(stiff.schedule, steps=_QUICK_STEPS)
+    return replace(stiff, samples=_QUICK_SAMPLES, back_points=_QUICK_SAMPLES, schedule=schedule, seed=seed)
 
 
 @dataclass(frozen=True, eq=False)
 class _Judged:
-    """Where least squares ended, and what is said of it."""
+    """Result of least squares with its judgement."""
 
     task: _Task
     found: _Fitted
@@ -445,10 +475,10 @@ class _Judged:
         )
         return cls(task, found, judge(features))
 
-    def fit(self, lead: float, began: float) -> Fit:
-        """As a fit, which is fair at best; ``lead`` is its `Fit.side`."""
+    def fit(self, log_ratio: float, began: float) -> Fit:
+        """Convert to a `Fit`, which is at most fair; ``log_ratio`` is its `Fit.side`."""
         task, found = self.task, self.found
-        frame = found.begin.frame
+        frame = found.initial.frame
         unsure = Reason("unsupervised", "fitted without a trained model: surfaces that lie close need not correspond")
         fit = judged_fit(
             self.judgement,
@@ -463,14 +493,14 @@ class _Judged:
             seed=task.config.seed,
             model=NO_MODEL,
             notes=("taken for the mirror image of the template",) if frame.mirrored else (),
-            side=lead,
+            side=log_ratio,
             partial=task.partial,
         )
-        # The trust is that of the fit itself: a collection compares it with others.
-        trust = min(fit.trust, found.begin.trust)
-        doubts = (reason for reason in found.begin.doubts if reason.code == "ambiguous")
+        # Keep the uncapped trust: a collection compares it with that of other fits.
+        trust = min(fit.trust, found.initial.trust)
+        doubts = (reason for reason in found.initial.doubts if reason.code == "ambiguous")
         fit = replace(cap_verdict(fit, [*doubts, unsure]), trust=trust)
-        if found.begin.trust >= _LOST:
+        if found.initial.trust >= _MIN_TRUST:
             return fit
-        lost = Reason("doubt", "no pose of the template is clearly right for this shape")
-        return replace(fit, verdict="poor", reasons=(lost, *fit.reasons))
+        no_pose = Reason("doubt", "no pose of the template is clearly right for this shape")
+        return replace(fit, verdict="poor", reasons=(no_pose, *fit.reasons))

@@ -148,7 +148,7 @@ def small_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fits without a model on few nodes, of few samples: enough for small bones."""
     for module in (settle, without_model):
         monkeypatch.setattr(module, "ViscousConfig", _Small)
-    monkeypatch.setattr(without_model, "_ALIGNED_BY", 300)
+    monkeypatch.setattr(without_model, "_ALIGN_SAMPLES", 300)
 
 
 def check_by_r(folder: Path) -> None:

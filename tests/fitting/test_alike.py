@@ -70,7 +70,7 @@ def test_specimens_get_a_finer_fit_that_keeps_the_verdict() -> None:
 
 
 def test_what_stands_otherwise_and_clouds_are_left_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = match_either_side(RIGHT.shape, RIGHT.shape, replace(FAST, better=2, best=1))
+    found = match_either_side(RIGHT.shape, RIGHT.shape, replace(FAST, n_second=2, n_third=1))
     cloud = Shape(RIGHT.shape.verts, np.empty((0, 3), np.int64))
     assert match_alike(cloud, RIGHT.shape, found, FitConfig()) is found
     for told in (replace(found, apart=(0.08, 0.07)), replace(found, apart=None)):
@@ -92,7 +92,7 @@ def test_cracks_are_no_rim() -> None:
 def test_a_broken_one_is_a_part_of_a_whole_one(source_is_broken: bool) -> None:
     broken, kept = cut(LEFT, -0.1)
     pair = (broken, RIGHT.shape) if source_is_broken else (RIGHT.shape, broken)
-    plain = match_either_side(*pair, replace(FAST, better=2, best=1))
+    plain = match_either_side(*pair, replace(FAST, n_second=2, n_third=1))
     seen = match_alike(*pair, plain, FitConfig())
     of_broken, of_whole = (seen.source, seen.target) if source_is_broken else (seen.target, seen.source)
     assert of_broken.partial and not of_whole.partial and seen.verdict != "good"
@@ -104,7 +104,7 @@ def test_a_broken_one_is_a_part_of_a_whole_one(source_is_broken: bool) -> None:
 
 def test_two_broken_ones_share_what_both_have() -> None:
     (low, kept), (upper, _) = cut(LEFT, 0.4), cut(RIGHT, -0.5, -1.0)
-    plain = match_either_side(low, upper, replace(FAST, better=2, best=1))
+    plain = match_either_side(low, upper, replace(FAST, n_second=2, n_third=1))
     seen = match_alike(low, upper, plain, FitConfig())
     shared = LEFT.directions[kept][:, 2] > -0.4
     assert errors(seen, LEFT, RIGHT, low, kept)[shared].mean() < 5

@@ -20,8 +20,8 @@ SMALL = ViscousConfig(
 
 @pytest.mark.parametrize("cut", [True, False])
 def test_a_cut_bone_is_a_part_and_a_whole_one_is_not(cut: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("meshmatch.fitting.without_model._ALIGNED_BY", 300)
-    monkeypatch.setattr("meshmatch.fitting.without_model._Task.searched", lambda *_: [])
+    monkeypatch.setattr("meshmatch.fitting.without_model._ALIGN_SAMPLES", 300)
+    monkeypatch.setattr("meshmatch.fitting.without_model._Task.search", lambda *_: [])
     one, other = (replace(bone, group="plain") for bone in draw_bones(2, 3))
     whole, found = scan(one, 500, 0), scan(other, 500, 1)
     kept = (found.directions[found.shape.faces, 2] < 0.45).all(axis=1) | (not cut)

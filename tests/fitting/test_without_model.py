@@ -59,7 +59,7 @@ def test_a_turned_mirror_image_is_found_and_named(template: Template, monkeypatc
 def test_another_pose_is_searched_for_and_is_where_the_mean_begins(
     template: Template, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(without_model, "_ROUGHLY", QUICK)
+    monkeypatch.setattr(without_model, "_SEARCH_CONFIG", QUICK)
     shape = bent(creature(3), Rotation.from_euler("xyz", (70, 130, -40), degrees=True), 250.0)
     fit = fit_without_model(template, shape, CONFIG, mirror=False)
     assert off(fit, shape) < 0.04
@@ -69,7 +69,7 @@ def test_another_pose_is_searched_for_and_is_where_the_mean_begins(
 
 
 def test_what_no_pose_fits_is_poor(template: Template, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(without_model, "_ROUGHLY", QUICK)
+    monkeypatch.setattr(without_model, "_SEARCH_CONFIG", QUICK)
     rod = creature(3)
     rod = replace(rod, verts=rod.verts * [0.1, 4.0, 0.1])
     assert fit_without_model(template, rod, CONFIG, mirror=False).verdict == "poor"
@@ -80,16 +80,16 @@ def test_another_turn_is_taken_where_the_template_is_near_or_the_fit_is_clearly_
     template: Template, monkeypatch: pytest.MonkeyPatch, stretch: float, energies: tuple[float, ...], chosen: int
 ) -> None:
     task = without_model._Task(template, creature(3), CONFIG)
-    begins = [without_model._Begin(IDENTITY, np.zeros((task.system.K, 3))) for _ in energies]
+    starts = [without_model._Start(IDENTITY, np.zeros((task.system.K, 3))) for _ in energies]
 
-    def fitted(begin: without_model._Begin) -> without_model._Fitted:
-        energy = energies[begins.index(begin)]
+    def fitted(initial: without_model._Start) -> without_model._Fitted:
+        energy = energies[starts.index(initial)]
         features = DirectFeatures(residual=energy - 0.03 * stretch, stretch=stretch)
-        return without_model._Fitted(begin, task._samples, begin.vectors, features)
+        return without_model._Fitted(initial, task._samples, initial.vectors, features)
 
-    monkeypatch.setattr(task, "turns", lambda *_, **__: begins)
+    monkeypatch.setattr(task, "aligned_starts", lambda *_, **__: starts)
     monkeypatch.setattr(task, "fitted", fitted)
-    assert task.best_turn(None).begin is begins[chosen]
+    assert task.best_turn(None).initial is starts[chosen]
 
 
 @pytest.mark.parametrize("far", [False, True])
@@ -103,7 +103,7 @@ def test_the_last_fit_is_softer_unless_the_template_is_far(
         return np.zeros((system.K, 3))
 
     monkeypatch.setattr(without_model, "viscous_vectors", still)
-    monkeypatch.setattr(without_model, "_FAR", -1.0 if far else 1.0)
+    monkeypatch.setattr(without_model, "_FOLDING_STRETCH", -1.0 if far else 1.0)
     fit = fit_without_model(template, template.shape, mirror=False)
     assert asked[0] == ViscousConfig.choosing()
     assert asked[-1] == (ViscousConfig.folding() if far else ViscousConfig())
@@ -118,7 +118,7 @@ def test_a_template_that_would_fold_is_held(template: Template) -> None:
     folded = []
     for config in (ViscousConfig.choosing(), ViscousConfig.folding()):
         task = without_model._Task(template, other, replace(config, samples=3000, back_points=1500))
-        vectors = task.fitted(without_model._Begin(sqrt_area_frame(other), np.zeros((task.system.K, 3)))).vectors
+        vectors = task.fitted(without_model._Start(sqrt_area_frame(other), np.zeros((task.system.K, 3)))).vectors
         folded.append(task.system.regularity(vectors).inverted)
     assert folded[1] < 0.5 * folded[0]
 
@@ -154,8 +154,8 @@ def test_rims_of_open_sheets_lie_on_each_other() -> None:
     at = cKDTree(template.shape.verts).query(sqrt_area_frame(first).apply(first.verts))[1]
     for width in (0.0, quick.rim_width):
         task = without_model._Task(template, other, replace(quick, rim_width=width))
-        found = task.fitted(task.turns(None, "near")[0])
-        points = found.begin.frame.undo(task.system.moved(found.vectors))
+        found = task.fitted(task.aligned_starts(None, "near")[0])
+        points = found.initial.frame.undo(task.system.moved(found.vectors))
         errors.append(np.linalg.norm(points[at] - other.verts, axis=1).mean())
     assert errors[1] < 0.5 * errors[0]
 

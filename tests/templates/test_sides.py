@@ -136,7 +136,7 @@ def test_fits_tell_sides_and_turns(
 ) -> None:
     few = partial(ViscousConfig, nodes=200, radius=0.15, faces=600)
     monkeypatch.setattr("meshmatch.api.prepare.ViscousConfig", few)
-    monkeypatch.setattr("meshmatch.fitting.without_model._FEW", 800)
+    monkeypatch.setattr("meshmatch.fitting.without_model._QUICK_SAMPLES", 800)
     monkeypatch.setattr("meshmatch.api.prepare.other_side", None)  # it is not asked
     nodes = NodeConfig("uniform", 60, 0.35)
     made = prepare(turned_hooks, tmp_path / "made", PrepareConfig(nodes, faces=500, template=template, mirror=mirror))

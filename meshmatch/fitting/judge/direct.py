@@ -67,7 +67,7 @@ class DirectFeatures:
         return self._energy(_STRETCH)
 
     @property
-    def energy_begun(self) -> float:
+    def early_energy(self) -> float:
         """The same of fits that have only begun: the right ones among them may yet have to stretch back."""
         return self._energy(_BEGUN)
 

@@ -1,8 +1,7 @@
 """The network's candidates for a shape that is assumed to be complete, or to be a part.
 
-Clouds: their area is only an estimate, which is too small where points are few and noisy and too large where outliers look
-like surface. The network's own fit gives a better scale, as its template has the area of a body; isolated points far from
-it are outliers.
+Clouds: their area is only an estimate, which is too small where points are few and noisy, and outliers look like surface.
+The network's own fit gives a better scale, as its template has the area of a body; isolated points far from it are outliers.
 
 Parts: the size of the whole is unknown, so several shares of the surface are tried. The samples must lie on the template;
 the rest of the template is left to the network and to the prior on its gradient.
@@ -125,7 +124,9 @@ def candidates_of_whole(task: FitTask) -> tuple[FitTask, list[Candidate]]:
     best = best_first(task.predictor.fit_all([(task.samples, each.pose) for each in chosen]))
     orientation(0.8)
     unusual = best[0].residual > SETTINGS.unusual_residual and not task.shape.is_cloud
-    if unusual and task.config.partial != "yes" and not task.config.again:  # which fits it once more
+    if (
+        unusual and task.config.partial != "yes" and not task.config.again
+    ):  # with `again`, a poor fit is repeated anyway
         best = best_first([*best, *_candidates_from_all_rotations(task)])
     best += _half_turned(task, best[0])
     orientation(1.0)
@@ -154,9 +155,8 @@ def _half_turned(task: FitTask, best: Candidate) -> list[Candidate]:
     """
     if task.config.front is not None or task.model.card.frame["orientation"] in ALIGNS:
         return []
-    predictor = replace(
-        task.predictor, rng=np.random.default_rng(task.config.seed)
-    )  # so that later steps draw the same numbers
+    # A generator of its own, so that later steps draw the same numbers as without this one.
+    predictor = replace(task.predictor, rng=np.random.default_rng(task.config.seed))
     turned = predictor.fit_all([(task.samples, RigidPose(best.pose.rotation * _HALF_TURN, best.pose.center))])
     return [each for each in turned if each.residual < SETTINGS.about_margin * best.residual]
 

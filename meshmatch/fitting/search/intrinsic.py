@@ -39,14 +39,14 @@ _RINGS, _RING = (0.25, 0.5, 0.75), 0.03  # shares of the way where there are rin
 
 
 @dataclass(frozen=True, eq=False)
-class ThinMesh:
+class DecimatedMesh:
     """A shape with about as many triangles as are asked, on some of its own vertices; in its frame."""
 
     verts: Float[Floats, "V 3"]
     faces: Int[Ints, "F 3"]
 
     @classmethod
-    def of(cls, shape: Shape, faces: int) -> ThinMesh:
+    def of(cls, shape: Shape, faces: int) -> DecimatedMesh:
         """`InputError` for a cloud whose points lie on no surface."""
         kept, corners = low_mesh(shape, faces)
         used, renumbered = np.unique(corners, return_inverse=True)
@@ -91,7 +91,7 @@ class ThinMesh:
             ranks.append((np.cumsum(share) - share / 2 - 0.5)[level])
         return np.stack(ranks, 1)
 
-    def likeness(self, other: ThinMesh, moved: OrientedPoints) -> float:
+    def likeness(self, other: DecimatedMesh, moved: OrientedPoints) -> float:
         """Correlation (0..1) of its relief with that of another mesh, where its vertices are moved to on it."""
         nearest = other.tree.query(with_normals(moved.points, moved.normals, _NORMAL_WEIGHT))[1]
         own, theirs = self.relief, other.relief[nearest]  # of its own the mean is 0
@@ -135,7 +135,7 @@ class Intrinsic:
     between all vertices would take long, and keep Python's lock meanwhile.
     """
 
-    mesh: ThinMesh
+    mesh: DecimatedMesh
 
     @cached_property
     def landmarks(self) -> Int[Ints, " L"]:

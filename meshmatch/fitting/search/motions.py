@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.fitting.search.intrinsic import ThinMesh
+from meshmatch.fitting.search.intrinsic import DecimatedMesh
 from meshmatch.geometry.closest_points import ClosestPoints
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints, feature_tree, with_normals
@@ -27,7 +27,7 @@ _NEAR = 2.0
 _OTHER = 10.0  # degrees between two that count as two
 
 
-def principal_axes(mesh: ThinMesh) -> Float[Floats, "3 3"]:
+def principal_axes(mesh: DecimatedMesh) -> Float[Floats, "3 3"]:
     """Of the surface, one in each column, right-handed."""
     axes = np.linalg.eigh(np.cov(mesh.verts.T, aweights=mesh.areas))[1]
     axes[:, 0] *= np.sign(np.linalg.det(axes))
@@ -38,7 +38,7 @@ class Motions:
     """Rigid and affine motions of one thin mesh onto another by iterative closest points, both ways, with robust weights;
     about the middle of each."""
 
-    def __init__(self, source: ThinMesh, target: ThinMesh) -> None:
+    def __init__(self, source: DecimatedMesh, target: DecimatedMesh) -> None:
         self.middles = source.areas @ source.verts, target.areas @ target.verts
         self._own = OrientedPoints(source.verts - self.middles[0], source.normals)
         self._onto = OrientedPoints(target.verts - self.middles[1], target.normals)
@@ -92,7 +92,7 @@ def _affine(source: Floats, goal: Floats, weights: Floats, near: Floats) -> tupl
     return found[:3].T, found[3]
 
 
-def turns_onto_itself(mesh: ThinMesh, held: Float[Floats, "N 3"] | None = None) -> int:
+def turns_onto_itself(mesh: DecimatedMesh, held: Float[Floats, "N 3"] | None = None) -> int:
     """How many turns bring a shape onto itself, that by nothing included: 2 of pliers, many of a bearing.
 
     Turns are about its principal axes. Where positions are ``held``, only those count that leave them where they are.

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.fitting.search.intrinsic import Intrinsic, ThinMesh
+from meshmatch.fitting.search.intrinsic import DecimatedMesh, Intrinsic
 from meshmatch.fitting.search.motions import Motions, principal_axes
 from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.geometry.triangles import triangle_vectors
@@ -87,7 +87,7 @@ class ProposalSettings:
 SETTINGS = ProposalSettings()
 
 
-def rigid_proposals(source: ThinMesh, target: ThinMesh) -> list[Proposal]:
+def rigid_proposals(source: DecimatedMesh, target: DecimatedMesh) -> list[Proposal]:
     """The best rigid motions from 48 starts by iterative closest points, and an affine one from each."""
     motions = Motions(source, target)
     middle = motions.middles[1]

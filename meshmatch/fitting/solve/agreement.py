@@ -61,7 +61,7 @@ class AgreeConfig(Pairing):
     def for_model(cls, model: TrainedModel) -> AgreeConfig:
         """As stiff as the model's card says, and by what the model knows of pairs."""
         stiff = model.card.stiffness
-        return cls(schedule=cls.schedule.grown(1, prior=(stiff, stiff)), known=float(model.pairs is not None))
+        return cls(schedule=cls.schedule.scaled_by(1, prior=(stiff, stiff)), known=float(model.pairs is not None))
 
     @classmethod
     def for_collection(cls, model: TrainedModel) -> AgreeConfig:
@@ -79,7 +79,7 @@ class AgreeConfig(Pairing):
 
     def for_noise(self, roughness: float) -> AgreeConfig:
         """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): all samples, shared, a stiffer template."""
-        schedule = self.schedule.grown(roughness, prior=(80, 80))
+        schedule = self.schedule.scaled_by(roughness, prior=(80, 80))
         return replace(
             self,
             schedule=replace(schedule, momentum=schedule.momentum * (1 - roughness)),

@@ -49,7 +49,7 @@ class SurfaceNodes:
     def system(self, shape: Shape, graph: csr_matrix, seed: int = 0) -> tuple[NodeSystem, ViscousGradient]:
         """The least-squares system of a thin mesh in the template frame, and its viscous prior along the surface.
 
-        ``graph`` holds the lengths of its edges, see `ThinMesh`.
+        ``graph`` holds the lengths of its edges, see `DecimatedMesh`.
         """
         verts = np.asarray(shape.verts)
         at = farthest_points(verts, min(self.K, len(verts)))
