@@ -1,9 +1,9 @@
-"""Two shapes that stand alike, such as two femurs, or of which one is a part of the other, matched more finely.
+"""Finer matches of shapes in the same pose, such as two femurs, of a part and its whole, and of a shape and a model's
+template.
 
-The same of a shape and the template of a model of its kind.
-
-A search without a model (`meshmatch.fitting.direct`) allows for any pose, so its fits have few nodes, and are held along the
-surface. Specimens of one kind need less freedom, and the whole of a broken bone is larger than what is left of it.
+A search without a model (`meshmatch.fitting.direct`) allows for any pose, so its fits have few nodes and are held along the
+surface. Shapes of one kind in the same pose ("alike") need less freedom, and can have more nodes. A part, such as a broken
+bone, needs the size of its whole.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from meshmatch.templates.sides import apart, mirrored
 from meshmatch.templates.template import Template
 from meshmatch.threads import parallel_map
 
-# How near shapes that stand alike must come by a rigid motion, in units of sqrt(area): femurs, knees and molars come to 0.04
-# to 0.06, hearts and leaves up to 0.066; people, ants and fish to 0.069 and more.
-_ALIKE = 0.067
-_CLEAR_SIDE = 0.05  # see `Fit.side`: 0.15 and more of molars
+# Shapes are alike if a rigid motion brings them this near (units of sqrt(area)): femurs, knees and molars come to 0.04 to
+# 0.06, hearts and leaves up to 0.066; people, ants and fish to 0.069 and more.
+_MAX_ALIKE_DISTANCE = 0.067
+_CLEAR_SIDE = 0.05  # least `Fit.side` of a clear side: 0.15 and more for molars
 
 
 def match_alike(
@@ -52,36 +52,38 @@ def match_alike(
     progress: ProgressCallback | None = None,
     turned: bool = True,
 ) -> DirectMatch:
-    """A direct match, made finer where the shapes stand alike, or where one is open and clearly better seen as a part.
+    """Refine a direct match of shapes in the same pose, or of a part and its whole if that explains an open shape clearly
+    better.
 
-    A part is as large as it is in the whole: the files are in one unit.
+    The files of part and whole are assumed to have the same unit.
 
     Parameters
     ----------
     source, target
         Repaired shapes.
     found
-        What `match_either_side` made of them.
+        Their match by `match_either_side`.
     config
-        Whether parts and mirror images are looked for, and the seed.
+        Whether parts and mirror images are allowed, and the seed.
     progress
-        As of `match_directly`.
+        As for `match_directly`.
     turned
-        Whether the shapes may be turned otherwise than the match says. A shape and its mirror image may not; one of them is
-        the template then, for busts come nearer to their own symmetry so (2.4 % of sqrt(area), 3.1 from half way).
+        Whether the shapes may have another rotation than the match says. Not for a shape and its mirror image; the template
+        is then one of the two rather than their mean, as busts come nearer to their own symmetry so (2.4 % of sqrt(area)
+        instead of 3.1).
 
     Returns
     -------
     DirectMatch
-        The same; or two fits of one template with more nodes, which lies half way between the shapes; or is the larger one
-        where one is open.
+        ``found`` itself; or two fits of one template with more nodes. The template is halfway between the shapes, or the
+        larger shape if the other is a part.
     """
     if source.is_cloud or target.is_cloud:
         return found
     smaller, larger = sorted((source, target), key=lambda shape: shape.area)
     part = may_show_part(smaller, config) and rim_lengths(smaller).max() > RIM
     whole, other = (larger, smaller) if part else (source, target)
-    if not part and min(found.apart or apart(source, target, config.seed)) > _ALIKE:
+    if not part and min(found.apart or apart(source, target, config.seed)) > _MAX_ALIKE_DISTANCE:
         return found
     report = Progress(progress, other.name).stage("fits of shapes that stand alike")
     report(0.0)
@@ -102,10 +104,10 @@ def match_alike(
         fit = replace(fit, verdict=found.verdict, reasons=moving.reasons, trust=moving.trust)
     else:
         fit = cap_verdict(fit, [reason for reason in found.reasons if reason.code == "ambiguous"])
-    fits = _at_rest(fit, template, whole, frame), _as_it_rests(fit, template)
+    fits = _fit_of_itself(fit, template, whole, frame), _aligned_to_rest(fit, template)
     system = viscous_system(template)
     if turned and not part:
-        fits, system = _from_half_way((whole, other), fits, viscous) or (fits, system)
+        fits, system = _fits_from_mean((whole, other), fits, viscous) or (fits, system)
     report(1.0)
     first, second = fits if whole is source else fits[::-1]
     return replace(found, source=first, target=second, system=system)
@@ -119,32 +121,32 @@ def finer(
     progress: ProgressCallback | None = None,
     turned: bool = True,
 ) -> Fit:
-    """A fit of a model that learned a kind without correspondence, made finer.
+    """Refine a fit of a model that was trained without correspondence.
 
-    Where the shape stands as the template does, in any turn, or mirrored, the template is given more nodes, and is judged
-    anew. Elsewhere it is matched to the shape directly, with this fit as one of the guesses; where another guess
-    is clearly better, the fit is fair at most. A poor fit of such a shape is not searched, and stays poor. All is as it was
-    where the model learned correspondence, and of a cloud or a part.
+    If the shape has the template's pose, in any rotation or mirrored, the template gets more nodes, and the fit is judged
+    anew. Otherwise the template is matched to the shape directly, with this fit as one of the guesses; if another guess is
+    clearly better, the fit is at most fair. A poor fit of such a shape is not searched and stays poor. The fit is returned
+    unchanged if the model learned correspondence or has no nodes, and for a cloud or a part.
 
     Parameters
     ----------
     model
-        Of the fit.
+        The model of the fit.
     shape
         The repaired shape.
     fit
-        Of the model's template to it.
+        Fit of the model's template to it.
     config
-        Whether mirror images are looked for.
+        Whether mirror images are allowed.
     progress
-        As of `match_directly`, of what is searched.
+        As for `match_directly`, for the search.
     turned
-        Whether other turns than that of the fit are tried.
+        Whether to try other rotations than that of the fit.
 
     Returns
     -------
     Fit
-        Of the same template; its node vectors come near its points.
+        Of the same template; its node vectors only approximate its points.
     """
     card = model.card
     if card.correspondence or shape.is_cloud or fit.partial or not model.has_nodes:
@@ -155,26 +157,26 @@ def finer(
     doubts = [] if near is None or not both or near.side > _CLEAR_SIDE else [Reason("side", SIDE_IN_DOUBT)]
     if near is None:
         doubts = [reason for reason in fit.reasons if reason.code == "side"]
-        found = fit if poor else _searched(model.template, shape, fit, progress)
+        found = fit if poor else _search_again(model.template, shape, fit, progress)
         near, moved = fit_otherwise(with_more_nodes(model.template, viscous), shape, found, viscous)
         if moved:
             near = replace(near, points=found.points)
-    made = cap_verdict(judge_unsupervised(card, _as_of(model, near)), doubts)
+    result = cap_verdict(judge_unsupervised(card, _as_of(model, near)), doubts)
     if near.points is fit.points:  # it may yet agree with others
-        made = replace(made, vectors=fit.vectors)
+        result = replace(result, vectors=fit.vectors)
     if poor:
-        made = replace(made, verdict="poor", reasons=fit.reasons, trust=min(fit.trust, made.trust))
-    notes = with_mirror_note(fit.notes, shape.name, card, made.frame.mirrored)
-    return replace(made, repaired=fit.repaired, left_out=fit.left_out, notes=notes)
+        result = replace(result, verdict="poor", reasons=fit.reasons, trust=min(fit.trust, result.trust))
+    notes = with_mirror_note(fit.notes, shape.name, card, result.frame.mirrored)
+    return replace(result, repaired=fit.repaired, left_out=fit.left_out, notes=notes)
 
 
 def is_finer(model: TrainedModel, fit: Fit) -> bool:
-    """Whether a fit was made finer than its node vectors are."""
+    """Return whether the points of a fit are finer than its node vectors give, as after `finer`."""
     return model.has_nodes and not np.allclose(fit.points, node_system(model).moved(fit.vectors), atol=1e-6)
 
 
 def _as_of(model: TrainedModel, fit: Fit) -> Fit:
-    """A fit of the same vertices with more nodes, as one of a model."""
+    """Convert a fit of the same vertices with more nodes to one of a model."""
     return replace(
         fit,
         model=model.card.name,
@@ -185,10 +187,9 @@ def _as_of(model: TrainedModel, fit: Fit) -> Fit:
     )
 
 
-def _searched(template: Template, shape: Shape, fit: Fit, progress: ProgressCallback | None) -> Fit:
-    """Where a search finds the template's vertices on a shape, with its trust and reasons; the fit itself where the search
-    finds nothing that is clearly better."""
-    rested = Shape(template.shape.verts, template.shape.faces, shape.name)  # the name is what progress tells
+def _search_again(template: Template, shape: Shape, fit: Fit, progress: ProgressCallback | None) -> Fit:
+    """Replace the points of a fit by those that a search finds, with its trust and reasons, if these are clearly better."""
+    rested = Shape(template.shape.verts, template.shape.faces, shape.name)  # the name is for progress reports
     side = MIRROR if fit.frame.mirrored else None
     image, guess = shape, fit.points_in_file
     if side is not None:
@@ -196,7 +197,7 @@ def _searched(template: Template, shape: Shape, fit: Fit, progress: ProgressCall
     config = DirectConfig(fine=max(DirectConfig.fine, rested.F), from_source=True, seed=fit.seed)
     try:
         found = match_directly(rested, image, config, progress=progress, guess=(rested.verts, guess))
-    except InputError:  # no surface without its loose ends
+    except InputError:  # the shape is not a surface
         return fit
     if found.verdict == "poor" or 0 < found.over_guess < CLEARLY:
         return fit
@@ -208,23 +209,23 @@ def _searched(template: Template, shape: Shape, fit: Fit, progress: ProgressCall
 
 
 def as_part(model: TrainedModel, shape: Shape, whole: float, config: FitConfig) -> Fit | None:
-    """A fit of the template of a model that learned a kind without correspondence to a repaired shape that is cut.
+    """Fit the template of a model that was trained without correspondence to a repaired shape that is cut.
 
     Parameters
     ----------
     model
-        Of the kind.
+        A model of the kind.
     shape
-        A mesh that is open.
+        An open mesh.
     whole
         The sqrt(area) of a whole shape, in the unit of the file.
     config
-        Whether mirror images are looked for, and the seed.
+        Whether mirror images are allowed, and the seed.
 
     Returns
     -------
     Fit
-        As a part, fair at best; None where it is better seen as a whole, and for a pointwise model.
+        As a part, at most fair; None if the shape is better explained as a whole, and for a pointwise model.
     """
     if not model.has_nodes:
         return None
@@ -236,55 +237,57 @@ def as_part(model: TrainedModel, shape: Shape, whole: float, config: FitConfig) 
     return _as_of(model, found)
 
 
-def _as_it_rests(fit: Fit, template: Template) -> Fit:
-    """The same fit in the core frame in which the moved template is not turned against the resting one."""
+def _aligned_to_rest(fit: Fit, template: Template) -> Fit:
+    """The same fit in the core frame in which the deformed template is rigidly aligned to the rest template."""
     system = viscous_system(template)
-    return _turned_to(system.verts, fit, system)
+    return _rigidly_aligned(system.verts, fit, system)
 
 
-def _turned_to(points_of_other: Float[Floats, "N 3"], fit: Fit, system: NodeSystem) -> Fit:
-    """The same fit in the core frame in which it is not turned against another one of the same vertices."""
+def _rigidly_aligned(points_of_other: Float[Floats, "N 3"], fit: Fit, system: NodeSystem) -> Fit:
+    """The same fit in the core frame in which it is rigidly aligned to given positions of the same vertices."""
     turn = kabsch(points_of_other, fit.points)
     core, points = fit.frame.compose(turn.frame), turn.to_local(fit.points)
     up, front = (axis_name(core.rotation[row]) for row in (1, 2))
     return replace(fit, frame=core, points=points, vectors=system.vectors_to(points), up=up, front=front)
 
 
-def _from_half_way(
+def _fits_from_mean(
     shapes: tuple[Shape, Shape], fits: tuple[Fit, Fit], config: ViscousConfig
 ) -> tuple[tuple[Fit, Fit], NodeSystem] | None:
-    """Fits of a template that lies half way between two shapes to both of them: each has half as far to go, and neither
-    shape is favoured. The mean of two fits leans on what they got wrong, so it is taken anew twice. None where one of the
-    shapes does not stand as the mean does.
+    """Fits of a template halfway between two shapes to both of them; None if one of the shapes has another pose than the
+    template.
+
+    Each shape then has half as far to go, and neither is favored. The mean of two fits contains their errors, so it is
+    computed again twice.
     """
     first, second = fits
-    for how in (config.rough(), config.rough(), config):
-        middle = (first.points + kabsch(first.points, second.points).to_local(second.points)) / 2
-        template = template_of(Shape(middle, first.faces), "half way", config)
-        if how is config:
+    for stage_config in (config.rough(), config.rough(), config):
+        mean = (first.points + kabsch(first.points, second.points).to_local(second.points)) / 2
+        template = template_of(Shape(mean, first.faces), "half way", config)
+        if stage_config is config:
             template = finest(template, config)
-        one, other = parallel_map(partial(fit_from, template, config=how), shapes, (first, second))
+        one, other = parallel_map(partial(fit_from, template, config=stage_config), shapes, (first, second))
         if one is None or other is None:
             return None
         first, second = one, other
     system = viscous_system(template)
-    second = _turned_to(first.points, second, system)
+    second = _rigidly_aligned(first.points, second, system)
     return (_judged_as(first, fits[0]), _judged_as(second, fits[1])), system
 
 
 def _judged_as(fit: Fit, before: Fit) -> Fit:
-    """A fit with the verdict of another one of the same shape."""
+    """Give a fit the verdict of another fit of the same shape."""
     return replace(fit, verdict=before.verdict, reasons=before.reasons, trust=before.trust, notes=before.notes)
 
 
 def _frame_of(shape: Shape, config: ViscousConfig) -> Frame:
-    """From the file of a shape to the template that is made of it."""
+    """Frame from the file of a shape to the template that is made of it."""
     kept, faces = low_mesh(shape, config.faces)
     return sqrt_area_frame(Shape(shape.verts[kept], faces))
 
 
-def _at_rest(fit: Fit, template: Template, shape: Shape, frame: Frame) -> Fit:
-    """The fit of the template to the shape that it is made of, beside that to another one."""
+def _fit_of_itself(fit: Fit, template: Template, shape: Shape, frame: Frame) -> Fit:
+    """The fit of a template to the shape that it was made of, given its fit to another shape."""
     return replace(
         fit,
         frame=frame,

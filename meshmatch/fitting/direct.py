@@ -1,9 +1,10 @@
-"""Two shapes registered to each other without a model: one of them is the template of both.
+"""Register two shapes to each other without a model; one of them becomes the template of both.
 
-Proposals of where the vertices of the source belong on the target (`meshmatch.fitting.search.proposals`) are fitted on few
-nodes, the best of these on more, and the energy of the fits decides. Where it does not decide clearly, the target is fitted
-to the source as well: what either search finds is fitted in the other direction too, and both energies decide. What comes
-out are two fits of one template, as of a model: one shape as it is, and moved onto the other.
+Proposals of where the source's vertices belong on the target (`meshmatch.fitting.search.proposals`) are fitted coarse to
+fine (`meshmatch.fitting.one_way`), and the energy of the fits decides. If it does not decide clearly, the target is fitted
+to the source as well. What either search finds is then continued in the other direction, and the mean of both energies
+decides. The result is two fits of one template, as from a model: one shape undeformed, and the same shape deformed to the
+other.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from meshmatch.fitting.one_way import (
 )
 from meshmatch.fitting.search.intrinsic import DecimatedMesh
 from meshmatch.fitting.search.motions import turns_onto_itself
-from meshmatch.fitting.search.proposals import Proposal, differ
+from meshmatch.fitting.search.proposals import Proposal, changed_share
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.frames import Frame, kabsch
@@ -49,53 +50,58 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.sides import apart, mirrored
 from meshmatch.threads import parallel_calls, parallel_map
 
-# Share of vertices by which a map differs from a guess, or from the same map found from the other side, if it is much the
-# same.
-_SAME = 0.1
-# How much nearer a mirror image must lie, after rigid motions, to be tried (0.2 to 0.3 of femurs, up to 0.12 of creatures in
-# other poses), or to be tried where the relief is as little alike as of a palm and the back of a hand (0.6 to 0.71; 0.8 of
-# two hands of one side). What share of the energy its fit may have at most: 0.64 to 0.97 of hands, 1 of symmetric shapes;
-# and, of shapes that a rigid motion brings no nearer than so, what share of the relief may be min_difference: 0.24 to 0.92 of
-# hands, mostly less than 0.6, and 0.5 to 1 of animals, mostly more than 0.75.
-_MIRRORED, _MAYBE_MIRRORED, _UNLIKE, _SHARE = 0.15, 0.03, 0.75, 0.93
-_POSED, _SHARE_UNLIKE = 0.07, 0.6
+# Two maps, for example a map and the guess, are the same if no more than this share of vertices differs.
+_MAX_SAME_DIFFERENCE = 0.1
+# The mirror image is tried if rigid motions bring it this much nearer (log ratio): 0.2 to 0.3 for femurs, up to 0.12 for
+# creatures in other poses. The second, smaller limit holds if the relief correlates less than the third number, as for a
+# palm on the back of a hand: 0.6 to 0.71, but 0.8 for two hands of one side. The mirror image is accepted if its energy is
+# below the fourth number as a share: 0.64 to 0.97 for hands, 1 for symmetric shapes.
+_MIRROR_LEAD, _MIRROR_LEAD_IF_UNLIKE, _MIN_RELIEF, _MIRROR_ENERGY_RATIO = 0.15, 0.03, 0.75, 0.93
+# If no rigid motion brings the shapes nearer than the first number, poses differ; the mirror image is then accepted only if
+# the difference of relief falls below the second number as a share: 0.24 to 0.92 for hands, mostly below 0.6; 0.5 to 1 for
+# animals, mostly above 0.75.
+_MAX_RIGID_DISTANCE, _MIRROR_RELIEF_RATIO = 0.07, 0.6
 CLEARLY = 0.003
-"""How much lower the energy must be of a map that leaves doubt, for it to replace what a model found."""
+"""How much lower the energy of a doubtful map must be for it to replace what a model found."""
 MIRROR = Frame(1.0, np.diag([-1.0, 1.0, 1.0]), np.zeros(3))
-_NORMALS = 0.1  # of unit normals beside positions, where vertices look for what was moved near them
+_NORMAL_WEIGHT = 0.1  # weight of unit normals against positions when vertices are transferred between deformed shapes
 
 
 @dataclass(frozen=True, eq=False)
 class _BothWays:
-    """One correspondence: the source fitted to the target, and the target to the source."""
+    """One correspondence, fitted in both directions: the source to the target, and the target to the source."""
 
-    there: DirectFit
-    back: DirectFit
+    forward: DirectFit
+    backward: DirectFit
 
     @property
     def proposal(self) -> Proposal:
-        return self.there.proposal
+        return self.forward.proposal
 
     @property
     def moved(self) -> Float[Floats, "V 3"]:
-        return self.there.moved
+        return self.forward.moved
 
     @property
     def energy(self) -> float:
-        return (self.there.energy + self.back.energy) / 2
+        return (self.forward.energy + self.backward.energy) / 2
 
 
 @dataclass(frozen=True, eq=False)
 class DirectMatch:
-    """Two fits of one template, which is the source or the target: the one as it is, and moved onto the other.
+    """Two fits of one template, which is the source or the target: one undeformed, and one deformed to the other shape.
 
-    ``system`` moves the template by node vectors: where that is the source, the same for every shape that one source is
-    registered to. ``tried`` are what the fits that were compared in the end began from, and their energies, best first;
-    ``leads`` how much higher the energies of those are that differ from the best one, and ``over_guess`` that of the
-    guess, if there was one: 0 where it is much the same map. ``turns`` is by how many turns one of the shapes comes onto
-    itself, which makes so many maps equally good. ``apart`` is how far apart a rigid motion leaves the shapes, and the
-    source and the mirror image of the target (units of sqrt(area)), if that was asked. Where the energies are means of both
-    directions, ``before`` is what the first of them alone would have given.
+    Attributes
+    ----------
+    source, target : the fits
+    tried : kind of proposal and energy of each fit that was compared in the end, best first
+    system : deforms the template by node vectors; if the source is the template, one system serves all of its targets
+    leads : energies of the fits that differ from the best one, minus its energy
+    over_guess : the same for the guess, if there was one; 0 if it is the same map
+    earlier : computes the match that the first direction alone would have given, if both directions were used
+    turns : number of rotations that map one of the shapes onto itself, and thus of equally good maps
+    apart : distances (units of sqrt(area)) that rigid motions leave between the shapes, and between the source and the
+        mirror image of the target; None if they were not computed
     """
 
     source: Fit
@@ -118,12 +124,12 @@ class DirectMatch:
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """Of the verdict."""
+        """Reasons of both fits."""
         return (*self.source.reasons, *self.target.reasons)
 
     @property
     def verdict(self) -> Verdict:
-        """That of the fit that moves the template; the other one is good."""
+        """Verdict of the fit that deforms the template; the other one is good."""
         return self.source.verdict if self.target.verdict == "good" else self.target.verdict
 
 
@@ -142,24 +148,24 @@ def match_directly(
     source, target
         Meshes, or clouds whose points lie on a surface; in any size and orientation.
     config
-        How hard the search is.
+        How thoroughly to search.
     known
-        Positions (N, 3) on the source and (N, 3) on the target, in their files' coordinates, that belong together.
+        Corresponding positions (N, 3) on the source and (N, 3) on the target, in their files' coordinates.
     progress
-        Called with the stage, the name of the source, and the share that is done.
+        Called with the stage, the name of the source, and the completed share.
     guess
-        Positions (T, 3) all over the source and where they may belong on the target, (T, 3), as another method found; one
-        more proposal.
+        Positions (T, 3) all over the source and (T, 3) on the target where another method puts them; used as one more
+        proposal.
 
     Returns
     -------
     DirectMatch
-        Two fits of one template, with the verdict on the one that moves it.
+        Two fits of one template; the one that deforms it has the verdict.
 
     Raises
     ------
     InputError
-        A shape without area, or a cloud whose points lie on no surface.
+        A shape has no area, or the points of a cloud do not lie on a surface.
     """
     began, report = time.monotonic(), Progress(progress, source.name)
     search = _Search.of(source, target, config or DirectConfig(), known, guess)
@@ -174,23 +180,25 @@ def match_either_side(
     progress: ProgressCallback | None = None,
     guess: KnownPairs | None = None,
 ) -> DirectMatch:
-    """As `match_directly`, with the mirror image of the target where that may be meant, and fits clearly better: a left bone
-    onto a right one. The second fit then says that it is mirrored."""
+    """As `match_directly`, but use the mirror image of the target if it may be meant and fits clearly better.
+
+    This matches a left bone to a right one, for example. The fit of the target is then marked as mirrored (its frame).
+    """
     config = config or DirectConfig()
     began, report = time.monotonic(), Progress(progress, source.name)
     search = _Search.of(source, target, config, known, guess)
-    there = search.one_way(report.stage("", 0.0, 0.3), [lambda: search.apart])
-    nearer = float(np.log(search.apart[0] / search.apart[1]))
-    if nearer < (_MAYBE_MIRRORED if there[0].features.likeness < _UNLIKE else _MIRRORED):
-        return replace(search.matched(there, report, began), apart=search.apart)
+    plain_fits = search.one_way(report.stage("", 0.0, 0.3), [lambda: search.apart])
+    mirror_lead = float(np.log(search.apart[0] / search.apart[1]))
+    if mirror_lead < (_MIRROR_LEAD_IF_UNLIKE if plain_fits[0].features.likeness < _MIN_RELIEF else _MIRROR_LEAD):
+        return replace(search.matched(plain_fits, report, began), apart=search.apart)
     known, guess = (pairs and (pairs[0], MIRROR.apply(pairs[1])) for pairs in (known, guess))
     image = _Search.of(source, mirrored(target), config, known, guess)
     to_image = image.one_way(report.stage("", 0.3, 0.6))
-    if to_image[0].energy > _SHARE * there[0].energy:
-        return replace(search.matched(there, report, began), apart=search.apart)
-    if not _alike(there[0].features, to_image[0].features, min(search.apart)):
-        return replace(_side_in_doubt(search.matched(there, report, began)), apart=search.apart)
-    return replace(_of_mirror_image(image.matched(to_image, report, began), target), apart=search.apart)
+    if to_image[0].energy > _MIRROR_ENERGY_RATIO * plain_fits[0].energy:
+        return replace(search.matched(plain_fits, report, began), apart=search.apart)
+    if not _mirror_is_meant(plain_fits[0].features, to_image[0].features, min(search.apart)):
+        return replace(_with_side_in_doubt(search.matched(plain_fits, report, began)), apart=search.apart)
+    return replace(_unmirrored(image.matched(to_image, report, began), target), apart=search.apart)
 
 
 def match_where_it_lies(
@@ -199,19 +207,19 @@ def match_where_it_lies(
     config: DirectConfig | None = None,
     progress: ProgressCallback | None = None,
 ) -> tuple[int, DirectMatch]:
-    """As `match_directly`, one way and without a search: to the one of some targets that fits best.
+    """As `match_directly`, but without a search and in one direction: to whichever of several targets fits best.
 
     Parameters
     ----------
     targets
-        One shape, moved rigidly in some ways, in each of which it may lie on the source.
+        Rigidly moved copies of one shape, each in a position where it may coincide with the source.
 
     Returns
     -------
     int
-        The number of the target.
+        The index of the target.
     DirectMatch
-        Of the source and of that target.
+        The match of the source to that target.
     """
     began, report = time.monotonic(), Progress(progress, source.name).stage("fits of the guesses")
     config = config or DirectConfig()
@@ -223,26 +231,26 @@ def match_where_it_lies(
     def number_of(found: DirectFit) -> int:
         return next(k for k, place in enumerate(places) if place is found.proposal)
 
-    def as_of_first(found: DirectFit) -> DirectFit:
+    def in_first_target(found: DirectFit) -> DirectFit:
         """A fit as if the target were the first one."""
         number = number_of(found)
         back = kabsch(targets[number].verts, targets[0].verts)
-        there = sides[number].frame.undo(own.fine.system.moved(found.vectors))
-        return replace(found, moved=sides[0].frame.apply(back.to_world(there)))
+        points = sides[number].frame.undo(own.fine.system.moved(found.vectors))
+        return replace(found, moved=sides[0].frame.apply(back.to_world(points)))
 
     def fit(place: Proposal, side: ShapeData) -> DirectFit:
-        return as_of_first(fit_fine(own, side, place, place.points))
+        return in_first_target(fit_fine(own, side, place, place.points))
 
-    def go_on(found: DirectFit) -> DirectFit:
-        return as_of_first(slide(own, sides[number_of(found)], found))
+    def continue_fit(found: DirectFit) -> DirectFit:
+        return in_first_target(slide(own, sides[number_of(found)], found))
 
-    _ = own.fine  # once, and not by each thread
+    _ = own.fine  # compute once, before threads start
     report(0.0)
     tried = parallel_map(fit, places, sides)
     report(0.6)
     best = distinct(tried, config.n_slid, config.min_difference)
     rest = [each for each in tried if each not in best]
-    found = sorted([*parallel_map(go_on, best), *rest], key=attrgetter("energy"))
+    found = sorted([*parallel_map(continue_fit, best), *rest], key=attrgetter("energy"))
     chosen = number_of(found[0])
     turns = turns_onto_itself(own.coarse_mesh)
     match = replace(searches[chosen], source=own)._match(_Judged(found, config.min_difference, DIRECT, turns))
@@ -251,35 +259,37 @@ def match_where_it_lies(
     return chosen, replace(match, source=first, target=second)
 
 
-def _alike(plain: DirectFeatures, image: DirectFeatures, apart: float) -> bool:
-    """Whether the mirror image is meant, if it fits better. A creature in another pose may have less to bend onto the mirror
-    image of a target, whose other leg is in front; there the relief must say so too.
+def _mirror_is_meant(plain: DirectFeatures, image: DirectFeatures, apart: float) -> bool:
+    """Return whether the mirror image, which fits better, is really meant.
+
+    A creature in another pose may bend less onto the mirror image of a target whose other leg is in front. If poses differ,
+    the relief must therefore prefer the mirror image too.
     """
-    return apart < _POSED or 1.0 - image.likeness < _SHARE_UNLIKE * (1.0 - plain.likeness)
+    return apart < _MAX_RIGID_DISTANCE or 1.0 - image.likeness < _MIRROR_RELIEF_RATIO * (1.0 - plain.likeness)
 
 
-def _side_in_doubt(found: DirectMatch) -> DirectMatch:
-    """A match whose sides may be exchanged."""
+def _with_side_in_doubt(found: DirectMatch) -> DirectMatch:
+    """Add a reason to a match: left and right may be exchanged."""
     doubt = [Reason("side", SIDE_IN_DOUBT)]
     if found.source.vectors.any():
         return replace(found, source=cap_verdict(found.source, doubt))
     return replace(found, target=cap_verdict(found.target, doubt))
 
 
-def _of_mirror_image(found: DirectMatch, target: Shape) -> DirectMatch:
-    """A match to the mirror image of a target as one to the target: its fit says that it is mirrored."""
+def _unmirrored(found: DirectMatch, target: Shape) -> DirectMatch:
+    """Turn a match to the mirror image of a target into one to the target, whose fit then has a mirrored frame."""
     frame, earlier = MIRROR.compose(found.target.frame), found.earlier
     up, front = (axis_name(frame.rotation[row]) for row in (1, 2))
     return replace(
         found,
         target=replace(found.target, frame=frame, verts=target.verts, up=up, front=front),
-        earlier=None if earlier is None else lambda: _of_mirror_image(earlier(), target),
+        earlier=None if earlier is None else lambda: _unmirrored(earlier(), target),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """Two shapes, and what another method says of where positions on the first belong on the second."""
+    """Two shapes, and a guess by another method: positions on the first and their counterparts on the second."""
 
     source: ShapeData
     target: ShapeData
@@ -289,7 +299,7 @@ class _Search:
     def of(
         cls, source: Shape, target: Shape, config: DirectConfig, known: KnownPairs | None, guess: KnownPairs | None
     ) -> _Search:
-        """``known`` and ``guess`` in the files' coordinates."""
+        """Prepare the shapes; ``known`` and ``guess`` are in the files' coordinates."""
         frames = sqrt_area_frame(source), sqrt_area_frame(target)
         shapes = [
             Shape(frame.apply(each.verts), each.faces) for frame, each in zip(frames, (source, target), strict=True)
@@ -303,68 +313,73 @@ class _Search:
 
     @cached_property
     def apart(self) -> tuple[float, float]:
-        """How far apart a rigid motion leaves the shapes, and the source and the mirror image of the target."""
+        """Distances that rigid motions leave: between the shapes, and between the source and the mirror image of the
+        target.
+        """
         return apart(self.source.original, self.target.original, self.source.config.seed)
 
     def one_way(self, report: Progress, meanwhile: Sequence[Callable[[], object]] = ()) -> list[DirectFit]:
-        """The best fits of the source to the target, best first; see `fitted`."""
+        """The best fits of the source to the target, best first; see `fit_one_way`."""
         return fit_one_way(self.source, self.target, self.guess, report, meanwhile)
 
-    def both_ways(self, there: list[DirectFit], report: Progress) -> list[_BothWays]:
-        """The best fits of the source to the target, and of the target to the source, each continued the other way; best
-        first."""
+    def both_ways(self, forward_fits: list[DirectFit], report: Progress) -> list[_BothWays]:
+        """The best fits in both directions, best first: those of either direction, each continued in the other one."""
         reverse = _Search(self.target, self.source, self.guess and self.guess[::-1])
-        there, back = self._best(there), self._best(reverse.one_way(report.between(0.0, 0.7)))
+        forward_fits, backward_fits = self._best(forward_fits), self._best(reverse.one_way(report.between(0.0, 0.7)))
         report = report.named("fits both ways")
         report(0.7)
-        returned = parallel_calls((*self._returned(there), *reverse._returned(back)))
-        ways = zip(there, returned, strict=False)
-        ways_back = zip(returned[len(there) :], back, strict=True)
+        returned = parallel_calls((*self._reverse_calls(forward_fits), *reverse._reverse_calls(backward_fits)))
+        ways = zip(forward_fits, returned, strict=False)
+        ways_back = zip(returned[len(forward_fits) :], backward_fits, strict=True)
         found = [_BothWays(*each) for each in (*ways, *ways_back)]
         report(0.9)
-        best = distinct(found, self.source.config.n_slid, _SAME)
+        best = distinct(found, self.source.config.n_slid, _MAX_SAME_DIFFERENCE)
         sides = (self.source, self.target), (self.target, self.source)
-        tasks = [partial(slide, *sides[back], (each.there, each.back)[back]) for back in (0, 1) for each in best]
+        tasks = [
+            partial(slide, *sides[direction], (each.forward, each.backward)[direction])
+            for direction in (0, 1)
+            for each in best
+        ]
         moved = parallel_calls(tasks)
         report(1.0)
         further = [_BothWays(*each) for each in zip(moved[: len(best)], moved[len(best) :], strict=True)]
         return sorted([*further, *(each for each in found if each not in best)], key=attrgetter("energy"))
 
     def _best(self, tried: list[DirectFit]) -> list[DirectFit]:
-        """The best few that differ, and the guess, whose energy is asked for."""
+        """The best few fits that differ, and that of the guess, whose energy is reported."""
         best = distinct(tried, self.source.config.n_returned, self.source.config.min_difference)
         return best + [each for each in tried if each.proposal.kind == "guess" and each not in best]
 
-    def _returned(self, tried: Sequence[DirectFit]) -> list[Callable[[], DirectFit]]:
-        """What fits the target to the source by what takes the source to the target."""
+    def _reverse_calls(self, tried: Sequence[DirectFit]) -> list[Callable[[], DirectFit]]:
+        """Calls that fit the target to the source, starting from the inverses of given fits of the source to the target."""
         own, other = self.source.fine, self.target.fine
-        at = with_normals(other.mesh.verts, vertex_normals(other.mesh.verts, other.system.faces), _NORMALS)
+        at = with_normals(other.mesh.verts, vertex_normals(other.mesh.verts, other.system.faces), _NORMAL_WEIGHT)
         tasks: list[Callable[[], DirectFit]] = []
         for each in tried:
-            moved = with_normals(each.moved, vertex_normals(each.moved, own.system.faces), _NORMALS)
+            moved = with_normals(each.moved, vertex_normals(each.moved, own.system.faces), _NORMAL_WEIGHT)
             goals = interpolate(at, moved, own.mesh.verts)
             tasks.append(partial(fit_fine, self.target, self.source, each.proposal, goals))
         return tasks
 
-    def matched(self, there: list[DirectFit], report: Progress, began: float) -> DirectMatch:
-        """The best of the fits as a match; of both ways, if one way leaves doubt."""
+    def matched(self, forward_fits: list[DirectFit], report: Progress, began: float) -> DirectMatch:
+        """The best fit as a match. Fits in both directions, if the configuration or doubt asks for it."""
         how, source, target = self.source.config.both_ways, self.source, self.target
         turns = max(turns_onto_itself(each.coarse_mesh, each.known and each.known[0]) for each in (source, target))
-        found = _Judged(there, self.source.config.min_difference, DIRECT, turns)
+        found = _Judged(forward_fits, self.source.config.min_difference, DIRECT, turns)
         if how == "always" or (how == "in doubt" and not found.clear):
-            both = self.both_ways(there, report.stage("", 0.6, 0.95))
-            found = _Judged(both, _SAME, DIRECT_BOTH_WAYS, turns, found)
+            both = self.both_ways(forward_fits, report.stage("", 0.6, 0.95))
+            found = _Judged(both, _MAX_SAME_DIFFERENCE, DIRECT_BOTH_WAYS, turns, found)
         match = self._match(found)
         report.stage("matching without a model")(1.0)
         first, second = (replace(fit, seconds=time.monotonic() - began) for fit in (match.source, match.target))
         return replace(match, source=first, target=second)
 
     def _match(self, judged: _Judged) -> DirectMatch:
-        """The best fit, refined to the end, beside those that were found."""
+        """The match of the best fit, after a last refinement."""
         best, own, other = judged.found[0], self.source, self.target
-        chosen = best.there if isinstance(best, _BothWays) else best
-        if isinstance(best, _BothWays) and not own.config.from_source and best.back.energy < best.there.energy:
-            own, other, chosen = other, own, best.back
+        chosen = best.forward if isinstance(best, _BothWays) else best
+        if isinstance(best, _BothWays) and not own.config.from_source and best.backward.energy < best.forward.energy:
+            own, other, chosen = other, own, best.backward
         vectors = own.fine.refined(other.samples, chosen.vectors, own.config.last, own.fine.viscous)
         fits = _fits(own, other, vectors, chosen.features.residual, judged.judged)
         source, target = fits if own is self.source else fits[::-1]
@@ -381,10 +396,10 @@ class _Search:
         )
 
     def _over_guess(self, found: Sequence[DirectFit | _BothWays]) -> float:
-        """How much lower the energy of the best fit is than that of the guess."""
+        """Energy of the guess minus that of the best fit; 0 if they are the same map."""
         if self.guess is None:
             return np.inf
-        if differ(found[0].moved, interpolate(self.source.fine.mesh.verts, *self.guess)) < _SAME:
+        if changed_share(found[0].moved, interpolate(self.source.fine.mesh.verts, *self.guess)) < _MAX_SAME_DIFFERENCE:
             return 0.0
         guessed = [each.energy for each in found if each.proposal.kind == "guess"]
         return min(guessed, default=np.inf) - found[0].energy
@@ -392,8 +407,11 @@ class _Search:
 
 @dataclass(frozen=True, eq=False)
 class _Judged:
-    """Fits, the best one first, and what is said of it; those are alike that differ at ``min_difference`` of the vertices, and
-    the ``earlier`` ones, of one direction, left doubt."""
+    """Fits, best first, and their judgement.
+
+    Fits differ if more than ``min_difference`` of the vertices do. ``earlier`` are the fits of one direction, if they left
+    doubt.
+    """
 
     found: Sequence[DirectFit | _BothWays]
     min_difference: float
@@ -403,10 +421,10 @@ class _Judged:
 
     @cached_property
     def leads(self) -> tuple[float, ...]:
-        """How much higher the energies of those are that differ from the first one, which has the lowest."""
+        """Energies of the fits that differ from the best one, minus its energy."""
         best, *others = self.found
         return tuple(
-            each.energy - best.energy for each in others if differ(each.moved, best.moved) > self.min_difference
+            each.energy - best.energy for each in others if changed_share(each.moved, best.moved) > self.min_difference
         )
 
     @property
@@ -415,7 +433,9 @@ class _Judged:
 
     @property
     def clear(self) -> bool:
-        """Whether the best is likely enough to be right; of ties and of turned shapes more fits know little more."""
+        """Whether the best fit is likely enough to be right without fits in the other direction; these hardly resolve
+        ties.
+        """
         return self.judged[1] >= LIKELY
 
 
@@ -426,16 +446,18 @@ def _fits(
     residual: float,
     judged: tuple[Verdict, float, tuple[Reason, ...]],
 ) -> tuple[Fit, Fit]:
-    """A shape as the template, unmoved, and the template moved onto the other one, whose core frame is turned to its."""
+    """The undeformed template as the fit of its own shape, and the deformed one as the fit of the other, in a rigidly
+    aligned frame.
+    """
     system, (verdict, trust, reasons) = own.fine.system, judged
-    still, moved = np.zeros((system.K, 3)), system.moved(vectors)
-    turn = kabsch(system.verts, moved)
-    core = other.frame.compose(turn.frame)
+    zero_vectors, moved = np.zeros((system.K, 3)), system.moved(vectors)
+    pose = kabsch(system.verts, moved)
+    core = other.frame.compose(pose.frame)
     first = Fit(
         template_hash=own.fine.mesh.shape.hash,
         frame=own.frame,
         points=system.verts,
-        vectors=still,
+        vectors=zero_vectors,
         resting=system.verts,
         faces=system.faces,
         residual=0.0,
@@ -452,8 +474,8 @@ def _fits(
     second = replace(
         first,
         frame=core,
-        points=turn.to_local(moved),
-        vectors=system.vectors_to(turn.to_local(moved)),
+        points=pose.to_local(moved),
+        vectors=system.vectors_to(pose.to_local(moved)),
         residual=residual,
         verts=other.original.verts,
         verdict=verdict,

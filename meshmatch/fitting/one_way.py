@@ -21,7 +21,7 @@ from meshmatch.fitting.search.discontinuities import Pairs, neighbours
 from meshmatch.fitting.search.intrinsic import DecimatedMesh, Intrinsic
 from meshmatch.fitting.search.proposals import (
     Proposal,
-    differ,
+    changed_share,
     extremity_proposals,
     rigid_proposals,
     spectral_proposals,
@@ -72,20 +72,21 @@ class DirectConfig:
 
     Attributes
     ----------
-    coarse, fine : triangles of the coarse and of the fine mesh
-    samples, few, fewer : samples of the target for the fine fits, for the better coarse fits, and for the first coarse fits
+    coarse, fine : number of triangles of the coarse and of the fine mesh
+    samples, second_samples, first_samples : samples of the target for fits of the fine mesh, for the second fits of the
+        coarse mesh, and for the first ones
     coarse_nodes, fine_nodes : nodes on the two meshes
     first, second : least squares for all proposals, and for the better ones, on the coarse mesh
     third : for the best ones, on the fine mesh; their energies decide
-    along : for the best of these, if it lowers their energy: samples hold vertices across the surface only, so that a limb
-        slides along itself until the ends meet
+    slide : continues the best of these, and is kept if the energy decreases: with a weaker pull along the surface, limbs
+        slide along themselves until their ends meet
     last : for the chosen fit, which may then stretch more
-    better, best, gliding : how many proposals get the second and third least squares, and ``slide``, in one direction or
+    n_second, n_third, n_slid : how many proposals get ``second``, ``third`` and ``slide``; the last in one direction or in
         both
-    returned : how many fits of each direction are continued in the other one
-    min_difference : share of vertices by which these differ at least
-    both_ways : when to fit the target to the source too; "in doubt" is if one direction is probably wrong
-    from_source : always use the source as the template, not whichever shape fits the other better
+    n_returned : how many fits of each direction are continued in the other one
+    min_difference : smallest share of vertices at which two of these differ
+    both_ways : when to fit the target to the source too; "in doubt" means if one direction alone is not likely to be right
+    from_source : always use the source as the template, instead of the shape that fits the other one better
     seed : seed of all random numbers
     """
 
@@ -213,8 +214,8 @@ class ShapeData:
     """One of two shapes, with what is needed to fit it to the other one and the other one to it.
 
     ``frame`` is that of its file; everything else is in units of sqrt(area). ``base_mesh`` is the shape, decimated if it is
-    large, from which coarse and fine meshes are made; ``coarse_mesh`` is the coarse mesh; ``known`` are corresponding positions
-    (N, 3) on this shape and on the other one.
+    large, from which coarse and fine meshes are made; ``known`` are corresponding positions (N, 3) on this shape and on the
+    other one.
     """
 
     original: Shape
@@ -399,11 +400,11 @@ F = TypeVar("F", bound=_Fitted)
 
 
 def distinct(tried: Sequence[F], count: int, min_difference: float, by: str = "energy") -> list[F]:
-    """The best ``count`` fits, by the attribute ``by``, that differ from each other at more than ``min_difference`` of the
-    vertices.
+    """The best ``count`` fits, by the attribute ``by``, that differ from each other at more than ``min_difference`` of
+    the vertices.
     """
     kept: list[F] = []
     for each in sorted(tried, key=attrgetter(by)):
-        if len(kept) < count and all(differ(each.moved, other.moved) > min_difference for other in kept):
+        if len(kept) < count and all(changed_share(each.moved, other.moved) > min_difference for other in kept):
             kept.append(each)
     return kept

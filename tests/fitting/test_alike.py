@@ -187,7 +187,7 @@ def test_what_stands_otherwise_is_only_turned_where_a_search_finds_nothing_bette
     shape = Shape(system.verts * [1, 3, 1], model.template.shape.faces)
     crumpled = system.verts @ np.diag([1.0, -1.0, 1.0]) * [3, 1, 1]
     fit = replace(Fitter(model).fit(shape), points=crumpled, verdict="fair", frame=Frame.identity())
-    monkeypatch.setattr(alike, "_searched", lambda template, part, start, progress: start)
+    monkeypatch.setattr(alike, "_search_again", lambda template, part, start, progress: start)
     found = finer(model, shape, fit, FitConfig(mirror="no"))
     assert cKDTree(found.points_in_file).query(shape.verts)[0].mean() < 0.1
     assert not np.allclose(found.points, fit.points)

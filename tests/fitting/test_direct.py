@@ -91,7 +91,7 @@ def test_extremities_are_the_ends_of_limbs_and_limbs_run_from_zero_to_one(thin: 
     reach, along = surface.limbs
     assert np.allclose(along[surface.extremities, np.arange(len(ends))], 1) and along.min() > -1e-9
     assert (reach > 0.2).all()
-    assert surface.among_landmarks.max() <= 1 and (surface.among_landmarks[~np.eye(300, dtype=bool)] > 0).all()
+    assert surface.landmark_distances.max() <= 1 and (surface.landmark_distances[~np.eye(300, dtype=bool)] > 0).all()
 
 
 def test_distances_bridge_separate_parts() -> None:

@@ -1,6 +1,6 @@
-"""A shape as the search without a model sees it: thinned, with what does not change when it bends.
+"""A decimated shape and its intrinsic properties, which do not change when it bends, for the search without a model.
 
-Distances along the surface, eigenfunctions of the Laplacian, and extremities: the ends of limbs, fins, legs and handles.
+These are distances along the surface, Laplacian eigenfunctions, and extremities: the ends of limbs, fins, legs and handles.
 """
 
 from __future__ import annotations
@@ -24,33 +24,36 @@ from meshmatch.shapes.sampling import farthest_points, triangulate_cloud
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import low_mesh
 
-_FUNCTIONS = 50  # eigenfunctions
-_SMOOTHED = 0.02, 0.08  # lengths over which a surface is smoothed, in units of sqrt(area)
-_FLAT = 0.001  # heights that differ by less are the same: so a plane has no relief
-_NORMAL_WEIGHT = 0.1  # of unit normals beside positions
-_TINY = 1e-12  # area of vertices whose triangles have none
-_LANDMARKS = 300  # vertices, evenly spread, that stand for all
-_PROFILE = 12  # distances at which the area around an extremity is asked
-# Of the diameter along the surface: an extremity is a maximum of the mean distance that stands out by so much from the
-# way to a higher one, and lies so far from the others. At most so many are told apart.
-_PERSISTENCE, _APART, _MOST = 0.04, 0.08, 14
-_SHARES = (0.15, 0.3, 0.5, 0.7)  # of the way to an extremity: where ways are compared
-_RINGS, _RING = (0.25, 0.5, 0.75), 0.03  # shares of the way where there are rings, and half of their width
+_N_FUNCTIONS = 50  # number of eigenfunctions
+_SMOOTHING_LENGTHS = 0.02, 0.08  # units of sqrt(area)
+_RELIEF_STEP = 0.001  # relief is rounded to multiples of this, so that a plane has none
+_NORMAL_WEIGHT = 0.1  # weight of unit normals against positions
+_MIN_AREA = 1e-12  # regularization for vertices whose triangles have no area
+_N_LANDMARKS = 300  # evenly spread vertices that represent all
+_N_DISTANCES = 12  # number of distances in the area profile of an extremity
+# Shares of the diameter along the surface: an extremity is a maximum of the eccentricity with at least the first
+# persistence, at least the second distance away from the others. The third number is the maximum number of extremities.
+_MIN_PERSISTENCE, _MIN_DISTANCE, _MAX_EXTREMITIES = 0.04, 0.08, 14
+_PATH_SHARES = (0.15, 0.3, 0.5, 0.7)  # shares of the paths from the center to extremities at which paths are compared
+_RING_SHARES, _RING_HALF_WIDTH = (
+    (0.25, 0.5, 0.75),
+    0.03,
+)  # shares of the paths at which there are rings, and half the width of a ring
 
 
 @dataclass(frozen=True, eq=False)
 class DecimatedMesh:
-    """A shape with about as many triangles as are asked, on some of its own vertices; in its frame."""
+    """A shape reduced to about the given number of triangles, on some of its own vertices; in the shape's frame."""
 
     verts: Float[Floats, "V 3"]
     faces: Int[Ints, "F 3"]
 
     @classmethod
     def of(cls, shape: Shape, faces: int) -> DecimatedMesh:
-        """`InputError` for a cloud whose points lie on no surface."""
+        """Decimate a shape. Raises `InputError` for a cloud whose points do not lie on a surface."""
         kept, corners = low_mesh(shape, faces)
         used, renumbered = np.unique(corners, return_inverse=True)
-        if len(used) > faces:  # twice as many as of a closed surface: it is in crumbs, and is thinned as a cloud
+        if len(used) > faces:  # twice as many as on a closed surface: too fragmented, so treat it as a cloud
             cloud = Shape(shape.verts, np.empty((0, 3), np.int64), shape.name)
             kept, corners = triangulate_cloud(cloud, faces)
             used, renumbered = np.unique(corners, return_inverse=True)
@@ -72,36 +75,43 @@ class DecimatedMesh:
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Of positions and weighted normals."""
+        """Tree over positions and weighted normals."""
         return feature_tree(with_normals(self.verts, self.normals, _NORMAL_WEIGHT))
 
     @cached_property
     def relief(self) -> Float[Floats, "V R"]:
-        """How far vertices stand out of the surface smoothed over two lengths, noses and navels: as ranks by area, from -1/2
-        to 1/2."""
+        """Height of each vertex above the surface smoothed over two lengths (noses, navels), as ranks by area from -1/2
+        to 1/2.
+        """
         stiffness, mass = robust_laplacian.mesh_laplacian(self.verts, self.faces)
         ranks = []
-        shortest = np.sqrt(2 * vertex_areas(self.verts, self.faces).sum() / len(self.faces))  # about an edge
-        for length in np.maximum(_SMOOTHED, shortest):
-            system = csc_matrix(mass + length**2 * stiffness + _TINY * identity(len(self.verts)))
+        shortest = np.sqrt(
+            2 * vertex_areas(self.verts, self.faces).sum() / len(self.faces)
+        )  # about the length of an edge
+        for length in np.maximum(_SMOOTHING_LENGTHS, shortest):
+            system = csc_matrix(mass + length**2 * stiffness + _MIN_AREA * identity(len(self.verts)))
             smooth = splu(system).solve(mass @ self.verts)
-            out = ((self.verts - smooth) * self.normals).sum(1)
-            height, level = np.unique(np.round(out / _FLAT), return_inverse=True)
+            heights = ((self.verts - smooth) * self.normals).sum(1)
+            height, level = np.unique(np.round(heights / _RELIEF_STEP), return_inverse=True)
             share = np.bincount(level, self.areas, len(height))
             ranks.append((np.cumsum(share) - share / 2 - 0.5)[level])
         return np.stack(ranks, 1)
 
     def likeness(self, other: DecimatedMesh, moved: OrientedPoints) -> float:
-        """Correlation (0..1) of its relief with that of another mesh, where its vertices are moved to on it."""
+        """Correlation (0..1) of the relief with that of another mesh, at the vertices nearest to this mesh's deformed
+        vertices.
+        """
         nearest = other.tree.query(with_normals(moved.points, moved.normals, _NORMAL_WEIGHT))[1]
-        own, theirs = self.relief, other.relief[nearest]  # of its own the mean is 0
+        own, theirs = self.relief, other.relief[nearest]  # the mean of `own` is 0 already
         theirs = theirs - self.areas @ theirs
         spreads = np.sqrt((self.areas @ own**2) * (self.areas @ theirs**2))
         return float(np.abs((self.areas @ (own * theirs)) / np.maximum(spreads, 1e-12)).mean())
 
     @cached_property
     def graph(self) -> csr_matrix:
-        """Edge lengths; separate parts are joined where they are nearest, so that every distance is finite."""
+        """Edge lengths as a graph; separate parts are connected where they are nearest, so that all distances are
+        finite.
+        """
         edges = edges_of(self.faces).vertices.astype(np.int64)
         length = edge_lengths(self.verts, edges)
         part = connected_components(coo_matrix((length, edges.T), (len(self.verts),) * 2), directed=False)[1]
@@ -113,7 +123,9 @@ class DecimatedMesh:
 
 
 def _bridges(verts: Float[Floats, "V 3"], part: Int[Ints, " V"]) -> Int[Ints, "N 2"]:
-    """Pairs of vertices that join all parts: each part, from the largest on, with the nearest of those before it."""
+    """Pairs of vertices that connect all parts: each part, from the second largest on, to the nearest of the larger
+    ones.
+    """
     found = []
     order = np.argsort(-np.bincount(part), kind="stable")
     rank = np.empty(len(order), np.int64)
@@ -129,18 +141,18 @@ def _bridges(verts: Float[Floats, "V 3"], part: Int[Ints, " V"]) -> Int[Ints, "N
 
 @dataclass(frozen=True, eq=False)
 class Intrinsic:
-    """What does not change when a shape bends, on a thin mesh.
+    """Intrinsic properties of a shape, on a decimated mesh.
 
-    Lengths along the surface are along edges, and shares of the ``diameter``: the longest from any of the `landmarks`. Those
-    between all vertices would take long, and keep Python's lock meanwhile.
+    Distances are along edges, relative to the ``diameter``: the largest distance from any of the `landmarks`. Distances
+    between all vertices would take long, and would hold Python's lock meanwhile.
     """
 
     mesh: DecimatedMesh
 
     @cached_property
     def landmarks(self) -> Int[Ints, " L"]:
-        """Vertices that are evenly spread, and stand for all where that suffices."""
-        return farthest_points(self.mesh.verts, min(_LANDMARKS, len(self.mesh.verts)))
+        """Evenly spread vertices that represent all vertices where that suffices."""
+        return farthest_points(self.mesh.verts, min(_N_LANDMARKS, len(self.mesh.verts)))
 
     @cached_property
     def _from_landmarks(self) -> Float[Floats, "L V"]:
@@ -151,12 +163,12 @@ class Intrinsic:
         return float(self._from_landmarks.max())
 
     @cached_property
-    def among_landmarks(self) -> Float[Floats, "L L"]:
-        """Distances between them."""
+    def landmark_distances(self) -> Float[Floats, "L L"]:
+        """Distances between the landmarks."""
         return np.asarray(self._from_landmarks[:, self.landmarks] / self.diameter)
 
     def distances_from(self, vertices: Int[Ints, " N"]) -> Float[Floats, "N V"]:
-        """From some vertices to all."""
+        """Distances from some vertices to all."""
         return np.asarray(dijkstra(self.mesh.graph, indices=vertices) / self.diameter)
 
     @cached_property
@@ -165,23 +177,23 @@ class Intrinsic:
         mesh, V = self.mesh, len(self.mesh.verts)
         stiffness, mass = robust_laplacian.mesh_laplacian(mesh.verts, mesh.faces)
         start = np.random.default_rng(0).standard_normal(V)
-        return np.asarray(eigsh(stiffness, min(_FUNCTIONS, V - 2), mass, sigma=-1e-8, v0=start)[1])
+        return np.asarray(eigsh(stiffness, min(_N_FUNCTIONS, V - 2), mass, sigma=-1e-8, v0=start)[1])
 
     @cached_property
     def eccentricity(self) -> Float[Floats, " V"]:
-        """Mean distance from all of the surface, by the landmarks: small in the middle, large at extremities."""
+        """Mean distance to the whole surface, estimated by the landmarks: small in the center, large at extremities."""
         nearest = self._from_landmarks.argmin(0)
         around = np.bincount(nearest, self.mesh.areas, len(self.landmarks))
         return np.asarray(around @ self._from_landmarks / self.diameter)
 
     @cached_property
     def extremities(self) -> Int[Ints, " T"]:
-        """The vertices furthest out, those first that stand out most: maxima of the eccentricity by their persistence."""
+        """The outermost vertices, most prominent first: maxima of the eccentricity, by persistence."""
         maxima = _persistent_maxima(self.eccentricity, self.mesh.graph)
-        found = np.array([vertex for persistence, vertex in maxima if persistence >= _PERSISTENCE], np.int64)
-        apart, chosen = self.distances_from(found)[:, found] > _APART, list[int]()
+        found = np.array([vertex for persistence, vertex in maxima if persistence >= _MIN_PERSISTENCE], np.int64)
+        is_apart, chosen = self.distances_from(found)[:, found] > _MIN_DISTANCE, list[int]()
         for number in range(len(found)):
-            if len(chosen) < _MOST and apart[number, chosen].all():
+            if len(chosen) < _MAX_EXTREMITIES and is_apart[number, chosen].all():
                 chosen.append(number)
         return found[chosen]
 
@@ -192,66 +204,73 @@ class Intrinsic:
 
     @cached_property
     def from_middle(self) -> Float[Floats, " V"]:
-        """Distances from where the eccentricity is least."""
+        """Distances from the center, where the eccentricity is smallest."""
         return np.asarray(self.distances_from(np.array([self.eccentricity.argmin()]))[0])
 
     @cached_property
     def profiles(self) -> Float[Floats, "T R"]:
-        """Share of the surface within growing distances of each extremity: a thin limb has little nearby."""
-        within = self.from_extremities[:, :, None] < np.linspace(0.05, 1, _PROFILE)
+        """Share of the surface within increasing distances of each extremity; small near the end of a thin limb."""
+        within = self.from_extremities[:, :, None] < np.linspace(0.05, 1, _N_DISTANCES)
         return np.asarray(np.einsum("tvr,v->tr", within.astype(np.float64), self.mesh.areas))
 
-    def _on_the_way(self, shares: Sequence[float]) -> Int[Ints, "S T"]:
-        """The vertex at each share of the way from the middle to each extremity."""
-        near, reach = self.from_middle, self.from_middle[self.extremities][:, None]
-        detour = near + self.from_extremities - reach  # (T, V), 0 on the way to each
-        return np.array([(np.abs(near - share * reach) + 2 * detour).argmin(1) for share in shares])
+    def _path_vertices(self, shares: Sequence[float]) -> Int[Ints, "S T"]:
+        """The vertex at each share of the path from the center to each extremity."""
+        from_middle, reach = self.from_middle, self.from_middle[self.extremities][:, None]
+        detour = from_middle + self.from_extremities - reach  # (T, V), 0 on the way to each
+        return np.array([(np.abs(from_middle - share * reach) + 2 * detour).argmin(1) for share in shares])
 
     @cached_property
     def spread(self) -> Float[Floats, "T T"]:
-        """How far apart the ways from the middle to two extremities run, from 0 for the closest two to 1 for the furthest:
-        distances between points at the same shares of each way, whatever their lengths. The order of legs along a body, or
-        of arms around it, is in these.
+        """Distances between the paths from the center to two extremities, from 0 for the closest two to 1 for the farthest.
+
+        These are mean distances between points at the same shares of two paths, whatever the paths' lengths. They reflect
+        the order of legs along a body, or of arms around it.
         """
-        at = self._on_the_way(_SHARES)
+        at = self._path_vertices(_PATH_SHARES)
         rows = self.distances_from(at.ravel()).reshape(*at.shape, -1)
         off = ~np.eye(at.shape[1], dtype=bool)
         spread = np.zeros(off.shape)
         for here, distances in zip(at, rows, strict=True):
             apart = distances[:, here]
             low, high = apart[off].min(), apart[off].max()
-            spread += np.where(off, (apart - low) / max(high - low, 1e-9), 0) / len(_SHARES)
+            spread += np.where(off, (apart - low) / max(high - low, 1e-9), 0) / len(_PATH_SHARES)
         return spread
 
     @cached_property
     def rings(self) -> list[list[Int[Ints, " N"]]]:
-        """Of each limb, vertices around it: at some shares of the way from the middle, and at its end."""
-        at = self._on_the_way(_RINGS).T
+        """For each limb, rings of vertices around it, at some shares of the path from the center, and the vertices at
+        its end.
+        """
+        at = self._path_vertices(_RING_SHARES).T
         rows, found = self.distances_from(at.ravel()).reshape(*at.shape, -1), []
         for before, places, distances in zip(self.from_extremities, at, rows, strict=True):
-            # so close that it is not the body beside the limb
+            # near the path, which excludes the body next to the limb
             limb = (
-                (np.abs(before - before[place]) < _RING) & (away < _RING + 0.6 * min(before[place], 0.25))
+                (np.abs(before - before[place]) < _RING_HALF_WIDTH)
+                & (away < _RING_HALF_WIDTH + 0.6 * min(before[place], 0.25))
                 for place, away in zip(places, distances, strict=True)
             )
-            found.append([*map(np.flatnonzero, limb), np.flatnonzero(before < _RING)])
+            found.append([*map(np.flatnonzero, limb), np.flatnonzero(before < _RING_HALF_WIDTH)])
         return found
 
     @cached_property
     def skeleton(self) -> Float[Floats, "T R 3"]:
-        """The middle of each of the `rings`."""
+        """Centers of the `rings`."""
         verts = self.mesh.verts
-        return np.array([[verts[ring].mean(0) for ring in limb] for limb in self.rings]).reshape(-1, len(_RINGS) + 1, 3)
+        return np.array([[verts[ring].mean(0) for ring in limb] for limb in self.rings]).reshape(
+            -1, len(_RING_SHARES) + 1, 3
+        )
 
     @cached_property
     def tour(self) -> list[int]:
-        """The extremities in the order in which they lie around the shape: along the shortest closed tour by `spread`."""
+        """The extremities in their order around the shape: the shortest closed tour by `spread`."""
         return shortest_tour(self.spread)
 
     @cached_property
     def limbs(self) -> tuple[Float[Floats, " T"], Float[Floats, "V T"]]:
-        """How far each extremity lies from the middle, and how far each vertex lies along the way there: from 0 in the
-        middle, or on another limb, to 1 at the end, whatever the length of the limb (Gromov's product).
+        """Distance of each extremity from the center, and the position of each vertex along the limb towards it.
+
+        The position is 0 in the center or on another limb and 1 at the end, whatever the limb's length (Gromov product).
         """
         reach = self.from_middle[self.extremities]
         along = 0.5 * (self.from_middle[:, None] + reach - self.from_extremities.T)
@@ -259,8 +278,9 @@ class Intrinsic:
 
 
 def _persistent_maxima(height: Float[Floats, " V"], graph: csr_matrix) -> list[tuple[float, int]]:
-    """Maxima of a function on a graph and how far each stands above the pass to a higher one; the highest persistence
-    first. By joining vertices from the highest down (a merge tree).
+    """Maxima of a function on a graph with their persistence, the height above the pass to a higher maximum; highest first.
+
+    Computed by adding vertices from the highest down (a merge tree).
     """
     parent, peak = np.full(len(height), -1), np.arange(len(height))
 
@@ -273,9 +293,9 @@ def _persistent_maxima(height: Float[Floats, " V"], graph: csr_matrix) -> list[t
     found = [(float(np.ptp(height)), int(height.argmax()))]
     for vertex in np.argsort(-height, kind="stable").tolist():
         parent[vertex] = vertex
-        around = graph.indices[graph.indptr[vertex] : graph.indptr[vertex + 1]]
+        neighbours = graph.indices[graph.indptr[vertex] : graph.indptr[vertex + 1]]
         roots = sorted(
-            {root(int(other)) for other in around if parent[other] >= 0} - {vertex}, key=lambda r: -height[peak[r]]
+            {root(int(other)) for other in neighbours if parent[other] >= 0} - {vertex}, key=lambda r: -height[peak[r]]
         )
         if roots:
             parent[vertex] = roots[0]
@@ -286,11 +306,11 @@ def _persistent_maxima(height: Float[Floats, " V"], graph: csr_matrix) -> list[t
 
 
 def shortest_tour(lengths: Float[Floats, "T T"]) -> list[int]:
-    """The order of a shortest closed tour through all of a few places (Held and Karp's algorithm: T^2 2^T steps)."""
+    """A shortest closed tour through a few places, by the Held-Karp algorithm (T^2 2^T steps)."""
     count = len(lengths)
     if count < 4:
         return list(range(count))
-    last = count - 1  # where the tour begins; a set of the others is a number
+    last = count - 1  # start of the tour; subsets of the other places are bit masks
     own = np.arange(last)
     cost, before = np.full((1 << last, last), np.inf), np.zeros((1 << last, last), np.int64)
     cost[1 << own, own] = lengths[last, own]

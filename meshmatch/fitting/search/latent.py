@@ -19,9 +19,9 @@ from meshmatch.templates.template import template_radius
 
 
 class PaperEnergy:
-    """The paper's energy of what a decoder answers: Chamfer distance to points drawn from samples, volume, rigidity.
+    """The paper's energy of decoded node vectors: Chamfer distance to points drawn from samples, plus volume and rigidity.
 
-    Samples are in the core frame. It is computed on one of torch's devices.
+    Samples are in the core frame. The energy is computed on a device of torch.
     """
 
     def __init__(
@@ -33,7 +33,7 @@ class PaperEnergy:
         device: str = "cpu",
     ) -> None:
         self.config, self.network = config, torch_network(model, device)
-        # The paper's weights are of lengths in the unit sphere, which models that scale by it share.
+        # The paper's weights are for shapes scaled to the unit sphere, as models with scale "sphere" have them.
         sphere = template_radius(model.template) if model.card.frame["scale"] == "sphere" else 1.0
         self._chamfer_weight = config.chamfer / sphere**2
         drawn = samples.drawn(config.points, rng)
@@ -42,7 +42,7 @@ class PaperEnergy:
         self._template = _on_template(model, min(config.points, model.template.shape.V), device)
 
     def __call__(self, vectors: torch.Tensor) -> torch.Tensor:
-        """Energy (a scalar tensor) of rows (1, R, 3), such as node vectors, in the core frame."""
+        """Energy (a scalar tensor) of a batch of one (1, R, 3), such as node vectors, in the core frame."""
         verts, field = self._template
         moved = verts + field.displacement(vectors)[0]
         chamfer = self._chamfer_weight * _chamfer(moved, self.points, self._tree)
@@ -53,7 +53,7 @@ class PaperEnergy:
         return chamfer + stiff
 
     def value(self, vectors: Float[Floats, "K 3"]) -> float:
-        """The same of an array."""
+        """The energy of an array of node vectors."""
         with torch.no_grad():
             return float(self(torch.from_numpy(vectors).float()[None].to(self.points.device)))
 
@@ -69,9 +69,9 @@ def refine_code(
 ) -> Float[Floats, "K 3"]:
     """Node vectors of the code that fits samples (core frame) best, found by Adam.
 
-    The best of all codes is returned, so the energy never ends higher than it began. The search starts from the network's
-    own answer, or from given node vectors. What the encoder's code does not say of them (the learned corrections, where
-    the model has them) stays as a constant offset.
+    The best of all visited codes is returned, so the final energy is never above the initial one. The search starts from
+    the network's own prediction, or from given node vectors. The difference between these and the decoder's output for the
+    encoder's code (learned corrections, if the model has them) is kept as a constant offset.
     """
     energy_of = PaperEnergy(model, samples, config, rng, device)
     network = energy_of.network
@@ -87,7 +87,7 @@ def refine_code(
         energy = energy_of(vectors)
         if float(energy.detach()) < best:
             best, best_vectors = float(energy.detach()), vectors.detach()[0]
-        # Of the code alone: the gradients of the decoder's weights would cost more than all the rest.
+        # The gradient of the code only: those of the decoder's weights would cost more than everything else.
         (code.grad,) = torch.autograd.grad(energy, code)
         optimiser.step()
         if progress is not None and (step % 20 == 0 or step == config.steps - 1):
@@ -98,7 +98,7 @@ def refine_code(
 
 @derived
 def _on_template(model: TrainedModel, P: int, device: str) -> tuple[torch.Tensor, PointField]:
-    """Template points (P, 3) and the field there."""
+    """Points (P, 3) of the template, and the field at these points."""
     verts = model.template.shape.verts
     verts = verts[farthest_points(verts, P)]
     at = torch.from_numpy(verts).float().to(device)
@@ -110,7 +110,9 @@ def _on_template(model: TrainedModel, P: int, device: str) -> tuple[torch.Tensor
 
 
 def _chamfer(moved: torch.Tensor, points: torch.Tensor, tree: cKDTree) -> torch.Tensor:
-    """Mean squared nearest distances both ways; neighbours from trees, gradients through the distances."""
+    """Mean squared nearest distances in both directions; trees find the neighbours, gradients pass through the
+    distances.
+    """
     here = moved.detach().cpu().numpy()
     forward = torch.from_numpy(tree.query(here)[1])
     back = torch.from_numpy(cKDTree(here).query(points.cpu().numpy())[1])

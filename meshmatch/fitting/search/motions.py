@@ -1,4 +1,4 @@
-"""Rigid and affine motions between two thin meshes, and turns that bring one onto itself."""
+"""Rigid and affine motions between two decimated meshes, and rotational symmetries of one."""
 
 from __future__ import annotations
 
@@ -13,76 +13,81 @@ from meshmatch.geometry.closest_points import ClosestPoints
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints, feature_tree, with_normals
 
-_SCALE = 0.1  # of the robust weight, in units of sqrt(area). Set by hand on 30 pairs of 15 kinds of shapes.
-_SOME = 200  # points of each mesh that look for their closest
-# A shape is the same after a turn that leaves it so near, both ways and normals included (vertices of 2,400 triangles are
-# never nearer than about 0.01), and takes a share of `_MOVED` of it `_APART` from where it was. Bearings come to 0.01 to
-# 0.02, tables to 0.015 to 0.025, pliers, which are turned over, to 0.024 to 0.029; of 90 shapes that have a front the
-# nearest, a plane, to 0.039.
-_SAME, _APART, _MOVED = 0.03, 0.1, 0.1
-_PARTS = 2, 3, 5, 7  # of a full turn: whatever symmetry an axis has, one of these is in it, or it has many
-_COUNTED = 24  # parts of a full turn about such an axis that are counted
-_STEPS = 3  # of closest points, from a turn that leaves the shape at most `_NEAR` times as far off
+_SCALE = 0.1  # scale of the robust weight, in units of sqrt(area). Set by hand on 30 pairs of 15 kinds of shapes.
+_N_QUERIES = 200  # points of each mesh that are paired with the closest point of the other
+# A rotation is a symmetry if its residual (both ways, normals included; units of sqrt(area)) is at most
+# `_MAX_SYMMETRIC_RESIDUAL`, and if at least a share of `_MIN_MOVED_SHARE` of the vertices move farther than
+# `_MIN_DISPLACEMENT`. Vertices of 2,400 triangles are never nearer than about 0.01. Bearings come to 0.01 to 0.02, tables
+# to 0.015 to 0.025, pliers, which are turned over, to 0.024 to 0.029; of 90 shapes with a front the nearest, a plane, comes
+# to 0.039.
+_MAX_SYMMETRIC_RESIDUAL, _MIN_DISPLACEMENT, _MIN_MOVED_SHARE = 0.03, 0.1, 0.1
+_FRACTIONS = 2, 3, 5, 7  # fractions of a full turn: any rotational symmetry includes one of these, or is of high order
+_N_FRACTIONS = 24  # fractions of a full turn about a symmetry axis that are then tested
+_STEPS = 3  # steps of closest points from rotations with at most `_NEAR` times that residual
 _NEAR = 2.0
-_OTHER = 10.0  # degrees between two that count as two
+_MIN_ANGLE = 10.0  # degrees between two rotations that count as different
 
 
 def principal_axes(mesh: DecimatedMesh) -> Float[Floats, "3 3"]:
-    """Of the surface, one in each column, right-handed."""
+    """Principal axes of the surface, one in each column, right-handed."""
     axes = np.linalg.eigh(np.cov(mesh.verts.T, aweights=mesh.areas))[1]
     axes[:, 0] *= np.sign(np.linalg.det(axes))
     return axes
 
 
 class Motions:
-    """Rigid and affine motions of one thin mesh onto another by iterative closest points, both ways, with robust weights;
-    about the middle of each."""
+    """Rigid and affine motions of one decimated mesh onto another, about the centroid of each.
+
+    Found by iterative closest points in both directions, with robust weights.
+    """
 
     def __init__(self, source: DecimatedMesh, target: DecimatedMesh) -> None:
         self.middles = source.areas @ source.verts, target.areas @ target.verts
         self._own = OrientedPoints(source.verts - self.middles[0], source.normals)
         self._onto = OrientedPoints(target.verts - self.middles[1], target.normals)
         some, some_onto = (
-            np.linspace(0, V - 1, min(_SOME, V)).astype(np.int64) for V in (len(source.verts), len(target.verts))
+            np.linspace(0, V - 1, min(_N_QUERIES, V)).astype(np.int64) for V in (len(source.verts), len(target.verts))
         )
         self._some = self._own.points[some], self._onto.points[some_onto]
         self._asking = some, self._onto.features[some_onto]
         self._rigid = ClosestPoints(self._onto, self._own, (some_onto, some))
 
     def rigid(self, starts: list[RigidPose], steps: int) -> list[RigidPose]:
-        """Rigid motions of the source after some steps from others."""
+        """Rigid motions of the source after some steps from the given starts."""
         return self._rigid.nearer(starts, steps)
 
     def residuals(self, motions: list[RigidPose]) -> Float[Floats, " N"]:
-        """Mean capped distance there and back, normals included, after each rigid motion."""
+        """Mean capped distance in both directions, normals included, after each rigid motion."""
         return self._rigid.residuals(motions)
 
     def moves(self, motion: RigidPose) -> float:
-        """Share (0..1) of the source's vertices that a motion takes clearly elsewhere."""
-        return float((np.linalg.norm(motion.to_world(self._own.points) - self._own.points, axis=1) > _APART).mean())
+        """Share (0..1) of the source's vertices that a motion clearly moves."""
+        return float(
+            (np.linalg.norm(motion.to_world(self._own.points) - self._own.points, axis=1) > _MIN_DISPLACEMENT).mean()
+        )
 
     def moved(self, matrix: Floats, shift: Floats) -> Float[Floats, "V 3"]:
-        """The source's vertices under a motion, about the middle of the target."""
+        """The source's vertices under an affine motion, relative to the target's centroid."""
         return np.asarray(self._own.points @ matrix.T + shift)
 
     def affine(self, start: RigidPose, steps: int) -> tuple[Floats, Floats]:
-        """Matrix and shift of an affine motion of the source after some steps from a rigid one."""
+        """Matrix and translation of an affine motion of the source after some steps from a rigid one."""
         matrix, shift = start.rotation, start.center
         for _ in range(steps):
             normals = self._own.normals @ np.linalg.inv(matrix)
             normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
             features = with_normals(self.moved(matrix, shift), normals)
-            forth = self._onto.tree.query(features[self._asking[0]])[1]
-            home = feature_tree(features).query(self._asking[1])[1]
-            source = np.concatenate([self._some[0], self._own.points[home]])
-            goal = np.concatenate([self._onto.points[forth], self._some[1]])
-            off = np.square(source @ matrix.T + shift - goal).sum(1)
-            matrix, shift = _affine(source, goal, 1 / np.square(1 + off / _SCALE**2), matrix)
+            forward = self._onto.tree.query(features[self._asking[0]])[1]
+            backward = feature_tree(features).query(self._asking[1])[1]
+            source = np.concatenate([self._some[0], self._own.points[backward]])
+            goal = np.concatenate([self._onto.points[forward], self._some[1]])
+            squared_distance = np.square(source @ matrix.T + shift - goal).sum(1)
+            matrix, shift = _affine(source, goal, 1 / np.square(1 + squared_distance / _SCALE**2), matrix)
         return matrix, shift
 
 
 def _affine(source: Floats, goal: Floats, weights: Floats, near: Floats) -> tuple[Floats, Floats]:
-    """The affine motion of weighted least squares, held near the rotation in ``near`` where points do not say."""
+    """Weighted least-squares affine motion, regularized towards the rotation in ``near``."""
     U, _, Vh = np.linalg.svd(near)
     lifted = np.hstack([source, np.ones((len(source), 1))])
     held = np.diag([1e-3, 1e-3, 1e-3, 0]) * weights.sum()
@@ -93,36 +98,40 @@ def _affine(source: Floats, goal: Floats, weights: Floats, near: Floats) -> tupl
 
 
 def turns_onto_itself(mesh: DecimatedMesh, held: Float[Floats, "N 3"] | None = None) -> int:
-    """How many turns bring a shape onto itself, that by nothing included: 2 of pliers, many of a bearing.
+    """Number of rotations that map a shape onto itself, including the identity: 2 for pliers, many for a bearing.
 
-    Turns are about its principal axes. Where positions are ``held``, only those count that leave them where they are.
+    Only rotations about principal axes are tried. If positions are ``held``, only rotations that leave them in place count.
     """
     motions, axes = Motions(mesh, mesh), principal_axes(mesh).T
     held = None if held is None else held - motions.middles[0]
 
-    def same(turn: RigidPose, residual: float) -> bool:
-        if held is not None and (np.linalg.norm(turn.to_world(held) - held, axis=1) > _APART).any():
+    def is_symmetry(turn: RigidPose, residual: float) -> bool:
+        if held is not None and (np.linalg.norm(turn.to_world(held) - held, axis=1) > _MIN_DISPLACEMENT).any():
             return False
-        return residual < _SAME and motions.moves(turn) > _MOVED
+        return residual < _MAX_SYMMETRIC_RESIDUAL and motions.moves(turn) > _MIN_MOVED_SHARE
 
-    def nearest(axis: Floats, shares: Iterable[float]) -> list[RigidPose]:
-        """Turns near parts of a full one that bring the shape onto itself."""
-        about = Rotation.from_rotvec(2 * np.pi * np.outer(list(shares), axis)).as_matrix()
-        starts = [RigidPose(turn, np.zeros(3)) for turn in about]
-        near = [turn for turn, off in zip(starts, motions.residuals(starts), strict=True) if off <= _NEAR * _SAME]
-        turns = motions.rigid(near, _STEPS) if near else []
+    def symmetries(axis: Floats, shares: Iterable[float]) -> list[RigidPose]:
+        """Symmetries near the given fractions of a full turn about an axis."""
+        rotations = Rotation.from_rotvec(2 * np.pi * np.outer(list(shares), axis)).as_matrix()
+        starts = [RigidPose(turn, np.zeros(3)) for turn in rotations]
+        promising = [
+            turn
+            for turn, off in zip(starts, motions.residuals(starts), strict=True)
+            if off <= _NEAR * _MAX_SYMMETRIC_RESIDUAL
+        ]
+        turns = motions.rigid(promising, _STEPS) if promising else []
         return (
-            [turn for turn, off in zip(turns, motions.residuals(turns), strict=True) if same(turn, off)]
+            [turn for turn, off in zip(turns, motions.residuals(turns), strict=True) if is_symmetry(turn, off)]
             if turns
             else []
         )
 
     found = [RigidPose.identity()]
     for axis in axes:
-        first = nearest(axis, (1 / parts for parts in _PARTS))
+        first = symmetries(axis, (1 / parts for parts in _FRACTIONS))
         if not first:
             continue
-        for turn in (*first, *nearest(axis, (number / _COUNTED for number in range(1, _COUNTED)))):
-            if all(turn.angle_to(other) > _OTHER for other in found):
+        for turn in (*first, *symmetries(axis, (number / _N_FRACTIONS for number in range(1, _N_FRACTIONS)))):
+            if all(turn.angle_to(other) > _MIN_ANGLE for other in found):
                 found.append(turn)
     return len(found)

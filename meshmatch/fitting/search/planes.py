@@ -1,7 +1,7 @@
-"""Planes in which a shape is nearly its own mirror image.
+"""Planes of approximate mirror symmetry of a shape.
 
-Each of many planes is moved to where the mirror image lies nearest, by closest points of like normals. What lies far off
-counts little, so that a plane is found that half of a shape has: a face under a hat, a head that is turned.
+Many planes are each moved to where the mirror image lies nearest, by iterative closest points with similar normals. Weights
+are robust, so that a plane is also found if only half of the shape is symmetric: a face under a hat, a turned head.
 """
 
 from __future__ import annotations
@@ -15,19 +15,22 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.geometry.oriented import OrientedPoints, feature_tree, with_normals
 
 # In units of sqrt(area). Set by hand, on busts and birds.
-_BEGUN, _FEW = 200, 300  # directions all around, and points by which they are compared
-_POINTS, _KEPT = 1500, 24  # of the planes that go on
-_NORMALS = 0.1
-_FAR = 0.08, 0.03  # what counts a quarter, where planes are compared first and last
-_FIRST = (*(0.15,) * 3, *(0.1,) * 5)  # the same of each step
-_LAST = (*np.geomspace(0.1, 0.02, 15), *(0.02,) * 8)
-_ALIKE, _SAME = np.cos(np.radians(8)), np.cos(np.radians(5))  # of planes that count as one
-_APART = 0.05
+_N_DIRECTIONS, _FIRST_POINTS = 200, 300  # initial directions over a half sphere, and points for the first stage
+_LAST_POINTS, _N_KEPT = 1500, 24  # points for the last stage, and planes that reach it
+_NORMAL_WEIGHT = 0.1  # weight of unit normals against positions
+_FAR = 0.08, 0.03  # scale of the robust weight when planes are compared, after the first and the last stage
+_FIRST = (*(0.15,) * 3, *(0.1,) * 5)  # scales of the robust weight in the steps of the first stage
+_LAST = (*np.geomspace(0.1, 0.02, 15), *(0.02,) * 8)  # and of the last stage
+_ALIKE, _SAME = (
+    np.cos(np.radians(8)),
+    np.cos(np.radians(5)),
+)  # cosines between normals of planes that count as one, likewise
+_APART = 0.05  # distance of planes that count as different after the first stage
 
 
 @dataclass(frozen=True, eq=False)
 class MirrorPlane:
-    """All x with x . normal = offset; ``share`` (0..1) is how much of the surface it brings near to the surface."""
+    """The plane x . normal = offset; ``share`` (0..1) is how much of the surface it maps near to the surface."""
 
     normal: Float[Floats, " 3"]
     offset: float
@@ -52,40 +55,44 @@ class MirrorPlane:
         return cls(normal, float(normal @ middle))
 
     def is_like(self, other: MirrorPlane, angle: float, apart: float = np.inf) -> bool:
-        """Whether the normals enclose an angle with less than a cosine, and the planes lie no further apart than that."""
+        """Whether two planes nearly coincide: the cosine of the angle between their normals exceeds ``angle``, and their
+        distance is below ``apart``.
+        """
         cosine = float(self.normal @ other.normal)
         return abs(cosine) > angle and abs(self.offset - np.sign(cosine) * other.offset) < apart
 
 
 def mirror_planes(samples: OrientedPoints, count: int) -> list[MirrorPlane]:
-    """Planes of symmetry of a shape with an area of 1 about the origin.
+    """Planes of symmetry of a shape with area 1 about the origin.
 
     Parameters
     ----------
     samples
-        Of its surface, in random order.
+        Samples of its surface, in random order.
     count
-        How many planes at most.
+        Maximum number of planes.
 
     Returns
     -------
     list of MirrorPlane
-        Those that bring most of the surface near to itself, best first, no two alike.
+        Planes that map most of the surface near to itself, best first, no two alike.
     """
-    few, more = samples.first(_FEW), samples.first(_POINTS)
-    begun = [_moved(few, MirrorPlane(each, 0.0), _FIRST, _FAR[0]) for each in _directions(_BEGUN)]
-    kept = _distinct(begun, _KEPT, _ALIKE, _APART)
-    return _distinct([_moved(more, each, _LAST, _FAR[1]) for each in kept], count, _SAME)
+    first_samples, last_samples = samples.first(_FIRST_POINTS), samples.first(_LAST_POINTS)
+    first_planes = [
+        _refined(first_samples, MirrorPlane(each, 0.0), _FIRST, _FAR[0]) for each in _directions(_N_DIRECTIONS)
+    ]
+    kept = _distinct(first_planes, _N_KEPT, _ALIKE, _APART)
+    return _distinct([_refined(last_samples, each, _LAST, _FAR[1]) for each in kept], count, _SAME)
 
 
-def _moved(samples: OrientedPoints, plane: MirrorPlane, reach: Iterable[float], far: float) -> MirrorPlane:
-    """A plane after closest points, of which those that are further than the reach of a step count little."""
+def _refined(samples: OrientedPoints, plane: MirrorPlane, reach: Iterable[float], far: float) -> MirrorPlane:
+    """Refine a plane by iterative closest points, with one scale of the robust weight for each step."""
     points, normals = samples.points, samples.normals
-    tree = feature_tree(with_normals(points, normals, _NORMALS))
+    tree = feature_tree(with_normals(points, normals, _NORMAL_WEIGHT))
     for near in reach:
-        off, found = tree.query(with_normals(plane.reflect(points), plane.turn(normals), _NORMALS))
+        off, found = tree.query(with_normals(plane.reflect(points), plane.turn(normals), _NORMAL_WEIGHT))
         plane = MirrorPlane.between(points, points[found], _weights(off, near))
-    off = tree.query(with_normals(plane.reflect(points), plane.turn(normals), _NORMALS))[0]
+    off = tree.query(with_normals(plane.reflect(points), plane.turn(normals), _NORMAL_WEIGHT))[0]
     return MirrorPlane(plane.normal, plane.offset, float(_weights(off, far).mean()))
 
 
@@ -102,7 +109,7 @@ def _distinct(planes: list[MirrorPlane], count: int, angle: float, apart: float 
 
 
 def _directions(count: int) -> Float[Floats, "N 3"]:
-    """Evenly over half of the sphere, along a spiral."""
+    """Directions spread evenly over a half sphere, along a spiral."""
     number = np.arange(count) + 0.5
     height, turn = number / count, np.pi * (1 + np.sqrt(5)) * number
     across = np.sqrt(1 - np.square(height))

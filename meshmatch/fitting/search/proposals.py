@@ -1,8 +1,8 @@
-"""Guesses of where the vertices of one shape belong on another, made without a model, and not yet fitted.
+"""Proposals of where the vertices of one shape belong on another, made without a model, before any fit.
 
-Rigid and affine motions; maps between eigenfunctions of the Laplacian (functional maps, Ovsjanikov et al. 2012, refined by
-ZoomOut, Melzi et al. 2019); and maps that send extremities to extremities. Each kind is right for some shapes and wrong
-for others: a fit of each decides.
+There are rigid and affine motions (iterative closest points); maps between Laplacian eigenfunctions (functional maps,
+Ovsjanikov et al. 2012, refined by ZoomOut, Melzi et al. 2019); and maps that send extremities to extremities. Each kind
+suits some shapes and fails for others, so each proposal is fitted.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ Kind = Literal["rigid", "affine", "spectral", "extremities", "guess"]
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """Where vertices of the source's thin mesh (V,) may belong.
+    """Where vertices of the source's decimated mesh (V,) may belong.
 
     Attributes
     ----------
-    kind : what it was made by
+    kind : how the proposal was made
     points : (N, 3) positions, in the frame of the target
-    at : (N,) which vertices belong there; all of them where it is None
+    at : (N,) the vertices that belong there; None for all vertices
     """
 
     kind: Kind
@@ -42,25 +42,26 @@ class Proposal:
 
 @dataclass(frozen=True, kw_only=True)
 class ProposalSettings:
-    """How many guesses are made, and how. Set by hand on 30 pairs of 15 kinds of shapes; lengths in units of sqrt(area).
+    """How many proposals are made, and how. Set by hand on 30 pairs of 15 kinds of shapes; lengths in units of sqrt(area).
 
     Attributes
     ----------
     rigid : rigid motions that are kept, each with an affine one
-    closest_point_steps, affine_steps : steps of closest points of each
-    turned : degrees by which two of them differ
-    signs : eigenfunctions whose signs, and whose order, are tried in all ways
-    compared : how many of these are refined to ``functions``, from ``first_functions``
-    functions, first_functions, more : eigenfunctions of a map in the end and after the first steps, and how many are added
-        in each step
-    maps : spectral maps that are kept
-    limbs : assignments of extremities that are kept
-    beam, assignments : partial assignments of extremities that are kept, and complete ones, of each search
-    turns : assignments that keep the order around the shape that are kept, of each search
+    closest_point_steps, affine_steps : steps of iterative closest points for each
+    turned : smallest angle in degrees between two rigid motions
+    signs : number of eigenfunctions whose signs are tried in all combinations, and whose order is varied
+    compared : how many of these maps are refined from ``first_functions`` to ``functions``
+    functions, first_functions, more : number of eigenfunctions of a map at the end and after the first stage, and how many
+        are added in each step
+    maps : maximum number of spectral maps
+    limbs : maximum number of assignments of extremities
+    beam, assignments : partial assignments that a beam search keeps, and complete ones that it returns
+    turns : cyclic assignments that each search keeps
     skipped : cost of an extremity without counterpart
-    same : share of vertices by which two maps differ at least, where two vertices ``apart`` differ
-    bent, left : how much it costs, beside the error of distances, that no turn takes limbs to limbs, and the share of the
-        length of limbs that has no counterpart
+    same : share of vertices by which two maps must differ, where vertices differ if they are more than ``apart`` from each
+        other
+    bent, left : weights, against the error of distances, of the distance that remains after the best rotation of limbs onto
+        limbs, and of the share of the limbs' length without counterpart
     """
 
     rigid: int = 10
@@ -88,7 +89,7 @@ SETTINGS = ProposalSettings()
 
 
 def rigid_proposals(source: DecimatedMesh, target: DecimatedMesh) -> list[Proposal]:
-    """The best rigid motions from 48 starts by iterative closest points, and an affine one from each."""
+    """The best rigid motions by iterative closest points from 48 starts, each with an affine motion."""
     motions = Motions(source, target)
     middle = motions.middles[1]
     turns = Rotation.create_group("O").as_matrix()
@@ -109,40 +110,45 @@ def rigid_proposals(source: DecimatedMesh, target: DecimatedMesh) -> list[Propos
 
 
 def spectral_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
-    """Maps by eigenfunctions, whose signs and order nobody knows: all are tried and refined, the most isometric kept."""
-    at, onto = source.landmarks, target.landmarks
-    own, theirs = source.functions[at], target.functions[onto]
+    """Maps by eigenfunctions, whose signs and order are unknown: many combinations are refined, and the most isometric
+    maps kept.
+    """
+    landmarks, their_landmarks = source.landmarks, target.landmarks
+    own, theirs = source.functions[landmarks], target.functions[their_landmarks]
     last = min(SETTINGS.functions, own.shape[1], theirs.shape[1])
     first = min(SETTINGS.first_functions, last)
     count = min(SETTINGS.signs, first - 1)
-    begun = []
+    initial = []
     for order in _near_orders(count):
         for signs in product((1.0, -1.0), repeat=count):
             C = np.zeros((count + 1, count + 1))
             C[0, 0] = 1.0
             C[np.arange(1, count + 1), 1 + np.array(order)] = signs
-            begun.append(C)
-    found, nearest = _zoomed(np.stack(begun), own, theirs, first, SETTINGS.more)
-    known, among = source.among_landmarks, target.among_landmarks
-    errors = [_distance_error(known, among, each) for each in nearest]
+            initial.append(C)
+    found, nearest = _zoom_out(np.stack(initial), own, theirs, first, SETTINGS.more)
+    own_distances, their_distances = source.landmark_distances, target.landmark_distances
+    errors = [_distance_error(own_distances, their_distances, each) for each in nearest]
     best = np.argsort(errors, kind="stable")[: SETTINGS.compared]
     maps = []
-    for C, near in zip(*_zoomed(found[best], own, theirs, last, SETTINGS.more), strict=True):
+    for C, near in zip(*_zoom_out(found[best], own, theirs, last, SETTINGS.more), strict=True):
         vertex = _nearest(source.functions[:, :last] @ C.T, target.functions[:, :last])
-        maps.append((_distance_error(known, among, near), vertex))
-    return _kept("spectral", source, target, maps)
+        maps.append((_distance_error(own_distances, their_distances, near), vertex))
+    return _select_maps("spectral", source, target, maps)
 
 
 def _near_orders(count: int) -> list[tuple[int, ...]]:
-    """The order of eigenfunctions as it is, and with two neighbours exchanged."""
+    """The order of eigenfunctions as given, and with two neighbours exchanged."""
     plain = tuple(range(count))
     swapped = [(*plain[:k], plain[k + 1], plain[k], *plain[k + 2 :]) for k in range(count - 1)]
     return [plain, *swapped]
 
 
-def _zoomed(C: Floats, own: Floats, theirs: Floats, last: int, more: int) -> tuple[Floats, Ints]:
-    """ZoomOut: the map of each functional map (N, K, K) gives one of more functions, until there are ``last``; and the
-    nearest rows (N, L) to all of ``own`` (L, F) among ``theirs``."""
+def _zoom_out(C: Floats, own: Floats, theirs: Floats, last: int, more: int) -> tuple[Floats, Ints]:
+    """Refine functional maps (N, K, K) by ZoomOut to ``last`` functions.
+
+    Each functional map gives a map of points, and that a functional map with ``more`` functions. Returns the final
+    functional maps, and for each the nearest rows (N, L) of ``theirs`` to all of ``own`` (L, F).
+    """
     size = C.shape[1]
     while True:
         turned = own[:, :size] @ C.transpose(0, 2, 1)
@@ -154,18 +160,18 @@ def _zoomed(C: Floats, own: Floats, theirs: Floats, last: int, more: int) -> tup
 
 
 def _nearest(points: Floats, among: Floats) -> Ints:
-    """The nearest row for each point, all compared with all: these spaces have too many dimensions for a tree."""
+    """Index of the nearest row for each point, by brute force: these spaces have too many dimensions for a tree."""
     lifted = np.column_stack([points, np.ones(len(points))])
     return np.asarray((lifted @ np.column_stack([among, -0.5 * np.square(among).sum(1)]).T).argmax(1))
 
 
 def _distance_error(known: Float[Floats, "L L"], distances: Float[Floats, "U U"], nearest: Int[Ints, " L"]) -> float:
-    """Mean change of the distances that are known between landmarks, which go to some of those that lie so far apart."""
+    """Mean change of the known distances between landmarks that are mapped to ``nearest``, given the distances there."""
     return float(np.abs(known - distances[np.ix_(nearest, nearest)]).mean())
 
 
-def _facing(source: Intrinsic, target: Intrinsic, vertex: Int[Ints, " V"]) -> float:
-    """Share of the mapped area that keeps its orientation, less the share that loses it: -1 for a mirrored map."""
+def _orientation_preserved(source: Intrinsic, target: Intrinsic, vertex: Int[Ints, " V"]) -> float:
+    """Share of the mapped area that keeps its orientation minus the share that reverses it; -1 for a mirrored map."""
     mesh = target.mesh
     turned = triangle_vectors(mesh.verts[vertex], source.mesh.faces)
     along = (turned * mesh.normals[vertex][source.mesh.faces].sum(1)).sum(1)
@@ -174,10 +180,11 @@ def _facing(source: Intrinsic, target: Intrinsic, vertex: Int[Ints, " V"]) -> fl
 
 
 def extremity_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
-    """Where limbs go if extremities are sent to extremities, chosen by how these lie to each other, by a beam search.
+    """Maps of limbs that send extremities to extremities, found by beam searches.
 
-    What is compared is how far they lie apart, how far the ways from the middle to two of them are one, in what order these
-    ways run, and whether a turn in space takes limbs to limbs. Lengths of limbs may differ.
+    Assignments are compared by the distances between extremities, by how much of the paths from the center to two of them
+    is shared, by the order in which these paths lie around the shape, and by how well a rotation takes limbs to limbs.
+    Lengths of limbs may differ.
     """
     if min(len(source.extremities), len(target.extremities)) < 2:
         return []
@@ -187,11 +194,11 @@ def extremity_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
 
 
 Assignment = tuple[int, ...]
-"""For each extremity of the source that of the target, or -1."""
+"""For each extremity of the source the corresponding one of the target, or -1."""
 
 
 class Assignments:
-    """Assignments of the extremities of two shapes, and what each costs."""
+    """Assignments of the extremities of two shapes, and their costs."""
 
     def __init__(self, source: Intrinsic, target: Intrinsic) -> None:
         self._source, self._target = source, target
@@ -202,7 +209,7 @@ class Assignments:
         single = 0.5 * (profiles + 0.3 * np.abs(reach[:, None] - reach_to))
         apart = source.from_extremities[:, ends], target.from_extremities[:, ends_to]
         shared = along[ends] * reach, along_to[ends_to] * reach_to
-        # Of i that goes to j, and of i, k that go to j, l; three ways to compare.
+        # Costs of assigning i to j, and of assigning i, k to j, l; in three variants.
         of_lengths = 0.5 * _changes(*apart) + 2.0 * _changes(*shared)
         of_order = [0.2 * _changes(of(source.spread), of(target.spread)) for of in (np.asarray, _ranks)]
         self._costs = [(single, of_lengths), *((0.2 * single, each) for each in of_order)]
@@ -210,38 +217,47 @@ class Assignments:
             np.column_stack([along, source.eccentricity])[source.landmarks[::2]],
             np.column_stack([along_to, target.eccentricity])[target.landmarks],
         )
-        self._apart = source.among_landmarks[::2, ::2], target.among_landmarks
+        self._apart = source.landmark_distances[::2, ::2], target.landmark_distances
         self._shares = reach / reach.sum(), reach_to / reach_to.sum()
 
     def candidates(self) -> list[list[Assignment]]:
-        """The best assignments of beam searches, and of those that keep the order around the shape, one list by each way
-        to compare.
-        """
-        return [self._searched(*costs) for costs in self._costs] + self._around()
+        """The best assignments of each beam search and of each cyclic search; one list per search."""
+        return [self._beam_search(*costs) for costs in self._costs] + self._cyclic_assignments()
 
-    def _around(self) -> list[list[Assignment]]:
-        """Assignments that turn one tour of the extremities onto the other, in both directions: of as many as possible,
-        and of all but one.
+    def _cyclic_assignments(self) -> list[list[Assignment]]:
+        """Assignments that rotate one tour of the extremities onto the other, in both directions.
+
+        They assign as many extremities as possible, or all but one.
         """
-        few = min(self._counts)
-        tours = [[k for k in tour if k < few + 2] for tour in (self._source.tour, self._target.tour)]
+        n_shared = min(self._counts)
+        tours = [[k for k in tour if k < n_shared + 2] for tour in (self._source.tour, self._target.tour)]
         found = []
-        for size in (few, few - 1):
+        for size in (n_shared, n_shared - 1):
             if size < 3:
                 break
-            own, theirs = (np.array(list(combinations(tour, size))) for tour in tours)
+            own_extremities, their_extremities = (np.array(list(combinations(tour, size))) for tour in tours)
             turns = np.array([np.roll(range(size)[::way], by) for way in (1, -1) for by in range(size)])
-            theirs = theirs[:, turns].reshape(-1, size)
-            own, theirs = np.repeat(own, len(theirs), 0), np.tile(theirs, (len(own), 1))
+            their_extremities = their_extremities[:, turns].reshape(-1, size)
+            own_extremities, their_extremities = (
+                np.repeat(own_extremities, len(their_extremities), 0),
+                np.tile(their_extremities, (len(own_extremities), 1)),
+            )
             for single, double in self._costs:
-                pairs = own[:, :, None], own[:, None], theirs[:, :, None], theirs[:, None]
-                cost = single[own, theirs].mean(1) + double[pairs].mean((1, 2))
+                pairs = (
+                    own_extremities[:, :, None],
+                    own_extremities[:, None],
+                    their_extremities[:, :, None],
+                    their_extremities[:, None],
+                )
+                cost = single[own_extremities, their_extremities].mean(1) + double[pairs].mean((1, 2))
                 best = np.argsort(cost, kind="stable")[: SETTINGS.turns]
-                found.append([self._completed(own[k], theirs[k], single) for k in best])
+                found.append([self._with_best_leftover(own_extremities[k], their_extremities[k], single) for k in best])
         return found
 
-    def _completed(self, own: Int[Ints, " N"], theirs: Int[Ints, " N"], single: Float[Floats, "T U"]) -> Assignment:
-        """An assignment, and of the extremities that it leaves over the two that are most alike."""
+    def _with_best_leftover(
+        self, own: Int[Ints, " N"], theirs: Int[Ints, " N"], single: Float[Floats, "T U"]
+    ) -> Assignment:
+        """Complete an assignment by the most similar pair of the extremities that are left over."""
         chosen = np.full(self._counts[0], -1)
         chosen[own] = theirs
         rest = np.flatnonzero(chosen < 0), np.setdiff1d(np.arange(self._counts[1]), theirs)
@@ -250,23 +266,23 @@ class Assignments:
             chosen[rest[0][i]] = rest[1][j]
         return tuple(chosen.tolist())
 
-    def _searched(self, single: Float[Floats, "T U"], double: Float[Floats, "T T U U"]) -> list[Assignment]:
-        """By a beam search, extremities in the order in which they stand out."""
+    def _beam_search(self, single: Float[Floats, "T U"], double: Float[Floats, "T T U U"]) -> list[Assignment]:
+        """Beam search, in order of the extremities' prominence."""
         beam: list[tuple[float, Assignment]] = [(0.0, ())]
         for i in range(self._counts[0]):
-            longer = []
-            for cost, sofar in beam:
-                longer.append((cost + SETTINGS.skipped, (*sofar, -1)))
-                known = [(k, other) for k, other in enumerate(sofar) if other >= 0]
-                for j in set(range(self._counts[1])).difference(sofar):
+            extended = []
+            for cost, partial in beam:
+                extended.append((cost + SETTINGS.skipped, (*partial, -1)))
+                known = [(k, other) for k, other in enumerate(partial) if other >= 0]
+                for j in set(range(self._counts[1])).difference(partial):
                     pairs = sum(double[i, k, j, other] for k, other in known) / max(len(known), 1)
-                    longer.append((cost + single[i, j] + pairs, (*sofar, j)))
-            beam = sorted(longer)[: SETTINGS.beam]
+                    extended.append((cost + single[i, j] + pairs, (*partial, j)))
+            beam = sorted(extended)[: SETTINGS.beam]
         found = [each for _, each in beam[: SETTINGS.assignments]]
         return [each for each in found if sum(j >= 0 for j in each) >= 2]
 
     def cost(self, assignment: Assignment) -> float:
-        """How far an assignment is from an isometry that bends limbs, but little."""
+        """Distance of an assignment from an isometry that hardly bends limbs."""
         own, theirs = _pairs(assignment)
         nearest = _nearest(self._along[0][:, [*own, -1]], self._along[1][:, [*theirs, -1]])
         error = _distance_error(*self._apart, nearest)
@@ -276,7 +292,9 @@ class Assignments:
         return float(error + SETTINGS.bent * bent + SETTINGS.left * left)
 
     def limbs(self, assignment: Assignment) -> Proposal:
-        """Where an assignment takes the limbs of the source: their rings to those of the target, turned as all of it is."""
+        """The proposal of an assignment: rings around the source's limbs are moved to those of the target, with one
+        rotation for all.
+        """
         own, theirs = _pairs(assignment)
         joints, goals = self._joints(own, theirs)
         turn, verts = kabsch(joints, goals).rotation, self._source.mesh.verts
@@ -285,12 +303,12 @@ class Assignments:
         return Proposal("extremities", np.concatenate(points), np.concatenate(rings))
 
     def _joints(self, own: list[int], theirs: list[int]) -> tuple[Float[Floats, "N 3"], Float[Floats, "N 3"]]:
-        """The middles of all rings of some limbs of the source, and of the target."""
+        """Centers of the rings of some limbs, of the source and of the target."""
         return self._source.skeleton[own].reshape(-1, 3), self._target.skeleton[theirs].reshape(-1, 3)
 
 
 def _pairs(assignment: Assignment) -> tuple[list[int], list[int]]:
-    """Extremities of the source that have a counterpart, and these."""
+    """Assigned extremities of the source, and their counterparts."""
     own = [number for number, other in enumerate(assignment) if other >= 0]
     return own, [assignment[number] for number in own]
 
@@ -300,31 +318,31 @@ def _changes(own: Float[Floats, "T T"], theirs: Float[Floats, "U U"]) -> Float[F
 
 
 def _ranks(table: Float[Floats, "T T"]) -> Float[Floats, "T T"]:
-    """Of a symmetric table the rank of each pair, from 0 to 1."""
+    """Rank of each pair in a symmetric table, from 0 to 1."""
     above = np.triu_indices(len(table), 1)
     ranks = np.zeros(table.shape)
     ranks[above] = np.argsort(np.argsort(table[above], kind="stable"), kind="stable") / max(len(above[0]) - 1, 1)
     return ranks + ranks.T
 
 
-def _kept(kind: Kind, source: Intrinsic, target: Intrinsic, maps: list[tuple[float, Ints]]) -> list[Proposal]:
-    """The best of some maps, no two of them alike; those that turn most triangles over are dropped."""
+def _select_maps(kind: Kind, source: Intrinsic, target: Intrinsic, maps: list[tuple[float, Ints]]) -> list[Proposal]:
+    """The best maps that differ from each other, without those that reverse most triangles."""
     best = [vertex for _, vertex in sorted(maps, key=lambda each: each[0])]
-    chosen = [vertex for vertex in _distinct(target, best) if _facing(source, target, vertex) >= 0]
+    chosen = [vertex for vertex in _distinct(target, best) if _orientation_preserved(source, target, vertex) >= 0]
     return [Proposal(kind, target.mesh.verts[vertex]) for vertex in chosen]
 
 
 def _distinct(target: Intrinsic, maps: Sequence[Ints]) -> list[Ints]:
-    """Maps that differ from all before them in more than a few vertices; so many as settings say."""
+    """Maps that differ from all previous ones, at most as many as the settings allow."""
     verts, kept = target.mesh.verts, list[Ints]()
     for vertex in maps:
         if len(kept) == SETTINGS.maps:
             break
-        if all(differ(verts[vertex], verts[other]) > SETTINGS.same for other in kept):
+        if all(changed_share(verts[vertex], verts[other]) > SETTINGS.same for other in kept):
             kept.append(vertex)
     return kept
 
 
-def differ(points: Float[Floats, "V 3"], others: Float[Floats, "V 3"]) -> float:
-    """Share (0..1) of vertices that lie in clearly other places."""
+def changed_share(points: Float[Floats, "V 3"], others: Float[Floats, "V 3"]) -> float:
+    """Share (0..1) of vertices that are clearly in different places."""
     return float((np.linalg.norm(points - others, axis=1) > SETTINGS.apart).mean())
