@@ -1,7 +1,7 @@
-"""Weights of the verdicts that commands fitted: replace them by what these print, and do not edit them by hand.
+"""Calibrated weights of verdicts. Do not edit them by hand: commands fit and print them.
 
-`experiments.bench.verdicts` and `experiments.bench.any_shapes` with ``--fit`` fit them to right and wrong fits whose truth
-is known (logistic regression), and print what belongs here, with its data, seeds and date inside.
+`experiments.bench.verdicts` and `experiments.bench.any_shapes` with ``--fit`` fit the weights to right and wrong fits with
+known truth (logistic regression) and print what belongs here, with data, seeds and date.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """The logit of a wrong fit: ``offset`` plus the sum of ``weights`` times what is measured of the fit."""
+    """The logit of a wrong fit: ``offset`` plus the dot product of ``weights`` and `FitFeatures.values`."""
 
     weights: tuple[float, ...]  # in the order of `FitFeatures.values`
     offset: float
-    data: str  # of which shapes
+    data: str  # the shapes that were used
     seeds: tuple[int, ...]
     date: str
 
@@ -42,14 +42,16 @@ _OF_CATEGORY = {
 
 
 def calibration_of(category: str) -> Calibration:
-    """That of fits by models of a category: people's, where it has none of its own."""
+    """Calibration for fits by models of a category; that of people if the category has none of its own."""
     return _OF_CATEGORY.get(category, CALIBRATION)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DirectCalibration:
-    """The logit of a right map without a model: ``offset``, less ``energy`` times the energy of the best fit, plus ``lead``
-    times how much higher that of the next one is. More than ``most`` of it says no more.
+    """The logit of a right map without a model.
+
+    It is ``offset``, minus ``energy`` times the energy of the best fit, plus ``lead`` times its lead: the least difference
+    to the energies of other fits, at most ``most``.
     """
 
     offset: float
@@ -60,7 +62,7 @@ class DirectCalibration:
     date: str
 
     def logit(self, energy: float, leads: Sequence[float]) -> float:
-        """Of a fit, and by how much it leads the others."""
+        """Logit for the energy of the best fit and its leads over the others."""
         return self.offset - self.energy * energy + self.lead * min([self.most, *leads])
 
 
@@ -73,7 +75,7 @@ DIRECT = DirectCalibration(
     date="2026-11-28",
 )
 
-# Of energies that are means of both directions.
+# For energies that are means over both directions.
 DIRECT_BOTH_WAYS = DirectCalibration(
     offset=6.761,
     energy=102.0,

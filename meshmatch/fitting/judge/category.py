@@ -1,7 +1,7 @@
 """Coarse classification: the residual of each model's unrefined prediction.
 
-Where that is inconclusive, as of a robot or of a cloud with many outliers, a full fit decides. The residual is that of a
-complete shape: of a part a high one says little.
+If it is inconclusive, as for a robot or for a cloud with many outliers, a full fit decides. The residual is that of a
+complete shape; a high residual of a part says little.
 """
 
 from __future__ import annotations
@@ -26,20 +26,21 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map
 
 KNOWN = 0.0485
-"""Residuals up to this (units of sqrt(area)) are of a shape that the model knows. The benchmark's bodies, scans and animals
-have 0.046 at most, its hearts and furniture 0.051 at least (docs/results.md)."""
+"""Largest residual (units of sqrt(area)) of a shape that the model knows. The benchmark's bodies, scans and animals have
+0.046 at most, its hearts and furniture 0.051 at least (docs/results.md)."""
 FAMILIAR, STRANGE = 0.0465, 0.062
 """Residuals between these limits are inconclusive, for robots as for aeroplanes with wings like arms: a full fit decides,
 see `is_of_category`."""
 SURE = 0.042
-"""Up to this a residual need not be compared with other models': those of other categories were 0.0439 at least
+"""Residuals up to this need no comparison with other models: those of other categories were 0.0439 at least
 (docs/results.md)."""
 BELONGS = 0.7
-"""Trust from which on such a fit decides; for a mesh, and a template with limbs, every fit that is not poor does. Limbless
-templates fit many shapes: the head model can fit a heart fairly. Clouds of aeroplanes have fair fits of people."""
-# Isoperimetric quotient of a template up to which it has limbs: people have 0.08, hands 0.12, animals 0.15, heads 0.27.
-_LIMBED = 0.2
-_SAMPLES, _THIN = 2048, 768  # for the residual, and to rank the orientations
+"""Least trust of a full fit that puts a shape into the category. For a mesh and a template with limbs, any fit that is
+not poor does: limbless templates fit many shapes (the head model can fit a heart fairly), and people fit clouds of
+aeroplanes fairly."""
+# Largest isoperimetric quotient of a template with limbs: people have 0.08, hands 0.12, animals 0.15, heads 0.27.
+_MAX_LIMBED_QUOTIENT = 0.2
+_SAMPLES, _RANKING_SAMPLES = 2048, 768  # samples for the residual, and for ranking orientations
 
 
 def category_samples(shape: Shape, seed: int = 0) -> OrientedPoints:
@@ -48,24 +49,25 @@ def category_samples(shape: Shape, seed: int = 0) -> OrientedPoints:
 
 
 def category_residual(model: TrainedModel, shape: Shape, samples: OrientedPoints, config: FitConfig) -> float:
-    """Mean distance both ways, normals included, of a shape and the model's unrefined template (units of sqrt(area)).
+    """Mean distance, both ways and normals included, between a shape and a model's unrefined template (units of
+    sqrt(area)).
 
-    ``samples`` are `category_samples` of the shape; of ``config`` the seed and the device count. A shape is of its category
-    whatever axes its user names, so all orientations are tried.
+    ``samples`` are the shape's `category_samples`; of ``config`` only seed and device are used. All orientations are tried,
+    as the category does not depend on the axes that the user gives.
     """
     config = replace(config, up=None, front=None, copies=16, hypotheses=3)
     rng = np.random.default_rng(config.seed)
     placed = samples.in_frame(scan_frame(model, without_outliers(shape)))
-    thin, predictor = placed.first(_THIN), Predictor.of(model, rng, config.device, mirrored=False)
-    starts = [(thin, pose) for pose in frames_to_try(model, thin, config, shape.upright)]
+    ranking_samples, predictor = placed.first(_RANKING_SAMPLES), Predictor.of(model, rng, config.device, mirrored=False)
+    starts = [(ranking_samples, pose) for pose in frames_to_try(model, ranking_samples, config, shape.upright)]
     best = best_first(predictor.fit_all(starts, rounds=1, draws=1))[0]
     return predictor.fit(placed, best.pose, draws=1).residual
 
 
 class Readings:
-    """`category_residual` of some repaired shapes by some models, which are loaded when they are asked.
+    """`category_residual` of several repaired shapes under several models, which are loaded when needed.
 
-    ``found`` (M, S) is infinite where a model is damaged or cannot see a shape, and where it was not asked.
+    ``found`` (M, S) is infinite where a model is damaged or cannot process a shape, and where it has not been asked.
     """
 
     def __init__(
@@ -76,31 +78,34 @@ class Readings:
         self.found = np.full((len(models), len(shapes)), np.inf)
 
     def ask(self, rows: Iterable[int], numbers: Iterable[int]) -> None:
-        """Ask these models about these shapes."""
-        at = [(row, number) for row in rows for number in numbers]
-        for place, value in zip(at, parallel_map(lambda at: self._read(*at), at), strict=True):
+        """Compute the residuals for some models (``rows``) and some shapes (``numbers``)."""
+        entries = [(row, number) for row in rows for number in numbers]
+        for place, value in zip(entries, parallel_map(lambda entries: self._read(*entries), entries), strict=True):
             self.found[place] = value
 
     def _read(self, row: int, number: int) -> float:
         try:
             model = self._models[row]()
             return category_residual(model, self._shapes[number], self._samples[number], self._configs[number])
-        except OptionError:  # a device that is not there: true of all models
+        except OptionError:  # a missing device fails for all models
             raise
-        except MeshmatchError:  # also of a damaged model: `meshmatch models list` tells what is wrong with it
+        except MeshmatchError:  # also for a damaged model, which `meshmatch models list` reports
             return np.inf
 
 
 @derived
 def has_limbs(model: TrainedModel) -> bool:
-    """Whether a model's template is far from round: 36 pi V^2 / A^3 is 1 for a ball. Cones to the center close its holes."""
+    """Whether a model's template is far from round: the isoperimetric quotient 36 pi V^2 / A^3 is 1 for a ball.
+
+    Cones to the origin close its holes.
+    """
     shape = model.template.shape
     volume = np.linalg.det(shape.verts[shape.faces]).sum() / 6
-    return bool(36 * np.pi * volume**2 / shape.area**3 <= _LIMBED)
+    return bool(36 * np.pi * volume**2 / shape.area**3 <= _MAX_LIMBED_QUOTIENT)
 
 
 class Judged(Protocol):
-    """What of a fit decides."""
+    """The properties of a fit that decide."""
 
     @property
     def partial(self) -> bool: ...
@@ -111,14 +116,14 @@ class Judged(Protocol):
 
 
 def needs_a_fit(residual: float) -> bool:
-    """Whether a residual alone does not tell if a shape is of a category."""
+    """Whether a residual alone does not decide if a shape is of a category."""
     return FAMILIAR < residual <= STRANGE
 
 
 def is_of_category(model: TrainedModel, shape: Shape, residual: float, fit: Judged | None) -> bool:
-    """Whether a shape is of a model's category, by its residual, and by its ``fit`` where it `needs_a_fit`.
+    """Whether a shape is of a model's category, by its residual, and by its ``fit`` if it `needs_a_fit`.
 
-    A fit of a part tells nothing that the residual does not.
+    A fit as a part adds nothing to the residual.
     """
     if fit is None:
         return residual <= FAMILIAR

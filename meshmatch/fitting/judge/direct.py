@@ -1,7 +1,7 @@
-"""What speaks for and against a fit of one shape to another, made without a model.
+"""Energy and verdict of a fit of one shape to another without a model.
 
-A wrong fit comes as near as a right one, if it is stretched enough. So fits are compared by an energy: how far the surfaces
-stay apart, how much had to be stretched, how much was torn, and how far noses, eyes and other relief come to lie elsewhere.
+A wrong fit comes as near as a right one if it is stretched enough. Fits are therefore compared by an energy: the distance
+of the surfaces, the stretch, the discontinuities, and how badly the relief (noses, eyes) matches.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from meshmatch.fitting.search.predictor import two_way_residual
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.oriented import OrientedPoints
 
-# Weights of the energy beside the residual: of the stretch, where a fit is finished and where it has begun, of what is torn,
-# and of relief. Chosen on 94 of the 450 pairs of `experiments.bench.any_shapes`, those that are hard to tell, and on a dozen
-# that more weight of the stretch made wrong.
-_STRETCH, _BEGUN, _TORN, _UNLIKE = 0.06, 0.03, 0.2, 0.01
+# Weights of the energy, relative to the residual: stretch of a complete fit, stretch of an early one, discontinuities,
+# relief. Chosen on the 94 of the 450 pairs of `experiments.bench.any_shapes` that are hard to decide, and on a dozen that
+# more weight of the stretch made wrong.
+_STRETCH_WEIGHT, _EARLY_STRETCH_WEIGHT, _DISCONTINUITY_WEIGHT, _RELIEF_WEIGHT = 0.06, 0.03, 0.2, 0.01
 LIKELY = 0.9
-"""How likely (0..1) a map is to be right at least that is called good."""
-_FAIR = 0.5
-# Another fit whose energy is so little higher is as good; so many are told.
-_TIE, _TOLD = 0.0015, 9
+"""Least trust (0..1) of a good map."""
+_FAIR_TRUST = 0.5
+# Fits whose energy is higher by less than the first number are equally good; at most the second number of them is reported.
+_MAX_TIE, _MAX_REPORTED_TIES = 0.0015, 9
 
 
 @dataclass(frozen=True, kw_only=True)
 class DirectFeatures:
-    """How a fit without a model came out.
+    """Features of a fit without a model.
 
     Attributes
     ----------
     residual : mean distance both ways, normals included (units of sqrt(area))
-    stretch : root mean square over the shape of the norm of the logarithms of its stretches
-    discontinuous : share (0..1) of neighbours on the target that belong far apart on the source
-    likeness : correlation (0..1) of what stands out, or is sunk, on both shapes; 1 where it was not asked
+    stretch : mean over the shape of the norm of the logarithms of the principal stretches
+    discontinuous : share (0..1) of neighbours on the target whose counterparts are far apart on the source
+    likeness : correlation (0..1) of the shapes' relief under the map; 1 if it was not computed
     """
 
     residual: float
@@ -51,8 +51,9 @@ class DirectFeatures:
     def of(
         cls, system: NodeSystem, samples: OrientedPoints, vectors: Float[Floats, "K 3"], pairs: Pairs | None = None
     ) -> DirectFeatures:
-        """Of node vectors; ``samples`` are of the target, ``pairs`` those that are neighbours (without them tears are not
-        looked for)."""
+        """Features of node vectors. ``samples`` are of the target; without ``pairs`` of neighbouring samples,
+        discontinuities are 0.
+        """
         stretches = np.linalg.svd(system.deformation_gradient(vectors), compute_uv=False)
         logarithms = np.log(np.clip(stretches, 1e-3, 1e3))
         return cls(
@@ -63,32 +64,40 @@ class DirectFeatures:
 
     @property
     def energy(self) -> float:
-        """Low for right fits."""
-        return self._energy(_STRETCH)
+        """Energy of a complete fit; low for right fits."""
+        return self._energy(_STRETCH_WEIGHT)
 
     @property
     def early_energy(self) -> float:
-        """The same of fits that have only begun: the right ones among them may yet have to stretch back."""
-        return self._energy(_BEGUN)
+        """Energy of an early fit; right fits may still be stretched too much."""
+        return self._energy(_EARLY_STRETCH_WEIGHT)
 
     def _energy(self, stretch: float) -> float:
         unlike = 1.0 - self.likeness
-        return self.residual + stretch * self.stretch + _TORN * self.discontinuous + _UNLIKE * unlike
+        return (
+            self.residual
+            + stretch * self.stretch
+            + _DISCONTINUITY_WEIGHT * self.discontinuous
+            + _RELIEF_WEIGHT * unlike
+        )
 
 
 def judge_direct(
     energy: float, leads: Sequence[float], calibration: DirectCalibration = DIRECT, turns: int = 1
 ) -> tuple[Verdict, float, tuple[Reason, ...]]:
-    """Verdict, trust (0..1) and reasons of the best fit; ``leads`` are how much higher the energies are of other fits, which
-    differ from it clearly, and ``turns`` by how many turns one of the shapes comes onto itself."""
+    """Verdict, trust (0..1) and reasons of the best fit.
+
+    ``leads`` are the energies of clearly different fits minus that of the best one; ``turns`` is the number of rotations
+    that map one of the shapes onto itself.
+    """
     trust = float(1 / (1 + np.exp(-calibration.logit(energy, leads))))
     reasons = []
-    if equal := max(sum(each < _TIE for each in leads), turns - 1):
-        count = f"{min(equal, _TOLD) + 1}{' or more' if equal > _TOLD else ''}"
+    if equal := max(sum(each < _MAX_TIE for each in leads), turns - 1):
+        count = f"{min(equal, _MAX_REPORTED_TIES) + 1}{' or more' if equal > _MAX_REPORTED_TIES else ''}"
         reasons.append(
             Reason("ambiguous", f"ambiguous: {count} different maps are equally good, as of a symmetric shape")
         )
     if trust < LIKELY:
         reasons.append(Reason("unsupervised", f"matched without a model: {int(100 * trust)} % likely to be right"))
-    verdict: Verdict = "poor" if trust < _FAIR else "fair" if reasons else "good"
+    verdict: Verdict = "poor" if trust < _FAIR_TRUST else "fair" if reasons else "good"
     return verdict, trust, tuple(reasons)

@@ -1,4 +1,4 @@
-"""Joints of a fit that bend as no joint does: of a body taken back to front, the knees bend forward."""
+"""Joints of a fit that bend the wrong way: if a body is fitted back to front, its knees bend forward."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from meshmatch.fitting.solve.priors import signed_svd
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.templates.template import Template
 
-# Labels of the parts above and below a knee. In the axes of a human template (y up, z to the front) a shin points down.
+# Labels of the parts above and below each knee. In the axes of a human template (y up, z to the front) a shin points down.
 _KNEES = (("left thigh", "left shin"), ("right thigh", "right shin"))
 _DOWN, _FRONT = np.array([0.0, -1.0, 0.0]), 2
 
@@ -17,8 +17,9 @@ _DOWN, _FRONT = np.array([0.0, -1.0, 0.0]), 2
 def knees_forward(
     system: NodeSystem, vectors: Float[Floats, "K 3"], template: Template, shown: Bool[Bools, " V"] | None = None
 ) -> float:
-    """How far (degrees) the knee bends forward that does so most; 0 where none does, or the template has no knees. Where
-    only some vertices are ``shown``, knees whose thigh or shin mostly is not say nothing.
+    """Largest angle (degrees) by which a knee bends forward; 0 if none does, or if the template has no knees.
+
+    If only some vertices are ``shown``, a knee is ignored unless more than half of its thigh and of its shin is.
     """
     names, labels = template.label_names or (), np.asarray(template.labels)[system.gradient_points]
     seen = np.ones(len(labels), bool) if shown is None else shown[system.gradient_points]
@@ -26,9 +27,9 @@ def knees_forward(
     for above, below in _KNEES:
         if above not in names or below not in names:
             continue
-        own = [labels == names.index(name) for name in (above, below)]
-        parts = [gradient[each] for each in own]
-        if all(len(part) and seen[each].mean() > 0.5 for part, each in zip(parts, own, strict=True)):
+        masks = [labels == names.index(name) for name in (above, below)]
+        parts = [gradient[each] for each in masks]
+        if all(len(part) and seen[each].mean() > 0.5 for part, each in zip(parts, masks, strict=True)):
             left, _, right = signed_svd(np.stack([part.mean(0) for part in parts]))
             thigh, shin = left @ right  # the rotations nearest to both
             direction = thigh.T @ shin @ _DOWN

@@ -1,4 +1,4 @@
-"""The words of a verdict: good, fair or poor, and the reasons why it is not good."""
+"""Verdicts (good, fair, poor), and the reasons why a verdict is not good."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ ReasonCode = Literal[
     "ambiguous",
     "outlier",
 ]
-"""Template and shape stay apart; some of the shape is not reached; template lies where the shape has no surface;
-neighbours belong far apart; the template is stretched or compressed; it is folded, or inside out, in places; pieces of a
-part lie beside it; a part ends where the shape has no edge; a knee bends forward; the shape faces the other way; the network
-predicts other points for tilted and mirrored copies of the shape; no feature alone, but all together; it was taken for a
-part; its mirror image fits as well; the model was learned without
-correspondence, or there was none; other fits are equally good; it stands out of its collection."""
+"""In this order: template and shape stay apart; some of the shape is not reached; template lies where the shape has no
+surface; neighbours are mapped far apart; the template is stretched or compressed; it is folded or inside out in places;
+separate pieces of a part lie next to it; a part ends where the shape has no edge; a knee bends forward; the shape faces
+the other way; the network predicts other points for tilted and mirrored copies of the shape; no single feature, but all
+together; it was fitted as a part; its mirror image fits as well; the model was trained without correspondence, or there
+was none; other fits are equally good; it is an outlier of its collection."""
 SIDE_IN_DOUBT = "its mirror image fits nearly as well: left and right may be exchanged"
 
 
 class Reason(str):
-    """Why a verdict is not good: a string with a sentence to print, and a ``code`` to branch on.
+    """Why a verdict is not good: a string with a sentence for people, and a ``code`` for programs.
 
     The codes are "residual", "unreached", "empty", "torn", "crushed", "folded", "pieces", "uncut", "bent", "facing",
     "unsure", "doubt", "part", "side", "unsupervised", "ambiguous" and "outlier".
@@ -44,7 +44,7 @@ class Reason(str):
     code
         One of these.
     sentence
-        For people; may be worded differently in another version.
+        The text; its wording may change between versions.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Good, fair or poor: how a fit is judged, by its features, and why."""
+"""Verdict of a fit (good, fair or poor) from its features, with reasons."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from meshmatch.fitting.search.task import Registration, without_interior
 from meshmatch.fitting.search.visibility import visible_vertices
 from meshmatch.fitting.solve.regularity import Regularity
 
-_SKIN = 1.9  # square metres of an adult's skin
+_SKIN = 1.9  # area of an adult's skin in square meters
 
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictLimits:
-    """Between good, fair and poor. Set by hand, apart from the trust, which is a probability.
+    """Limits between good, fair and poor. Set by hand, apart from the trust, which is a probability.
 
     Attributes
     ----------
-    good_trust, fair_trust : trust from which on a fit is good, and fair: more likely right than wrong
-    uninformative_trust : upper bound where the residual is uninformative
-    good_share : share (0..1) of shape or template without counterpart up to which a fit is good
-    fair_share : share of the template up to which it is fair
-    hidden : share of the template: a part that shows less than the rest, such as a leg, is not enough to judge
-    crushed, flat : stretch of the template from which on no fit is good, and from which on it is poor
-    folded : share of the template's vertices that are folded, up to which a fit is good: right fits of generated animals
-        have up to 0.03, those of people up to 0.01
-    folded_by_agreement : the same for vertices that fold only when fits agree, which is no property of the shape
-    search_parts : residual (units of sqrt(area)) from which on a fit may be one of a part
-    residual, discontinuous, flipped, spread : what is above, is given as a reason
+    good_trust, fair_trust : least trust of a good and of a fair fit
+    uninformative_trust : upper bound of the trust if the residual is uninformative
+    good_share : largest share (0..1) of shape or template without counterpart in a good fit
+    fair_share : largest share of the template without counterpart in a fair fit
+    hidden : largest share of the template that a fair fit of a part may leave hidden: a leg alone is not enough to judge
+    crushed, flat : stretch of the template above which no fit is good, and above which it is poor
+    folded : largest share of folded template vertices in a good fit: right fits of generated animals have up to 0.03, those
+        of people up to 0.01
+    folded_by_agreement : the same for vertices that fold only during agreement, which is no property of the shape
+    search_parts : residual (units of sqrt(area)) above which a fit may be one of a part
+    residual, discontinuous, flipped, spread : values above these are reported as reasons
     """
 
     good_trust: float = 0.99
@@ -68,7 +68,7 @@ LIMITS = VerdictLimits()
 
 @dataclass(frozen=True)
 class Judgement:
-    """A verdict, why it is not good, and by what features."""
+    """A verdict, the reasons why it is not good, and the features behind it."""
 
     verdict: Verdict
     reasons: tuple[Reason, ...]
@@ -77,12 +77,12 @@ class Judgement:
 
     @property
     def trust(self) -> float:
-        """How far (0..1) the fit can be trusted."""
+        """Probability (0..1) that the fit is right."""
         return self.features.p_correct(self.calibration)
 
 
 def judge_registration(found: Registration, partial: bool) -> Judgement:
-    """What is thought of a registration."""
+    """Judge a registration."""
     task, vectors = found.task, found.candidate.vectors
     if task.shape.is_cloud:
         allowance = cloud_allowance(task.system, found.local, task.shape.V, vectors, task.config.seed)
@@ -116,9 +116,9 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
 
 
 def judge_with_allowance(features: FitFeatures, residual: float, calibration: Calibration = CALIBRATION) -> Judgement:
-    """Verdict, reasons and trust of a fit of a mesh that has that ``residual``, some of it excused in ``features``.
+    """Verdict, reasons and trust of a fit of a mesh, where part of ``residual`` is allowed for in ``features``.
 
-    What is excused makes no fit good: front and back of a figure of solids differ by no more than that.
+    The allowance makes no fit good: front and back of a figure of solids differ by no more than that.
     """
     judged = judge(features, calibration)
     if judged.verdict != "good" or judge(replace(features, residual=residual), calibration).verdict == "good":
@@ -127,7 +127,7 @@ def judge_with_allowance(features: FitFeatures, residual: float, calibration: Ca
 
 
 def judge(features: FitFeatures, calibration: Calibration = CALIBRATION) -> Judgement:
-    """Verdict, reasons and trust."""
+    """Verdict, reasons and trust for features."""
     trust, reasons = features.p_correct(calibration), _reasons(features)
     lacking = max(features.uncovered_shape, features.uncovered_template)
     if features.partial:
@@ -157,7 +157,7 @@ def judge(features: FitFeatures, calibration: Calibration = CALIBRATION) -> Judg
 
 
 def _reasons(features: FitFeatures) -> list[Reason]:
-    """Features that speak against the fit."""
+    """Features that speak against the fit, as reasons."""
     unreached = f"{100 * features.uncovered_shape:.0f} % of the shape is not reached by the template"
     empty = f"{100 * features.uncovered_template:.0f} % of the template lies where the shape has no surface"
     crushed = f"the template had to be stretched or compressed {np.exp(features.stretch):.1f}-fold on average"
@@ -170,7 +170,7 @@ def _reasons(features: FitFeatures) -> list[Reason]:
     uncut = f"{100 * features.uncut:.0f} % of the border of the fitted part is not an open edge of the shape"
     bent = f"a knee bends forward by {features.forward:.0f} degrees, as if front and back were exchanged"
     astray, open_border, forward = features.alone
-    told: list[tuple[bool, ReasonCode, str]] = [
+    criteria: list[tuple[bool, ReasonCode, str]] = [
         (features.residual > LIMITS.residual, "residual", _gap(features.residual)),
         (features.uncovered_shape > LIMITS.good_share, "unreached", unreached),
         (features.uncovered_template > LIMITS.good_share, "empty", empty),
@@ -188,7 +188,7 @@ def _reasons(features: FitFeatures) -> list[Reason]:
         (features.flipped > LIMITS.flipped, "facing", facing),
         (features.spread > LIMITS.spread, "unsure", unsure),
     ]
-    return [Reason(code, words) for speaks, code, words in told if speaks]
+    return [Reason(code, text) for applies, code, text in criteria if applies]
 
 
 def _gap(residual: float) -> str:
@@ -202,7 +202,9 @@ def _folds(inverted: float) -> str:
 
 
 def folded_by_agreement(before: Regularity | None, after: Regularity) -> Reason | None:
-    """Why a fit is no longer good whose deformation folds more than right ones do, or clearly more than before."""
+    """The reason why a fit is no longer good, if its deformation folds more than right ones do, or clearly more than
+    before.
+    """
     folded = 0.0 if before is None else before.inverted
     if after.inverted <= min(LIMITS.folded, folded + LIMITS.folded_by_agreement):
         return None
