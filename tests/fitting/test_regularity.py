@@ -12,7 +12,7 @@ import meshmatch
 from meshmatch.fitting.agree import agreed_fits, with_vectors
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree
-from meshmatch.fitting.solve.regularity import Regularity, opened
+from meshmatch.fitting.solve.regularity import Regularity, unfolded_gradients
 from meshmatch.fitting.solve.system import NodeSystem, node_system
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
@@ -43,11 +43,11 @@ def test_where_all_of_space_moves_alike_it_is_the_same_everywhere(system: NodeSy
 def test_the_nearest_stretch_that_is_open_has_the_same_axes() -> None:
     rng = np.random.default_rng(0)
     F = rng.normal(size=(50, 3, 3))
-    found = opened(F)
+    found = unfolded_gradients(F)
     assert (np.linalg.det(found) > 0).all()
-    assert np.allclose(opened(found), found)  # what is open stays as it is
+    assert np.allclose(unfolded_gradients(found), found)  # what is open stays as it is
     sound = F[np.linalg.svd(F)[1][:, 2] * np.sign(np.linalg.det(F)) > 0.1]
-    assert len(sound) and np.allclose(opened(sound), sound)
+    assert len(sound) and np.allclose(unfolded_gradients(sound), sound)
     others = np.linalg.qr(rng.normal(size=(50, 3, 3)))[0]
     others[:, :, 2] *= np.sign(np.linalg.det(others))[:, None]  # rotations are open, and none is nearer
     assert (np.linalg.norm(F - found, axis=(1, 2)) <= np.linalg.norm(F - others, axis=(1, 2))).all()

@@ -1,8 +1,8 @@
-"""Symmetric positive definite band matrices, factored while other threads go on.
+"""Solvers for symmetric positive definite band matrices that release Python's lock.
 
-SciPy's wrappers of LAPACK keep Python's lock, so that fits in two threads wait for one another. Here the function that SciPy
-exports for compiled code is called through ctypes, which gives the lock up. Where it is exported with other types, such as
-integers of 64 bits, SciPy's wrapper does.
+SciPy's wrappers of LAPACK hold the lock, so that fits in two threads would wait for each other. LAPACK functions that SciPy
+exports for compiled code are therefore called through ctypes, which releases it. If they are exported with other types,
+such as 64-bit integers, SciPy's wrapper is used.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ _ROUTINES = {
     "dtrsm": (cython_blas, "char, char, char, char, int, int, double, double, int, double, int"),
     "dsyrk": (cython_blas, "char, char, int, int, double, double, int, double, double, int"),
 }
-"""The modules that export them, and what their arguments point to."""
-_AT_ONCE = 32  # columns that `Envelope` eliminates at once
+"""Name of each routine, the module that exports it, and the types to which its arguments point."""
+_BLOCK_SIZE = 32  # columns that `Envelope` eliminates at once
 
 
 def _exported() -> dict[str, Callable[..., None]] | None:
-    """The routines, if SciPy exports all with the types that are expected."""
+    """The routines, or None unless SciPy exports all of them with the expected types."""
     python = getattr(ctypes, "pythonapi", None)
     if python is None:
         return None
@@ -51,7 +51,7 @@ _LAPACK = _exported()
 
 
 def solved_band(band: Float[Floats, "N B"], right: Float[Floats, "*R N"]) -> Float[Floats, "*R N"]:
-    """Solve A x = b, with A[i + k, i] in ``band[i, k]``, for each row of ``right``; both arrays are used up.
+    """Solve A x = b for each row of ``right``, with A[i + k, i] in ``band[i, k]``; both arrays are overwritten.
 
     Raises
     ------
@@ -67,34 +67,35 @@ def solved_band(band: Float[Floats, "N B"], right: Float[Floats, "*R N"]) -> Flo
     N, above, columns, rows, failed = map(ctypes.c_int, (len(band), band.shape[1] - 1, sides, band.shape[1], 0))
     sizes = [ctypes.byref(each) for each in (N, above, columns, rows, N, failed)]
     _LAPACK["dpbsv"](b"L", *sizes[:3], band.ctypes.data, sizes[3], right.ctypes.data, *sizes[4:])
-    _refuse(failed.value)
+    _raise_if_failed(failed.value)
     return right
 
 
 class Envelope:
-    """Which part of a band a matrix and its Cholesky factor fill: unknowns of limbs meet few others, and only those of a
-    torso as many as the band is wide.
+    """The part of a band that a matrix and its Cholesky factor fill.
 
-    Column i has nothing from row ``ends[i]`` on, and no column ends before the one that precedes it. LAPACK's banded routine
-    eliminates all columns as far as the widest reaches; this does the same with each block of columns as far as its own do.
+    Unknowns of limbs interact with few others, and only those of a torso with as many as the band is wide. Column i is zero
+    from row ``ends[i]`` on, and ``ends`` does not decrease. LAPACK's banded routine eliminates all columns over the full
+    bandwidth; this class eliminates each block of columns only as far as it reaches.
     """
 
     def __init__(self, ends: Int[Ints, " N"]) -> None:
         N = len(ends)
         self.above = int((ends - np.arange(N)).max()) - 1
-        self.columns = self.above + 1 + _AT_ONCE
-        """Of the array of the band: `above` the diagonal, the diagonal, and room for the corners of a block."""
-        step, size = self.columns - 1, np.dtype(np.float64).itemsize  # from a column to the next, in the same row
-        self._sizes = [_integer(each) for each in (N, self.above, 1, self.columns)]
-        self._step, self._blocks = _integer(step), []
-        for first in range(0, N, _AT_ONCE):
-            after = min(first + _AT_ONCE, N)
+        self.columns = self.above + 1 + _BLOCK_SIZE
+        """Columns of the band's array: `above` off the diagonal, the diagonal, and room for the corners of a block."""
+        step, size = self.columns - 1, np.dtype(np.float64).itemsize  # distance in memory between neighbours in a row
+        self._sizes = [_int_pointer(each) for each in (N, self.above, 1, self.columns)]
+        self._step, self._blocks = _int_pointer(step), []
+        for first in range(0, N, _BLOCK_SIZE):
+            after = min(first + _BLOCK_SIZE, N)
             below, width, start = int(ends[after - 1]) - after, after - first, first * self.columns
             places = (size * start, size * (start + width), size * after * self.columns)
-            self._blocks.append((first, _integer(width), _integer(below) if below > 0 else None, places))
+            self._blocks.append((first, _int_pointer(width), _int_pointer(below) if below > 0 else None, places))
 
     def solve(self, band: Float[Floats, "N B"], right: Float[Floats, " N"]) -> Float[Floats, " N"]:
-        """Solve A x = b, with A[i + k, i] in ``band[i, k]`` for k up to `above`, and zeros then; both arrays are used up.
+        """Solve A x = b, with A[i + k, i] in ``band[i, k]`` for k up to `above` and zeros beyond; both arrays are
+        overwritten.
 
         Raises
         ------
@@ -111,7 +112,7 @@ class Envelope:
         for first, width, below, places in self._blocks:
             diagonal, under, rest = (array + place for place in places)
             _LAPACK["dpotrf"](b"L", width, diagonal, step, code)
-            _refuse(failed.value and first + failed.value)
+            _raise_if_failed(failed.value and first + failed.value)
             if below is not None:
                 _LAPACK["dtrsm"](b"R", b"L", b"T", b"N", below, width, _ONE, diagonal, step, under, step)
                 _LAPACK["dsyrk"](b"L", b"N", below, width, _MINUS_ONE, under, step, _ONE, rest, step)
@@ -123,17 +124,17 @@ class Envelope:
 _ONE, _MINUS_ONE = (ctypes.byref(ctypes.c_double(value)) for value in (1.0, -1.0))
 
 
-def _integer(value: int) -> Any:
+def _int_pointer(value: int) -> Any:
     return ctypes.byref(ctypes.c_int(value))
 
 
 def _check(*arrays: Floats) -> None:
-    """LAPACK reads and writes where arrays lie."""
+    """Check that arrays have the memory layout that LAPACK expects."""
     for each in arrays:
         if not each.flags.c_contiguous or each.dtype != np.float64:
             raise ValueError("a band and its right sides are contiguous 64-bit floats")
 
 
-def _refuse(failed: int) -> None:
+def _raise_if_failed(failed: int) -> None:
     if failed:
         raise np.linalg.LinAlgError(f"the leading block of {failed} rows is not positive definite")

@@ -1,11 +1,11 @@
-"""Poses between several fits of one template, by what the field does at its gradient points.
+"""Interpolation between several fits of one template, by the deformation gradients at its gradient points.
 
-Limbs turn and keep their size. Blending node vectors would move every point along a straight line, and a turning arm would
-shrink on its way. Here the deformation gradient of each fit is split into a rotation and a stretch (polar decomposition).
-Stretches are blended by their logarithms. Rotations are taken from neighbour to neighbour, along a spanning tree of the
-surface that prefers neighbours which turn alike: a forearm turns about its elbow and the elbow goes where the upper arm
-takes it. Then follow the node vectors that fit the blended gradients best (least squares), and a few rounds in which every
-point may choose its own rotation anew (local and global steps of Sorkine and Alexa, 2007).
+Limbs rotate and keep their size. If node vectors were blended, every point would move along a straight line, and a rotating
+arm would shrink on its way. Instead, the deformation gradient of each fit is split into a rotation and a stretch (polar
+decomposition). Stretches are blended by their logarithms. Rotations are blended relative to a neighbour's, along a spanning
+tree of the surface that prefers neighbours with similar rotations: a forearm rotates about its elbow, and the elbow follows
+the upper arm. Then the node vectors are found that fit the blended gradients best (least squares), followed by a few rounds
+in which every point may change its rotation (local and global steps of Sorkine and Alexa, 2007).
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from meshmatch.fitting.solve.driver import Problem, minimise
 from meshmatch.fitting.solve.priors import FixedGradient, RotatedReference, signed_svd
 from meshmatch.fitting.solve.system import NodeSystem
 
-_MIN_STRETCH = 1e-3  # smaller ones count as this: a logarithm must stay finite
-_MAX_LOG = 5.0  # a stretch of 150, which only a far extrapolation reaches
-# The first solve holds the blended gradients; in the rounds after it every point chooses its own rotation. Set by hand.
+_MIN_STRETCH = 1e-3  # smaller stretches are raised to this, so that logarithms are finite
+_MAX_LOG = 5.0  # a stretch of 150, which only distant extrapolation reaches
+# The first solve fits the blended gradients; in the following rounds every point may change its rotation. Set by hand.
 _FIRST = Schedule(steps=1, prior=(1.0, 1.0), damping=1e-7)
 _ROUNDS = Schedule(steps=3, prior=(1.0, 1.0), damping=1e-4)
-_MIN_COST = 1e-6  # of an edge over which rotations do not change: a graph drops edges of cost 0
+_MIN_COST = 1e-6  # cost of an edge without a change of rotation; sparse graphs drop edges of cost 0
 
 
 class RotationBlend:
     """Weighted means of N rotations in each of several keys; exact at the keys.
 
-    In the tangent space at the mean of the keys: for two keys that is the shortest turn from one to the other at
-    constant speed. The order of the keys, each (N, 3, 3), does not matter.
+    Computed in the tangent space at the mean of the keys; for two keys this is the shortest rotation from one to the other
+    at constant speed. The order of the keys, each (N, 3, 3), does not matter.
     """
 
     def __init__(self, keys: Sequence[Floats]) -> None:
@@ -66,7 +66,7 @@ class StretchBlend:
 def polar(F: Float[Floats, "N 3 3"]) -> tuple[Float[Floats, "N 3 3"], Float[Floats, "N 3 3"]]:
     """Polar decomposition F = R S: the rotations R nearest to F, and the logarithms of the stretches S.
 
-    Where F turns space inside out the smallest stretch would be negative; it counts as a very small one.
+    If F inverts orientation, the smallest stretch would be negative; it is raised to a very small one.
     """
     U, sizes, Vh = signed_svd(F)
     logs = np.log(np.maximum(sizes, _MIN_STRETCH))
@@ -74,9 +74,10 @@ def polar(F: Float[Floats, "N 3 3"]) -> tuple[Float[Floats, "N 3 3"], Float[Floa
 
 
 class FieldPath:
-    """The poses between several fits of one template, by what the field does at its gradient points.
+    """Poses between several fits of one template, by the deformation gradients at its gradient points.
 
-    Keys are node vectors (K, 3) of the fits, each in its core frame; vertices of the core stay in the middle.
+    Keys are node vectors (K, 3) of the fits, each in its core frame; the core moves on a straight line between its
+    positions.
     """
 
     def __init__(self, system: NodeSystem, keys: Sequence[Floats], core: Int[Ints, " C"]) -> None:
@@ -86,28 +87,32 @@ class FieldPath:
         self.stretches = StretchBlend([logs for _, logs in parts])
         self._parent, self._levels = _spanning_order(system, rotations, core)
         child = np.flatnonzero(self._parent >= 0)
-        relative = [rotation.copy() for rotation in rotations]  # to that of each point's parent; of roots as they are
+        relative = [
+            rotation.copy() for rotation in rotations
+        ]  # rotations relative to each point's parent; absolute for roots
         for own, whole in zip(relative, rotations, strict=True):
             own[child] = whole[self._parent[child]].transpose(0, 2, 1) @ whole[child]
         self._joints = RotationBlend(relative)
-        self._core = np.asarray(system.phi[core].mean(0)).ravel()  # of the node vectors: how the core moves
+        self._core = np.asarray(
+            system.phi[core].mean(0)
+        ).ravel()  # weights of the node vectors in the core's mean displacement
 
     def __call__(self, weights: Float[Floats, " n"]) -> Float[Floats, "K 3"]:
         """Node vectors for weights of the keys that sum to one."""
         stretch = self.stretches.at(weights)
-        straight = np.tensordot(weights, self._keys, 1)
-        turned = self._joints.at(weights)
+        linear = np.tensordot(weights, self._keys, 1)
+        rotations = self._joints.at(weights)
         for level in self._levels:
-            turned[level] = turned[self._parent[level]] @ turned[level]
+            rotations[level] = rotations[self._parent[level]] @ rotations[level]
 
         def anchored(vectors: Float[Floats, "K 3"]) -> Float[Floats, "K 3"]:
-            """The core goes where it goes on the straight way."""
-            return vectors + self._core @ (straight - vectors)
+            """Translate so that the core moves as under linearly blended node vectors."""
+            return vectors + self._core @ (linear - vectors)
 
         first, rounds = (
             Problem(system=self._system, terms=(), schedule=schedule, anchor=anchored) for schedule in (_FIRST, _ROUNDS)
         )
-        vectors = minimise(first, FixedGradient(turned @ stretch), straight)
+        vectors = minimise(first, FixedGradient(rotations @ stretch), linear)
         return minimise(rounds, RotatedReference(stretch), vectors)
 
 
@@ -116,8 +121,8 @@ def _spanning_order(
 ) -> tuple[Int[Ints, " G"], list[Ints]]:
     """Parents (G,) of the gradient points, -1 for roots, and the other points level by level below their roots.
 
-    One tree for each connected part, along the edges over which the rotations change least. Its root is the point
-    nearest to the middle of the core.
+    Each connected part has one spanning tree, along the edges over which the rotations change least. Its root is the point
+    nearest to the center of the core.
     """
     at = system.verts[system.gradient_points]
     G = len(at)
@@ -141,7 +146,7 @@ def _spanning_order(
 
 
 def _neighbours(system: NodeSystem) -> tuple[Ints, Ints]:
-    """Pairs (a < b) of gradient points whose regions of the surface touch."""
+    """Pairs (a < b) of gradient points whose regions on the surface touch."""
     V, G = len(system.verts), len(system.gradient_points)
     edges = np.concatenate([system.faces[:, [0, 1]], system.faces[:, [1, 2]], system.faces[:, [2, 0]]])
     length = np.linalg.norm(system.verts[edges[:, 0]] - system.verts[edges[:, 1]], axis=1)
@@ -149,7 +154,7 @@ def _neighbours(system: NodeSystem) -> tuple[Ints, Ints]:
     found = dijkstra(graph, directed=False, indices=system.gradient_points, min_only=True, return_predecessors=True)
     number = np.full(V + 1, -1)
     number[system.gradient_points] = np.arange(G)
-    # Of the nearest gradient point along the surface, -1 out of reach.
+    # Number of the nearest gradient point along the surface for each vertex; -1 if none is connected.
     region = number[np.where(found[2] < 0, V, found[2])]
     pairs = region[edges]
     pairs = np.sort(pairs[(pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])], axis=1)

@@ -1,9 +1,9 @@
-"""The one driver of least squares on node vectors: a schedule, terms and a prior, step by step.
+"""The driver for all least-squares fits of node vectors: a schedule, terms and a prior, step by step.
 
-Each step freezes the pairs and the robust weights of the terms, and the targets of the prior (rotations, say), and solves
-one linear system. That is iteratively reweighted least squares with local/global rotations: iterative closest points with
-an as-rigid-as-possible prior (Sorkine and Alexa, 2007). Refinement of one fit, agreement of several, the fit without a
-model and interpolation differ only in what they hand over.
+In each step the pairs and robust weights of the terms are frozen, and so are the targets of the prior (rotations, for
+example); then one linear system is solved. This is iteratively reweighted least squares with local/global rotations, that
+is, iterative closest points with an as-rigid-as-possible prior (Sorkine and Alexa, 2007). Refinement of one fit, agreement
+of several, fits without a model and interpolation differ only in their terms, priors and schedules.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from meshmatch.fitting.solve.terms import Quadratic, Term
 from meshmatch.threads import parallel_map
 
 JointPrior = Callable[[Sequence[Float[Floats, "G 3 3"]]], Sequence[Prior]]
-"""From the current deformation gradients of several fits to the prior of each in the next step."""
+"""Maps the current deformation gradients of several fits to the prior of each fit in the next step."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Problem:
-    """What is minimised for one fit, apart from its prior.
+    """The least-squares problem of one fit, without its prior.
 
-    ``anchor`` moves the node vectors after each step, such as to where no term holds them.
+    ``anchor``, if given, corrects the node vectors after each step, for example by a translation if no term determines it.
     """
 
     system: NodeSystem
@@ -39,7 +39,7 @@ class Problem:
     def step(
         self, number: int, start: Float[Floats, "K 3"], F: Float[Floats, "G 3 3"], prior: Prior
     ) -> Float[Floats, "K 3"]:
-        """Node vectors after a step of the schedule from ``start``, where the deformation gradients are F."""
+        """Node vectors after one step of the schedule from ``start``, where the deformation gradients are F."""
         system, schedule = self.system, self.schedule
         weights, pulls = self._sum(start, schedule.scale_at(number))
         targets = prior.targets(F)
@@ -48,7 +48,7 @@ class Problem:
         return found if self.anchor is None else self.anchor(found)
 
     def _sum(self, vectors: Float[Floats, "K 3"], scale: float) -> Quadratic:
-        """The sum of all terms."""
+        """Sum of the quadratic forms of all terms."""
         V = len(self.system.verts)
         weights, pulls = np.zeros((V, 6)), np.zeros((V, 3))
         for term in self.terms:
@@ -58,19 +58,19 @@ class Problem:
         return weights, pulls
 
     def start(self, now: Float[Floats, "K 3"], before: Float[Floats, "K 3"]) -> Float[Floats, "K 3"]:
-        """Where a step begins: further on along the last one, which led from ``before`` to ``now``."""
+        """Starting point of a step: ``now``, extrapolated from ``before`` by the momentum."""
         return now + self.schedule.momentum * (now - before) if self.schedule.momentum else now
 
 
 def minimise(problem: Problem, prior: Prior, vectors: Float[Floats, "K 3"]) -> Float[Floats, "K 3"]:
-    """Node vectors of one fit after all steps."""
+    """Node vectors of one fit after all steps of the schedule."""
     return minimise_together([problem], lambda _: [prior], [vectors])[0]
 
 
 def minimise_together(
     problems: Sequence[Problem], joint_prior: JointPrior, vectors: Sequence[Float[Floats, "K 3"]], threads: int = 1
 ) -> list[Float[Floats, "K 3"]]:
-    """Node vectors of several fits after as many steps as the first has, so many fits beside each other."""
+    """Node vectors of several fits after all steps of the first one's schedule; up to ``threads`` fits in parallel."""
     now = before = list(vectors)
     for number in range(problems[0].schedule.steps):
         starts = [each.start(*path) for each, *path in zip(problems, now, before, strict=True)]

@@ -1,8 +1,8 @@
-"""From the network's fit to the surface: the refinement of one fit's node vectors.
+"""Refinement of one fit's node vectors, from the network's prediction to the surface.
 
-The prior keeps the deformation gradient at every gradient point near a rotated copy of the network's own, R_g F_g(network)
-with R_g the best local rotation: the surface may bend to meet the samples but not stretch along itself, which Chamfer
-distance and normals cannot see.
+The prior keeps the deformation gradient at every gradient point near R_g F_g(network), the network's own gradient under the
+best local rotation R_g. The surface may bend to meet the samples but cannot stretch along itself, which neither Chamfer
+distance nor normals would notice.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def refine_nodes(
 ) -> Float[Floats, "K 3"]:
     """Fit node vectors to samples in the core frame.
 
-    Deformation gradients of the vectors to start from are the prior. Landmarks are pairs that the fit holds.
+    The deformation gradients of the initial vectors are the prior. Landmarks pull on the template.
     """
     prior = RotatedReference(system.deformation_gradient(vectors))
     problem = Problem(system=system, terms=terms_of(samples, config, landmarks), schedule=config.schedule)

@@ -1,8 +1,8 @@
-"""Priors of the least squares of a fit: which deformation gradients it should have where the shape does not say.
+"""Priors of the least squares: deformation gradients that a fit should have where the shape does not determine them.
 
-A prior gives a target T_g for the deformation gradient F_g at every gradient point, from the current F. This is the local
-step of local/global optimisation (Sorkine and Alexa, *As-rigid-as-possible surface modeling*, 2007); the linear system that
-holds F_g near T_g is the global one. A new prior is a class with `Prior`'s one method.
+A prior turns the current deformation gradients F_g at the gradient points into targets T_g. This is the local step of
+local/global optimisation (Sorkine and Alexa, *As-rigid-as-possible surface modeling*, 2007); the linear system that holds
+F_g near T_g is the global step. A new prior is a class with the one method of `Prior`.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from scipy.sparse import csr_matrix
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.trees import cKDTree
 
-_MAX_ITERATIONS = 20  # of Newton's: five are the rule, and convergence is quadratic
+_MAX_ITERATIONS = 20  # of Newton's method: usually five suffice, as it converges quadratically
 
 
 class Prior(Protocol):
-    """Which deformation gradients are sought."""
+    """Targets for deformation gradients."""
 
     def targets(self, F: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
         """Targets for the gradients of the next step, given the current ones."""
@@ -30,7 +30,7 @@ class Prior(Protocol):
 class RotatedReference:
     """As rigid as possible about a reference: R_g S_g, with R_g the rotation that brings S_g closest to F_g.
 
-    The surface may bend, but it keeps the stretch of the reference.
+    The surface may bend, but keeps the stretch of the reference.
     """
 
     reference: Float[Floats, "G 3 3"]
@@ -41,7 +41,7 @@ class RotatedReference:
 
 @dataclass(frozen=True, eq=False)
 class FixedGradient:
-    """Gradients that are known."""
+    """Known gradients."""
 
     wanted: Float[Floats, "G 3 3"]
 
@@ -53,20 +53,19 @@ class FixedGradient:
 class ViscousGradient:
     """The mean of the current gradients over the nearest gradient points.
 
-    The stretch may be any, but changes slowly from place to place, and what a step has gained is kept, as in a viscous
-    fluid.
+    Any stretch is possible if it varies slowly over the surface, and the progress of a step is kept, as in a viscous fluid.
     """
 
     mean: Any  # sparse (G, G)
 
     @classmethod
     def over(cls, points: Float[Floats, "G 3"], count: int) -> ViscousGradient:
-        """For gradient points on the resting template: each mean is over ``count`` of them, itself included."""
+        """Averages over ``count`` nearest gradient points on the rest template, including the point itself."""
         return cls._of_neighbours(cKDTree(points).query(points, count)[1])
 
     @classmethod
     def by_distance(cls, distances: Float[Floats, "G G"], count: int) -> ViscousGradient:
-        """The same, by distances between gradient points, such as those along the surface."""
+        """The same with given distances between gradient points, such as those along the surface."""
         return cls._of_neighbours(np.argsort(distances, axis=1, kind="stable")[:, :count])
 
     @classmethod
@@ -81,8 +80,9 @@ class ViscousGradient:
 def nearest_rotations(F: Float[Floats, "G 3 3"], start: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
     """Rotations R_g that bring start_g closest to F_g (orthogonal Procrustes).
 
-    The orthogonal factor of F start^T by Newton's iteration with scaling (Higham, 1986), all matrices side by side: a
-    sixth of the time of singular values, which remain for those that are nearly singular or turned inside out.
+    The orthogonal factor of F start^T is computed by Newton's iteration with scaling (Higham, 1986), for all matrices at
+    once, in a sixth of the time of singular value decompositions. These are used for matrices that are nearly singular or
+    inverted.
     """
     M = F @ start.transpose(0, 2, 1)
     X = np.ascontiguousarray(M.reshape(-1, 9).T)
@@ -108,7 +108,7 @@ def nearest_rotations(F: Float[Floats, "G 3 3"], start: Float[Floats, "G 3 3"]) 
 def signed_svd(
     F: Float[Floats, "N 3 3"],
 ) -> tuple[Float[Floats, "N 3 3"], Float[Floats, "N 3"], Float[Floats, "N 3 3"]]:
-    """U, s and V^T of singular values with U V^T a rotation: where F turns space inside out the smallest s is negative."""
+    """Singular value decomposition U, s, V^T with a rotation U V^T: the smallest s is negative if F inverts orientation."""
     U, sizes, Vh = np.linalg.svd(F)
     side = np.where(np.linalg.det(U @ Vh) < 0, -1.0, 1.0)
     U[:, :, 2] *= side[:, None]

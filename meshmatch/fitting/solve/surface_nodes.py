@@ -1,8 +1,8 @@
-"""Nodes on a shape itself, each moving only what lies near it along the surface.
+"""Nodes on a shape itself, each of which moves only what is near it along the surface.
 
-The two sides of a wing, fingers that touch and the leaves of a plant are near in space and have nothing to do with each
-other. A template of a category has nodes that avoid this by where they lie; here a shape is met for the first time, and each
-node is told what it moves.
+The two sides of a wing, touching fingers and the leaves of a plant are close in space but independent. Templates of a
+category avoid this problem by the positions of their nodes; for a new shape, the vertices that each node moves are listed
+explicitly.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
 
-_NEAR = 0.2  # share of the distance to look for neighbours in, at first
+_FIRST_LIMIT = 0.2  # share of the distance limit within which neighbours are searched first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,12 +30,12 @@ class SurfaceNodes:
 
     Attributes
     ----------
-    K, radius : how many nodes, and how far each reaches
-    along : how many times as far it may be along the surface as the radius
-    depth : nodes lie up to so far below the surface, for vectors across it to turn it
-    least : nodes that a vertex has at least; where it has fewer, those around it grow
-    gradient_points : where the deformation gradient is asked
-    neighbours : gradient points, itself included, over which the viscous prior averages
+    K, radius : number of nodes, and their support radius
+    along : largest distance along the surface, as a multiple of the radius
+    depth : nodes lie up to this far below the surface, so that vectors across it can rotate it
+    least : minimum number of nodes per vertex; where there are fewer, the radii of the nearest nodes grow
+    gradient_points : number of points where the deformation gradient is evaluated
+    neighbours : number of gradient points, including the point itself, over which the viscous prior averages
     """
 
     K: int
@@ -47,9 +47,9 @@ class SurfaceNodes:
     neighbours: int = 6
 
     def system(self, shape: Shape, graph: csr_matrix, seed: int = 0) -> tuple[NodeSystem, ViscousGradient]:
-        """The least-squares system of a thin mesh in the template frame, and its viscous prior along the surface.
+        """The least-squares system of a decimated mesh in the template frame, and its viscous prior along the surface.
 
-        ``graph`` holds the lengths of its edges, see `DecimatedMesh`.
+        ``graph`` has the lengths of its edges, see `DecimatedMesh`.
         """
         verts = np.asarray(shape.verts)
         at = farthest_points(verts, min(self.K, len(verts)))
@@ -59,39 +59,42 @@ class SurfaceNodes:
         far = 3 * self.along * self.radius
         lengths = np.asarray(dijkstra(graph, directed=False, indices=at, limit=far))
         straight = np.linalg.norm(nodes[:, None] - verts, axis=2)
-        radii, reached = self._grown(straight, lengths)
+        radii, reached = self._grow_radii(straight, lengths)
         vertex, node = np.nonzero(reached.T)
         field = build_surface_field(verts, nodes, radii, (vertex, node))
         system = NodeSystem(shape, field, self.gradient_points)
         points = system.gradient_points
-        return system, ViscousGradient.by_distance(_apart(graph, points, self.neighbours, far), self.neighbours)
+        return system, ViscousGradient.by_distance(
+            _edge_distances(graph, points, self.neighbours, far), self.neighbours
+        )
 
-    def _grown(
+    def _grow_radii(
         self, straight: Float[Floats, "K V"], lengths: Float[Floats, "K V"]
     ) -> tuple[Float[Floats, " K"], Bool[Bools, "K V"]]:
-        """Radii, and which vertices each node moves: at least so many for each vertex."""
+        """Radii, and which vertices each node moves, such that each vertex has enough nodes."""
         radii = np.full(len(straight), self.radius)
         near = np.where(np.isfinite(lengths), straight, np.inf)
         least = min(self.least, len(straight))
         for _ in range(30):
             reached = (straight < radii[:, None]) & (lengths < self.along * radii[:, None])
-            few = reached.sum(0) < least
-            if not few.any():
+            lacking = reached.sum(0) < least
+            if not lacking.any():
                 return radii, reached
-            around = np.argpartition(near[:, few], least - 1, axis=0)[:least]
-            radii[np.unique(around)] *= 1.15
-        # A part with fewer nodes than that: its vertices take the nearest ones, however far.
-        for vertex in np.flatnonzero(few).tolist():
+            nearest = np.argpartition(near[:, lacking], least - 1, axis=0)[:least]
+            radii[np.unique(nearest)] *= 1.15
+        # A part with too few nodes: its vertices get the nearest ones, however far away.
+        for vertex in np.flatnonzero(lacking).tolist():
             closest = np.argsort(straight[:, vertex], kind="stable")[:least]
             radii[closest] = np.maximum(radii[closest], 1.5 * straight[closest, vertex])
             reached[closest, vertex] = True
         return radii, reached
 
 
-def _apart(graph: csr_matrix, points: Int[Ints, " G"], count: int, far: float) -> Float[Floats, "G G"]:
-    """Distances along edges between some vertices, as far as it takes to know so many nearest ones of each, or ``far``;
-    infinite beyond."""
-    limit = _NEAR * far
+def _edge_distances(graph: csr_matrix, points: Int[Ints, " G"], count: int, far: float) -> Float[Floats, "G G"]:
+    """Distances along edges between some vertices, at least up to the ``count`` nearest of each or up to ``far``;
+    infinite beyond.
+    """
+    limit = _FIRST_LIMIT * far
     while True:
         found = np.asarray(dijkstra(graph, directed=False, indices=points, limit=limit))[:, points]
         if limit >= far or (np.isfinite(found).sum(1) >= count).all():

@@ -1,12 +1,11 @@
-"""The linear algebra of a node fit, compiled once per template.
+"""Least squares on the node vectors of a template; whatever is constant is computed once per template.
 
-Unknowns are the K node vectors. A data term at template point p is a 3 x 3 weight H_p and a target; its
-normal matrix is sum_p (Phi_p^T Phi_p) (x) H_p. The products Phi_pi Phi_pj never change, so they are kept as
-one sparse matrix over node pairs: assembling costs about 6 V n^2 / 2 multiplications (n = 17 nodes in
-reach), a few milliseconds. Only nodes that meet at some template point share an entry; with the nodes in
-reverse Cuthill-McKee order these lie in a band, in whose envelope Cholesky takes a fifth of the dense one's time.
-Where nodes reach most points, keeping the products would take gigabytes: they are formed in each step, and the band is
-the whole matrix.
+Unknowns are the K node vectors. A data term at template point p is a 3 x 3 weight H_p and a target; its normal matrix is
+sum_p (Phi_p^T Phi_p) (x) H_p. The products Phi_pi Phi_pj are constant and are stored as a sparse matrix over pairs of
+nodes, so that assembly takes about 6 V n^2 / 2 multiplications (n = 17 nodes in reach), a few milliseconds. Only nodes that
+both reach some template point share an entry. With nodes in reverse Cuthill-McKee order the entries lie in a band, and
+Cholesky factorization within the band's envelope takes a fifth of the time of a dense one. If nodes reach most points,
+stored products would take gigabytes; they are then computed in each step, and the band is the whole matrix.
 """
 
 from __future__ import annotations
@@ -35,30 +34,31 @@ from meshmatch.shapes.shape import Shape
 if TYPE_CHECKING:
     from meshmatch.fields.field import PointwiseField
 
-# Where the upper triangle xx xy xz yy yz zz belongs in a 3 x 3 block, row by row.
+# Index into the upper triangle xx xy xz yy yz zz for each entry of a 3 x 3 block, row by row.
 _BLOCK = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 _DIAGONAL = [0, 3, 5]
-_HELD = 1e-6  # weight of what decides where points do not
-# More products than this (about a gigabyte while they are sorted) are not kept.
+_REGULARIZATION = 1e-6  # weight of prior and damping where points alone might not determine the node vectors
+# More products than this (about a gigabyte during sorting) are not stored.
 _MAX_PRODUCTS = 20_000_000
 
 
 class NodeSystem:
-    """A field on a template's vertices, arranged for repeated least squares on its node vectors.
+    """A field on a template's vertices, prepared for repeated least squares on its node vectors.
 
-    With a field that is not linear it moves the template all the same, but there is nothing to `solve` for. The deformation
-    gradient F is asked at ``gradient_points`` of the vertices, at most.
+    A field that is not linear can deform the template too, but there is nothing to `solve` for. Deformation gradients F are
+    evaluated at ``gradient_points``, at most as many vertices as the argument says.
 
-    ``verts`` (V, 3) and ``faces`` (F, 3) are the template's, in its frame; ``gradient_points`` (G,) numbers of vertices.
+    ``verts`` (V, 3) and ``faces`` (F, 3) are the template's, in its frame; ``gradient_points`` (G,) are indices of
+    vertices.
     """
 
-    phi: Any  # (V, K), sparse or dense, where the field is linear
+    phi: Any  # (V, K), sparse or dense; only if the field is linear
 
     def __init__(self, shape: Shape, field: ShapeFunctions | PointwiseField, gradient_points: int = 1500) -> None:
         self.verts = np.asarray(shape.verts)
         self.faces = np.asarray(shape.faces)
         self.linear = isinstance(field, ShapeFunctions)
-        F = len(self.faces)  # each vertex with the faces around it
+        F = len(self.faces)  # the incidence matrix below sums over the faces around each vertex
         corners = self.faces.T.reshape(-1), np.tile(np.arange(F), 3)
         self._incidence = csr_matrix((np.ones(3 * F), corners), shape=(len(self.verts), F))
         self.field = field
@@ -75,7 +75,7 @@ class NodeSystem:
     @property
     @derived
     def rim(self) -> Bool[Bools, " V"]:
-        """Which vertices of the template lie where it ends; at cracks it does not."""
+        """Mask (V,) of vertices where the template ends; cracks are not ends."""
         return rim_lengths(Shape(self.verts, self.faces)) > RIM
 
     @property
@@ -87,7 +87,7 @@ class NodeSystem:
     @property
     @derived
     def rim_corners(self) -> Int[Ints, "E 3"]:
-        """Edges of the template where it ends, see `meshmatch.shapes.rims.rim_corners`."""
+        """Boundary edges where the template ends, see `meshmatch.shapes.rims.rim_corners`."""
         return rim_corners(Shape(self.verts, self.faces))
 
     @property
@@ -99,19 +99,19 @@ class NodeSystem:
     @property
     @derived
     def shows_all(self) -> bool:
-        """Whether all of the resting template can be seen from outside; the chambers of a heart cannot."""
+        """Whether all of the rest template is visible from outside; the chambers of a heart are not."""
         resting = Shape(self.verts, self.faces)
         return without_hidden(resting) is resting
 
     def moved(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3"]:
-        """Template vertices under node vectors, or under whatever rows the field reads."""
+        """Template vertices under node vectors (or the output rows of a field without nodes)."""
         return self.verts + (self.phi @ vectors if self.linear else self.field.displaced(vectors))
 
     def vectors_to(self, points: Float[Floats, "V 3"]) -> Float[Floats, "K 3"]:
-        """Node vectors that take the template's vertices to points that the field can reach, or nearly."""
+        """Node vectors that move the template's vertices to given points, exactly or approximately."""
         weights = np.tile([1.0, 0.0, 0.0, 1.0, 0.0, 1.0], (len(points), 1))
         turns = np.tile(kabsch(self.verts, points).rotation, (len(self.gradient_points), 1, 1))
-        return self.solve(weights, points, _HELD, turns, _HELD, np.zeros((self.K, 3)))
+        return self.solve(weights, points, _REGULARIZATION, turns, _REGULARIZATION, np.zeros((self.K, 3)))
 
     def deformation_gradient(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "G 3 3"]:
         """F at the gradient points, F[g, a, k] = d x'_a / d x_k."""
@@ -120,11 +120,11 @@ class NodeSystem:
         return np.asarray((self.equations.gradient @ vectors).reshape(-1, 3, 3).transpose(0, 2, 1) + np.eye(3))
 
     def regularity(self, vectors: Float[Floats, "K 3"]) -> Regularity:
-        """How regular the deformation is, at all vertices."""
+        """Regularity of the deformation at all vertices."""
         return Regularity.of(self.field.deformation_gradient_at(vectors))
 
     def unfolded(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "K 3"]:
-        """Node vectors near the given ones under which no vertex is folded, or fewer; see `Unfolding`."""
+        """Node vectors near the given ones with no folded vertices, or fewer; see `Unfolding`."""
         return self._unfolding(vectors)
 
     @property
@@ -139,7 +139,7 @@ class NodeSystem:
         return OrientedPoints(moved, self.normals(moved))
 
     def normals(self, moved: Float[Floats, "V 3"]) -> Float[Floats, "V 3"]:
-        """Area-weighted unit vertex normals of moved vertices."""
+        """Area-weighted unit vertex normals for deformed vertices."""
         summed = np.asarray(self._incidence @ triangle_vectors(moved, self.faces))
         return np.asarray(summed / np.maximum(np.sqrt(row_sums(np.square(summed))), 1e-20)[:, None])
 
@@ -154,56 +154,56 @@ class NodeSystem:
     ) -> Float[Floats, "K 3"]:
         """Minimise sum_p |y_p - s_p|^2_{H_p} + w sum_g |F_g - T_g|^2 + damping |u - current|^2 over node vectors u.
 
-        ``weights`` are upper triangles of H_p in the order xx xy xz yy yz zz, ``pulls`` right-hand sides H_p s_p,
+        ``weights`` are upper triangles of H_p in the order xx xy xz yy yz zz, ``pulls`` are right-hand sides H_p s_p,
         ``prior_weight`` is w, and ``targets`` are the T_g.
         """
-        fixed = self.equations
+        equations = self.equations
         (xx, xy, xz, yy, yz, zz), (x, y, z) = weights.T, self.verts.T
-        full = np.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z], 1)
-        right = self.phi.T @ (pulls - full)
+        weighted_verts = np.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z], 1)
+        right_side = self.phi.T @ (pulls - weighted_verts)
         wanted = (targets - np.eye(3)).transpose(0, 2, 1).reshape(-1, 3)
-        right += prior_weight * (fixed.gradient.T @ wanted) + damping * current
-        right, solved = right[fixed.order], np.empty((self.K, 3))
+        right_side += prior_weight * (equations.gradient.T @ wanted) + damping * current
+        right_side, solved = right_side[equations.order], np.empty((self.K, 3))
         if not (xy.any() or xz.any() or yz.any()) and (xx == yy).all() and (xx == zz).all():
-            solved[fixed.order] = self._solved_alike(weights[:, :1], prior_weight, damping, right)
+            solved[equations.order] = self._solve_isotropic(weights[:, :1], prior_weight, damping, right_side)
             return solved
-        blocks = fixed.pairs @ weights  # pairs 6
-        blocks[:, _DIAGONAL] += prior_weight * fixed.gradient_pairs[:, None]
-        normal = np.zeros((3 * self.K, fixed.envelope.columns))
-        normal.reshape(-1)[fixed.place] = blocks.reshape(-1).take(fixed.entry)
+        blocks = equations.pairs @ weights  # pairs 6
+        blocks[:, _DIAGONAL] += prior_weight * equations.gradient_pairs[:, None]
+        normal = np.zeros((3 * self.K, equations.envelope.columns))
+        normal.reshape(-1)[equations.place] = blocks.reshape(-1).take(equations.entry)
         normal[:, 0] += damping
-        solved[fixed.order] = fixed.envelope.solve(normal, right.reshape(-1)).reshape(-1, 3)
+        solved[equations.order] = equations.envelope.solve(normal, right_side.reshape(-1)).reshape(-1, 3)
         return solved
 
-    def _solved_alike(
-        self, weights: Float[Floats, "V 1"], prior_weight: float, damping: float, right: Float[Floats, "K 3"]
+    def _solve_isotropic(
+        self, weights: Float[Floats, "V 1"], prior_weight: float, damping: float, right_side: Float[Floats, "K 3"]
     ) -> Float[Floats, "K 3"]:
-        """Where every H_p is a multiple of the identity: x, y and z have the same matrix, of a third of the size."""
-        fixed = self.equations
-        normal = np.zeros((self.K, fixed.node_band + 1))
-        blocks = fixed.pairs @ weights
-        normal.reshape(-1)[fixed.node_place] = blocks[:, 0] + prior_weight * fixed.gradient_pairs
+        """Solve if every H_p is a multiple of the identity: x, y and z then share one matrix of a third of the size."""
+        equations = self.equations
+        normal = np.zeros((self.K, equations.node_band + 1))
+        blocks = equations.pairs @ weights
+        normal.reshape(-1)[equations.node_place] = blocks[:, 0] + prior_weight * equations.gradient_pairs
         normal[:, 0] += damping
-        return solved_band(normal, np.ascontiguousarray(right.T)).T
+        return solved_band(normal, np.ascontiguousarray(right_side.T)).T
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Equations:
-    """What never changes of a linear field's normal equations."""
+    """The constant parts of a linear field's normal equations."""
 
-    gradient: Any  # (3 G, K), of the shape functions at the gradient points
-    pairs: Any  # (pairs, V), products Phi_pi Phi_pj of the nodes that meet somewhere
-    gradient_pairs: Float[Floats, " pairs"]  # the same of the gradient, summed
-    order: Int[Ints, " K"]  # of the nodes, in which those that meet are near one another
-    envelope: Envelope  # of the band
-    place: Int[Ints, " entries"]  # in its array, see `_band_places`, in ascending order
-    entry: Int[Ints, " entries"]  # which number of the blocks (pairs, 6) belongs there
-    node_band: int  # half width of the band of one unknown for each node
+    gradient: Any  # (3 G, K), gradient of the shape functions at the gradient points
+    pairs: Any  # (pairs, V), products Phi_pi Phi_pj for pairs of nodes that reach a common vertex
+    gradient_pairs: Float[Floats, " pairs"]  # the same for the gradient, summed over the gradient points
+    order: Int[Ints, " K"]  # order of the nodes with a small bandwidth
+    envelope: Envelope  # envelope of the band
+    place: Int[Ints, " entries"]  # indices into the band's array, see `_band_places`, in ascending order
+    entry: Int[Ints, " entries"]  # index into the blocks (pairs, 6) for each of these
+    node_band: int  # half bandwidth with one unknown per node
     node_place: Int[Ints, " pairs"]
 
     @classmethod
     def of(cls, phi: Any, gradient: Any) -> Equations:
-        """For shape functions at the vertices, and their gradient at the gradient points."""
+        """Precompute from the shape functions at the vertices, and their gradient at the gradient points."""
         K, gradient = phi.shape[1], gradient.astype(np.float64)
         row, column, pairs = _pair_products(phi)
         graph = coo_matrix((np.ones(len(row), np.int8), (row, column)), (K, K))
@@ -211,7 +211,7 @@ class Equations:
         met = gradient.T @ gradient
         summed = (met if isinstance(met, np.ndarray) else met.toarray())[row, column]
         rank = np.argsort(order)
-        reach = np.arange(K)  # the last node that each meets, in that order, or one before it does
+        reach = np.arange(K)  # last node, in that order, with which each node shares an entry
         np.maximum.at(reach, np.minimum(rank[row], rank[column]), np.maximum(rank[row], rank[column]))
         envelope = Envelope(np.repeat(3 * np.maximum.accumulate(reach) + 3, 3))
         node_band = int((reach - np.arange(K)).max())
@@ -238,8 +238,8 @@ def node_system(model: TrainedModel) -> NodeSystem:
     return NodeSystem(shape, model.field(shape.verts))
 
 
-class _EveryPair:
-    """The matrix (pairs, V) of Phi_pi Phi_pj where all nodes meet everywhere, formed when it is multiplied."""
+class _DensePairs:
+    """The matrix (pairs, V) of Phi_pi Phi_pj for all pairs of nodes, computed only when it is multiplied."""
 
     def __init__(self, phi: Float[Floats, "V K"], row: Ints, column: Ints) -> None:
         self._phi, self._at = phi, (row, column)
@@ -250,7 +250,7 @@ class _EveryPair:
 
 
 def _pair_products(phi: Any) -> tuple[Ints, Ints, Any]:
-    """Node pairs (i <= j) that meet somewhere, and the sparse matrix (pairs, V) of Phi_pi Phi_pj."""
+    """Pairs of nodes (i <= j) that reach a common vertex, and the sparse matrix (pairs, V) of Phi_pi Phi_pj."""
     V, K = phi.shape
     if not isinstance(phi, np.ndarray):
         counts = np.diff(phi.indptr).astype(np.int64)
@@ -258,8 +258,8 @@ def _pair_products(phi: Any) -> tuple[Ints, Ints, Any]:
         phi = phi.toarray() if sizes.sum() > _MAX_PRODUCTS else phi
     if isinstance(phi, np.ndarray):
         row, column = np.triu_indices(K)
-        return row, column, _EveryPair(phi, row, column)
-    # Vertices with equally many nodes in reach at a time: each node of a vertex with itself and with those after it.
+        return row, column, _DensePairs(phi, row, column)
+    # Group vertices by their number of nodes in reach; pair each node of a vertex with itself and those after it.
     phi.sort_indices()
     rows, codes, products = [], [], []
     for count in np.unique(counts[counts > 0]):
@@ -274,16 +274,16 @@ def _pair_products(phi: Any) -> tuple[Ints, Ints, Any]:
     met = np.zeros(K * K, bool)
     met[code] = True
     pairs, number = np.flatnonzero(met), np.cumsum(met, dtype=np.int32) - np.int32(1)
-    # By columns, with which the product takes half as long as by rows.
+    # Stored by columns, as the product then takes half as long.
     found = coo_matrix((np.concatenate(products), (number[code], where)), shape=(len(pairs), V)).tocsc()
     return pairs // K, pairs % K, found
 
 
 def _band_places(row: Ints, column: Ints, rank: Int[Ints, " K"], size: int, columns: int) -> Int[Ints, "pairs places"]:
-    """Where the block of every pair lies in the band of so many unknowns for each node, row by row.
+    """Index of every entry of each pair's block in the band array, with ``size`` unknowns per node.
 
-    The band is stored column by column, each from its diagonal down: entry (i, j), i >= j, lies at j columns + i - j. The
-    block of a node with itself names its off-diagonal entries twice.
+    The band is stored column by column, each from the diagonal down: entry (i, j), i >= j, is at j columns + i - j. The
+    block of a node with itself has each off-diagonal index twice.
     """
     a, b = np.divmod(np.arange(size**2), size)
     i, j = size * rank[row][:, None] + a, size * rank[column][:, None] + b
