@@ -1,9 +1,8 @@
-"""Finer matches of shapes in the same pose, such as two femurs, of a part and its whole, and of a shape and a model's
-template.
+"""Finer matches of alike shapes, of a part and its whole, and of a shape and a model's template.
 
 A search without a model (`meshmatch.fitting.direct`) allows for any pose, so its fits have few nodes and are held along the
-surface. Shapes of one kind in the same pose ("alike") need less freedom, and can have more nodes. A part, such as a broken
-bone, needs the size of its whole.
+surface. Shapes of one kind in the same pose ("alike"), such as two femurs, need less freedom and can have more nodes. A
+part, such as a broken bone, needs the size of its whole.
 """
 
 from __future__ import annotations
@@ -52,10 +51,10 @@ def match_alike(
     progress: ProgressCallback | None = None,
     turned: bool = True,
 ) -> DirectMatch:
-    """Refine a direct match of shapes in the same pose, or of a part and its whole if that explains an open shape clearly
-    better.
+    """Refine a direct match of two shapes in the same pose, or of a part and its whole.
 
-    The files of part and whole are assumed to have the same unit.
+    A fit as a part is used only if it explains an open shape clearly better. The files of part and whole are assumed to
+    have the same unit.
 
     Parameters
     ----------
@@ -68,8 +67,8 @@ def match_alike(
     progress
         As for `match_directly`.
     turned
-        Whether the shapes may have another rotation than the match says. Not for a shape and its mirror image; the template
-        is then one of the two rather than their mean, as busts come nearer to their own symmetry so (2.4 % of sqrt(area)
+        Whether the shapes may have another rotation than the match says. Not for a shape and its mirror image: one of the
+        two, not their mean, is then the template, as busts come nearer to their own symmetry so (2.4 % of sqrt(area)
         instead of 3.1).
 
     Returns
@@ -254,11 +253,10 @@ def _rigidly_aligned(points_of_other: Float[Floats, "N 3"], fit: Fit, system: No
 def _fits_from_mean(
     shapes: tuple[Shape, Shape], fits: tuple[Fit, Fit], config: ViscousConfig
 ) -> tuple[tuple[Fit, Fit], NodeSystem] | None:
-    """Fits of a template halfway between two shapes to both of them; None if one of the shapes has another pose than the
-    template.
+    """Fits of a template halfway between two shapes to both of them.
 
     Each shape then has half as far to go, and neither is favored. The mean of two fits contains their errors, so it is
-    computed again twice.
+    computed again twice. None if one of the shapes has another pose than the template.
     """
     first, second = fits
     for stage_config in (config.rough(), config.rough(), config):

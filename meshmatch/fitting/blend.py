@@ -33,8 +33,7 @@ BlendPath = Callable[[Float[Floats, " n"]], Float[Floats, "K 3"]]
 
 @dataclass(frozen=True)
 class Deviation:
-    """Differences between a pose and the stretch that it should have, and between it and the rest template; means over the
-    surface.
+    """Deviation of a pose from the stretch that it should have, and from the rest template; means over the surface.
 
     With S the log-Euclidean blend of the fits' stretches, ``volume`` is |det F - det S| and ``arap`` is |F^T F - S^T S|
     (Frobenius); both are 0 at the fits. ``template_volume`` and ``template_arap`` are the same for S = I: the paper's

@@ -116,10 +116,12 @@ class DirectMatch:
 
     @property
     def energy(self) -> float:
+        """Energy of the best fit."""
         return self.tried[0][1]
 
     @property
     def before(self) -> DirectMatch | None:
+        """The match that the first direction alone would have given; None if only one was used."""
         return None if self.earlier is None else self.earlier()
 
     @property
@@ -313,9 +315,7 @@ class _Search:
 
     @cached_property
     def apart(self) -> tuple[float, float]:
-        """Distances that rigid motions leave: between the shapes, and between the source and the mirror image of the
-        target.
-        """
+        """Distances that rigid motions leave between the shapes, and between the source and the target's mirror image."""
         return apart(self.source.original, self.target.original, self.source.config.seed)
 
     def one_way(self, report: Progress, meanwhile: Sequence[Callable[[], object]] = ()) -> list[DirectFit]:
@@ -429,12 +429,14 @@ class _Judged:
 
     @property
     def judged(self) -> tuple[Verdict, float, tuple[Reason, ...]]:
+        """Verdict, trust and reasons of the best fit."""
         return judge_direct(self.found[0].energy, self.leads, self.calibration, self.turns)
 
     @property
     def clear(self) -> bool:
-        """Whether the best fit is likely enough to be right without fits in the other direction; these hardly resolve
-        ties.
+        """Whether the best fit is likely enough to be right without fits in the other direction.
+
+        Ties and symmetries do not count, as fits in the other direction hardly resolve them.
         """
         return self.judged[1] >= LIKELY
 
@@ -446,8 +448,9 @@ def _fits(
     residual: float,
     judged: tuple[Verdict, float, tuple[Reason, ...]],
 ) -> tuple[Fit, Fit]:
-    """The undeformed template as the fit of its own shape, and the deformed one as the fit of the other, in a rigidly
-    aligned frame.
+    """The fits of both shapes: the undeformed template on its own shape, and the deformed one on the other.
+
+    The core frame of the other shape is chosen so that the deformed template is rigidly aligned to the undeformed one.
     """
     system, (verdict, trust, reasons) = own.fine.system, judged
     zero_vectors, moved = np.zeros((system.K, 3)), system.moved(vectors)

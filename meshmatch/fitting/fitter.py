@@ -77,6 +77,7 @@ class Fitter:
         return found
 
     def _fit(self, config: FitConfig, shape: Shape, landmarks: Landmarks | None, began: float) -> Fit:
+        """Fit as a whole, as a part and mirrored, as far as the configuration allows, and return the best fit."""
         progress, card = Progress(self.progress, shape.name), self.model.card
         doubts: list[Reason] = []
         both_sides = (config.mirror or card.mirror) != "no" and mirror_of(self.model) is None
@@ -140,6 +141,7 @@ def judge_unsupervised(card: ModelCard, fit: Fit) -> Fit:
 
 
 def _cost(found: Registration) -> float:
+    """Cost of a registration's candidate."""
     return found.candidate.cost
 
 

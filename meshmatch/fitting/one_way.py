@@ -57,6 +57,7 @@ def _pairs(
     along: float = 0.1,
     momentum: float = 0.0,
 ) -> NodeRefineConfig:
+    """Settings of least squares with pairs; ``back`` samples are paired, and ``along`` is the weight along the surface."""
     schedule = Schedule(steps=steps, prior=prior, scale=scale, damping=1e-6, momentum=momentum)
     return NodeRefineConfig(schedule=schedule, point_share=along, back_points=back)
 
@@ -67,8 +68,9 @@ _FINE_NODES = SurfaceNodes(K=320, radius=0.13)
 
 @dataclass(frozen=True, kw_only=True)
 class DirectConfig:
-    """How two shapes are matched without a model; lengths in units of sqrt(area). Set by hand on 30 pairs of 15 kinds;
-    ``third``, ``slide`` and ``n_slid`` on these and six pairs of FAUST.
+    """How two shapes are matched without a model; lengths in units of sqrt(area).
+
+    Set by hand on 30 pairs of 15 kinds; ``third``, ``slide`` and ``n_slid`` on these and six pairs of FAUST.
 
     Attributes
     ----------
@@ -228,6 +230,7 @@ class ShapeData:
 
     @cached_property
     def coarse(self) -> Level:
+        """The coarse mesh with its least-squares system."""
         return Level.of(self.coarse_mesh, self.config.coarse_nodes, self.known, self.config.seed)
 
     @cached_property
@@ -236,6 +239,7 @@ class ShapeData:
 
     @cached_property
     def fine(self) -> Level:
+        """The fine mesh with its least-squares system."""
         return Level.of(self.fine_mesh, self.config.fine_nodes, self.known, self.config.seed)
 
     @cached_property
@@ -244,6 +248,7 @@ class ShapeData:
 
     @cached_property
     def samples(self) -> OrientedPoints:
+        """Samples of the shape, for fits of the other one to it."""
         return sample_surface(self.shape, self.config.samples, np.random.default_rng(self.config.seed))
 
     @cached_property
@@ -273,8 +278,9 @@ def fit_fine(own: ShapeData, onto: ShapeData, proposal: Proposal, goals: Float[F
 
 
 def slide_all(own: ShapeData, onto: ShapeData, tried: Sequence[DirectFit], report: Progress) -> list[DirectFit]:
-    """Continue fine fits along the surface, unless that was done; each is kept as it was if its energy does not
-    decrease.
+    """Continue fine fits along the surface, unless that was done.
+
+    A fit is kept as it was if its energy does not decrease.
     """
     report(0.0)
     found = parallel_map(lambda each: slide(own, onto, each), tried)
@@ -400,8 +406,9 @@ F = TypeVar("F", bound=_Fitted)
 
 
 def distinct(tried: Sequence[F], count: int, min_difference: float, by: str = "energy") -> list[F]:
-    """The best ``count`` fits, by the attribute ``by``, that differ from each other at more than ``min_difference`` of
-    the vertices.
+    """The best ``count`` fits that differ from each other at more than ``min_difference`` of the vertices.
+
+    ``by`` is the attribute by which they are ordered; the smallest is the best.
     """
     kept: list[F] = []
     for each in sorted(tried, key=attrgetter(by)):

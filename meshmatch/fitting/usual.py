@@ -34,10 +34,9 @@ _CLEAR_SIDE, _MIN_CLEAR_SHARE = 0.15, 0.8
 
 
 def have_sides(leads: Sequence[float]) -> bool:
-    """Return whether shapes of a kind have a left and a right form, as bones do: nearly all clearly differ from their
-    mirror images.
+    """Return whether shapes of a kind have a left and a right form, as bones do.
 
-    ``leads`` are the `Fit.side` of the shapes.
+    Nearly all of them must clearly differ from their mirror images. ``leads`` are the `Fit.side` of the shapes.
     """
     return len(leads) >= FEWEST and bool((np.abs(leads) > _CLEAR_SIDE).mean() >= _MIN_CLEAR_SHARE)
 

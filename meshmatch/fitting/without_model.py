@@ -93,8 +93,9 @@ def stand_alike(residual: float, stretch: float) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Start:
-    """Starting point of least squares: the core frame, and node vectors in it; ``trust`` and ``doubts`` are those of the
-    search that found it, if any.
+    """Starting point of least squares: the core frame, and node vectors in it.
+
+    ``trust`` and ``doubts`` are those of the search that found it, if any.
     """
 
     frame: Frame
@@ -114,8 +115,9 @@ class _Fitted:
 
     @property
     def energy(self) -> float:
-        """Low for right fits; weighs stretch less than `DirectFeatures.energy`, as shapes of one kind differ more in
-        proportions.
+        """Energy of the fit; low for right fits.
+
+        It weighs stretch less than `DirectFeatures.energy`, as shapes of one kind differ more in proportions than in pose.
         """
         return self.features.residual + _STRETCH_WEIGHT * self.features.stretch
 
@@ -188,8 +190,9 @@ class _Task:
         return minimise(problem, prior, np.zeros((self.system.K, 3)))
 
     def start_near(self, frame: Frame) -> _Start:
-        """Start with the undeformed template, aligned near the frame in which another template with the same vertices
-        was fitted.
+        """Start with the undeformed template, aligned near a given frame.
+
+        ``frame`` is that of a fit of another template with the same vertices.
         """
         samples = self._samples.first(_ALIGN_SAMPLES)
         points = frame.apply(self._own.undo(samples.points))
@@ -414,8 +417,10 @@ def fit_alike(
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """A shape relative to a rigidly aligned template: the frame from the shape's file to the template, the template's
-    stretch, and whether the shape has the template's pose.
+    """A shape relative to a rigidly aligned template.
+
+    ``frame`` goes from the shape's file to the template, ``stretch`` is the template's, and ``alike`` says whether the
+    shape has the template's pose.
     """
 
     frame: Frame
@@ -440,8 +445,9 @@ def fit_from(template: Template, shape: Shape, start: Fit, config: ViscousConfig
 
 
 def fit_turned(template: Template, shape: Shape, turn: Float[Floats, "3 3"], config: ViscousConfig) -> Fit:
-    """Fit a template to a repaired shape in the template's pose, given the rotation from the shape's file to the
-    template.
+    """Fit a template to a repaired shape in the template's pose.
+
+    ``turn`` is the rotation from the shape's file to the template.
     """
     began, task = time.monotonic(), _Task(template, shape, config)
     initial = task.start_near(replace(sqrt_area_frame(shape), rotation=turn))

@@ -49,11 +49,10 @@ def category_samples(shape: Shape, seed: int = 0) -> OrientedPoints:
 
 
 def category_residual(model: TrainedModel, shape: Shape, samples: OrientedPoints, config: FitConfig) -> float:
-    """Mean distance, both ways and normals included, between a shape and a model's unrefined template (units of
-    sqrt(area)).
+    """Mean distance, both ways and normals included, between a shape and a model's unrefined template.
 
-    ``samples`` are the shape's `category_samples`; of ``config`` only seed and device are used. All orientations are tried,
-    as the category does not depend on the axes that the user gives.
+    It is in units of sqrt(area). ``samples`` are the shape's `category_samples`; of ``config`` only seed and device are
+    used. All orientations are tried, as the category does not depend on the axes that the user gives.
     """
     config = replace(config, up=None, front=None, copies=16, hypotheses=3)
     rng = np.random.default_rng(config.seed)

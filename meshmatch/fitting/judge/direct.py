@@ -51,8 +51,9 @@ class DirectFeatures:
     def of(
         cls, system: NodeSystem, samples: OrientedPoints, vectors: Float[Floats, "K 3"], pairs: Pairs | None = None
     ) -> DirectFeatures:
-        """Features of node vectors. ``samples`` are of the target; without ``pairs`` of neighbouring samples,
-        discontinuities are 0.
+        """Compute the features of node vectors.
+
+        ``samples`` are of the target. Without ``pairs`` of neighbouring samples, discontinuities are not measured.
         """
         stretches = np.linalg.svd(system.deformation_gradient(vectors), compute_uv=False)
         logarithms = np.log(np.clip(stretches, 1e-3, 1e3))

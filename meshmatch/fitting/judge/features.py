@@ -114,9 +114,7 @@ class FitFeatures:
 
     @property
     def alone(self) -> tuple[bool, bool, bool]:
-        """Whether each of the features ``astray``, ``uncut`` and ``forward``, which decide alone, speaks against the
-        fit.
-        """
+        """Whether ``astray``, ``uncut`` and ``forward``, which decide alone, each speak against the fit."""
         return self.astray > _MAX_ASTRAY, self.uncut > _MAX_UNCUT, self.forward > _MAX_FORWARD
 
     def p_correct(self, calibration: Calibration = CALIBRATION) -> float:
@@ -196,8 +194,9 @@ def shortening(system: NodeSystem, gradient: Float[Floats, "G 3 3"]) -> Float[Fl
 def astray_share(
     connected: Int[Ints, " P"], gap: Float[Floats, " P"], weights: Float[Floats, " P"] | None = None
 ) -> float:
-    """Share (0..1) of samples on connected parts that lie entirely next to the template, by mean ``gap`` (distance) to
-    it.
+    """Share (0..1) of samples on connected parts that lie next to the template.
+
+    A part does if the mean distance (``gap``) of its samples to the template is large.
     """
     weight = np.bincount(connected, weights)
     mean = np.bincount(connected, gap if weights is None else weights * gap) / np.maximum(weight, 1e-300)

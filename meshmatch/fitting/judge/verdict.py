@@ -192,18 +192,21 @@ def _reasons(features: FitFeatures) -> list[Reason]:
 
 
 def _gap(residual: float) -> str:
+    """Sentence on the residual (units of sqrt(area))."""
     on_a_person = 100 * np.sqrt(_SKIN) * residual
     as_much = f"as {on_a_person:.1f} cm would be on a person"
     return f"template and shape are {100 * residual:.1f} % of sqrt(area) apart on average, {as_much}"
 
 
 def _folds(inverted: float) -> str:
+    """Sentence on the share (0..1) of folded vertices."""
     return f"the template is folded or inside out at {100 * inverted:.1f} % of its vertices"
 
 
 def folded_by_agreement(before: Regularity | None, after: Regularity) -> Reason | None:
-    """The reason why a fit is no longer good, if its deformation folds more than right ones do, or clearly more than
-    before.
+    """The reason why a fit is no longer good after agreement, or None.
+
+    It is not if its deformation folds more than right ones do, or clearly more than before.
     """
     folded = 0.0 if before is None else before.inverted
     if after.inverted <= min(LIMITS.folded, folded + LIMITS.folded_by_agreement):

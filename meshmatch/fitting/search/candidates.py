@@ -55,8 +55,8 @@ class CandidateSettings:
     scale_rounds : how often the scale and the outliers of a cloud are estimated
     max_scale_change : largest total change of scale, as a factor; more indicates a wrong fit rather than a wrong area
     outlier_distance : isolated points farther than this from the fitted template are outliers
-    isolation : a point is isolated if its neighbors reach this many times as far as the cloud's median
-    neighbours : number of neighbors for this
+    isolation : a point is isolated if its neighbours reach this many times as far as the cloud's median
+    neighbours : number of neighbours for this
     scale_tolerance : relative change of the scale below which the estimate has converged
     scale_margin : candidates with a residual up to this multiple of the best one's estimate a cloud's scale
     unusual_residual : if all candidates have a larger residual, the aligner may not know the shape's pose
@@ -147,11 +147,10 @@ def _candidates_from_all_rotations(task: FitTask) -> list[Candidate]:
 
 
 def _half_turned(task: FitTask, best: Candidate) -> list[Candidate]:
-    """The best candidate after half a turn about its up axis, if that fits about as well and the user does not give the
-    front.
+    """The best candidate after half a turn about its up axis, as a list, if that fits about as well.
 
-    Flipped votes are ranked by single predictions, which are wrong if a vote is far from the core frame: people in a bridge
-    were read as being on all fours.
+    Empty if the user gives the front. Flipped votes are ranked by single predictions, which are wrong if a vote is far from
+    the core frame: people in a bridge were read as being on all fours.
     """
     if task.config.front is not None or task.model.card.frame["orientation"] in ALIGNS:
         return []
@@ -218,9 +217,9 @@ def estimate_scale(
 
 
 def isolated_points(points: Float[Floats, "P 3"]) -> Bool[Bools, " P"]:
-    """Whether the nearest few neighbors of each point (P,) are farther away than is usual for the cloud.
+    """Whether the nearest few neighbours of each point (P,) are farther away than is usual for the cloud.
 
-    Samples of a small cloud repeat its points; copies of a point are not its neighbors.
+    Samples of a small cloud repeat its points; copies of a point are not its neighbours.
     """
     unique_points, index = np.unique(points, axis=0, return_inverse=True)
     reach = cKDTree(unique_points).query(unique_points, min(SETTINGS.neighbours + 1, len(unique_points)))[0][:, -1]
@@ -228,12 +227,12 @@ def isolated_points(points: Float[Floats, "P 3"]) -> Bool[Bools, " P"]:
 
 
 def candidates_of_part(task: FitTask, wide: bool = False) -> tuple[FitTask, list[Candidate]]:
-    """The network's candidates for a shape that may show only a part, best first, each with the share that it shows; and
-    the task.
+    """The network's candidates for a shape that may show only a part, best first; and the task.
 
-    The task's predictor restarts from its seed, so every search draws the same random numbers. A ``wide`` search tries more
-    orientations. Any other search returns no candidates if none is near, except for clouds, whose residuals are as large as
-    their noise. Residuals are from the samples to the template only.
+    Each candidate has the share that the shape shows. The task's predictor restarts from its seed, so every search draws
+    the same random numbers. A ``wide`` search tries more orientations. Any other search returns no candidates if none is
+    near, except for clouds, whose residuals are as large as their noise. Residuals are from the samples to the template
+    only.
     """
     config = task.config
     if wide:
@@ -321,10 +320,10 @@ def completed(
     rng: np.random.Generator,
     visible: Bool[Bools, " V"] | None = None,
 ) -> OrientedPoints:
-    """Samples (core frame) of a ``share`` of the surface, completed by points of the fitted template where they show
-    nothing.
+    """Complete samples of a ``share`` of the surface by points of the fitted template where they show nothing.
 
-    ``visible`` are the `visible_vertices` of the template, computed from the samples if not given.
+    Samples are in the core frame. ``visible`` are the `visible_vertices` of the template, computed from the samples if not
+    given.
     """
     surface = system.surface(vectors)
     if visible is None:

@@ -80,8 +80,9 @@ class DecimatedMesh:
 
     @cached_property
     def relief(self) -> Float[Floats, "V R"]:
-        """Height of each vertex above the surface smoothed over two lengths (noses, navels), as ranks by area from -1/2
-        to 1/2.
+        """Height of each vertex above the smoothed surface, as ranks by area from -1/2 to 1/2.
+
+        There is one column for each of two smoothing lengths. Noses are high, navels low.
         """
         stiffness, mass = robust_laplacian.mesh_laplacian(self.verts, self.faces)
         ranks = []
@@ -98,8 +99,9 @@ class DecimatedMesh:
         return np.stack(ranks, 1)
 
     def likeness(self, other: DecimatedMesh, moved: OrientedPoints) -> float:
-        """Correlation (0..1) of the relief with that of another mesh, at the vertices nearest to this mesh's deformed
-        vertices.
+        """Correlation (0..1) of the relief with that of another mesh.
+
+        ``moved`` are this mesh's vertices, deformed onto the other mesh; each is compared with the nearest vertex there.
         """
         nearest = other.tree.query(with_normals(moved.points, moved.normals, _NORMAL_WEIGHT))[1]
         own, theirs = self.relief, other.relief[nearest]  # the mean of `own` is 0 already
@@ -109,8 +111,9 @@ class DecimatedMesh:
 
     @cached_property
     def graph(self) -> csr_matrix:
-        """Edge lengths as a graph; separate parts are connected where they are nearest, so that all distances are
-        finite.
+        """Edge lengths as a graph; separate parts are connected where they are nearest.
+
+        So all distances are finite.
         """
         edges = edges_of(self.faces).vertices.astype(np.int64)
         length = edge_lengths(self.verts, edges)
@@ -123,8 +126,9 @@ class DecimatedMesh:
 
 
 def _bridges(verts: Float[Floats, "V 3"], part: Int[Ints, " V"]) -> Int[Ints, "N 2"]:
-    """Pairs of vertices that connect all parts: each part, from the second largest on, to the nearest of the larger
-    ones.
+    """Pairs of vertices that connect all parts.
+
+    Each part, from the second largest on, is connected to the nearest of the larger ones.
     """
     found = []
     order = np.argsort(-np.bincount(part), kind="stable")
@@ -160,6 +164,7 @@ class Intrinsic:
 
     @cached_property
     def diameter(self) -> float:
+        """Largest distance along the surface from any landmark."""
         return float(self._from_landmarks.max())
 
     @cached_property
@@ -238,8 +243,9 @@ class Intrinsic:
 
     @cached_property
     def rings(self) -> list[list[Int[Ints, " N"]]]:
-        """For each limb, rings of vertices around it, at some shares of the path from the center, and the vertices at
-        its end.
+        """For each limb, rings of vertices around it.
+
+        There is one at each of some shares of the path from the center, and the last is the limb's end.
         """
         at = self._path_vertices(_RING_SHARES).T
         rows, found = self.distances_from(at.ravel()).reshape(*at.shape, -1), []

@@ -110,8 +110,9 @@ def _on_template(model: TrainedModel, P: int, device: str) -> tuple[torch.Tensor
 
 
 def _chamfer(moved: torch.Tensor, points: torch.Tensor, tree: cKDTree) -> torch.Tensor:
-    """Mean squared nearest distances in both directions; trees find the neighbours, gradients pass through the
-    distances.
+    """Mean squared nearest distances in both directions.
+
+    Neighbours are found by trees; gradients pass through the distances.
     """
     here = moved.detach().cpu().numpy()
     forward = torch.from_numpy(tree.query(here)[1])

@@ -111,8 +111,9 @@ class Branch:
 
 
 class Limbs:
-    """The limbs of a template: ``bends`` are all ways to bend them, ``branches`` are limbs that can be tangled with each
-    other.
+    """The limbs of a template.
+
+    ``bends`` are all ways to bend them; ``branches`` are limbs that can be tangled with each other.
     """
 
     def __init__(self, template: Template, system: NodeSystem) -> None:
@@ -144,10 +145,10 @@ class Limbs:
     def bent(
         self, vectors: Float[Floats, "K 3"], bend: Bend, target: Float[Floats, " 3"]
     ) -> tuple[Float[Floats, "K 3"], float]:
-        """Bend a limb towards a point (core frame); return node vectors, and the distance that remains from the limb's
-        centroid.
+        """Bend a limb towards a point (core frame) by cyclic coordinate descent.
 
-        Cyclic coordinate descent: each joint in order turns the limb's centroid towards the point.
+        Each joint in order turns the limb's centroid towards the point. Returns node vectors, and the distance that remains
+        between centroid and point.
         """
         moved, nodes = self._system.moved(vectors), self._nodes + vectors
         end = moved[bend.end.verts].mean(0)
@@ -164,8 +165,9 @@ class Limbs:
     def reaching(
         self, samples: OrientedPoints, vectors: Float[Floats, "K 3"], target: Float[Floats, " 3"]
     ) -> Float[Floats, "K 3"] | None:
-        """Node vectors with one limb bent to a point (core frame), with the least residual; None if no limb reaches the
-        point.
+        """Node vectors with one limb bent to a point (core frame), or None if no limb reaches it.
+
+        Of several limbs that do, the one with the least residual is chosen.
         """
         found: list[Floats] = []
         for bend in self.bends:

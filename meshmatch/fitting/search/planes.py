@@ -55,8 +55,9 @@ class MirrorPlane:
         return cls(normal, float(normal @ middle))
 
     def is_like(self, other: MirrorPlane, angle: float, apart: float = np.inf) -> bool:
-        """Whether two planes nearly coincide: the cosine of the angle between their normals exceeds ``angle``, and their
-        distance is below ``apart``.
+        """Whether two planes nearly coincide.
+
+        The cosine of the angle between their normals must exceed ``angle``, and their distance must be below ``apart``.
         """
         cosine = float(self.normal @ other.normal)
         return abs(cosine) > angle and abs(self.offset - np.sign(cosine) * other.offset) < apart
@@ -101,6 +102,7 @@ def _weights(off: Float[Floats, " N"], near: float) -> Float[Floats, " N"]:
 
 
 def _distinct(planes: list[MirrorPlane], count: int, angle: float, apart: float = np.inf) -> list[MirrorPlane]:
+    """The best planes, no two of which nearly coincide."""
     kept: list[MirrorPlane] = []
     for plane in sorted(planes, key=lambda each: -each.share):
         if len(kept) < count and not any(plane.is_like(other, angle, apart) for other in kept):

@@ -115,6 +115,7 @@ def mirror_of(model: TrainedModel) -> Mirror | None:
 
 
 def _dense(matrix: Any) -> Floats:
+    """A matrix as a dense array."""
     return np.asarray(matrix if isinstance(matrix, np.ndarray) else matrix.toarray())
 
 
@@ -205,8 +206,9 @@ class Predictor:
         )
 
     def predict_tilted(self, local: OrientedPoints, count: int, degrees: float) -> list[Floats]:
-        """Node vectors (K, 3) predicted for tilted copies of samples, and as many for their mirror image if there is a
-        mirror.
+        """Predict node vectors (K, 3) from tilted copies of samples.
+
+        With a mirror, as many are predicted from their mirror image.
         """
         tilts = Rotation.from_rotvec(np.radians(degrees) * self.rng.standard_normal((count, 3))).as_matrix()
         sides = [local]
@@ -224,8 +226,9 @@ class Predictor:
 
 @derived
 def is_tilt_consistent(model: TrainedModel) -> bool:
-    """Return whether a model's predictions for tilted copies of its rest template agree; otherwise `spread` is
-    meaningless.
+    """Return whether a model's predictions for tilted copies of its rest template agree.
+
+    If they do not, `spread` is meaningless.
     """
     predictor = Predictor.of(model, np.random.default_rng(_SPREAD_SEED))
     system = predictor.system
@@ -237,7 +240,7 @@ def is_tilt_consistent(model: TrainedModel) -> bool:
 def two_way_residual(
     system: NodeSystem, samples: OrientedPoints, vectors: Float[Floats, "K 3"], stride: int = 2, cap: float = 0.1
 ) -> float:
-    """Mean of the capped 6-D nearest-neighbor distances, template to samples and back (units of sqrt(area)).
+    """Mean of the capped 6-D nearest-neighbour distances, template to samples and back (units of sqrt(area)).
 
     Only every ``stride``-th point of either side is queried. Distances from and to samples are weighted by the samples'
     weights.
@@ -280,6 +283,7 @@ def ranking_residual(system: NodeSystem, samples: OrientedPoints, vectors: Float
 
 
 def _back_residual(surface: OrientedPoints, samples: OrientedPoints, stride: int, cap: float) -> np.floating:
+    """Mean capped distance from every ``stride``-th sample to the surface."""
     points, normals = samples.points[::stride], samples.normals[::stride]
     distance, _ = _capped_distances(surface.tree, points, normals, samples.signed, cap)
     return weighted_mean(distance, None if samples.weights is None else samples.weights[::stride])

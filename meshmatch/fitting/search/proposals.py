@@ -110,8 +110,9 @@ def rigid_proposals(source: DecimatedMesh, target: DecimatedMesh) -> list[Propos
 
 
 def spectral_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
-    """Maps by eigenfunctions, whose signs and order are unknown: many combinations are refined, and the most isometric
-    maps kept.
+    """Maps by eigenfunctions, whose signs and order are unknown.
+
+    Many combinations are refined by ZoomOut, and the most isometric maps are kept.
     """
     landmarks, their_landmarks = source.landmarks, target.landmarks
     own, theirs = source.functions[landmarks], target.functions[their_landmarks]
@@ -292,8 +293,9 @@ class Assignments:
         return float(error + SETTINGS.bent * bent + SETTINGS.left * left)
 
     def limbs(self, assignment: Assignment) -> Proposal:
-        """The proposal of an assignment: rings around the source's limbs are moved to those of the target, with one
-        rotation for all.
+        """The proposal of an assignment: where it moves the rings around the source's limbs.
+
+        Rings are moved to those of the target, with one rotation for all.
         """
         own, theirs = _pairs(assignment)
         joints, goals = self._joints(own, theirs)

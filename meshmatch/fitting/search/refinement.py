@@ -221,8 +221,9 @@ def with_limb_bent(comparison: WholeComparison, chosen: Candidate, fit: Candidat
 
 
 def _screen(candidates: list[Candidate], comparison: WholeComparison, progress: Progress) -> list[Candidate]:
-    """Drop candidates that become equal to a better one after a few steps, or fall far behind; return the rest, best
-    first.
+    """Compare candidates after a few steps; return those that are worth all steps, best first.
+
+    Candidates that become equal to a better one, or fall far behind, are dropped.
     """
 
     def screen(candidate: Candidate) -> tuple[float, Candidate, Floats]:
@@ -239,8 +240,9 @@ def _screen(candidates: list[Candidate], comparison: WholeComparison, progress: 
 
 
 class WholeComparison:
-    """Refines and scores candidates of a whole shape: ``in_full`` with all steps, otherwise with the few steps of
-    screening.
+    """Refines and scores candidates of a whole shape.
+
+    ``in_full`` is with all steps, otherwise with the few steps of screening.
     """
 
     def __init__(self, task: FitTask, candidates: list[Candidate], roughness: float | None = None) -> None:

@@ -91,8 +91,9 @@ class FitTask:
         return replace(self, samples=self.visible_samples)
 
     def rescaled(self, scale: float, samples: OrientedPoints | None = None) -> FitTask:
-        """The same task with lengths divided by ``scale``, and with ``samples`` (already in the new scale) if they are
-        given.
+        """The same task with lengths divided by ``scale``.
+
+        ``samples``, already in the new scale, replace both sets of samples if they are given.
         """
         frame = self.frame.compose(Frame(scale, np.eye(3), np.zeros(3)))
         if samples is not None:

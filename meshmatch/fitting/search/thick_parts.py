@@ -54,8 +54,9 @@ _MAX_MEAN_DIRECTION, _MIN_OUTWARD_COSINE = 0.6, 0.3
 
 
 def with_thick_part_smaller(found: Registration) -> Registration | None:
-    """Fit a whole shape by way of a copy with its thickest part contracted; None if it has no thick part or that is no
-    better.
+    """Fit a whole shape by way of a copy with its thickest part contracted.
+
+    None if the shape has no thick part, or if the result is no better.
     """
     task, best = found.task, found.candidate
     if not (task.samples.signed and task.system.linear):
@@ -110,8 +111,9 @@ class Contraction:
 
 
 def _fit_contracted(task: FitTask, contraction: Contraction) -> Candidate:
-    """Fit a contracted copy of the shape (contraction in the frame of the samples), and map the result back to a
-    candidate.
+    """Fit a contracted copy of the shape, and map the result back to a candidate.
+
+    The contraction is in the frame of the samples.
     """
     frame, shape, system = task.frame, task.shape, task.system
 

@@ -57,8 +57,9 @@ SETTINGS = UntanglingSettings()
 
 
 def untangled(found: Registration) -> Registration | None:
-    """Predict the limbs of a fit of a whole again if parts touch or the shape has uncovered regions; None if that is no
-    better.
+    """Predict the limbs of a fit of a whole again, if parts touch or the shape has uncovered regions.
+
+    None if there is nothing to predict again, or if the result is no better.
     """
     task, best, limbs = found.task, found.candidate, limbs_of(found.task.model)
     if not (limbs.branches and task.samples.signed and is_tilt_consistent(task.model)):

@@ -40,8 +40,9 @@ _KNOWN_STEPS = 12  # number of steps if the statistics of pairs are used
 
 @dataclass(frozen=True, kw_only=True)
 class AgreeConfig(Pairing):
-    """How fits are refined together. Set by hand on 24 to 30 pairs each of SCAPE and FAUST; ``alike`` on generated
-    people in clothes.
+    """How fits are refined together.
+
+    Set by hand on 24 to 30 pairs each of SCAPE and FAUST; ``alike`` on generated people in clothes.
     """
 
     # The prior is the common stretch. Fits have to move far along the surface, hence the momentum.
@@ -65,15 +66,17 @@ class AgreeConfig(Pairing):
 
     @classmethod
     def for_collection(cls, model: TrainedModel) -> AgreeConfig:
-        """Settings for many shapes, whose mean hardly moves: they need more steps to reach it than two fits that meet
-        halfway.
+        """Settings for many shapes.
+
+        Their mean hardly moves, so they need more steps to reach it than two fits that meet halfway.
         """
         own = cls.for_model(model)
         return replace(own, schedule=replace(own.schedule, steps=12))
 
     def between(self, known: float, different: float) -> AgreeConfig:
-        """Settings for two shapes that are of ``different`` individuals with this probability, used to the degree
-        ``known``.
+        """Settings for two shapes that are of different individuals with the probability ``different``.
+
+        ``known`` (0..1) is how much this is taken into account.
         """
         steps = round(self.schedule.steps + known * (_KNOWN_STEPS - self.schedule.steps))
         drift = different * self.drift_different + (1 - different) * self.drift_same
@@ -82,8 +85,9 @@ class AgreeConfig(Pairing):
         return replace(self, schedule=schedule, drift=self.drift + known * (drift - self.drift), alike=alike)
 
     def for_noise(self, roughness: float) -> AgreeConfig:
-        """Settings for a cloud with the given ``roughness`` (0..1, see `Shape.roughness`): all samples, shared pairs, a
-        stiffer template.
+        """Settings for a cloud with the given ``roughness`` (0..1, see `Shape.roughness`).
+
+        These use all samples, shared pairs and a stiffer template.
         """
         schedule = self.schedule.scaled_by(roughness, prior=(80, 80))
         return replace(

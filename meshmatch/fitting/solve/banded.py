@@ -94,8 +94,9 @@ class Envelope:
             self._blocks.append((first, _int_pointer(width), _int_pointer(below) if below > 0 else None, places))
 
     def solve(self, band: Float[Floats, "N B"], right: Float[Floats, " N"]) -> Float[Floats, " N"]:
-        """Solve A x = b, with A[i + k, i] in ``band[i, k]`` for k up to `above` and zeros beyond; both arrays are
-        overwritten.
+        """Solve A x = b, where A[i + k, i] is ``band[i, k]``; both arrays are overwritten.
+
+        k goes up to `above`; the further columns of ``band`` are zero.
 
         Raises
         ------

@@ -91,8 +91,9 @@ class SurfaceNodes:
 
 
 def _edge_distances(graph: csr_matrix, points: Int[Ints, " G"], count: int, far: float) -> Float[Floats, "G G"]:
-    """Distances along edges between some vertices, at least up to the ``count`` nearest of each or up to ``far``;
-    infinite beyond.
+    """Distances along edges between some vertices.
+
+    They are finite at least for the ``count`` nearest of each, or up to ``far``; the others may be infinite.
     """
     limit = _FIRST_LIMIT * far
     while True:

@@ -38,8 +38,9 @@ class Term(Protocol):
     """Something that pulls on template vertices."""
 
     def quadratic(self, system: NodeSystem, vectors: Float[Floats, "K 3"], scale: float) -> Quadratic:
-        """The quadratic form of the term about the current node vectors; ``scale`` is that of robust weights (units of
-        sqrt(area)).
+        """The quadratic form of the term about the current node vectors.
+
+        ``scale`` is that of robust weights (units of sqrt(area)).
         """
 
 

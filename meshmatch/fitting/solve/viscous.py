@@ -48,8 +48,9 @@ class ViscousConfig(Pairing):
 
     @classmethod
     def choosing(cls) -> ViscousConfig:
-        """Settings for choosing among poses: stiffer, and with more weight along the surface, so that wrong poses cost
-        more.
+        """Settings for choosing among poses.
+
+        They are stiffer and have more weight along the surface, so that wrong poses cost more.
         """
         stiffer = replace(cls().schedule, prior=(1e-3, 1e-6), scale=(0.1, 0.02), momentum=0.0)
         return cls(schedule=stiffer, point_share=0.01)
