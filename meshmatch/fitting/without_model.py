@@ -1,10 +1,8 @@
 """Fit a template to a shape of its kind without a network; the shape may have any pose and orientation, or be mirrored.
 
 Surfaces are brought together by least squares alone (`meshmatch.fitting.solve.viscous`), which finds what is nearby. That
-suffices for a shape in the template's pose, after rotation. For other poses the template is first registered to the shape
-as two arbitrary shapes are (`meshmatch.fitting.direct`), and least squares start from there.
-
-"Alike" below means that a shape has the template's pose, up to a rigid motion.
+suffices for a shape in the template's pose ("alike"), after rotation. For other poses the template is first registered to
+the shape as two arbitrary shapes are (`meshmatch.fitting.direct`), and least squares start from there.
 """
 
 from __future__ import annotations
@@ -93,10 +91,7 @@ def stand_alike(residual: float, stretch: float) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Start:
-    """Starting point of least squares: the core frame, and node vectors in it.
-
-    ``trust`` and ``doubts`` are those of the search that found it, if any.
-    """
+    """Starting point of least squares; ``trust`` and ``doubts`` are those of the search that found it, if any."""
 
     frame: Frame
     vectors: Float[Floats, "K 3"]
@@ -115,10 +110,7 @@ class _Fitted:
 
     @property
     def energy(self) -> float:
-        """Energy of the fit; low for right fits.
-
-        It weighs stretch less than `DirectFeatures.energy`, as shapes of one kind differ more in proportions than in pose.
-        """
+        """Low for right fits; weighs stretch less than `DirectFeatures.energy`, as a kind varies in proportions."""
         return self.features.residual + _STRETCH_WEIGHT * self.features.stretch
 
     @property
@@ -190,10 +182,7 @@ class _Task:
         return minimise(problem, prior, np.zeros((self.system.K, 3)))
 
     def start_near(self, frame: Frame) -> _Start:
-        """Start with the undeformed template, aligned near a given frame.
-
-        ``frame`` is that of a fit of another template with the same vertices.
-        """
+        """Start with the undeformed template, aligned near the frame of a fit of another template."""
         samples = self._samples.first(_ALIGN_SAMPLES)
         points = frame.apply(self._own.undo(samples.points))
         normals = samples.normals @ self._own.rotation @ frame.rotation.T
@@ -360,7 +349,7 @@ def fit_otherwise(template: Template, shape: Shape, start: Fit, config: ViscousC
 def fit_alike(
     template: Template,
     shape: Shape,
-    begun: tuple[Float[Floats, "N 3"], Fit],
+    search_result: tuple[Float[Floats, "N 3"], Fit],
     config: ViscousConfig | None = None,
     mirror: bool = True,
     whole: float | None = None,
@@ -370,7 +359,7 @@ def fit_alike(
 
     Parameters
     ----------
-    begun
+    search_result
         Positions (N, 3) on the rest template, and a fit whose points (N, 3) are their counterparts according to a search.
     mirror, whole
         As for `fit_without_model`.
@@ -388,7 +377,7 @@ def fit_alike(
     """
     began, config = time.monotonic(), config or ViscousConfig()
     quick, sides = _quick(config.seed), (None, MIRROR) if mirror else (None,)
-    task, (resting, start) = _Task(template, shape, quick), begun
+    task, (resting, start) = _Task(template, shape, quick), search_result
     at = np.asarray(cKDTree(task.system.verts).query(resting)[1], np.int64)
     search_call = partial(task.fitted, _Start(start.frame, task.deformed_to(at, start.points)))
     turn_calls = [partial(task.best_turn, side) for side in sides] if turned else []
@@ -435,20 +424,14 @@ def standing(template: Template, shape: Shape, seed: int) -> Standing:
 
 
 def fit_from(template: Template, shape: Shape, start: Fit, config: ViscousConfig) -> Fit | None:
-    """Fit a template to a repaired shape, starting from the pose of a fit of another template with the same vertices.
-
-    None if the shape has another pose.
-    """
+    """Fit a template from the pose of another one's fit with the same vertices; None if the shape has another pose."""
     began, task = time.monotonic(), _Task(template, shape, config)
     found = task.fitted(task.start_near(start.frame))
     return _Judged.of(task, found).fit(0.0, began) if found.alike else None
 
 
 def fit_turned(template: Template, shape: Shape, turn: Float[Floats, "3 3"], config: ViscousConfig) -> Fit:
-    """Fit a template to a repaired shape in the template's pose.
-
-    ``turn`` is the rotation from the shape's file to the template.
-    """
+    """Fit a template to a repaired shape in the same pose, given the rotation from the shape's file to the template."""
     began, task = time.monotonic(), _Task(template, shape, config)
     initial = task.start_near(replace(sqrt_area_frame(shape), rotation=turn))
     return _Judged.of(task, task.fitted(initial)).fit(0.0, began)
