@@ -90,7 +90,7 @@ def match_alike(
     template, frame = template_of(whole, whole.name, viscous), _frame_of(whole, viscous)
     of_whole, of_other = (found.source, found.target) if whole is source else (found.target, found.source)
     resting = frame.apply(of_whole.points_in_file)
-    if of_whole.frame.mirrored:  # the template is not
+    if of_whole.frame.mirrored:  # the template is not mirrored
         of_other = replace(of_other, frame=of_other.frame.compose(MIRROR), points=MIRROR.apply(of_other.points))
     size = float(np.sqrt(whole.area)) if part else None
     finer = fit_alike(template, other, (resting, of_other), viscous, config.mirror != "no", size, turned)
@@ -161,7 +161,7 @@ def finer(
         if moved:
             near = replace(near, points=found.points)
     result = cap_verdict(judge_unsupervised(card, _as_of(model, near)), doubts)
-    if near.points is fit.points:  # it may yet agree with others
+    if near.points is fit.points:  # keep them, as the fit may yet agree with others
         result = replace(result, vectors=fit.vectors)
     if poor:
         result = replace(result, verdict="poor", reasons=fit.reasons, trust=min(fit.trust, result.trust))

@@ -204,7 +204,7 @@ def test_nodes_move_one_side_of_a_thin_sheet(thin: DecimatedMesh) -> None:
         sheet = sheet.subdivide()
     shape = Shape(np.asarray(sheet.vertices), np.asarray(sheet.faces))
     mesh = DecimatedMesh.of(shape, 10_000)
-    system, prior = SurfaceNodes(K=150, radius=0.13, least=4).system(mesh.shape, mesh.graph)
+    system, prior = SurfaceNodes(K=150, radius=0.13, min_nodes=4).system(mesh.shape, mesh.graph)
     assert np.allclose(np.asarray(system.phi.sum(1)), 1)
     turn = Rotation.from_rotvec([0.2, 0.1, 0.3])
     top = mesh.verts[:, 2] > 0

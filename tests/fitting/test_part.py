@@ -174,7 +174,7 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
     task = FitTask.of(model, FitConfig(samples=400, variants=1, refine="none"), open_egg)
     far, near = (RigidPose(np.eye(3), np.array([away, 0.0, 0.0])) for away in (5.0, 0.0))
     asked: set[tuple[int, int, bool]] = set()
-    patient = replace(candidates.SETTINGS, lost=np.inf)
+    patient = replace(candidates.SETTINGS, max_narrow_residual=np.inf)
 
     def frames(
         model: TrainedModel, samples: OrientedPoints, config: FitConfig, wide: bool, upright: bool
@@ -199,7 +199,7 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
     assert found["poor"] <= found["fair"]
     assert (found["poor"] < found["fair"]) or not wide_is_better
     # where nothing is near, the wide search begins before anything is refined
-    monkeypatch.setattr(candidates, "SETTINGS", replace(patient, lost=0.0))
+    monkeypatch.setattr(candidates, "SETTINGS", replace(patient, max_narrow_residual=0.0))
     assert fitter.fit_part(task) is None
     wide = fitter.fit_part(task, wide=True)
     best = fitter._best_part(task, thorough=True)

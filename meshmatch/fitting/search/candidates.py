@@ -55,51 +55,51 @@ class CandidateSettings:
     scale_rounds : how often the scale and the outliers of a cloud are estimated
     max_scale_change : largest total change of scale, as a factor; more indicates a wrong fit rather than a wrong area
     outlier_distance : isolated points farther than this from the fitted template are outliers
-    isolation : a point is isolated if its neighbours reach this many times as far as the cloud's median
-    neighbours : number of neighbours for this
+    isolation_ratio : a point is isolated if its neighbours reach this many times as far as the cloud's median
+    n_neighbours : number of neighbours for this
     scale_tolerance : relative change of the scale below which the estimate has converged
     scale_margin : candidates with a residual up to this multiple of the best one's estimate a cloud's scale
     unusual_residual : if all candidates have a larger residual, the aligner may not know the shape's pose
-    careful_if_unusual : how many of the frames that are then tried are fitted on all samples
-    about_margin : the best candidate turned by half a turn is kept if its residual is below this multiple
+    n_careful_if_unusual : how many of the frames that are then tried are fitted on all samples
+    half_turn_margin : the best candidate is also kept after half a turn if its residual then is below this multiple
     shares : shares of the surface that a part may show
     min_share : the smallest share that a shape is assumed to show
-    lost : if all residuals exceed this, the candidates of a narrow search are not worth refining: those of people's parts
-        that were fitted right are 0.020 to 0.030
+    max_narrow_residual : if all residuals exceed this, the candidates of a narrow search are not worth refining: those of
+        people's parts that were fitted right are 0.020 to 0.030
     wide_shares : shares for which a wide search tries all frames
-    wide_kept : one in this many of these frames, the best, is tried for the other shares
+    wide_kept_divisor : one in this many of these frames, the best, is tried for the other shares
     ranking_samples, ranking_samples_if_wide : number of samples for ranking frames
-    careful : candidates per share that are fitted on all samples
-    worth_if_wide : in a wide search, the multiple of the best residual up to which they are
-    completed : how many candidates are completed and fitted again in each of the rounds
-    varied : candidates for which variants are sought
+    n_careful : candidates per share that are fitted on all samples
+    careful_margin_if_wide : in a wide search, only those with a residual up to this multiple of the best one's
+    n_completed : how many candidates are completed and fitted again in each of the rounds
+    n_varied : candidates for which variants are sought
     coarse_samples : number of samples for comparing variants and for finding visible vertices
-    max_added : maximum number of points per sample that complete the samples
+    max_added_per_sample : maximum number of points per sample that complete the samples
     """
 
     scale_rounds: int = 3
     max_scale_change: float = 1.3
     outlier_distance: float = 0.06
-    isolation: float = 1.5
-    neighbours: int = 8
+    isolation_ratio: float = 1.5
+    n_neighbours: int = 8
     scale_tolerance: float = 0.005
     scale_margin: float = 1.1
     unusual_residual: float = 0.045
-    careful_if_unusual: int = 12
-    about_margin: float = 1.1
+    n_careful_if_unusual: int = 12
+    half_turn_margin: float = 1.1
     shares: tuple[float, ...] = (1.0, 0.8, 0.62, 0.48, 0.36)
     min_share: float = 0.2
-    lost: float = 0.034
+    max_narrow_residual: float = 0.034
     wide_shares: tuple[float, ...] = (0.62,)
-    wide_kept: int = 8
+    wide_kept_divisor: int = 8
     ranking_samples: int = 768
     ranking_samples_if_wide: int = 512
-    careful: int = 5
-    worth_if_wide: float = 1.3
-    completed: tuple[int, ...] = (10, 5, 3)
-    varied: int = 1
+    n_careful: int = 5
+    careful_margin_if_wide: float = 1.3
+    n_completed: tuple[int, ...] = (10, 5, 3)
+    n_varied: int = 1
     coarse_samples: int = 2048
-    max_added: int = 3
+    max_added_per_sample: int = 3
 
 
 SETTINGS = CandidateSettings()
@@ -142,7 +142,7 @@ def _candidates_from_all_rotations(task: FitTask) -> list[Candidate]:
     if not frames:  # this category has a fixed orientation
         return []
     rough = task.predictor.fit_all([(task.coarse, pose) for pose in frames], draws=1, measure=ranking_residual)
-    careful = SETTINGS.careful_if_unusual
+    careful = SETTINGS.n_careful_if_unusual
     return task.predictor.fit_all([(task.samples, each.pose) for each in best_first(rough)[:careful]])
 
 
@@ -157,7 +157,7 @@ def _half_turned(task: FitTask, best: Candidate) -> list[Candidate]:
     # A generator of its own, so that later steps draw the same numbers as without this one.
     predictor = replace(task.predictor, rng=np.random.default_rng(task.config.seed))
     turned = predictor.fit_all([(task.samples, RigidPose(best.pose.rotation * _HALF_TURN, best.pose.center))])
-    return [each for each in turned if each.residual < SETTINGS.about_margin * best.residual]
+    return [each for each in turned if each.residual < SETTINGS.half_turn_margin * best.residual]
 
 
 def upright_candidate(task: FitTask, candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -222,8 +222,8 @@ def isolated_points(points: Float[Floats, "P 3"]) -> Bool[Bools, " P"]:
     Samples of a small cloud repeat its points; copies of a point are not its neighbours.
     """
     unique_points, index = np.unique(points, axis=0, return_inverse=True)
-    reach = cKDTree(unique_points).query(unique_points, min(SETTINGS.neighbours + 1, len(unique_points)))[0][:, -1]
-    return np.asarray((reach > SETTINGS.isolation * np.median(reach))[index.reshape(-1)])
+    reach = cKDTree(unique_points).query(unique_points, min(SETTINGS.n_neighbours + 1, len(unique_points)))[0][:, -1]
+    return np.asarray((reach > SETTINGS.isolation_ratio * np.median(reach))[index.reshape(-1)])
 
 
 def candidates_of_part(task: FitTask, wide: bool = False) -> tuple[FitTask, list[Candidate]]:
@@ -241,13 +241,13 @@ def candidates_of_part(task: FitTask, wide: bool = False) -> tuple[FitTask, list
     task = replace(task, config=config, predictor=predictor)
     progress = task.progress.stage(STAGE)
     candidates = _careful(task, wide, progress.between(0.0, 0.4))
-    if not (wide or task.shape.is_cloud) and min(each.residual for each in candidates) > SETTINGS.lost:
+    if not (wide or task.shape.is_cloud) and min(each.residual for each in candidates) > SETTINGS.max_narrow_residual:
         return task, []
-    for number, count in enumerate(SETTINGS.completed):
+    for number, count in enumerate(SETTINGS.n_completed):
         candidates = _refit_completed(task, best_first(candidates)[:count])
-        progress(0.4 + 0.2 * (number + 1) / len(SETTINGS.completed))
+        progress(0.4 + 0.2 * (number + 1) / len(SETTINGS.n_completed))
     candidates = best_first(candidates)
-    for candidate in candidates[: SETTINGS.varied]:
+    for candidate in candidates[: SETTINGS.n_varied]:
         # further candidates from the completed samples
         local, config = candidate.local(task.samples), task.config
         whole = completed(task.system, local, candidate.vectors, candidate.share, task.predictor.rng)
@@ -271,15 +271,15 @@ def _careful(task: FitTask, wide: bool, progress: Progress) -> list[Candidate]:
         frames, others = frames_of_part(task.model, samples, task.config, wide, task.shape.upright)
         frame_numbers = list(range(len(others)))
         if wide and number >= len(SETTINGS.wide_shares):
-            frame_numbers = sorted(best, key=lambda frame: best[frame])[: len(others) // SETTINGS.wide_kept]
+            frame_numbers = sorted(best, key=lambda frame: best[frame])[: len(others) // SETTINGS.wide_kept_divisor]
         ranking = samples.first(SETTINGS.ranking_samples_if_wide if wide else SETTINGS.ranking_samples)
         starts = [(ranking, pose) for pose in [*(others[k] for k in frame_numbers), *frames]]
         ranked = task.predictor.fit_all(starts, 1, 1, ranking_residual if wide else one_way_residual)
         for k, candidate in zip(frame_numbers, ranked, strict=False):
             best[k] = min(candidate.residual, best.get(k, np.inf))
         ranked.sort(key=lambda candidate: candidate.residual)
-        limit = SETTINGS.worth_if_wide * ranked[0].residual if wide else np.inf
-        careful = [(samples, each.pose) for each in ranked[: SETTINGS.careful] if each.residual <= limit]
+        limit = SETTINGS.careful_margin_if_wide * ranked[0].residual if wide else np.inf
+        careful = [(samples, each.pose) for each in ranked[: SETTINGS.n_careful] if each.residual <= limit]
         found += [replace(fit, share=share) for fit in task.predictor.fit_all(careful, measure=one_way_residual)]
         progress((number + 1) / len(order))
     return found
@@ -335,7 +335,7 @@ def completed(
     if not missing.area > 0:
         return local
     P = len(local.points)
-    count = min(round(P * missing.area / share), SETTINGS.max_added * P)
+    count = min(round(P * missing.area / share), SETTINGS.max_added_per_sample * P)
     added = sample_surface(missing, count, rng)
     local = local.facing(surface)
     order = rng.permutation(P + count)

@@ -45,12 +45,12 @@ class Motions:
         self.middles = source.areas @ source.verts, target.areas @ target.verts
         self._own = OrientedPoints(source.verts - self.middles[0], source.normals)
         self._onto = OrientedPoints(target.verts - self.middles[1], target.normals)
-        some, some_onto = (
+        queries, onto_queries = (
             np.linspace(0, V - 1, min(_N_QUERIES, V)).astype(np.int64) for V in (len(source.verts), len(target.verts))
         )
-        self._some = self._own.points[some], self._onto.points[some_onto]
-        self._asking = some, self._onto.features[some_onto]
-        self._rigid = ClosestPoints(self._onto, self._own, (some_onto, some))
+        self._query_points = self._own.points[queries], self._onto.points[onto_queries]
+        self._queries = queries, self._onto.features[onto_queries]
+        self._rigid = ClosestPoints(self._onto, self._own, (onto_queries, queries))
 
     def rigid(self, starts: list[RigidPose], steps: int) -> list[RigidPose]:
         """Rigid motions of the source after some steps from the given starts."""
@@ -77,12 +77,12 @@ class Motions:
             normals = self._own.normals @ np.linalg.inv(matrix)
             normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
             features = with_normals(self.moved(matrix, shift), normals)
-            forward = self._onto.tree.query(features[self._asking[0]])[1]
-            backward = feature_tree(features).query(self._asking[1])[1]
-            source = np.concatenate([self._some[0], self._own.points[backward]])
-            goal = np.concatenate([self._onto.points[forward], self._some[1]])
-            squared_distance = np.square(source @ matrix.T + shift - goal).sum(1)
-            matrix, shift = _affine(source, goal, 1 / np.square(1 + squared_distance / _SCALE**2), matrix)
+            forward = self._onto.tree.query(features[self._queries[0]])[1]
+            backward = feature_tree(features).query(self._queries[1])[1]
+            source = np.concatenate([self._query_points[0], self._own.points[backward]])
+            goals = np.concatenate([self._onto.points[forward], self._query_points[1]])
+            squared_distance = np.square(source @ matrix.T + shift - goals).sum(1)
+            matrix, shift = _affine(source, goals, 1 / np.square(1 + squared_distance / _SCALE**2), matrix)
         return matrix, shift
 
 

@@ -46,43 +46,44 @@ class ProposalSettings:
 
     Attributes
     ----------
-    rigid : rigid motions that are kept, each with an affine one
+    n_rigid : rigid motions that are kept, each with an affine one
     closest_point_steps, affine_steps : steps of iterative closest points for each
-    turned : smallest angle in degrees between two rigid motions
-    signs : number of eigenfunctions whose signs are tried in all combinations, and whose order is varied
-    compared : how many of these maps are refined from ``first_functions`` to ``functions``
-    functions, first_functions, more : number of eigenfunctions of a map at the end and after the first stage, and how many
-        are added in each step
-    maps : maximum number of spectral maps
-    limbs : maximum number of assignments of extremities
-    beam, assignments : partial assignments that a beam search keeps, and complete ones that it returns
-    turns : cyclic assignments that each search keeps
-    skipped : cost of an extremity without counterpart
-    same : share of vertices by which two maps must differ, where vertices differ if they are more than ``apart`` from each
-        other
-    bent, left : weights, against the error of distances, of the distance that remains after the best rotation of limbs onto
-        limbs, and of the share of the limbs' length without counterpart
+    min_angle : smallest angle in degrees between two rigid motions
+    n_signed : number of eigenfunctions whose signs are tried in all combinations, and whose order is varied
+    n_refined : how many of these maps are refined from ``n_first_functions`` to ``n_functions``
+    n_functions, n_first_functions : number of eigenfunctions of a map at the end, and after the first stage
+    functions_per_step : how many eigenfunctions are added in each step
+    n_maps : maximum number of spectral maps
+    n_assignments_kept : maximum number of assignments of extremities
+    beam_width, n_per_beam_search : partial assignments that a beam search keeps, and complete ones that it returns
+    n_per_cyclic_search : cyclic assignments that each search keeps
+    skip_cost : cost of an extremity without counterpart
+    min_changed_share : share of vertices by which two maps must differ
+    changed_distance : a vertex differs if the maps send it to places farther apart than this
+    bend_weight : weight of the distance that the best rotation of limbs onto limbs leaves, relative to the error of
+        distances
+    leftover_weight : weight of the share of the limbs' length without counterpart
     """
 
-    rigid: int = 10
+    n_rigid: int = 10
     closest_point_steps: int = 6
     affine_steps: int = 10
-    turned: float = 20.0
-    signs: int = 5
-    compared: int = 32
-    first_functions: int = 14
-    functions: int = 40
-    more: int = 5
-    maps: int = 16
-    limbs: int = 14
-    beam: int = 400
-    assignments: int = 50
-    turns: int = 8
-    skipped: float = 0.12
-    same: float = 0.02
-    apart: float = 0.1
-    bent: float = 0.15
-    left: float = 0.05
+    min_angle: float = 20.0
+    n_signed: int = 5
+    n_refined: int = 32
+    n_first_functions: int = 14
+    n_functions: int = 40
+    functions_per_step: int = 5
+    n_maps: int = 16
+    n_assignments_kept: int = 14
+    beam_width: int = 400
+    n_per_beam_search: int = 50
+    n_per_cyclic_search: int = 8
+    skip_cost: float = 0.12
+    min_changed_share: float = 0.02
+    changed_distance: float = 0.1
+    bend_weight: float = 0.15
+    leftover_weight: float = 0.05
 
 
 SETTINGS = ProposalSettings()
@@ -98,10 +99,10 @@ def rigid_proposals(source: DecimatedMesh, target: DecimatedMesh) -> list[Propos
     found = motions.rigid([RigidPose(start, np.zeros(3)) for start in starts], SETTINGS.closest_point_steps)
     chosen: list[RigidPose] = []
     for best in np.argsort(motions.residuals(found), kind="stable"):
-        if all(found[best].angle_to(other) > SETTINGS.turned for other in chosen):
+        if all(found[best].angle_to(other) > SETTINGS.min_angle for other in chosen):
             chosen.append(found[best])
     proposals = []
-    for motion in chosen[: SETTINGS.rigid]:
+    for motion in chosen[: SETTINGS.n_rigid]:
         proposals.append(Proposal("rigid", motions.moved(motion.rotation, motion.center) + middle))
         matrix, shift = motions.affine(motion, SETTINGS.affine_steps)
         if np.linalg.det(matrix) > 0.1:
@@ -116,9 +117,9 @@ def spectral_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
     """
     landmarks, their_landmarks = source.landmarks, target.landmarks
     own, theirs = source.functions[landmarks], target.functions[their_landmarks]
-    last = min(SETTINGS.functions, own.shape[1], theirs.shape[1])
-    first = min(SETTINGS.first_functions, last)
-    count = min(SETTINGS.signs, first - 1)
+    last = min(SETTINGS.n_functions, own.shape[1], theirs.shape[1])
+    first = min(SETTINGS.n_first_functions, last)
+    count = min(SETTINGS.n_signed, first - 1)
     initial = []
     for order in _near_orders(count):
         for signs in product((1.0, -1.0), repeat=count):
@@ -126,12 +127,12 @@ def spectral_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
             C[0, 0] = 1.0
             C[np.arange(1, count + 1), 1 + np.array(order)] = signs
             initial.append(C)
-    found, nearest = _zoom_out(np.stack(initial), own, theirs, first, SETTINGS.more)
+    found, nearest = _zoom_out(np.stack(initial), own, theirs, first, SETTINGS.functions_per_step)
     own_distances, their_distances = source.landmark_distances, target.landmark_distances
     errors = [_distance_error(own_distances, their_distances, each) for each in nearest]
-    best = np.argsort(errors, kind="stable")[: SETTINGS.compared]
+    best = np.argsort(errors, kind="stable")[: SETTINGS.n_refined]
     maps = []
-    for C, near in zip(*_zoom_out(found[best], own, theirs, last, SETTINGS.more), strict=True):
+    for C, near in zip(*_zoom_out(found[best], own, theirs, last, SETTINGS.functions_per_step), strict=True):
         vertex = _nearest(source.functions[:, :last] @ C.T, target.functions[:, :last])
         maps.append((_distance_error(own_distances, their_distances, near), vertex))
     return _select_maps("spectral", source, target, maps)
@@ -174,10 +175,10 @@ def _distance_error(known: Float[Floats, "L L"], distances: Float[Floats, "U U"]
 def _orientation_preserved(source: Intrinsic, target: Intrinsic, vertex: Int[Ints, " V"]) -> float:
     """Share of the mapped area that keeps its orientation minus the share that reverses it; -1 for a mirrored map."""
     mesh = target.mesh
-    turned = triangle_vectors(mesh.verts[vertex], source.mesh.faces)
-    along = (turned * mesh.normals[vertex][source.mesh.faces].sum(1)).sum(1)
-    area = np.linalg.norm(turned, axis=1)
-    return float((area * np.sign(along)).sum() / max(area.sum(), 1e-12))
+    mapped = triangle_vectors(mesh.verts[vertex], source.mesh.faces)
+    dots = (mapped * mesh.normals[vertex][source.mesh.faces].sum(1)).sum(1)
+    area = np.linalg.norm(mapped, axis=1)
+    return float((area * np.sign(dots)).sum() / max(area.sum(), 1e-12))
 
 
 def extremity_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
@@ -189,9 +190,9 @@ def extremity_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
     """
     if min(len(source.extremities), len(target.extremities)) < 2:
         return []
-    judge = Assignments(source, target)
-    found = dict.fromkeys(each for ways in judge.candidates() for each in ways)
-    return [judge.limbs(each) for each in sorted(found, key=judge.cost)[: SETTINGS.limbs]]
+    assignments = Assignments(source, target)
+    found = dict.fromkeys(each for search_results in assignments.candidates() for each in search_results)
+    return [assignments.limbs(each) for each in sorted(found, key=assignments.cost)[: SETTINGS.n_assignments_kept]]
 
 
 Assignment = tuple[int, ...]
@@ -203,23 +204,25 @@ class Assignments:
 
     def __init__(self, source: Intrinsic, target: Intrinsic) -> None:
         self._source, self._target = source, target
-        (reach, along), (reach_to, along_to) = source.limbs, target.limbs
-        ends, ends_to = source.extremities, target.extremities
-        self._counts = len(ends), len(ends_to)
+        (reach, along), (target_reach, target_along) = source.limbs, target.limbs
+        ends, target_ends = source.extremities, target.extremities
+        self._counts = len(ends), len(target_ends)
         profiles = np.abs(source.profiles[:, None] - target.profiles[None]).mean(2)
-        single = 0.5 * (profiles + 0.3 * np.abs(reach[:, None] - reach_to))
-        apart = source.from_extremities[:, ends], target.from_extremities[:, ends_to]
-        shared = along[ends] * reach, along_to[ends_to] * reach_to
+        end_costs = 0.5 * (profiles + 0.3 * np.abs(reach[:, None] - target_reach))
+        distances = source.from_extremities[:, ends], target.from_extremities[:, target_ends]
+        shared_paths = along[ends] * reach, target_along[target_ends] * target_reach
         # Costs of assigning i to j, and of assigning i, k to j, l; in three variants.
-        of_lengths = 0.5 * _changes(*apart) + 2.0 * _changes(*shared)
-        of_order = [0.2 * _changes(of(source.spread), of(target.spread)) for of in (np.asarray, _ranks)]
-        self._costs = [(single, of_lengths), *((0.2 * single, each) for each in of_order)]
+        length_costs = 0.5 * _pairwise_changes(*distances) + 2.0 * _pairwise_changes(*shared_paths)
+        order_costs = [
+            0.2 * _pairwise_changes(rescale(source.spread), rescale(target.spread)) for rescale in (np.asarray, _ranks)
+        ]
+        self._costs = [(end_costs, length_costs), *((0.2 * end_costs, each) for each in order_costs)]
         self._along = (
             np.column_stack([along, source.eccentricity])[source.landmarks[::2]],
-            np.column_stack([along_to, target.eccentricity])[target.landmarks],
+            np.column_stack([target_along, target.eccentricity])[target.landmarks],
         )
         self._apart = source.landmark_distances[::2, ::2], target.landmark_distances
-        self._shares = reach / reach.sum(), reach_to / reach_to.sum()
+        self._shares = reach / reach.sum(), target_reach / target_reach.sum()
 
     def candidates(self) -> list[list[Assignment]]:
         """The best assignments of each beam search and of each cyclic search; one list per search."""
@@ -236,61 +239,53 @@ class Assignments:
         for size in (n_shared, n_shared - 1):
             if size < 3:
                 break
-            own_extremities, their_extremities = (np.array(list(combinations(tour, size))) for tour in tours)
-            turns = np.array([np.roll(range(size)[::way], by) for way in (1, -1) for by in range(size)])
-            their_extremities = their_extremities[:, turns].reshape(-1, size)
-            own_extremities, their_extremities = (
-                np.repeat(own_extremities, len(their_extremities), 0),
-                np.tile(their_extremities, (len(own_extremities), 1)),
-            )
-            for single, double in self._costs:
-                pairs = (
-                    own_extremities[:, :, None],
-                    own_extremities[:, None],
-                    their_extremities[:, :, None],
-                    their_extremities[:, None],
-                )
-                cost = single[own_extremities, their_extremities].mean(1) + double[pairs].mean((1, 2))
-                best = np.argsort(cost, kind="stable")[: SETTINGS.turns]
-                found.append([self._with_best_leftover(own_extremities[k], their_extremities[k], single) for k in best])
+            own, theirs = (np.array(list(combinations(tour, size))) for tour in tours)
+            turns = np.array([np.roll(range(size)[::step], by) for step in (1, -1) for by in range(size)])
+            theirs = theirs[:, turns].reshape(-1, size)
+            own, theirs = (np.repeat(own, len(theirs), 0), np.tile(theirs, (len(own), 1)))
+            for end_costs, pair_costs in self._costs:
+                pairs = (own[:, :, None], own[:, None], theirs[:, :, None], theirs[:, None])
+                cost = end_costs[own, theirs].mean(1) + pair_costs[pairs].mean((1, 2))
+                best = np.argsort(cost, kind="stable")[: SETTINGS.n_per_cyclic_search]
+                found.append([self._with_best_leftover(own[k], theirs[k], end_costs) for k in best])
         return found
 
     def _with_best_leftover(
-        self, own: Int[Ints, " N"], theirs: Int[Ints, " N"], single: Float[Floats, "T U"]
+        self, own: Int[Ints, " N"], theirs: Int[Ints, " N"], end_costs: Float[Floats, "T U"]
     ) -> Assignment:
         """Complete an assignment by the most similar pair of the extremities that are left over."""
         chosen = np.full(self._counts[0], -1)
         chosen[own] = theirs
         rest = np.flatnonzero(chosen < 0), np.setdiff1d(np.arange(self._counts[1]), theirs)
         if len(rest[0]) and len(rest[1]):
-            i, j = np.unravel_index(single[np.ix_(*rest)].argmin(), (len(rest[0]), len(rest[1])))
+            i, j = np.unravel_index(end_costs[np.ix_(*rest)].argmin(), (len(rest[0]), len(rest[1])))
             chosen[rest[0][i]] = rest[1][j]
         return tuple(chosen.tolist())
 
-    def _beam_search(self, single: Float[Floats, "T U"], double: Float[Floats, "T T U U"]) -> list[Assignment]:
+    def _beam_search(self, end_costs: Float[Floats, "T U"], pair_costs: Float[Floats, "T T U U"]) -> list[Assignment]:
         """Beam search, in order of the extremities' prominence."""
         beam: list[tuple[float, Assignment]] = [(0.0, ())]
         for i in range(self._counts[0]):
             extended = []
             for cost, partial in beam:
-                extended.append((cost + SETTINGS.skipped, (*partial, -1)))
+                extended.append((cost + SETTINGS.skip_cost, (*partial, -1)))
                 known = [(k, other) for k, other in enumerate(partial) if other >= 0]
                 for j in set(range(self._counts[1])).difference(partial):
-                    pairs = sum(double[i, k, j, other] for k, other in known) / max(len(known), 1)
-                    extended.append((cost + single[i, j] + pairs, (*partial, j)))
-            beam = sorted(extended)[: SETTINGS.beam]
-        found = [each for _, each in beam[: SETTINGS.assignments]]
+                    pairs = sum(pair_costs[i, k, j, other] for k, other in known) / max(len(known), 1)
+                    extended.append((cost + end_costs[i, j] + pairs, (*partial, j)))
+            beam = sorted(extended)[: SETTINGS.beam_width]
+        found = [each for _, each in beam[: SETTINGS.n_per_beam_search]]
         return [each for each in found if sum(j >= 0 for j in each) >= 2]
 
     def cost(self, assignment: Assignment) -> float:
         """Distance of an assignment from an isometry that hardly bends limbs."""
-        own, theirs = _pairs(assignment)
-        nearest = _nearest(self._along[0][:, [*own, -1]], self._along[1][:, [*theirs, -1]])
+        own_limbs, their_limbs = _pairs(assignment)
+        nearest = _nearest(self._along[0][:, [*own_limbs, -1]], self._along[1][:, [*their_limbs, -1]])
         error = _distance_error(*self._apart, nearest)
-        joints, goals = self._joints(own, theirs)
-        bent = np.sqrt(np.square(kabsch(joints, goals).to_world(joints) - goals).sum(1).mean())
-        left = 2 - self._shares[0][own].sum() - self._shares[1][theirs].sum()
-        return float(error + SETTINGS.bent * bent + SETTINGS.left * left)
+        joints, goals = self._joints(own_limbs, their_limbs)
+        bending = np.sqrt(np.square(kabsch(joints, goals).to_world(joints) - goals).sum(1).mean())
+        leftover = 2 - self._shares[0][own_limbs].sum() - self._shares[1][their_limbs].sum()
+        return float(error + SETTINGS.bend_weight * bending + SETTINGS.leftover_weight * leftover)
 
     def limbs(self, assignment: Assignment) -> Proposal:
         """The proposal of an assignment: where it moves the rings around the source's limbs.
@@ -299,9 +294,11 @@ class Assignments:
         """
         own, theirs = _pairs(assignment)
         joints, goals = self._joints(own, theirs)
-        turn, verts = kabsch(joints, goals).rotation, self._source.mesh.verts
+        rotation, verts = kabsch(joints, goals).rotation, self._source.mesh.verts
         rings = [ring for limb in own for ring in self._source.rings[limb]]
-        points = [goal + (verts[ring] - joint) @ turn.T for ring, joint, goal in zip(rings, joints, goals, strict=True)]
+        points = [
+            goal + (verts[ring] - joint) @ rotation.T for ring, joint, goal in zip(rings, joints, goals, strict=True)
+        ]
         return Proposal("extremities", np.concatenate(points), np.concatenate(rings))
 
     def _joints(self, own: list[int], theirs: list[int]) -> tuple[Float[Floats, "N 3"], Float[Floats, "N 3"]]:
@@ -315,7 +312,7 @@ def _pairs(assignment: Assignment) -> tuple[list[int], list[int]]:
     return own, [assignment[number] for number in own]
 
 
-def _changes(own: Float[Floats, "T T"], theirs: Float[Floats, "U U"]) -> Float[Floats, "T T U U"]:
+def _pairwise_changes(own: Float[Floats, "T T"], theirs: Float[Floats, "U U"]) -> Float[Floats, "T T U U"]:
     return np.abs(own[:, :, None, None] - theirs)
 
 
@@ -338,13 +335,13 @@ def _distinct(target: Intrinsic, maps: Sequence[Ints]) -> list[Ints]:
     """Maps that differ from all previous ones, at most as many as the settings allow."""
     verts, kept = target.mesh.verts, list[Ints]()
     for vertex in maps:
-        if len(kept) == SETTINGS.maps:
+        if len(kept) == SETTINGS.n_maps:
             break
-        if all(changed_share(verts[vertex], verts[other]) > SETTINGS.same for other in kept):
+        if all(changed_share(verts[vertex], verts[other]) > SETTINGS.min_changed_share for other in kept):
             kept.append(vertex)
     return kept
 
 
 def changed_share(points: Float[Floats, "V 3"], others: Float[Floats, "V 3"]) -> float:
     """Share (0..1) of vertices that are clearly in different places."""
-    return float((np.linalg.norm(points - others, axis=1) > SETTINGS.apart).mean())
+    return float((np.linalg.norm(points - others, axis=1) > SETTINGS.changed_distance).mean())

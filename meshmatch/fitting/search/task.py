@@ -37,7 +37,7 @@ class FitTask:
     shape: Shape  # repaired, in its file's frame
     roughness: float  # of the shape without outliers (0..1, see `Shape.roughness`)
     frame: Frame  # from the file to the frame of the samples: area about 1, centroid 0
-    samples: OrientedPoints  # of the shape without outliers, for the network, which was trained on hidden surface
+    samples: OrientedPoints  # of the shape without outliers, for the network, which can handle hidden surface
     visible_samples: OrientedPoints  # of what is visible from outside, for everything but the network
     landmarks: Landmarks | None  # template vertices (N,), positions (N, 3) in the file
     progress: Progress

@@ -29,18 +29,18 @@ class ThicknessSettings:
 
     Attributes
     ----------
-    thick : a part is thick if it contains a ball this many times as large as the rest template does: trunks of SCAPE and
-        FAUST contain 1.0 to 1.14 times its ball, misread heads of stylised people 1.17 to 2
+    min_ball_ratio : a part is thick if it contains a ball this many times as large as the rest template does: trunks of
+        SCAPE and FAUST contain 1.0 to 1.14 times its ball, misread heads of stylised people 1.17 to 2
     factors : contraction factors to try, in order
-    around : the contraction is uniform within this many radii of the ball's center
-    balls : number of samples at which balls touching the surface are tried
+    contracted_radii : the contraction is uniform within this many radii of the ball's center
+    n_balls : number of samples at which balls touching the surface are tried
     margin : the fit is accepted if its score is below this multiple of the original fit's
     """
 
-    thick: float = 1.1
+    min_ball_ratio: float = 1.1
     factors: tuple[float, ...] = (0.36, 0.5, 0.65)
-    around: float = 1.3
-    balls: int = 500
+    contracted_radii: float = 1.3
+    n_balls: int = 500
     margin: float = 0.98
 
 
@@ -61,13 +61,13 @@ def with_thick_part_smaller(found: Registration) -> Registration | None:
     task, best = found.task, found.candidate
     if not (task.samples.signed and task.system.linear):
         return None
-    template_radius, ball = template_ball_radius(task.model), largest_ball(task.samples, SETTINGS.balls)
-    if template_radius is None or ball is None or ball[1] < SETTINGS.thick * template_radius:
+    template_radius, ball = template_ball_radius(task.model), largest_ball(task.samples, SETTINGS.n_balls)
+    if template_radius is None or ball is None or ball[1] < SETTINGS.min_ball_ratio * template_radius:
         return None
     comparison = WholeComparison(task, [])
 
     def fit_with(factor: float) -> Candidate:
-        contraction = Contraction(ball[0], SETTINGS.around * ball[1], factor)
+        contraction = Contraction(ball[0], SETTINGS.contracted_radii * ball[1], factor)
         return comparison.refined(_fit_contracted(task, contraction), in_full=True)
 
     refined = parallel_map(fit_with, SETTINGS.factors)
@@ -80,7 +80,7 @@ def with_thick_part_smaller(found: Registration) -> Registration | None:
 def template_ball_radius(model: TrainedModel) -> float | None:
     """Radius of the largest ball inside a model's rest template (units of sqrt(area))."""
     samples = take_samples(model.template.shape, _SAMPLES, np.random.default_rng(0))[1]
-    ball = largest_ball(samples, SETTINGS.balls)
+    ball = largest_ball(samples, SETTINGS.n_balls)
     return None if ball is None else ball[1]
 
 

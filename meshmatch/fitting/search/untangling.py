@@ -30,26 +30,26 @@ class UntanglingSettings:
 
     Attributes
     ----------
-    discontinuous : share of discontinuous pairs of neighbouring samples from which on parts are assumed to touch
-    samples, compared : number of samples for the network, and for comparing its predictions
-    near : samples this close to a limb move with it
-    kept : number of tilted copies and typical degrees of tilt, if one limb stays in place and if two do
-    rounds : maximum number of passes over all limbs
-    taken : maximum number of limbs taken from one group of predictions
+    min_discontinuous : share of discontinuous pairs of neighbouring samples from which on parts are assumed to touch
+    n_samples, n_compared : number of samples for the network, and for comparing its predictions
+    max_distance : samples this close to a limb move with it
+    tilts_by_kept_limbs : number of tilted copies and typical degrees of tilt, if one limb stays in place and if two do
+    max_rounds : maximum number of passes over all limbs
+    max_taken : maximum number of limbs taken from one group of predictions
     cap : maximum distance that counts
-    gain : least reduction of the residual for which a predicted limb is taken
+    min_gain : least reduction of the residual for which a predicted limb is taken
     margin : the result is accepted if its score is below this multiple of the original fit's
     """
 
-    discontinuous: float = 0.005
-    samples: int = 2048
-    compared: int = 512
-    near: float = 0.08
-    kept: tuple[tuple[int, float], ...] = ((5, 20.0), (4, 30.0))
-    rounds: int = 2
-    taken: int = 2
+    min_discontinuous: float = 0.005
+    n_samples: int = 2048
+    n_compared: int = 512
+    max_distance: float = 0.08
+    tilts_by_kept_limbs: tuple[tuple[int, float], ...] = ((5, 20.0), (4, 30.0))
+    max_rounds: int = 2
+    max_taken: int = 2
     cap: float = 0.1
-    gain: float = 0.0002
+    min_gain: float = 0.0002
     margin: float = 0.98
 
 
@@ -66,7 +66,7 @@ def untangled(found: Registration) -> Registration | None:
         return None
     coarse = task.coarse
     local = coarse.to_local(best.pose)
-    touching = discontinuous_share(task.system, neighbours(coarse), local, best.vectors) >= SETTINGS.discontinuous
+    touching = discontinuous_share(task.system, neighbours(coarse), local, best.vectors) >= SETTINGS.min_discontinuous
     if not (touching or uncovered_regions(local, task.system.surface(best.vectors))):
         return None
     predictor = replace(task.predictor, rng=np.random.default_rng(task.config.seed))
@@ -76,7 +76,7 @@ def untangled(found: Registration) -> Registration | None:
     )
     comparison = WholeComparison(task, predictions)
     start = comparison.averaged(predictions[0])
-    predicted = replace(best, vectors=_predict_limbs(predictor, limbs, local.first(SETTINGS.samples), start.vectors))
+    predicted = replace(best, vectors=_predict_limbs(predictor, limbs, local.first(SETTINGS.n_samples), start.vectors))
     fit = with_limb_bent(comparison, predicted, comparison.refined(predicted, in_full=True))
     better = comparison.score(fit, False) < SETTINGS.margin * comparison.score(best, False)
     return replace(found, candidate=fit) if better else None
@@ -87,18 +87,18 @@ def _predict_limbs(
 ) -> Float[Floats, "K 3"]:
     """Node vectors with limbs taken from predictions for samples (core frame) whose other limbs are at rest."""
     system = predictor.system
-    whole = _Composition(system, samples.first(SETTINGS.compared), vectors)
-    for _ in range(SETTINGS.rounds):
+    whole = _Composition(system, samples.first(SETTINGS.n_compared), vectors)
+    for _ in range(SETTINGS.max_rounds):
         before = whole.residual
-        for count in range(len(SETTINGS.kept), 0, -1):
-            tilts, degrees = SETTINGS.kept[count - 1]
+        for count in range(len(SETTINGS.tilts_by_kept_limbs), 0, -1):
+            tilts, degrees = SETTINGS.tilts_by_kept_limbs[count - 1]
             for kept in combinations(limbs.branches, count):
                 resting = _at_rest(
                     system, samples, whole.vectors, [each for each in limbs.branches if each not in kept]
                 )
                 predictions = predictor.predict_tilted(resting, tilts, degrees)
                 whole = _with_best_limbs(whole, predictions, kept)
-        if whole.residual > before - SETTINGS.gain:
+        if whole.residual > before - SETTINGS.min_gain:
             break
     return whole.vectors
 
@@ -109,7 +109,7 @@ def _at_rest(
     """Move the samples of some limbs, as rigid pieces, to where the rest template has these limbs."""
     surface = system.surface(vectors)
     nearest = surface.tree.query(samples.features)[1]
-    close = np.linalg.norm(samples.points - surface.points[nearest], axis=1) < SETTINGS.near
+    close = np.linalg.norm(samples.points - surface.points[nearest], axis=1) < SETTINGS.max_distance
     points, normals = samples.points.copy(), samples.normals.copy()
     for branch in branches:
         base = kabsch(system.verts[branch.holder], surface.points[branch.holder])
@@ -181,10 +181,10 @@ def _with_best_limbs(whole: _Composition, predictions: list[Floats], kept: tuple
             (limb, prediction, to_samples[limb.verts].sum(), whole.distances_from_samples(surface.rows(limb.verts)))
             for limb in limbs
         ]
-    for _ in range(SETTINGS.taken):
+    for _ in range(SETTINGS.max_taken):
         limb, prediction = min(options, key=lambda each: whole.residual_with(each[0], *each[2:]))[:2]
         closer = whole.with_predicted_limb(limb, prediction)
-        if closer.residual > whole.residual - SETTINGS.gain:
+        if closer.residual > whole.residual - SETTINGS.min_gain:
             break
         whole = closer
     return whole

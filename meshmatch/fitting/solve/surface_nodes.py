@@ -31,18 +31,18 @@ class SurfaceNodes:
     Attributes
     ----------
     K, radius : number of nodes, and their support radius
-    along : largest distance along the surface, as a multiple of the radius
-    depth : nodes lie up to this far below the surface, so that vectors across it can rotate it
-    least : minimum number of nodes per vertex; where there are fewer, the radii of the nearest nodes grow
+    max_along : largest distance along the surface, as a multiple of the radius
+    max_depth : nodes lie up to this far below the surface, so that vectors across it can rotate it
+    min_nodes : minimum number of nodes per vertex; where there are fewer, the radii of the nearest nodes grow
     gradient_points : number of points where the deformation gradient is evaluated
     neighbours : number of gradient points, including the point itself, over which the viscous prior averages
     """
 
     K: int
     radius: float
-    along: float = 1.5
-    depth: float = 0.02
-    least: int = 8
+    max_along: float = 1.5
+    max_depth: float = 0.02
+    min_nodes: int = 8
     gradient_points: int = 1500
     neighbours: int = 6
 
@@ -54,9 +54,9 @@ class SurfaceNodes:
         verts = np.asarray(shape.verts)
         at = farthest_points(verts, min(self.K, len(verts)))
         normals = vertex_normals(verts, np.asarray(shape.faces))[at]
-        depth = np.random.default_rng(seed).uniform(0, self.depth, (len(at), 1))
+        depth = np.random.default_rng(seed).uniform(0, self.max_depth, (len(at), 1))
         nodes = verts[at] - depth * normals
-        far = 3 * self.along * self.radius
+        far = 3 * self.max_along * self.radius
         lengths = np.asarray(dijkstra(graph, directed=False, indices=at, limit=far))
         straight = np.linalg.norm(nodes[:, None] - verts, axis=2)
         radii, reached = self._grow_radii(straight, lengths)
@@ -74,17 +74,17 @@ class SurfaceNodes:
         """Radii, and which vertices each node moves, such that each vertex has enough nodes."""
         radii = np.full(len(straight), self.radius)
         near = np.where(np.isfinite(lengths), straight, np.inf)
-        least = min(self.least, len(straight))
+        count = min(self.min_nodes, len(straight))
         for _ in range(30):
-            reached = (straight < radii[:, None]) & (lengths < self.along * radii[:, None])
-            lacking = reached.sum(0) < least
+            reached = (straight < radii[:, None]) & (lengths < self.max_along * radii[:, None])
+            lacking = reached.sum(0) < count
             if not lacking.any():
                 return radii, reached
-            nearest = np.argpartition(near[:, lacking], least - 1, axis=0)[:least]
+            nearest = np.argpartition(near[:, lacking], count - 1, axis=0)[:count]
             radii[np.unique(nearest)] *= 1.15
         # A part with too few nodes: its vertices get the nearest ones, however far away.
         for vertex in np.flatnonzero(lacking).tolist():
-            closest = np.argsort(straight[:, vertex], kind="stable")[:least]
+            closest = np.argsort(straight[:, vertex], kind="stable")[:count]
             radii[closest] = np.maximum(radii[closest], 1.5 * straight[closest, vertex])
             reached[closest, vertex] = True
         return radii, reached
