@@ -135,7 +135,7 @@ def test_what_is_said_to_be_a_part_is_tried_as_a_whole_with_little_effort(
     usual = fitted("no")
     monkeypatch.setattr(fitter, "fit_whole", counted)
     monkeypatch.setattr(fitter, "_may_be_part", lambda whole: part)
-    monkeypatch.setattr(fitter, "_as_part_if_closer", lambda whole: (whole, True))
+    monkeypatch.setattr(fitter, "_as_part_if_better", lambda whole: (whole, True))
     found = fitted("yes")
     assert found.partial == part
     assert tried == ([1] if part else [1, 3])

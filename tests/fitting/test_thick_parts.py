@@ -108,13 +108,13 @@ def test_only_a_better_fit_is_taken(human: TrainedModel, monkeypatch: pytest.Mon
         read.append(contraction.factor)
         return found.candidate
 
-    monkeypatch.setattr(thick_parts, "_read_through", nothing)
+    monkeypatch.setattr(thick_parts, "_fit_contracted", nothing)
     monkeypatch.setattr(thick_parts, "WholeComparison", Unrefined)
     assert with_thick_part_smaller(found) is None and sorted(read) == [0.36, 0.5, 0.65]
 
 
 def test_ordinary_bodies_and_clouds_are_not_asked(human: TrainedModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(thick_parts, "_read_through", lambda *_: pytest.fail("read anew"))
+    monkeypatch.setattr(thick_parts, "_fit_contracted", lambda *_: pytest.fail("read anew"))
     body = human.template.shape
     for shape in (body, Shape(cartoon(human).verts, np.zeros((0, 3), np.int64))):
         task = FitTask.of(human, FitConfig(), shape)

@@ -76,7 +76,7 @@ def test_a_limb_in_a_wrong_place_is_found(human: TrainedModel, monkeypatch: pyte
 def test_a_fit_without_a_sign_of_tangles_is_left(human: TrainedModel, monkeypatch: pytest.MonkeyPatch) -> None:
     still = np.zeros((node_system(human).K, 3))
     found = registered(human, still, still)
-    monkeypatch.setattr(untangling, "_read_anew", lambda *_: pytest.fail("looked for limbs"))
+    monkeypatch.setattr(untangling, "_predict_limbs", lambda *_: pytest.fail("looked for limbs"))
     assert untangled(found) is None
     cloud = replace(found.task, samples=replace(found.task.samples, signed=False))
     assert untangled(replace(found, task=cloud)) is None
