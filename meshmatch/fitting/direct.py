@@ -25,17 +25,17 @@ from meshmatch.fitting.judge.direct import LIKELY, DirectFeatures, judge_direct
 from meshmatch.fitting.judge.reasons import SIDE_IN_DOUBT, Reason, Verdict
 from meshmatch.fitting.one_way import (
     DirectConfig,
-    DirectFit,
     KnownPairs,
     ShapeData,
-    decimate_if_large,
+    ShapeFit,
     distinct,
     fit_fine,
     fit_one_way,
     interpolate,
+    simplify_if_large,
     slide,
 )
-from meshmatch.fitting.search.intrinsic import DecimatedMesh
+from meshmatch.fitting.search.intrinsic import SimplifiedMesh
 from meshmatch.fitting.search.motions import turns_onto_itself
 from meshmatch.fitting.search.proposals import Proposal, changed_share
 from meshmatch.fitting.solve.regularity import Regularity
@@ -71,8 +71,8 @@ _NORMAL_WEIGHT = 0.1  # weight of unit normals against positions when vertices a
 class _BothWays:
     """One correspondence, fitted in both directions: the source to the target, and the target to the source."""
 
-    forward: DirectFit
-    backward: DirectFit
+    forward: ShapeFit
+    backward: ShapeFit
 
     @property
     def proposal(self) -> Proposal:
@@ -230,20 +230,20 @@ def match_where_it_lies(
     at = own.frame.undo(own.fine_mesh.verts)
     places = [Proposal("guess", side.frame.apply(at)) for side in sides]
 
-    def number_of(found: DirectFit) -> int:
+    def number_of(found: ShapeFit) -> int:
         return next(k for k, place in enumerate(places) if place is found.proposal)
 
-    def in_first_target(found: DirectFit) -> DirectFit:
+    def in_first_target(found: ShapeFit) -> ShapeFit:
         """A fit as if the target were the first one."""
         number = number_of(found)
         back = kabsch(targets[number].verts, targets[0].verts)
         points = sides[number].frame.undo(own.fine.system.moved(found.vectors))
         return replace(found, moved=sides[0].frame.apply(back.to_world(points)))
 
-    def fit(place: Proposal, side: ShapeData) -> DirectFit:
+    def fit(place: Proposal, side: ShapeData) -> ShapeFit:
         return in_first_target(fit_fine(own, side, place, place.points))
 
-    def continue_fit(found: DirectFit) -> DirectFit:
+    def continue_fit(found: ShapeFit) -> ShapeFit:
         return in_first_target(slide(own, sides[number_of(found)], found))
 
     _ = own.fine  # compute once, before threads start
@@ -306,11 +306,11 @@ class _Search:
         shapes = [
             Shape(frame.apply(each.verts), each.faces) for frame, each in zip(frames, (source, target), strict=True)
         ]
-        light = parallel_map(decimate_if_large, shapes)
-        thin = parallel_map(DecimatedMesh.of, light, [config.coarse] * 2)
+        base = parallel_map(simplify_if_large, shapes)
+        coarse = parallel_map(SimplifiedMesh.of, base, [config.coarse] * 2)
         known, guess = (pairs and (frames[0].apply(pairs[0]), frames[1].apply(pairs[1])) for pairs in (known, guess))
-        first = ShapeData(source, frames[0], shapes[0], light[0], thin[0], known, config)
-        second = ShapeData(target, frames[1], shapes[1], light[1], thin[1], known and known[::-1], config)
+        first = ShapeData(source, frames[0], shapes[0], base[0], coarse[0], known, config)
+        second = ShapeData(target, frames[1], shapes[1], base[1], coarse[1], known and known[::-1], config)
         return cls(first, second, guess)
 
     @cached_property
@@ -318,26 +318,26 @@ class _Search:
         """Distances that rigid motions leave between the shapes, and between the source and the target's mirror image."""
         return apart(self.source.original, self.target.original, self.source.config.seed)
 
-    def one_way(self, report: Progress, meanwhile: Sequence[Callable[[], object]] = ()) -> list[DirectFit]:
+    def one_way(self, report: Progress, meanwhile: Sequence[Callable[[], object]] = ()) -> list[ShapeFit]:
         """The best fits of the source to the target, best first; see `fit_one_way`."""
         return fit_one_way(self.source, self.target, self.guess, report, meanwhile)
 
-    def both_ways(self, forward_fits: list[DirectFit], report: Progress) -> list[_BothWays]:
+    def both_ways(self, forward: list[ShapeFit], report: Progress) -> list[_BothWays]:
         """The best fits in both directions, best first: those of either direction, each continued in the other one."""
         reverse = _Search(self.target, self.source, self.guess and self.guess[::-1])
-        forward_fits, backward_fits = self._best(forward_fits), self._best(reverse.one_way(report.between(0.0, 0.7)))
+        forward, backward = self._best(forward), self._best(reverse.one_way(report.between(0.0, 0.7)))
         report = report.named("fits both ways")
         report(0.7)
-        returned = parallel_calls((*self._reverse_calls(forward_fits), *reverse._reverse_calls(backward_fits)))
-        ways = zip(forward_fits, returned, strict=False)
-        ways_back = zip(returned[len(forward_fits) :], backward_fits, strict=True)
+        returned = parallel_calls((*self._reverse_calls(forward), *reverse._reverse_calls(backward)))
+        ways = zip(forward, returned, strict=False)
+        ways_back = zip(returned[len(forward) :], backward, strict=True)
         found = [_BothWays(*each) for each in (*ways, *ways_back)]
         report(0.9)
         best = distinct(found, self.source.config.n_slid, _MAX_SAME_DIFFERENCE)
         sides = (self.source, self.target), (self.target, self.source)
         tasks = [
-            partial(slide, *sides[direction], (each.forward, each.backward)[direction])
-            for direction in (0, 1)
+            partial(slide, *sides[backward], (each.forward, each.backward)[backward])
+            for backward in (0, 1)
             for each in best
         ]
         moved = parallel_calls(tasks)
@@ -345,23 +345,23 @@ class _Search:
         further = [_BothWays(*each) for each in zip(moved[: len(best)], moved[len(best) :], strict=True)]
         return sorted([*further, *(each for each in found if each not in best)], key=attrgetter("energy"))
 
-    def _best(self, tried: list[DirectFit]) -> list[DirectFit]:
+    def _best(self, tried: list[ShapeFit]) -> list[ShapeFit]:
         """The best few fits that differ, and that of the guess, whose energy is reported."""
         best = distinct(tried, self.source.config.n_returned, self.source.config.min_difference)
         return best + [each for each in tried if each.proposal.kind == "guess" and each not in best]
 
-    def _reverse_calls(self, tried: Sequence[DirectFit]) -> list[Callable[[], DirectFit]]:
+    def _reverse_calls(self, tried: Sequence[ShapeFit]) -> list[Callable[[], ShapeFit]]:
         """Calls that fit the target to the source, starting from the inverses of given fits of the source to the target."""
         own, other = self.source.fine, self.target.fine
         at = with_normals(other.mesh.verts, vertex_normals(other.mesh.verts, other.system.faces), _NORMAL_WEIGHT)
-        tasks: list[Callable[[], DirectFit]] = []
+        tasks: list[Callable[[], ShapeFit]] = []
         for each in tried:
             moved = with_normals(each.moved, vertex_normals(each.moved, own.system.faces), _NORMAL_WEIGHT)
             goals = interpolate(at, moved, own.mesh.verts)
             tasks.append(partial(fit_fine, self.target, self.source, each.proposal, goals))
         return tasks
 
-    def matched(self, forward_fits: list[DirectFit], report: Progress, began: float) -> DirectMatch:
+    def matched(self, forward_fits: list[ShapeFit], report: Progress, began: float) -> DirectMatch:
         """The best fit as a match. Fits in both directions, if the configuration or doubt asks for it."""
         how, source, target = self.source.config.both_ways, self.source, self.target
         turns = max(turns_onto_itself(each.coarse_mesh, each.known and each.known[0]) for each in (source, target))
@@ -395,7 +395,7 @@ class _Search:
             judged.turns,
         )
 
-    def _over_guess(self, found: Sequence[DirectFit | _BothWays]) -> float:
+    def _over_guess(self, found: Sequence[ShapeFit | _BothWays]) -> float:
         """Energy of the guess minus that of the best fit; 0 if they are the same map."""
         if self.guess is None:
             return np.inf
@@ -413,7 +413,7 @@ class _Judged:
     doubt.
     """
 
-    found: Sequence[DirectFit | _BothWays]
+    found: Sequence[ShapeFit | _BothWays]
     min_difference: float
     calibration: DirectCalibration
     turns: int

@@ -18,7 +18,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fitting.fit_config import NodeRefineConfig, Schedule
 from meshmatch.fitting.judge.direct import DirectFeatures
 from meshmatch.fitting.search.discontinuities import Pairs, neighbours
-from meshmatch.fitting.search.intrinsic import DecimatedMesh, Intrinsic
+from meshmatch.fitting.search.intrinsic import Intrinsic, SimplifiedMesh
 from meshmatch.fitting.search.proposals import (
     Proposal,
     changed_share,
@@ -39,7 +39,7 @@ from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_calls, parallel_map
 
-# A mesh with more triangles than the first number is decimated once to the second, as decimation of large meshes is slow.
+# A mesh with more triangles than the first number is simplified to the second at once, as this is slow.
 _HEAVY, _LIGHT = 60_000, 24_000
 KnownPairs = tuple[Float[Floats, "N 3"], Float[Floats, "N 3"]]
 """Corresponding positions on the source and on the target."""
@@ -116,15 +116,15 @@ class DirectConfig:
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """A decimated shape at one resolution, its least-squares system, and the prior under which its parts may stretch."""
+    """A simplified shape at one resolution, its least-squares system, and the prior under which its parts may stretch."""
 
-    mesh: DecimatedMesh
+    mesh: SimplifiedMesh
     system: NodeSystem
     viscous: ViscousGradient
     known: tuple[LandmarkTerm, ...]
 
     @classmethod
-    def of(cls, mesh: DecimatedMesh, nodes: SurfaceNodes, known: KnownPairs | None, seed: int) -> Level:
+    def of(cls, mesh: SimplifiedMesh, nodes: SurfaceNodes, known: KnownPairs | None, seed: int) -> Level:
         terms: tuple[LandmarkTerm, ...] = ()
         if known is not None:
             nearest = np.asarray(cKDTree(mesh.verts).query(known[0])[1])
@@ -132,7 +132,7 @@ class Level:
         return cls(mesh, *nodes.system(mesh.shape, mesh.graph, seed), terms)
 
     def features(
-        self, onto: DecimatedMesh, samples: OrientedPoints, vectors: Float[Floats, "K 3"], pairs: Pairs | None = None
+        self, onto: SimplifiedMesh, samples: OrientedPoints, vectors: Float[Floats, "K 3"], pairs: Pairs | None = None
     ) -> DirectFeatures:
         """Features of node vectors; the mean distance of known pairs is added to the residual."""
         found = DirectFeatures.of(self.system, samples, vectors, pairs)
@@ -179,17 +179,17 @@ class Level:
 
     def fit_proposal(
         self,
-        onto: DecimatedMesh,
+        onto: SimplifiedMesh,
         samples: OrientedPoints,
         proposal: Proposal,
         vectors: Float[Floats, "K 3"],
         how: NodeRefineConfig,
         pairs: Pairs | None = None,
-    ) -> DirectFit:
+    ) -> ShapeFit:
         """Refine a proposal from the given node vectors and evaluate the fit."""
         vectors = self.refined(samples, vectors, how)
         features = self.features(onto, samples, vectors, pairs)
-        return DirectFit(proposal, vectors, self.system.moved(vectors), features)
+        return ShapeFit(proposal, vectors, self.system.moved(vectors), features)
 
 
 _GOAL_SCHEDULE = Schedule(steps=6, prior=(3e-2, 1e-3), scale=(1.0, 0.3), damping=1e-6)
@@ -197,7 +197,7 @@ _REACHING_SCHEDULE = Schedule(steps=8, prior=(3e-2, 3e-3), damping=1e-6)
 
 
 @dataclass(frozen=True, eq=False)
-class DirectFit:
+class ShapeFit:
     """A fitted proposal: node vectors, deformed vertices and features; ``slid`` after the fit along the surface."""
 
     proposal: Proposal
@@ -215,7 +215,7 @@ class DirectFit:
 class ShapeData:
     """One of two shapes, with what is needed to fit it to the other one and the other one to it.
 
-    ``frame`` is that of its file; everything else is in units of sqrt(area). ``base_mesh`` is the shape, decimated if it is
+    ``frame`` is that of its file; everything else is in units of sqrt(area). ``base_mesh`` is the shape, simplified if it is
     large, from which coarse and fine meshes are made; ``known`` are corresponding positions (N, 3) on this shape and on the
     other one.
     """
@@ -224,7 +224,7 @@ class ShapeData:
     frame: Frame
     shape: Shape
     base_mesh: Shape
-    coarse_mesh: DecimatedMesh
+    coarse_mesh: SimplifiedMesh
     known: KnownPairs | None
     config: DirectConfig
 
@@ -234,8 +234,8 @@ class ShapeData:
         return Level.of(self.coarse_mesh, self.config.coarse_nodes, self.known, self.config.seed)
 
     @cached_property
-    def fine_mesh(self) -> DecimatedMesh:
-        return DecimatedMesh.of(self.base_mesh, self.config.fine)
+    def fine_mesh(self) -> SimplifiedMesh:
+        return SimplifiedMesh.of(self.base_mesh, self.config.fine)
 
     @cached_property
     def fine(self) -> Level:
@@ -256,14 +256,14 @@ class ShapeData:
         return neighbours(self.samples)
 
 
-def decimate_if_large(shape: Shape) -> Shape:
-    """The shape, decimated once if it is large."""
-    return DecimatedMesh.of(shape, _LIGHT).shape if shape.F > _HEAVY else shape
+def simplify_if_large(shape: Shape) -> Shape:
+    """The shape, simplified once if it is large."""
+    return SimplifiedMesh.of(shape, _LIGHT).shape if shape.F > _HEAVY else shape
 
 
 def fit_all_fine(
     own: ShapeData, onto: ShapeData, proposals: Sequence[tuple[Proposal, Float[Floats, "V 3"]]], report: Progress
-) -> list[DirectFit]:
+) -> list[ShapeFit]:
     """Fine fits of one shape to another, from proposals with the positions (V, 3) where its vertices may belong."""
     report(0.0)
     _ = own.fine, onto.neighbours, onto.fine_mesh.relief, onto.fine_mesh.tree  # compute once, before threads start
@@ -272,12 +272,12 @@ def fit_all_fine(
     return found
 
 
-def fit_fine(own: ShapeData, onto: ShapeData, proposal: Proposal, goals: Float[Floats, "V 3"]) -> DirectFit:
+def fit_fine(own: ShapeData, onto: ShapeData, proposal: Proposal, goals: Float[Floats, "V 3"]) -> ShapeFit:
     """One fine fit."""
     return _fit_on_fine_mesh(own, onto, proposal, own.fine.system.vectors_to(goals), own.config.third)
 
 
-def slide_all(own: ShapeData, onto: ShapeData, tried: Sequence[DirectFit], report: Progress) -> list[DirectFit]:
+def slide_all(own: ShapeData, onto: ShapeData, tried: Sequence[ShapeFit], report: Progress) -> list[ShapeFit]:
     """Continue fine fits along the surface, unless that was done.
 
     A fit is kept as it was if its energy does not decrease.
@@ -288,7 +288,7 @@ def slide_all(own: ShapeData, onto: ShapeData, tried: Sequence[DirectFit], repor
     return found
 
 
-def slide(own: ShapeData, onto: ShapeData, tried: DirectFit) -> DirectFit:
+def slide(own: ShapeData, onto: ShapeData, tried: ShapeFit) -> ShapeFit:
     """Continue one fine fit along the surface."""
     if tried.slid:
         return tried
@@ -298,7 +298,7 @@ def slide(own: ShapeData, onto: ShapeData, tried: DirectFit) -> DirectFit:
 
 def _fit_on_fine_mesh(
     own: ShapeData, onto: ShapeData, proposal: Proposal, vectors: Float[Floats, "K 3"], how: NodeRefineConfig
-) -> DirectFit:
+) -> ShapeFit:
     return own.fine.fit_proposal(onto.fine_mesh, onto.samples, proposal, vectors, how, onto.neighbours)
 
 
@@ -308,7 +308,7 @@ def fit_one_way(
     guess: KnownPairs | None,
     report: Progress,
     meanwhile: Sequence[Callable[[], object]] = (),
-) -> list[DirectFit]:
+) -> list[ShapeFit]:
     """The best fits of one shape to another, best first.
 
     ``guess`` is one more proposal. The calls in ``meanwhile`` run where a thread would otherwise wait.
@@ -339,7 +339,7 @@ def _fit_all_proposals(
     guesses: list[Proposal],
     report: Progress,
     meanwhile: Sequence[Callable[[], object]],
-) -> list[DirectFit]:
+) -> list[ShapeFit]:
     """Proposals of all kinds, fitted on the coarse mesh for a few steps.
 
     Distances along the surface are slow and hold Python's lock. The rigid proposals with their fits, whatever later fits
@@ -348,7 +348,7 @@ def _fit_all_proposals(
     level, samples = own.coarse, onto.samples.first(own.config.first_samples)
     _ = onto.coarse_mesh.relief, onto.coarse_mesh.tree, own.coarse_mesh.normals  # compute once, before threads start
 
-    def fit(proposal: Proposal) -> DirectFit:
+    def fit(proposal: Proposal) -> ShapeFit:
         return level.fit_proposal(
             onto.coarse_mesh, samples, proposal, level.initial_vectors(proposal), own.config.first
         )
@@ -357,7 +357,7 @@ def _fit_all_proposals(
         pair = own.intrinsic, onto.intrinsic
         return [*extremity_proposals(*pair), *spectral_proposals(*pair)]
 
-    def rigid_fits() -> list[DirectFit]:
+    def rigid_fits() -> list[ShapeFit]:
         return [fit(each) for each in rigid_proposals(own.coarse_mesh, onto.coarse_mesh)]
 
     def next_level() -> None:
@@ -371,12 +371,12 @@ def _fit_all_proposals(
     return found
 
 
-def _refit_better(own: ShapeData, onto: ShapeData, first_fits: list[DirectFit], report: Progress) -> list[DirectFit]:
+def _refit_better(own: ShapeData, onto: ShapeData, first_fits: list[ShapeFit], report: Progress) -> list[ShapeFit]:
     """The better proposals, fitted on the coarse mesh for more steps; the best of these that differ from each other."""
     config, samples = own.config, onto.samples.first(own.config.second_samples)
     pairs = neighbours(samples)
 
-    def refit(each: DirectFit) -> DirectFit:
+    def refit(each: ShapeFit) -> ShapeFit:
         return own.coarse.fit_proposal(onto.coarse_mesh, samples, each.proposal, each.vectors, config.second, pairs)
 
     report(0.0)

@@ -13,7 +13,7 @@ from meshmatch.fitting.direct import match_directly, match_either_side
 from meshmatch.fitting.fit import axis_name
 from meshmatch.fitting.judge.direct import DirectFeatures, judge_direct
 from meshmatch.fitting.one_way import DirectConfig, ShapeData, fit_all_fine, slide_all
-from meshmatch.fitting.search.intrinsic import DecimatedMesh, Intrinsic, shortest_tour
+from meshmatch.fitting.search.intrinsic import Intrinsic, SimplifiedMesh, shortest_tour
 from meshmatch.fitting.search.motions import turns_onto_itself
 from meshmatch.fitting.search.proposals import (
     Assignments,
@@ -67,7 +67,7 @@ def bent(shape: Shape, turn: Rotation, size: float = 1.0) -> Shape:
 
 def thinned(shape: Shape, faces: int) -> Any:
     """Which vertices of a shape are those of its thinned mesh."""
-    return cKDTree(shape.verts).query(DecimatedMesh.of(shape, faces).verts)[1]
+    return cKDTree(shape.verts).query(SimplifiedMesh.of(shape, faces).verts)[1]
 
 
 @pytest.fixture(scope="module")
@@ -77,11 +77,11 @@ def pair() -> tuple[Shape, Shape]:
 
 
 @pytest.fixture(scope="module")
-def thin() -> DecimatedMesh:
-    return DecimatedMesh.of(creature(), 900)
+def thin() -> SimplifiedMesh:
+    return SimplifiedMesh.of(creature(), 900)
 
 
-def test_extremities_are_the_ends_of_limbs_and_limbs_run_from_zero_to_one(thin: DecimatedMesh) -> None:
+def test_extremities_are_the_ends_of_limbs_and_limbs_run_from_zero_to_one(thin: SimplifiedMesh) -> None:
     surface = Intrinsic(thin)
     ends = thin.verts[surface.extremities]
     tips = np.array([np.array(way) / np.linalg.norm(way) for way, *_ in LIMBS])
@@ -98,7 +98,7 @@ def test_distances_bridge_separate_parts() -> None:
     ball = trimesh.creation.icosphere(subdivisions=2)
     verts = np.concatenate([ball.vertices, ball.vertices + np.array([3, 0, 0]), ball.vertices + np.array([6, 0, 0])])
     faces = np.concatenate([ball.faces + k * len(ball.vertices) for k in range(3)])
-    surface = Intrinsic(DecimatedMesh.of(Shape(verts, faces), 10_000))
+    surface = Intrinsic(SimplifiedMesh.of(Shape(verts, faces), 10_000))
     distances = surface.distances_from(np.arange(len(surface.mesh.verts)))
     assert np.isfinite(distances).all() and np.allclose(distances, distances.T)
     assert np.allclose(distances @ surface.mesh.areas, surface.eccentricity, atol=0.02)
@@ -106,7 +106,7 @@ def test_distances_bridge_separate_parts() -> None:
 
 @pytest.mark.parametrize("make", [extremity_proposals, spectral_proposals])
 def test_a_map_of_the_surface_is_among_the_proposals(make: Any, pair: tuple[Shape, Shape]) -> None:
-    meshes = [DecimatedMesh.of(frame_applied(shape), 900) for shape in pair]
+    meshes = [SimplifiedMesh.of(frame_applied(shape), 900) for shape in pair]
     found = make(*(Intrinsic(mesh) for mesh in meshes))
     true = frame_applied(pair[1]).verts[thinned(frame_applied(pair[0]), 900)]
     every = np.arange(len(true))
@@ -116,14 +116,14 @@ def test_a_map_of_the_surface_is_among_the_proposals(make: Any, pair: tuple[Shap
     assert min(errors) < 0.08
 
 
-def test_the_right_assignment_costs_least_and_a_mirror_image_costs_more(thin: DecimatedMesh) -> None:
+def test_the_right_assignment_costs_least_and_a_mirror_image_costs_more(thin: SimplifiedMesh) -> None:
     surface = Intrinsic(thin)
     right = tuple(range(len(LIMBS)))
     same = Assignments(surface, surface)
     for way in same.candidates():  # each way to compare
         assert way[0] == right
     assert min(same.candidates()[0], key=same.cost) == right and same.cost(right) < same.cost((0, 2, 1, 4, 3))
-    mirrored = DecimatedMesh(thin.verts * [-1, 1, 1], thin.faces[:, ::-1])  # as far apart, but turned over
+    mirrored = SimplifiedMesh(thin.verts * [-1, 1, 1], thin.faces[:, ::-1])  # as far apart, but turned over
     assert Assignments(surface, Intrinsic(mirrored)).cost(right) > same.cost(right) + 0.02
 
 
@@ -137,7 +137,7 @@ def test_arms_of_other_lengths_are_found_by_their_order() -> None:
         radius = np.full(len(way), 0.5)
         for angle, length in zip(angles, lengths, strict=True):
             radius += length * np.exp(-(1 - way @ [np.cos(angle), np.sin(angle), 0]) / 0.03)
-        return Intrinsic(DecimatedMesh.of(frame_applied(Shape(way * radius[:, None], np.asarray(ball.faces))), 1200))
+        return Intrinsic(SimplifiedMesh.of(frame_applied(Shape(way * radius[:, None], np.asarray(ball.faces))), 1200))
 
     def arms(surface: Intrinsic) -> np.ndarray:
         ends = surface.mesh.verts[surface.extremities]
@@ -167,24 +167,24 @@ def test_a_tour_is_the_shortest() -> None:
         )
 
 
-def test_a_turned_copy_is_found_by_a_rigid_motion(thin: DecimatedMesh) -> None:
+def test_a_turned_copy_is_found_by_a_rigid_motion(thin: SimplifiedMesh) -> None:
     turn = Rotation.from_euler("xyz", (100, 20, 200), degrees=True)
-    copy = DecimatedMesh(turn.apply(thin.verts), thin.faces)
+    copy = SimplifiedMesh(turn.apply(thin.verts), thin.faces)
     best = rigid_proposals(thin, copy)[0]
     assert best.kind == "rigid" and np.abs(best.points - copy.verts).max() < 0.02
 
 
-def around(radius: Any) -> DecimatedMesh:
+def around(radius: Any) -> SimplifiedMesh:
     """A turned piece whose radius may change with the height and the angle."""
     piece = trimesh.creation.cylinder(0.5, 1.0, sections=64).subdivide_to_size(0.08)
     x, y, z = np.asarray(piece.vertices).T
     wide = radius(z, np.arctan2(y, x))
-    return DecimatedMesh.of(
+    return SimplifiedMesh.of(
         frame_applied(Shape(np.column_stack([x * wide, y * wide, z]), np.asarray(piece.faces))), 1800
     )
 
 
-def test_turns_that_bring_a_shape_onto_itself_are_counted(thin: DecimatedMesh) -> None:
+def test_turns_that_bring_a_shape_onto_itself_are_counted(thin: SimplifiedMesh) -> None:
     assert turns_onto_itself(thin) == 1
     assert turns_onto_itself(around(lambda z, _: 1 + 0.5 * z)) > 12  # a cup without a handle
     assert turns_onto_itself(around(lambda z, angle: (1 + 0.5 * z) * (1 + 0.3 * np.cos(3 * angle)))) == 3
@@ -198,12 +198,12 @@ def test_turns_that_move_known_positions_do_not_count() -> None:
     assert [turns_onto_itself(prism, held) for held in (None, top[None], side[None])] == [2, 2, 1]
 
 
-def test_nodes_move_one_side_of_a_thin_sheet(thin: DecimatedMesh) -> None:
+def test_nodes_move_one_side_of_a_thin_sheet(thin: SimplifiedMesh) -> None:
     sheet = trimesh.creation.box((1, 1, 0.01)).subdivide_loop(0)
     for _ in range(4):
         sheet = sheet.subdivide()
     shape = Shape(np.asarray(sheet.vertices), np.asarray(sheet.faces))
-    mesh = DecimatedMesh.of(shape, 10_000)
+    mesh = SimplifiedMesh.of(shape, 10_000)
     system, prior = SurfaceNodes(K=150, radius=0.13, min_nodes=4).system(mesh.shape, mesh.graph)
     assert np.allclose(np.asarray(system.phi.sum(1)), 1)
     turn = Rotation.from_rotvec([0.2, 0.1, 0.3])
@@ -221,20 +221,20 @@ def test_relief_is_alike_where_a_bump_lies_on_a_bump() -> None:
     ball = trimesh.creation.icosphere(subdivisions=4)
     verts = np.asarray(ball.vertices) * 0.3
     nose = np.exp(-np.square(np.linalg.norm(verts - [0.3, 0, 0], axis=1) / 0.06))
-    with_nose = DecimatedMesh.of(Shape(verts * (1 + 0.2 * nose[:, None]), np.asarray(ball.faces)), 10_000)
+    with_nose = SimplifiedMesh.of(Shape(verts * (1 + 0.2 * nose[:, None]), np.asarray(ball.faces)), 10_000)
     likeness = {}
     for degrees in (0, 90):
         turn = Rotation.from_euler("z", degrees, degrees=True)
         moved = OrientedPoints(turn.apply(with_nose.verts), turn.apply(with_nose.normals))
         likeness[degrees] = with_nose.likeness(with_nose, moved)
     assert likeness[0] == pytest.approx(1) and likeness[90] < 0.6
-    inside_out = DecimatedMesh(with_nose.verts, with_nose.faces[:, ::-1])
+    inside_out = SimplifiedMesh(with_nose.verts, with_nose.faces[:, ::-1])
     assert with_nose.likeness(inside_out, OrientedPoints(with_nose.verts, -with_nose.normals)) == pytest.approx(1)
     assert np.allclose(with_nose.areas @ with_nose.relief, 0)
     flat = trimesh.creation.box((1, 1, 0)).subdivide().subdivide().subdivide()
     tilted = Rotation.from_rotvec([0.3, 0.2, 0.1]).apply(np.asarray(flat.vertices))
     upper = np.asarray(flat.faces)[np.asarray(flat.face_normals)[:, 2] > 0]
-    assert np.ptp(DecimatedMesh.of(Shape(tilted, upper), 10_000).relief) == 0
+    assert np.ptp(SimplifiedMesh.of(Shape(tilted, upper), 10_000).relief) == 0
 
 
 def test_energy_prefers_what_is_near_unstretched_and_whole() -> None:
@@ -337,7 +337,7 @@ def test_known_pairs_settle_what_symmetry_leaves_open() -> None:
     assert min(found.leads, default=np.inf) > 0.01 and not any(reason.code == "ambiguous" for reason in found.reasons)
 
 
-def test_goals_are_reached_by_vectors(thin: DecimatedMesh) -> None:
+def test_goals_are_reached_by_vectors(thin: SimplifiedMesh) -> None:
     from meshmatch.fitting.fit_config import Schedule
     from meshmatch.fitting.solve.driver import Problem
     from meshmatch.fitting.solve.priors import RotatedReference
@@ -385,7 +385,7 @@ def test_a_limb_glides_along_itself_until_its_end_is_at_the_end() -> None:
 
     def errors() -> list[float]:
         config = replace(QUICK, fine=2400, samples=4000)
-        frame, thin = sqrt_area_frame(shape), DecimatedMesh.of(shape, config.coarse)
+        frame, thin = sqrt_area_frame(shape), SimplifiedMesh.of(shape, config.coarse)
         side = ShapeData(shape, frame, shape, shape, thin, None, config)
         verts = side.fine_mesh.verts
         along = np.clip((verts[:, 0] - 0.1) / np.ptp(shape.verts[:, 0]), 0, 1)
@@ -409,7 +409,7 @@ def test_a_palm_on_the_back_of_a_hand_asks_for_the_mirror_image(
 ) -> None:
     source = curled()
     monkeypatch.setattr("meshmatch.fitting.direct.apart", lambda *_: (apart * np.exp(nearer), apart))
-    monkeypatch.setattr(DecimatedMesh, "likeness", lambda *_: alike)
+    monkeypatch.setattr(SimplifiedMesh, "likeness", lambda *_: alike)
     found = match_either_side(source, mirrored(source), replace(QUICK, n_second=4, n_third=2, both_ways="no"))
     assert found.target.frame.mirrored is asked
     doubt = any(reason.code == "side" for reason in found.reasons)

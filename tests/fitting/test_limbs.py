@@ -76,7 +76,7 @@ def test_limbs_hang_on_a_template_by_its_labels(human: TrainedModel) -> None:
     ends_of = {" ".join(sorted(names_of(human, end.verts))): end for end in ends}
     assert {"left foot", "left foot left shin", "head neck", "left hand"} <= set(ends_of)
     ways = [
-        [" ".join(sorted(names_of(human, limb.verts))) for limb in bend.joints]
+        [" ".join(sorted(names_of(human, limb.verts))) for limb in bend.turned_joints]
         for bend in limbs.bends
         if bend.end is ends_of["left foot"]
     ]
@@ -99,7 +99,9 @@ def test_a_bent_limb_is_as_long_as_before_and_the_rest_stays(human: TrainedModel
     limbs, system = limbs_of(human), node_system(human)
     still = np.zeros((system.K, 3))
     bend = next(
-        each for each in limbs.bends if names_of(human, each.end.verts) == {"left hand"} and len(each.joints) == 2
+        each
+        for each in limbs.bends
+        if names_of(human, each.end.verts) == {"left hand"} and len(each.turned_joints) == 2
     )
     hand = system.verts[bend.end.verts].mean(0)
     place = hand + np.array([-0.2, 0.15, 0.2])

@@ -30,7 +30,7 @@ def raised(human: TrainedModel, place: np.ndarray) -> np.ndarray:
     hand = next(
         each
         for each in limbs.bends
-        if len(each.joints) == 3 and (labels[each.end.verts] == names.index("left hand")).all()
+        if len(each.turned_joints) == 3 and (labels[each.end.verts] == names.index("left hand")).all()
     )
     vectors, missed = limbs.bent(np.zeros((node_system(human).K, 3)), hand, place)
     assert missed < 0.05

@@ -1,4 +1,4 @@
-"""A decimated shape and its intrinsic properties, which do not change when it bends, for the search without a model.
+"""A simplified shape and its intrinsic properties, which do not change when it bends, for the search without a model.
 
 These are distances along the surface, Laplacian eigenfunctions, and extremities: the ends of limbs, fins, legs and handles.
 """
@@ -42,15 +42,15 @@ _RING_SHARES, _RING_HALF_WIDTH = (
 
 
 @dataclass(frozen=True, eq=False)
-class DecimatedMesh:
+class SimplifiedMesh:
     """A shape reduced to about the given number of triangles, on some of its own vertices; in the shape's frame."""
 
     verts: Float[Floats, "V 3"]
     faces: Int[Ints, "F 3"]
 
     @classmethod
-    def of(cls, shape: Shape, faces: int) -> DecimatedMesh:
-        """Decimate a shape. Raises `InputError` for a cloud whose points do not lie on a surface."""
+    def of(cls, shape: Shape, faces: int) -> SimplifiedMesh:
+        """Simplify a shape. Raises `InputError` for a cloud whose points do not lie on a surface."""
         kept, corners = low_mesh(shape, faces)
         used, renumbered = np.unique(corners, return_inverse=True)
         if len(used) > faces:  # twice as many as on a closed surface: too fragmented, so treat it as a cloud
@@ -98,7 +98,7 @@ class DecimatedMesh:
             ranks.append((np.cumsum(share) - share / 2 - 0.5)[level])
         return np.stack(ranks, 1)
 
-    def likeness(self, other: DecimatedMesh, moved: OrientedPoints) -> float:
+    def likeness(self, other: SimplifiedMesh, moved: OrientedPoints) -> float:
         """Correlation (0..1) of the relief with that of another mesh.
 
         ``moved`` are this mesh's vertices, deformed onto the other mesh; each is compared with the nearest vertex there.
@@ -145,13 +145,13 @@ def _bridges(verts: Float[Floats, "V 3"], part: Int[Ints, " V"]) -> Int[Ints, "N
 
 @dataclass(frozen=True, eq=False)
 class Intrinsic:
-    """Intrinsic properties of a shape, on a decimated mesh.
+    """Intrinsic properties of a shape, on a simplified mesh.
 
     Distances are along edges, relative to the ``diameter``: the largest distance from any of the `landmarks`. Distances
     between all vertices would take long, and would hold Python's lock meanwhile.
     """
 
-    mesh: DecimatedMesh
+    mesh: SimplifiedMesh
 
     @cached_property
     def landmarks(self) -> Int[Ints, " L"]:

@@ -1,4 +1,4 @@
-"""Rigid and affine motions between two decimated meshes, and rotational symmetries of one."""
+"""Rigid and affine motions between two simplified meshes, and rotational symmetries of one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.fitting.search.intrinsic import DecimatedMesh
+from meshmatch.fitting.search.intrinsic import SimplifiedMesh
 from meshmatch.geometry.closest_points import ClosestPoints
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints, feature_tree, with_normals
@@ -28,7 +28,7 @@ _NEAR = 2.0
 _MIN_ANGLE = 10.0  # degrees between two rotations that count as different
 
 
-def principal_axes(mesh: DecimatedMesh) -> Float[Floats, "3 3"]:
+def principal_axes(mesh: SimplifiedMesh) -> Float[Floats, "3 3"]:
     """Principal axes of the surface, one in each column, right-handed."""
     axes = np.linalg.eigh(np.cov(mesh.verts.T, aweights=mesh.areas))[1]
     axes[:, 0] *= np.sign(np.linalg.det(axes))
@@ -36,12 +36,12 @@ def principal_axes(mesh: DecimatedMesh) -> Float[Floats, "3 3"]:
 
 
 class Motions:
-    """Rigid and affine motions of one decimated mesh onto another, about the centroid of each.
+    """Rigid and affine motions of one simplified mesh onto another, about the centroid of each.
 
     Found by iterative closest points in both directions, with robust weights.
     """
 
-    def __init__(self, source: DecimatedMesh, target: DecimatedMesh) -> None:
+    def __init__(self, source: SimplifiedMesh, target: SimplifiedMesh) -> None:
         self.middles = source.areas @ source.verts, target.areas @ target.verts
         self._own = OrientedPoints(source.verts - self.middles[0], source.normals)
         self._onto = OrientedPoints(target.verts - self.middles[1], target.normals)
@@ -97,7 +97,7 @@ def _affine(source: Floats, goal: Floats, weights: Floats, near: Floats) -> tupl
     return found[:3].T, found[3]
 
 
-def turns_onto_itself(mesh: DecimatedMesh, held: Float[Floats, "N 3"] | None = None) -> int:
+def turns_onto_itself(mesh: SimplifiedMesh, held: Float[Floats, "N 3"] | None = None) -> int:
     """Number of rotations that map a shape onto itself, including the identity: 2 for pliers, many for a bearing.
 
     Only rotations about principal axes are tried. If positions are ``held``, only rotations that leave them in place count.

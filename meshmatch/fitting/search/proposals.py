@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.fitting.search.intrinsic import DecimatedMesh, Intrinsic
+from meshmatch.fitting.search.intrinsic import Intrinsic, SimplifiedMesh
 from meshmatch.fitting.search.motions import Motions, principal_axes
 from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.geometry.triangles import triangle_vectors
@@ -26,7 +26,7 @@ Kind = Literal["rigid", "affine", "spectral", "extremities", "guess"]
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """Where vertices of the source's decimated mesh (V,) may belong.
+    """Where vertices of the source's simplified mesh (V,) may belong.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class ProposalSettings:
 SETTINGS = ProposalSettings()
 
 
-def rigid_proposals(source: DecimatedMesh, target: DecimatedMesh) -> list[Proposal]:
+def rigid_proposals(source: SimplifiedMesh, target: SimplifiedMesh) -> list[Proposal]:
     """The best rigid motions by iterative closest points from 48 starts, each with an affine motion."""
     motions = Motions(source, target)
     middle = motions.middles[1]

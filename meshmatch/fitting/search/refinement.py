@@ -212,7 +212,7 @@ def with_limb_bent(comparison: WholeComparison, chosen: Candidate, fit: Candidat
     regions = uncovered_regions(local, task.system.surface(fit.vectors))
     if len(regions) != 1:
         return fit
-    reaching = limbs.reaching(local, comparison.averaged(chosen).vectors, regions[0])
+    reaching = limbs.reaching(local, comparison.average_similar(chosen).vectors, regions[0])
     if reaching is None:
         return fit
     bent = comparison.refined(replace(chosen, vectors=reaching), in_full=True)
@@ -262,7 +262,7 @@ class WholeComparison:
         """Return a candidate after refinement."""
         task = self.task
         if in_full:
-            candidate = self.averaged(candidate)
+            candidate = self.average_similar(candidate)
         fixed = None
         if self._landmarks is not None:
             fixed = self._landmarks[0], candidate.pose.to_local(self._landmarks[1])
@@ -271,7 +271,7 @@ class WholeComparison:
         vectors = refine_nodes(task.system, facing, candidate.vectors, self.schedule(in_full), fixed)
         return replace(candidate, vectors=vectors, residual=two_way_residual(task.system, local, vectors))
 
-    def averaged(self, candidate: Candidate) -> Candidate:
+    def average_similar(self, candidate: Candidate) -> Candidate:
         """Return a candidate with the mean node vectors of those that agree with it, see `average_similar`."""
         return average_similar(self.task.system, candidate, self._candidates)
 

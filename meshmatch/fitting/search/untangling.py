@@ -75,7 +75,7 @@ def untangled(found: Registration) -> Registration | None:
         predictor.variants(local_samples, local, best.pose, task.config.variants, task.config.tilt)
     )
     comparison = WholeComparison(task, predictions)
-    start = comparison.averaged(predictions[0])
+    start = comparison.average_similar(predictions[0])
     predicted = replace(best, vectors=_predict_limbs(predictor, limbs, local.first(SETTINGS.n_samples), start.vectors))
     fit = with_limb_bent(comparison, predicted, comparison.refined(predicted, in_full=True))
     better = comparison.score(fit, False) < SETTINGS.margin * comparison.score(best, False)

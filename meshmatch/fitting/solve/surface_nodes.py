@@ -47,9 +47,9 @@ class SurfaceNodes:
     neighbours: int = 6
 
     def system(self, shape: Shape, graph: csr_matrix, seed: int = 0) -> tuple[NodeSystem, ViscousGradient]:
-        """The least-squares system of a decimated mesh in the template frame, and its viscous prior along the surface.
+        """The least-squares system of a simplified mesh in the template frame, and its viscous prior along the surface.
 
-        ``graph`` has the lengths of its edges, see `DecimatedMesh`.
+        ``graph`` has the lengths of its edges, see `SimplifiedMesh`.
         """
         verts = np.asarray(shape.verts)
         at = farthest_points(verts, min(self.K, len(verts)))
