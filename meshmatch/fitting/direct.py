@@ -97,7 +97,7 @@ class DirectMatch:
     tried : kind of proposal and energy of each fit that was compared in the end, best first
     system : deforms the template by node vectors; if the source is the template, one system serves all of its targets
     leads : energies of the fits that differ from the best one, minus its energy
-    over_guess : the same for the guess, if there was one; 0 if it is the same map
+    over_guess : energy of the guess minus that of the best fit; 0 if they are the same map, infinite without a guess
     earlier : computes the match that the first direction alone would have given, if both directions were used
     turns : number of rotations that map one of the shapes onto itself, and thus of equally good maps
     apart : distances (units of sqrt(area)) that rigid motions leave between the shapes, and between the source and the

@@ -5,7 +5,7 @@ import pytest
 
 from meshmatch.fitting.solve import banded
 from meshmatch.fitting.solve.banded import Envelope, solved_band
-from meshmatch.fitting.solve.system import NodeSystem, _EveryPair, node_system
+from meshmatch.fitting.solve.system import NodeSystem, _DensePairs, node_system
 from meshmatch.geometry.kernels import KERNELS
 from meshmatch.models.trained import TrainedModel
 from tests.fitting.eggs import egg_model, gentle_vectors
@@ -88,7 +88,7 @@ def test_products_too_many_to_be_kept_are_formed_anew(
     for most, formed in ((kept, False), (kept - 1, True)):
         monkeypatch.setattr("meshmatch.fitting.solve.system._MAX_PRODUCTS", most)
         other = NodeSystem(shape, model.field(shape.verts), gradient_points=40)
-        assert isinstance(other.equations.pairs, _EveryPair) == formed
+        assert isinstance(other.equations.pairs, _DensePairs) == formed
         assert np.allclose(problem.solve(other), problem.solve(system), atol=1e-8)
 
 

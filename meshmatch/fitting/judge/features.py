@@ -209,7 +209,7 @@ def uncut_share(
     """Share (0..1) by length of the border of the shown template that is far from all open ``edges`` of the shape.
 
     ``edges`` are midpoints in the core frame. Where the border is far from them, the template continues although nothing
-    was cut off. Small hidden pieces are ignored.
+    was cut off. Small hidden pieces are ignored. The share is 0 if the shape has no open edges.
     """
     shown, faces = visible_vertices(system, local, vectors), system.faces
     sides = edges_of(faces).vertices

@@ -168,7 +168,7 @@ def principal_pose(points: Float[Floats, "P 3"]) -> RigidPose:
 
 
 def random_rotations(count: int, seed: int) -> Float[Floats, "count 3 3"]:
-    """Well-spread random rotations, the first of which is the identity."""
+    """Uniformly random rotations, the first of which is replaced by the identity."""
     rotations = Rotation.random(count, random_state=np.random.default_rng(seed)).as_matrix()
     rotations[0] = np.eye(3)
     return rotations
