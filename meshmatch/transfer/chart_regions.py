@@ -1,9 +1,9 @@
-"""Which triangles of a surface become one chart: compact regions that lie flat, found on a coarse copy.
+"""Segmentation of a surface into charts: compact regions that can be flattened with little stretch.
 
-On the copy, cells that face about one way are joined as long as they lie flat together and fill a rectangle well; each
-triangle of the surface then goes with the region of the coarse triangle beside it. What lies flat there only with too much
-stretch is halved. At last small charts are joined along hinges. Nothing is tried without end: what is left when the effort
-is spent becomes charts of single polygons.
+Regions are found on a decimated copy. Cells grow there from farthest-point seeds, and neighboring cells are merged as long
+as they flatten together and fill their convex hull. Each triangle of the surface then takes the region of the nearest coarse
+triangle, and regions that stretch too much are bisected. Small charts are finally merged along hinges. All attempts share a
+work budget; once it is spent, what is left becomes charts of single polygons.
 """
 
 from __future__ import annotations
@@ -20,110 +20,113 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import triangle_areas, triangle_vectors, unit
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.flat_layout import Layout, across, laid_flat
-from meshmatch.transfer.hinged_charts import Hinging
-from meshmatch.transfer.pack_charts import Chart, hull
-from meshmatch.transfer.whole_polygons import unfolded_polygon
+from meshmatch.transfer.flat_layout import Layout, adjacent_faces, flatten_faces
+from meshmatch.transfer.hinged_charts import HingeMerger
+from meshmatch.transfer.pack_charts import Chart, hull_area
+from meshmatch.transfer.whole_polygons import unfold_polygon
 
-# All of these were set by hand; areas are shares of the whole.
-_COARSE = 2_000  # triangles of the copy
-_MOST_STEPS = 100  # of smoothing borders of the surface; beyond, a copy between the two takes them
-_CELLS = 80
-_BEND = 4.0  # how much further it is to a triangle that faces another way
-_CENTERED = 4  # rounds in which cells are grown from their middles
-_NOTCH, _FILLED_IN = 0.7, 3  # of the angle around a vertex; rounds
-_SOFT = 3  # steps of smoothing borders of the copy
-_STRETCH, _MORE = 1.5, 1.6  # mean stretch or shrinking of a region at most: of the copy and of the surface
-_FILLED = 0.78  # of the convex hull of a region, at least
-_ROUGH = 0.004  # smaller regions may have any form
-_FEW = 2_500  # triangles of the surface, in which crumbs are joined again at last
-_CRUMB = 0.004  # smaller ones join whatever they can
-_LARGEST = 0.2
-_SPOILED = 0.01  # of the area of a region, at most, that is handed on to its neighbours
-_HANGING = 10  # rounds of joining what does not hang together
-_RINGS = 4  # of triangles around it
-_HANDED_ON = 6  # rounds in which this is done
-_SHARED = 0.25  # of the smaller border of two regions, that joining them removes at least
-_TEXELS = 96, 256  # of the copy and of the surface, across a region that must not cover itself
-_FACING = 0.02  # of sqrt(area), that a normal counts as when the nearest triangle is looked for
-# Of triangles that are laid out: times all and so many more at most, and what an attempt costs beside its own.
-_EFFORT, _ALWAYS, _OVERHEAD = 8, 200_000, 300
+# All of these were set by hand; areas are shares of the whole surface.
+_COARSE_FACES = 2_000  # triangles of the decimated copy
+_MAX_SMOOTHING = 100  # steps that smooth borders on the surface; where more are needed, a finer copy does the rest
+_N_CELLS = 80
+_BEND_COST = 4.0  # how much longer a path becomes where neighboring triangles face different ways
+_CENTERING_ROUNDS = 4  # rounds in which cells grow again from their centers
+_NOTCH_SHARE, _NOTCH_ROUNDS = 0.7, 3  # share of the angle around a vertex above which a region takes the rest
+_COPY_SMOOTHING = 3  # steps that smooth borders on the copy
+_COPY_STRETCH, _MAX_STRETCH = 1.5, 1.6  # largest mean stretch or shrinking of a region: on the copy, on the surface
+_MIN_FILL = 0.78  # smallest share of its convex hull that a region fills
+_ANY_FORM_AREA = 0.004  # smaller regions may have any form
+_MAX_CRUMB_FACES = 2_500  # triangles of two charts of the surface together, up to which crumbs are merged at the end
+_CRUMB_AREA = 0.004  # smaller regions (crumbs) join whatever they can
+_MAX_CHART_AREA = 0.2
+_MAX_BAD_AREA = 0.01  # share of a region's area that may be given to its neighbors
+_CONNECT_ROUNDS = 10  # rounds that reassign disconnected parts of regions
+_MAX_RINGS = 4  # rings of triangles around bad ones that are given away with them
+_REASSIGN_ROUNDS = 6  # rounds in which bad triangles are given to neighbors
+_MIN_SHARED = 0.25  # smallest share of the shorter border of two regions that merging them removes
+_TEXELS = 96, 256  # resolution of the test for self-overlap: on the copy, on the surface
+_NORMAL_WEIGHT = 0.02  # length (sqrt(area)) that a unit normal counts for in the search for the nearest triangle
+# Work budget, counted in flattened triangles: per triangle of the surface, in addition, and the cost of an attempt.
+_EFFORT, _MIN_EFFORT, _ATTEMPT_COST = 8, 200_000, 300
 
 
 @dataclass
 class _Surface:
-    """Triangles, who lies beside whom, and what may still be tried."""
+    """Triangles, their adjacency, and the work budget that is left for flattening them."""
 
     verts: Floats
     faces: Ints
-    texels: int  # across a region, on which it must not cover itself
-    one: Ints = field(init=False)
-    two: Ints = field(init=False)
+    texels: int  # resolution across a region of the test for self-overlap
+    face_a: Ints = field(init=False)
+    face_b: Ints = field(init=False)
     length: Floats = field(init=False)
 
     def __post_init__(self) -> None:
-        self.one, self.two, self.length = across(self.verts, self.faces)
+        self.face_a, self.face_b, self.length = adjacent_faces(self.verts, self.faces)
         vectors = triangle_vectors(self.verts, self.faces)
         self.areas, self.normals = triangle_areas(self.verts, self.faces), unit(vectors)
-        self.middles = self.verts[self.faces].mean(axis=1)
+        self.centers = self.verts[self.faces].mean(axis=1)
         self.total = float(self.areas.sum())
-        self.beside = self.graph(self.length)
-        self.effort = _EFFORT * len(self.faces) + _ALWAYS
+        self.adjacency = self.graph(self.length)
+        self.budget = _EFFORT * len(self.faces) + _MIN_EFFORT
 
     def graph(self, weights: Floats) -> csr_array:
-        """Triangles joined over their common edges."""
+        """(F, F) sparse: adjacent faces, with the weight (E,) of their common edge."""
         F = len(self.faces)
-        ends = np.concatenate([self.one, self.two]), np.concatenate([self.two, self.one])
+        ends = np.concatenate([self.face_a, self.face_b]), np.concatenate([self.face_b, self.face_a])
         return coo_array((np.concatenate([weights, weights]), ends), shape=(F, F)).tocsr()
 
-    def laid(self, members: Ints, most: float) -> Layout | None:
-        """How some triangles lie flat, for as long as the effort lasts."""
-        self.effort -= len(members) + _OVERHEAD
-        return laid_flat(self.verts, self.faces[members], most, self.texels) if self.effort > 0 else None
+    def flatten(self, members: Ints, max_stretch: float) -> Layout | None:
+        """Flatten some triangles; None if that fails, or the work budget is spent."""
+        self.budget -= len(members) + _ATTEMPT_COST
+        return flatten_faces(self.verts, self.faces[members], max_stretch, self.texels) if self.budget > 0 else None
 
-    def spoiled(self, members: Ints, layout: Layout | None) -> float:
-        """The area of what is turned over, or lies on the rest."""
+    def bad_area(self, members: Ints, layout: Layout | None) -> float:
+        """Area of the triangles that are flipped or overlap others; infinite without a layout."""
         return np.inf if layout is None else float(self.areas[members[layout.bad]].sum())
 
 
 def chart_regions(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], polygons: Int[Ints, " F"]) -> list[Chart]:
-    """Charts of all triangles, each once: compact, with little stretch, and none of them covers itself.
+    """Charts that cover every triangle once: compact, with little stretch, free of overlaps.
 
     Parameters
     ----------
     verts, faces
         The surface, in units of sqrt(area).
     polygons
-        What each triangle is part of: these stay whole where charts meet.
+        (F,) the polygon that each triangle belongs to; polygons are not cut where charts meet.
     """
     surface = _Surface(verts, faces, _TEXELS[1])
-    copy = _Surface(*_coarse(verts, faces, _COARSE), _TEXELS[0])
-    alone = np.arange(len(copy.faces))
-    cells = _flat_parts(copy, _smooth(copy, _cells(copy), _SOFT), _STRETCH, alone)
+    copy = _Surface(*_decimated(verts, faces, _COARSE_FACES), _TEXELS[0])
+    own_polygon = np.arange(len(copy.faces))
+    cells = _split_until_flat(
+        copy, _smooth_regions(copy, _grow_cells(copy), _COPY_SMOOTHING), _COPY_STRETCH, own_polygon
+    )
     regions = np.empty(len(copy.faces), np.int64)
-    for joined, chart in enumerate(_Joining(copy, cells, _STRETCH).charts()):
-        regions[chart.members] = joined
-    if len(faces) // len(copy.faces) > _MOST_STEPS:
-        between = _Surface(*_coarse(verts, faces, int(np.sqrt(len(faces) * len(copy.faces)))), _TEXELS[1])
-        copy, regions = between, _carried_over(copy, regions, between)
-    region = _carried_over(copy, regions, surface)
+    for label, chart in enumerate(_ChartMerger(copy, cells, _COPY_STRETCH).charts()):
+        regions[chart.members] = label
+    if len(faces) // len(copy.faces) > _MAX_SMOOTHING:
+        between = _Surface(*_decimated(verts, faces, int(np.sqrt(len(faces) * len(copy.faces)))), _TEXELS[1])
+        copy, regions = between, _transfer_regions(copy, regions, between)
+    region = _transfer_regions(copy, regions, surface)
     first, number = np.unique(polygons, return_index=True, return_inverse=True)[1:]
-    region = _hanging(surface, region[first][number])
-    charts = _flat_parts(surface, region, _MORE, number)
-    charts = _Joining(surface, charts, _MORE, crumbs=True).charts()
-    return Hinging(surface.verts, surface.faces, charts, _MORE, surface.texels).charts()
+    region = _connect_regions(surface, region[first][number])
+    charts = _split_until_flat(surface, region, _MAX_STRETCH, number)
+    charts = _ChartMerger(surface, charts, _MAX_STRETCH, crumbs_only=True).charts()
+    return HingeMerger(surface.verts, surface.faces, charts, _MAX_STRETCH, surface.texels).charts()
 
 
-def _carried_over(copy: _Surface, regions: Ints, surface: _Surface) -> Int[Ints, " F"]:
-    """The regions of the triangles beside, with borders that do not follow the larger triangles of the copy."""
-    places = [np.concatenate([each.middles, _FACING * each.normals], axis=1) for each in (copy, surface)]
-    region = regions[cKDTree(places[0]).query(places[1])[1]]
+def _transfer_regions(copy: _Surface, regions: Ints, surface: _Surface) -> Int[Ints, " F"]:
+    """Give each triangle the region of the nearest triangle of the copy; smooth away the coarse triangles' outlines."""
+    features = [np.concatenate([each.centers, _NORMAL_WEIGHT * each.normals], axis=1) for each in (copy, surface)]
+    region = regions[cKDTree(features[0]).query(features[1])[1]]
     if len(copy.faces) >= len(surface.faces):
         return np.asarray(region)
-    return _smooth(surface, region, len(surface.faces) // len(copy.faces))
+    return _smooth_regions(surface, region, len(surface.faces) // len(copy.faces))
 
 
-def _coarse(verts: Floats, faces: Ints, count: int) -> tuple[Floats, Ints]:
+def _decimated(verts: Floats, faces: Ints, count: int) -> tuple[Floats, Ints]:
+    """At most about `count` triangles of the same surface, without degenerate ones."""
     if len(faces) <= count:
         return verts, faces
     copy = decimate(Shape(verts, faces), count)
@@ -131,32 +134,32 @@ def _coarse(verts: Floats, faces: Ints, count: int) -> tuple[Floats, Ints]:
     return (copy.verts, copy.faces[real]) if real.any() else (verts, faces)
 
 
-def _cells(surface: _Surface) -> Int[Ints, " F"]:
-    """Cells of about the same width, narrower where the surface bends."""
-    one, two = surface.one, surface.two
-    turned = 1 - np.einsum("ni,ni->n", surface.normals[one], surface.normals[two])
-    away = np.linalg.norm(surface.middles[one] - surface.middles[two], axis=1)
-    graph = surface.graph(away * (1 + _BEND * turned) + 1e-9)
+def _grow_cells(surface: _Surface) -> Int[Ints, " F"]:
+    """Grow cells of similar width, narrower where the surface bends (geodesic Voronoi cells, recentered a few times)."""
+    one, two = surface.face_a, surface.face_b
+    bend = 1 - np.einsum("ni,ni->n", surface.normals[one], surface.normals[two])
+    length = np.linalg.norm(surface.centers[one] - surface.centers[two], axis=1)
+    graph = surface.graph(length * (1 + _BEND_COST * bend) + 1e-9)
     part = connected_components(graph, directed=False)[1]
     seeds = np.unique(part, return_index=True)[1].tolist()
-    far = dijkstra(graph, indices=seeds, min_only=True)
-    while len(seeds) < _CELLS and far.max() > 0:
-        seeds.append(int(far.argmax()))
-        far = np.minimum(far, dijkstra(graph, indices=seeds[-1], limit=float(far.max())))
-    for _ in range(_CENTERED):
+    distance = dijkstra(graph, indices=seeds, min_only=True)
+    while len(seeds) < _N_CELLS and distance.max() > 0:
+        seeds.append(int(distance.argmax()))
+        distance = np.minimum(distance, dijkstra(graph, indices=seeds[-1], limit=float(distance.max())))
+    for _ in range(_CENTERING_ROUNDS):
         source = dijkstra(graph, indices=seeds, min_only=True, return_predecessors=True)[2]
         cell = np.unique(source, return_inverse=True)[1]
         weight = np.bincount(cell, surface.areas)
         middle = (
-            np.stack([np.bincount(cell, surface.areas * axis) for axis in surface.middles.T], axis=1) / weight[:, None]
+            np.stack([np.bincount(cell, surface.areas * axis) for axis in surface.centers.T], axis=1) / weight[:, None]
         )
-        order = np.lexsort((((surface.middles - middle[cell]) ** 2).sum(axis=1), cell))
+        order = np.lexsort((((surface.centers - middle[cell]) ** 2).sum(axis=1), cell))
         seeds = order[np.searchsorted(cell[order], np.arange(len(weight)))].tolist()
     return cell
 
 
-def _smooth(surface: _Surface, region: Ints, steps: int) -> Int[Ints, " F"]:
-    """Regions with smoother borders: each spreads over its neighbours, and a triangle goes with what it has most of."""
+def _smooth_regions(surface: _Surface, region: Ints, steps: int) -> Int[Ints, " F"]:
+    """Smooth the borders of regions: shares diffuse over edges, and each triangle takes the region with the largest."""
     F = len(region)
     graph = surface.graph(surface.length)
     around = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1e-300)
@@ -164,14 +167,14 @@ def _smooth(surface: _Surface, region: Ints, steps: int) -> Int[Ints, " F"]:
     share = coo_array((np.ones(F), (np.arange(F), region)), shape=(F, int(region.max()) + 1)).tocsr()
     for _ in range(steps):
         share = 0.5 * share + spread @ share
-    region = _most(share.tocoo(), region)
-    for _ in range(_FILLED_IN):
-        region = _without_notches(surface, region)
-    return _hanging(surface, region)
+    region = _heaviest_column(share.tocoo(), region)
+    for _ in range(_NOTCH_ROUNDS):
+        region = _fill_notches(surface, region)
+    return _connect_regions(surface, region)
 
 
-def _without_notches(surface: _Surface, region: Ints) -> Int[Ints, " F"]:
-    """Regions that have most of the angle around a vertex get the rest: laid flat, they would cover themselves there."""
+def _fill_notches(surface: _Surface, region: Ints) -> Int[Ints, " F"]:
+    """Complete regions that have most of the angle around a vertex: flattened, they would overlap themselves there."""
     corners, F = surface.faces, len(region)
     ends = [
         unit(surface.verts[np.roll(corners, -k, axis=1)].reshape(-1, 3) - surface.verts[corners.ravel()])
@@ -180,29 +183,29 @@ def _without_notches(surface: _Surface, region: Ints) -> Int[Ints, " F"]:
     angles = np.arccos(np.clip(np.einsum("ni,ni->n", *ends), -1, 1))
     rows, owner = corners.ravel(), np.repeat(region, 3)
     V = len(surface.verts)
-    held = coo_array((angles, (rows, owner)), shape=(V, int(region.max()) + 1)).tocsr()
-    held.sum_duplicates()
+    sums = coo_array((angles, (rows, owner)), shape=(V, int(region.max()) + 1)).tocsr()
+    sums.sum_duplicates()
     total = np.bincount(rows, angles, V)
-    most = _most(held.tocoo(), np.full(V, -1))
-    best = np.maximum.reduceat(held.data, held.indptr[:-1][np.diff(held.indptr) > 0]) if held.nnz else held.data
+    heaviest = _heaviest_column(sums.tocoo(), np.full(V, -1))
+    best = np.maximum.reduceat(sums.data, sums.indptr[:-1][np.diff(sums.indptr) > 0]) if sums.nnz else sums.data
     share = np.zeros(V)
-    share[np.diff(held.indptr) > 0] = best
-    claims = (share > _NOTCH * total) & (share < total * (1 - 1e-9))
-    corner_claims = np.where(claims[corners], most[corners], -1)
+    share[np.diff(sums.indptr) > 0] = best
+    claims = (share > _NOTCH_SHARE * total) & (share < total * (1 - 1e-9))
+    corner_claims = np.where(claims[corners], heaviest[corners], -1)
     strength = np.where(claims[corners], (share / np.maximum(total, 1e-300))[corners], 0.0)
     winner = strength.argmax(axis=1)
     new = corner_claims[np.arange(F), winner]
     return np.where(new >= 0, new, region)
 
 
-def _hanging(surface: _Surface, region: Ints, most: float = np.inf) -> Int[Ints, " F"]:
-    """Regions that hang together: parts beside the largest of one join the neighbour of their longest border, or become
-    regions if they are larger than `most`.
+def _connect_regions(surface: _Surface, region: Ints, most: float = np.inf) -> Int[Ints, " F"]:
+    """Make regions connected: all but the largest part of each join the neighbor across their longest border, or become
+    regions themselves if their area is `most` or more.
     """
-    one, two = (np.concatenate(ends) for ends in ((surface.one, surface.two), (surface.two, surface.one)))
+    one, two = (np.concatenate(ends) for ends in ((surface.face_a, surface.face_b), (surface.face_b, surface.face_a)))
     length = np.concatenate([surface.length, surface.length])
-    part = _parts(surface, region)
-    for _ in range(_HANGING):
+    part = _connected_parts(surface, region)
+    for _ in range(_CONNECT_ROUNDS):
         size = np.bincount(part, surface.areas)
         owner = np.zeros(len(size), np.int64)
         owner[part] = region
@@ -210,17 +213,17 @@ def _hanging(surface: _Surface, region: Ints, most: float = np.inf) -> Int[Ints,
         np.maximum.at(largest, owner, size)
         meets = part[one] != part[two]
         shape = len(size), len(largest)
-        joins = _most(coo_array((length[meets], (part[one[meets]], region[two[meets]])), shape=shape), owner)
+        joins = _heaviest_column(coo_array((length[meets], (part[one[meets]], region[two[meets]])), shape=shape), owner)
         joins = np.where((size < largest[owner]) & (size < most), joins, owner)
         if (joins == owner).all():
             break
         region = joins[part]
-        part = _parts(surface, region)
+        part = _connected_parts(surface, region)
     return part
 
 
-def _most(shares: coo_array, now: Ints) -> Int[Ints, " N"]:
-    """The column with the largest sum of each row; `now` for a row that is empty."""
+def _heaviest_column(shares: coo_array, now: Ints) -> Int[Ints, " N"]:
+    """The column with the largest sum in each row; `now` where a row is empty."""
     sums = shares.tocsr()
     sums.sum_duplicates()
     out, rows = now.copy(), np.repeat(np.arange(len(now)), np.diff(sums.indptr))
@@ -230,69 +233,72 @@ def _most(shares: coo_array, now: Ints) -> Int[Ints, " N"]:
     return out
 
 
-def _parts(surface: _Surface, region: Ints) -> Int[Ints, " F"]:
-    """What hangs together of each region."""
-    same = (region[surface.one] == region[surface.two]).astype(float)
+def _connected_parts(surface: _Surface, region: Ints) -> Int[Ints, " F"]:
+    """Connected components of all regions."""
+    same = (region[surface.face_a] == region[surface.face_b]).astype(float)
     graph = surface.graph(same)
     graph.eliminate_zeros()
     return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
-def _flat_parts(surface: _Surface, region: Ints, most: float, polygons: Ints) -> list[Chart]:
-    """Regions that lie flat. What spoils a region goes to its neighbours; regions that do
-    not lie flat even so are halved.
+def _split_until_flat(surface: _Surface, region: Ints, max_stretch: float, polygons: Ints) -> list[Chart]:
+    """Split regions until each can be flattened. Small flipped or overlapping parts of a region go to its neighbors;
+    regions with larger ones are bisected.
     """
-    known, tried = _Known(surface, most, polygons), set[int]()
-    turn = 0
+    cache, tried = _LayoutCache(surface, max_stretch, polygons), set[int]()
+    iteration = 0
     while True:
-        parts, spoiled, after = _split(region), [np.empty(0, np.int64)], region.copy()
-        layouts = [known.layout(members) for members in parts]
+        parts, bad_parts, new = _members_of_regions(region), [np.empty(0, np.int64)], region.copy()
+        layouts = [cache.layout(members) for members in parts]
         for members, layout in zip(parts, layouts, strict=True):
             if layout is not None and not len(layout.bad):
                 continue
-            home, small = int(known.home[members[0]]), _SPOILED * surface.areas[members].sum()
-            if layout is not None and home not in tried and surface.spoiled(members, layout) < small:
+            home, small = int(cache.home[members[0]]), _MAX_BAD_AREA * surface.areas[members].sum()
+            if layout is not None and home not in tried and surface.bad_area(members, layout) < small:
                 tried.add(home)
-                spoiled.append(members[layout.bad])
-            elif surface.effort > 0:
+                bad_parts.append(members[layout.bad])
+            elif surface.budget > 0:
                 pair = None if layout is None else layout.pair
-                after[members] = after.max() + 1 + _halved(surface, members, polygons, pair)
+                new[members] = new.max() + 1 + _bisect(surface, members, polygons, pair)
             else:
-                after[members] = after.max() + 1 + np.unique(polygons[members], return_inverse=True)[1]
-        bad = _with_rings(surface, region, np.concatenate(spoiled), min(turn, _RINGS))
+                new[members] = new.max() + 1 + np.unique(polygons[members], return_inverse=True)[1]
+        bad = _add_rings(surface, region, np.concatenate(bad_parts), min(iteration, _MAX_RINGS))
         if len(bad):
             bad = np.flatnonzero(np.isin(polygons, polygons[bad]))
-        if turn < _HANDED_ON:
-            after = _handed_on(surface, after, bad, polygons)
+        if iteration < _REASSIGN_ROUNDS:
+            new = _reassign(surface, new, bad, polygons)
         elif len(bad):
-            after[bad] = after.max() + 1
-        if (after == region).all() and not len(bad):
+            new[bad] = new.max() + 1
+        if (new == region).all() and not len(bad):
             return [Chart(members, own.uv, own.corners) for members, own in zip(parts, layouts, strict=True) if own]
-        turn, region = turn + 1, _hanging(surface, after, 0.0 if turn >= _HANDED_ON else 0.5 * _CRUMB * surface.total)
+        iteration, region = (
+            iteration + 1,
+            _connect_regions(surface, new, 0.0 if iteration >= _REASSIGN_ROUNDS else 0.5 * _CRUMB_AREA * surface.total),
+        )
 
 
-class _Known:
-    """How regions lie flat: part of one that did stays where it is."""
+class _LayoutCache:
+    """Layouts of regions; a subset of a region that was flattened keeps its place there."""
 
-    def __init__(self, surface: _Surface, most: float, polygons: Ints) -> None:
-        self.surface, self.most, self.polygons = surface, most, polygons
+    def __init__(self, surface: _Surface, max_stretch: float, polygons: Ints) -> None:
+        self.surface, self.max_stretch, self.polygons = surface, max_stretch, polygons
         self.layouts: list[tuple[Ints, Layout | None]] = []
         self.home = np.full(len(surface.faces), -1)
 
     def layout(self, members: Ints) -> Layout | None:
-        """None where it is not known how."""
+        """Flatten a region; None if that fails. A single polygon is unfolded triangle by triangle."""
         whole = self.polygons[members]
         if (whole == whole[0]).all():
-            laid = unfolded_polygon(self.surface.verts, self.surface.faces[members])
-            return Layout(*laid, np.ones(len(members), bool), np.empty(0, np.int64))
+            unfolded = unfold_polygon(self.surface.verts, self.surface.faces[members])
+            return Layout(*unfolded, np.ones(len(members), bool), np.empty(0, np.int64))
         home = int(self.home[members[0]])
         if home >= 0 and (self.home[members] == home).all():
-            whole, before = self.layouts[home]
+            whole, known = self.layouts[home]
             if len(whole) == len(members):
-                return before
-            if before is not None:
-                return self._keep(members, before.only(np.searchsorted(whole, members), self.surface.texels))
-        return self._keep(members, self.surface.laid(members, self.most))
+                return known
+            if known is not None:
+                return self._keep(members, known.only(np.searchsorted(whole, members), self.surface.texels))
+        return self._keep(members, self.surface.flatten(members, self.max_stretch))
 
     def _keep(self, members: Ints, layout: Layout | None) -> Layout | None:
         self.home[members] = len(self.layouts)
@@ -300,17 +306,17 @@ class _Known:
         return layout
 
 
-def _split(region: Ints) -> list[Ints]:
-    """The members of each."""
+def _members_of_regions(region: Ints) -> list[Ints]:
+    """The members of each region."""
     return np.split(np.argsort(region, kind="stable"), np.cumsum(np.bincount(region))[:-1])
 
 
-def _with_rings(surface: _Surface, region: Ints, faces: Ints, rings: int) -> Ints:
-    """Faces with those of their regions around them."""
+def _add_rings(surface: _Surface, region: Ints, faces: Ints, rings: int) -> Ints:
+    """Add rings of adjacent faces of the same regions."""
     marked = np.zeros(len(region), bool)
     marked[faces] = True
-    same = region[surface.one] == region[surface.two]
-    one, two = surface.one[same], surface.two[same]
+    same = region[surface.face_a] == region[surface.face_b]
+    one, two = surface.face_a[same], surface.face_b[same]
     for _ in range(rings):
         beside = np.zeros(len(region), bool)
         beside[one[marked[two]]] = beside[two[marked[one]]] = True
@@ -318,17 +324,17 @@ def _with_rings(surface: _Surface, region: Ints, faces: Ints, rings: int) -> Int
     return np.flatnonzero(marked)
 
 
-def _handed_on(surface: _Surface, region: Ints, faces: Ints, polygons: Ints) -> Int[Ints, " F"]:
-    """Regions in which some faces are part of a neighbour, where they have one."""
-    one, two = (np.concatenate(ends) for ends in ((surface.one, surface.two), (surface.two, surface.one)))
+def _reassign(surface: _Surface, region: Ints, faces: Ints, polygons: Ints) -> Int[Ints, " F"]:
+    """Give faces, a polygon at a time, to the neighboring region across their longest border, where there is one."""
+    one, two = (np.concatenate(ends) for ends in ((surface.face_a, surface.face_b), (surface.face_b, surface.face_a)))
     length = np.concatenate([surface.length, surface.length])
     left = np.zeros(len(region), bool)
     left[faces] = True
     K = int(polygons.max()) + 1, int(region.max()) + 1
-    for _ in range(_HANDED_ON):
+    for _ in range(_REASSIGN_ROUNDS):
         meets = left[one] & ~left[two] & (region[one] != region[two])
         shares = coo_array((length[meets], (polygons[one[meets]], region[two[meets]])), shape=K)
-        taker = _most(shares, np.full(K[0], -1))[polygons]
+        taker = _heaviest_column(shares, np.full(K[0], -1))[polygons]
         taken = left & (taker >= 0)
         if not taken.any():
             break
@@ -336,99 +342,108 @@ def _handed_on(surface: _Surface, region: Ints, faces: Ints, polygons: Ints) -> 
     return region
 
 
-def _halved(surface: _Surface, members: Ints, polygons: Ints, pair: tuple[int, int] | None) -> Int[Ints, " n"]:
-    """Parts of a region: what is closer to one and the other of a pair; what faces one way and the other; or else what lies
-    on one side and the other.
+def _bisect(surface: _Surface, members: Ints, polygons: Ints, pair: tuple[int, int] | None) -> Int[Ints, " n"]:
+    """Bisect a region (labels 0 and 1 of its members): by distance to the two faces of `pair`, if given; else along the
+    principal axis of its normals, or of its centers; else by half of its polygons each.
     """
     first, number = np.unique(
         members if polygons is None else polygons[members], return_index=True, return_inverse=True
     )[1:]
-    if len(first) == 1:  # a polygon alone
+    if len(first) == 1:  # a single polygon
         return np.arange(len(members))
     part = _Surface(surface.verts, surface.faces[members], surface.texels)
     if pair is not None:
-        away = np.linalg.norm(part.middles[part.one] - part.middles[part.two], axis=1)
+        away = np.linalg.norm(part.centers[part.face_a] - part.centers[part.face_b], axis=1)
         source = dijkstra(part.graph(away + 1e-9), indices=pair, min_only=True, return_predecessors=True)[2]
         half = np.asarray(source == pair[0]).astype(np.int64)[first][number]
         if half.min() < half.max():
             return half
-    for values, least in ((part.normals, 0.1), (part.middles, 1e-3)):
+    for values, least in ((part.normals, 0.1), (part.centers, 1e-3)):
         about = values - np.average(values, axis=0, weights=part.areas)
         along = about @ np.linalg.eigh((about * part.areas[:, None]).T @ about)[1][:, 2]
-        half = _smooth(part, (along > 0).astype(np.int64), _SOFT)[first][number]
+        half = _smooth_regions(part, (along > 0).astype(np.int64), _COPY_SMOOTHING)[first][number]
         if half.min() < half.max() and np.bincount(half, part.areas).max() < (1 - least) * part.total:
             return np.asarray(half)
     return np.asarray(number > number.max() // 2).astype(np.int64)
 
 
-class _Joining:
-    """Charts joined as long as they lie flat together, those first whose common border is long for their size."""
+class _ChartMerger:
+    """Greedy merging of charts that flatten together, longest common border for their size first."""
 
-    def __init__(self, surface: _Surface, charts: list[Chart], most: float, crumbs: bool = False) -> None:
-        self.surface, self.most, self.crumbs, K = surface, most, crumbs, len(charts)
-        self.own = dict(enumerate(charts))
+    def __init__(self, surface: _Surface, charts: list[Chart], max_stretch: float, crumbs_only: bool = False) -> None:
+        self.surface, self.max_stretch, self.crumbs_only, K = surface, max_stretch, crumbs_only, len(charts)
+        self.by_number = dict(enumerate(charts))
         region = np.empty(len(surface.faces), np.int64)
-        for number, chart in self.own.items():
+        for number, chart in self.by_number.items():
             region[chart.members] = number
         self.area = (np.bincount(region, surface.areas) / surface.total).tolist()
         edges = surface.verts[surface.faces] - surface.verts[np.roll(surface.faces, -1, axis=1)]
         border = np.bincount(region, np.linalg.norm(edges, axis=2).sum(axis=1))
-        same = region[surface.one] == region[surface.two]
-        border -= 2 * np.bincount(region[surface.one[same]], surface.length[same], K)
+        same = region[surface.face_a] == region[surface.face_b]
+        border -= 2 * np.bincount(region[surface.face_a[same]], surface.length[same], K)
         self.border = np.maximum(border, 1e-300).tolist()
-        self.shared: dict[int, dict[int, float]] = {k: {} for k in self.own}
+        self.shared: dict[int, dict[int, float]] = {k: {} for k in self.by_number}
         for one, two, length in zip(
-            region[surface.one].tolist(), region[surface.two].tolist(), surface.length.tolist(), strict=True
+            region[surface.face_a].tolist(), region[surface.face_b].tolist(), surface.length.tolist(), strict=True
         ):
             if one != two:
                 self.shared[one][two] = self.shared[two][one] = self.shared[one].get(two, 0.0) + length
-        self.grown = [0] * K
-        self.waiting: list[tuple[float, int, int, int, int]] = []
+        self.version = [0] * K
+        self.queue: list[tuple[float, int, int, int, int]] = []
         for one, others in self.shared.items():
             for two in others:
                 if one < two:
-                    self._wait(one, two)
+                    self._enqueue(one, two)
 
     def charts(self) -> list[Chart]:
-        """What they become."""
-        while self.waiting:
-            _, one, two, *grown = heappop(self.waiting)
-            if [self.grown[one], self.grown[two]] == grown and (chart := self._together(one, two)):
+        """Merge until the queue is empty, and return the charts."""
+        while self.queue:
+            _, one, two, *grown = heappop(self.queue)
+            if [self.version[one], self.version[two]] == grown and (chart := self._merge_if_flat(one, two)):
                 self._join(one, two, chart)
                 for other in self.shared[one]:
-                    self._wait(min(one, other), max(one, other))
-        return list(self.own.values())
+                    self._enqueue(min(one, other), max(one, other))
+        return list(self.by_number.values())
 
-    def _wait(self, one: int, two: int) -> None:
+    def _enqueue(self, one: int, two: int) -> None:
         shared, area = self.shared[one][two], self.area[one] + self.area[two]
         removed = 2 * shared / min(self.border[one], self.border[two])
-        crumb = min(self.area[one], self.area[two]) < _CRUMB
-        if not crumb and (self.crumbs or area > _LARGEST or removed < _SHARED):
+        crumb = min(self.area[one], self.area[two]) < _CRUMB_AREA
+        if not crumb and (self.crumbs_only or area > _MAX_CHART_AREA or removed < _MIN_SHARED):
             return
-        if self.crumbs and len(self.own[one].members) + len(self.own[two].members) > _FEW:
+        if self.crumbs_only and len(self.by_number[one].members) + len(self.by_number[two].members) > _MAX_CRUMB_FACES:
             return
-        around = self.border[one] + self.border[two] - 2 * shared
-        round_ = around / np.sqrt(area)
+        border = self.border[one] + self.border[two] - 2 * shared
+        roundness = border / np.sqrt(area)
         small = 0.05 + np.sqrt(min(self.area[one], self.area[two]))
-        heappush(self.waiting, (-removed / (max(round_, 1e-300) * small), one, two, self.grown[one], self.grown[two]))
+        heappush(
+            self.queue, (-removed / (max(roundness, 1e-300) * small), one, two, self.version[one], self.version[two])
+        )
 
-    def _together(self, one: int, two: int) -> Chart | None:
-        members, least = np.concatenate([self.own[k].members for k in (one, two)]), min(self.area[one], self.area[two])
-        layout = self.surface.laid(members, self.most)
-        allowed = 0.0 if self.crumbs else _SPOILED * least * self.surface.total
-        if layout is None or self.surface.spoiled(members, layout) > allowed:
+    def _merge_if_flat(self, one: int, two: int) -> Chart | None:
+        members, least = (
+            np.concatenate([self.by_number[k].members for k in (one, two)]),
+            min(self.area[one], self.area[two]),
+        )
+        layout = self.surface.flatten(members, self.max_stretch)
+        allowed = 0.0 if self.crumbs_only else _MAX_BAD_AREA * least * self.surface.total
+        if layout is None or self.surface.bad_area(members, layout) > allowed:
             return None
         area = (self.area[one] + self.area[two]) * self.surface.total
-        filled = area < _ROUGH * self.surface.total or least < _CRUMB or area >= _FILLED * hull(layout.uv)
+        filled = (
+            area < _ANY_FORM_AREA * self.surface.total
+            or least < _CRUMB_AREA
+            or area >= _MIN_FILL * hull_area(layout.uv)
+        )
         return Chart(members, layout.uv, layout.corners) if filled else None
 
     def _join(self, one: int, two: int, chart: Chart) -> None:
-        self.own[one] = chart
-        del self.own[two]
+        self.by_number[one] = chart
+        del self.by_number[two]
         self.border[one] += self.border[two] - 2 * self.shared[one][two]
         self.area[one] += self.area[two]
-        self.grown[one] += 1
-        self.grown[two] = -1
+        self.version[one] += 1
+        self.version[two] = -1
         for other, length in self.shared.pop(two).items():
             del self.shared[other][two]
             if other != one:

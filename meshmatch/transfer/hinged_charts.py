@@ -1,7 +1,8 @@
-"""Charts joined along a part of their common border alone, as the sides of an unfolded box are: a closed piece, which cannot
-lie flat, becomes one chart instead of two. Both keep their form; only the corners along the hinge move.
+"""Merging of charts along a part of their common border, as the sides of an unfolded box are joined at hinges: a closed
+piece, which cannot be flattened whole, becomes one chart instead of two. Both charts keep their form; only the corners along
+the hinge move.
 
-Where there are still many charts, pairs that both bend are laid flat again, cut along all of their border but the hinge.
+Where many charts remain, pairs that both bend are flattened again together, cut along all of their border but the hinge.
 """
 
 from __future__ import annotations
@@ -15,36 +16,40 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import together, triangle_areas
-from meshmatch.transfer.flat_layout import Layout, laid_flat, twins
-from meshmatch.transfer.pack_charts import Chart, hull
+from meshmatch.transfer.flat_layout import Layout, flatten_faces, opposite_edges
+from meshmatch.transfer.pack_charts import Chart, hull_area
 
 Complexes: TypeAlias = NDArray[np.complex128]
 
-# All of these were set by hand; areas are shares of the whole.
-_ENOUGH = 40  # charts: so few are left as they are
-_SMALL = 0.02  # of two charts one at least is smaller
-_OFF = 0.1  # of its length, by which an edge of the hinge may miss the one that it is joined with
-_FILLED, _KEPT = 0.72, 0.95  # of the convex hull of both, at least; of what each fills of its own
-_ROUGH = 0.004  # both together may have any form if they are smaller
-_TRIED = 4  # hinges of two charts
-_MANY = 60  # charts: of more, some are laid flat again
-_AGAIN_FILLED, _AGAIN_KEPT, _AGAIN_ROUGH = 0.7, 0.9, 0.02  # the same limits for these
-_HINGES, _PARTS = 3, (1.0, 0.6, 0.35)  # borders of two charts that are tried, and how much of each
-_FEW, _LARGE = 2_500, 8_000  # triangles: of more, only whole borders are tried; of still more, none
+# All of these were set by hand; areas are shares of the whole surface.
+_MIN_CHARTS = 40  # charts below which merging stops
+_MAX_SMALLER_AREA = 0.02  # of the smaller chart of a pair
+_MAX_EDGE_MISMATCH = 0.1  # as a fraction of the edge's length, between an edge of the hinge and its counterpart
+# Smallest share of its convex hull that a merged chart fills: in all, and of what the two charts fill of theirs.
+_MIN_FILL, _MIN_FILL_KEPT = 0.72, 0.95
+_ANY_FORM_AREA = 0.004  # area of both together below which any form is accepted
+_MAX_HINGES = 4  # hinges that are tried for a pair of charts
+_MIN_CHARTS_REFLATTEN = 60  # charts below which none are flattened again
+_REFLATTEN_FILL, _REFLATTEN_FILL_KEPT, _REFLATTEN_ANY_FORM = 0.7, 0.9, 0.02  # the same limits for these
+_MAX_CHAINS, _CHAIN_PARTS = 3, (1.0, 0.6, 0.35)  # stretches of a common border that are tried, and shares of each
+_MAX_FACES_PARTS, _MAX_FACES = (
+    2_500,
+    8_000,
+)  # triangles: above the first only whole stretches are tried, above both none
 
 
 @dataclass(frozen=True, eq=False)
 class _Edges:
-    """Edges that two charts share: their ends in each, in the order of the first."""
+    """Edges that two charts share: their end corners in each chart, in the order of the first."""
 
     one: Int[Ints, "N 2"]
     two: Int[Ints, "N 2"]
 
     def chains(self) -> list[_Edges]:
-        """Those that follow one another in both."""
-        left = {int(begin): k for k, begin in enumerate(self.one[:, 0])}
-        before = {int(end) for end in self.one[:, 1]}
-        starts = [k for k in range(len(self.one)) if int(self.one[k, 0]) not in before] + list(range(len(self.one)))
+        """Maximal runs of edges that are consecutive in both charts."""
+        begins = {int(begin): k for k, begin in enumerate(self.one[:, 0])}
+        ends = {int(end) for end in self.one[:, 1]}
+        starts = [k for k in range(len(self.one)) if int(self.one[k, 0]) not in ends] + list(range(len(self.one)))
         done = np.zeros(len(self.one), bool)
         found = []
         for k in starts:
@@ -52,7 +57,7 @@ class _Edges:
             while not done[k]:
                 done[k] = True
                 chain.append(k)
-                k = left.get(int(self.one[k, 1]), k)
+                k = begins.get(int(self.one[k, 1]), k)
                 if self.two[chain[-1], 1] != self.two[k, 0]:
                     break
             if chain:
@@ -60,107 +65,118 @@ class _Edges:
         return found
 
 
-class Hinging:
-    """Charts of a surface, the small of which are joined with others, those first that fill their common hull best."""
+class HingeMerger:
+    """Greedy merging of small charts with neighbors along hinges, the pairs first that fill their common hull best."""
 
     def __init__(
-        self, verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], charts: list[Chart], most: float, texels: int
+        self, verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], charts: list[Chart], max_stretch: float, texels: int
     ) -> None:
         areas = triangle_areas(verts, faces)
-        self.verts, self.faces, self.most, self.texels, self.total = verts, faces, most, texels, float(areas.sum())
-        self.again = False  # whether charts are laid flat again
-        self.own: dict[int, Chart] = dict(enumerate(charts))
+        self.verts, self.faces, self.max_stretch, self.texels, self.total = (
+            verts,
+            faces,
+            max_stretch,
+            texels,
+            float(areas.sum()),
+        )
+        self.reflatten = False  # whether pairs are flattened again
+        self.by_number: dict[int, Chart] = dict(enumerate(charts))
         self.area = [float(areas[chart.members].sum()) / self.total for chart in charts]
         region, corner = np.empty(len(faces), np.int64), np.empty((len(faces), 3), np.int64)
-        for number, chart in self.own.items():
+        for number, chart in self.by_number.items():
             region[chart.members], corner[chart.members] = number, chart.corners
         edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         local = corner[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-        one, two = twins(edges)
+        one, two = opposite_edges(edges)
         apart = region[one // 3] != region[two // 3]
         one, two = one[apart], two[apart]
         first, second = region[one // 3], region[two // 3]
         swap = first > second
         one, two = np.where(swap, two, one), np.where(swap, one, two)
         key = np.minimum(first, second) * len(charts) + np.maximum(first, second)
-        self.shared: dict[int, dict[int, _Edges]] = {k: {} for k in self.own}
+        self.shared: dict[int, dict[int, _Edges]] = {k: {} for k in self.by_number}
         order = np.argsort(key, kind="stable")
         for rows in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
             if len(rows):
                 a, b = divmod(int(key[rows[0]]), len(charts))
-                self._share(a, b, _Edges(local[one[rows]], local[two[rows]][:, ::-1]))
-        self.waiting: list[tuple[float, int, int, Chart | None]] = []
+                self._set_shared(a, b, _Edges(local[one[rows]], local[two[rows]][:, ::-1]))
+        self.queue: list[tuple[float, int, int, Chart | None]] = []
 
-    def _share(self, a: int, b: int, edges: _Edges) -> None:
+    def _set_shared(self, a: int, b: int, edges: _Edges) -> None:
         self.shared[a][b], self.shared[b][a] = edges, _Edges(edges.two[::-1, ::-1], edges.one[::-1, ::-1])
 
     def charts(self) -> list[Chart]:
-        """What they become."""
-        for self.again, enough in ((False, _ENOUGH), (True, _MANY)):
-            if len(self.own) > enough:
+        """Merge along hinges, then by flattening again, while there are more charts than needed; return the charts."""
+        for self.reflatten, enough in ((False, _MIN_CHARTS), (True, _MIN_CHARTS_REFLATTEN)):
+            if len(self.by_number) > enough:
                 for one, others in self.shared.items():
                     for two in others:
                         if one < two:
-                            self._wait(one, two)
-            while self.waiting and len(self.own) > enough:
-                _, one, two, chart = heappop(self.waiting)
-                if one in self.own and two in self.own and (joined := chart or self._laid_again(one, two)):
-                    self._join(one, two, joined)
-            self.waiting = []
-        return list(self.own.values())
+                            self._enqueue(one, two)
+            while self.queue and len(self.by_number) > enough:
+                _, one, two, chart = heappop(self.queue)
+                if (
+                    one in self.by_number
+                    and two in self.by_number
+                    and (joined := chart or self._flatten_pair(one, two))
+                ):
+                    self._replace(one, two, joined)
+            self.queue = []
+        return list(self.by_number.values())
 
-    def _wait(self, one: int, two: int) -> None:
+    def _enqueue(self, one: int, two: int) -> None:
         smaller = min(self.area[one], self.area[two])
-        if self.again:
-            heappush(self.waiting, (smaller, one, two, None))
-        elif smaller < _SMALL and (found := self._hinged(one, two)):
-            heappush(self.waiting, (-found[0], one, two, found[1]))
+        if self.reflatten:
+            heappush(self.queue, (smaller, one, two, None))
+        elif smaller < _MAX_SMALLER_AREA and (found := self._best_hinge(one, two)):
+            heappush(self.queue, (-found[0], one, two, found[1]))
 
-    def _hinged(self, one: int, two: int) -> tuple[float, Chart] | None:
-        """How much of its hull both fill as one chart, and that; None if they lie on each other, or have a poor form."""
-        a, b = self.own[one], self.own[two]
+    def _best_hinge(self, one: int, two: int) -> tuple[float, Chart] | None:
+        """The share of its hull that the merged chart fills, and the chart; None if all overlap or are badly formed."""
+        a, b = self.by_number[one], self.by_number[two]
         area, best = (self.area[one] + self.area[two]) * self.total, None
-        least = max(_FILLED, _KEPT * area / max(hull(a.uv) + hull(b.uv), 1e-300)) if area > _ROUGH * self.total else 0.0
-        for hinge in _hinges(a.uv, b.uv, self.shared[one][two]):
-            chart = _joined(a, b, hinge)
-            filled = area / max(hull(chart.uv), 1e-300)
+        least = (
+            max(_MIN_FILL, _MIN_FILL_KEPT * area / max(hull_area(a.uv) + hull_area(b.uv), 1e-300))
+            if area > _ANY_FORM_AREA * self.total
+            else 0.0
+        )
+        for hinge in _find_hinges(a.uv, b.uv, self.shared[one][two]):
+            chart = _merge(a, b, hinge)
+            filled = area / max(hull_area(chart.uv), 1e-300)
             if filled >= least and (best is None or filled > best[0]):
                 layout = Layout.of(chart.uv, chart.corners, np.ones(len(chart.members), bool), self.texels)
                 best = best if len(layout.bad) else (filled, chart)
         return best
 
-    def _laid_again(self, one: int, two: int) -> Chart | None:
-        """Both laid flat as one chart, by the hinge with which that fills most of its hull."""
-        a, b = self.own[one], self.own[two]
-        if len(a.members) + len(b.members) > _LARGE:
+    def _flatten_pair(self, one: int, two: int) -> Chart | None:
+        """Flatten both as one chart, joined at the hinge that gives the largest share of the hull; None if none is good."""
+        a, b = self.by_number[one], self.by_number[two]
+        if len(a.members) + len(b.members) > _MAX_FACES:
             return None
         area, best = (self.area[one] + self.area[two]) * self.total, None
-        least = max(_AGAIN_FILLED, _AGAIN_KEPT * area / max(hull(a.uv) + hull(b.uv), 1e-300))
-        few = len(a.members) + len(b.members) <= _FEW
-        for hinge in _parts_of(a.uv, self.shared[one][two], _PARTS if few else _PARTS[:1]):
-            chart = _joined(a, b, hinge)
+        least = max(_REFLATTEN_FILL, _REFLATTEN_FILL_KEPT * area / max(hull_area(a.uv) + hull_area(b.uv), 1e-300))
+        try_parts = len(a.members) + len(b.members) <= _MAX_FACES_PARTS
+        for hinge in _chain_parts(a.uv, self.shared[one][two], _CHAIN_PARTS if try_parts else _CHAIN_PARTS[:1]):
+            chart = _merge(a, b, hinge)
             points = np.empty((len(chart.uv), 3))
             points[chart.corners.ravel()] = self.verts[self.faces[chart.members].ravel()]
-            layout = laid_flat(points, chart.corners, self.most, self.texels)
+            layout = flatten_faces(points, chart.corners, self.max_stretch, self.texels)
             if layout is None or len(layout.bad):
                 continue
-            filled = area / max(hull(layout.uv), 1e-300)
-            if (filled >= least or area <= _AGAIN_ROUGH * self.total) and (best is None or filled > best[0]):
+            filled = area / max(hull_area(layout.uv), 1e-300)
+            if (filled >= least or area <= _REFLATTEN_ANY_FORM * self.total) and (best is None or filled > best[0]):
                 best = filled, Chart(chart.members, layout.uv, layout.corners)
         return best and best[1]
 
-    def _join(self, one: int, two: int, joined: Chart) -> None:
-        a, b = self.own[one], self.own[two]
+    def _replace(self, one: int, two: int, joined: Chart) -> None:
+        a, b = self.by_number[one], self.by_number[two]
         new = len(self.area)
-        self.own[new] = joined
+        self.by_number[new] = joined
         self.area.append(self.area[one] + self.area[two])
-        number = {
-            one: np.zeros(len(a.uv), np.int64),
-            two: np.zeros(len(b.uv), np.int64),
-        }  # of corners, in the new chart
+        number = {one: np.zeros(len(a.uv), np.int64), two: np.zeros(len(b.uv), np.int64)}  # of corners in the new chart
         number[one][a.corners.ravel()] = joined.corners[: len(a.members)].ravel()
         number[two][b.corners.ravel()] = joined.corners[len(a.members) :].ravel()
-        del self.own[one], self.own[two]
+        del self.by_number[one], self.by_number[two]
         self.shared[new] = {}
         parts: dict[int, list[_Edges]] = {}
         for old in (one, two):
@@ -170,15 +186,15 @@ class Hinging:
                 del self.shared[other][old]
                 parts.setdefault(other, []).append(_Edges(number[old][edges.one], edges.two))
         for other, some in parts.items():
-            self._share(
+            self._set_shared(
                 new, other, _Edges(np.concatenate([e.one for e in some]), np.concatenate([e.two for e in some]))
             )
         for other in parts:
-            self._wait(*sorted((new, other)))
+            self._enqueue(*sorted((new, other)))
 
 
-def _hinges(a: Floats, b: Floats, edges: _Edges) -> list[_Edges]:
-    """The longest parts of a common border that fit together when one chart is moved to the other as it is."""
+def _find_hinges(a: Floats, b: Floats, edges: _Edges) -> list[_Edges]:
+    """The longest parts of a common border along which the second chart fits the first after a rigid motion."""
     found: list[tuple[float, _Edges]] = []
     for chain in edges.chains():
         p = a[np.append(chain.one[:, 0], chain.one[-1, 1])] @ [1, 1j]
@@ -192,15 +208,15 @@ def _hinges(a: Floats, b: Floats, edges: _Edges) -> list[_Edges]:
             if end > max(begin, last):
                 found.append((float(length[begin:end].sum()), _Edges(chain.one[begin:end], chain.two[begin:end])))
                 last = end
-    return [hinge for _, hinge in sorted(found, key=lambda each: -each[0])[:_TRIED]]
+    return [hinge for _, hinge in sorted(found, key=lambda each: -each[0])[:_MAX_HINGES]]
 
 
-def _parts_of(a: Floats, edges: _Edges, parts: tuple[float, ...]) -> list[_Edges]:
-    """The longest parts of a common border, each as a whole and its beginning, middle and end."""
+def _chain_parts(a: Floats, edges: _Edges, parts: tuple[float, ...]) -> list[_Edges]:
+    """The longest stretches of a common border: each whole, and its beginning, middle and end."""
     chains = edges.chains()
-    long = np.array([np.linalg.norm(a[chain.one[:, 0]] - a[chain.one[:, 1]], axis=1).sum() for chain in chains])
+    lengths = np.array([np.linalg.norm(a[chain.one[:, 0]] - a[chain.one[:, 1]], axis=1).sum() for chain in chains])
     found = []
-    for k in np.argsort(-long, kind="stable")[:_HINGES].tolist():
+    for k in np.argsort(-lengths, kind="stable")[:_MAX_CHAINS].tolist():
         count, ends = len(chains[k].one), set()
         for part in parts:
             some = int(np.ceil(part * count))
@@ -209,26 +225,26 @@ def _parts_of(a: Floats, edges: _Edges, parts: tuple[float, ...]) -> list[_Edges
     return found
 
 
-def _moved(p: Complexes, q: Complexes) -> tuple[complex, complex]:
-    """The turn and the way that bring q closest to p."""
-    turn = complex((np.conj(q - q.mean()) * (p - p.mean())).sum())
-    turn = turn / abs(turn) if abs(turn) > 0 else 1.0 + 0j
-    return turn, complex(p.mean() - turn * q.mean())
+def _rigid_motion(p: Complexes, q: Complexes) -> tuple[complex, complex]:
+    """Rotation (a unit complex number) and translation that bring q closest to p."""
+    rotation = complex((np.conj(q - q.mean()) * (p - p.mean())).sum())
+    rotation = rotation / abs(rotation) if abs(rotation) > 0 else 1.0 + 0j
+    return rotation, complex(p.mean() - rotation * q.mean())
 
 
 def _fits(p: Complexes, q: Complexes, length: Floats) -> bool:
-    """Whether the edges between points miss those between others by little, after the best turn."""
-    turn, way = _moved(p, q)
-    off = np.abs(turn * q + way - p)
-    return bool((np.maximum(off[1:], off[:-1]) <= _OFF * length).all())
+    """Whether q fits p after the best rigid motion, up to a small fraction of each edge's length."""
+    rotation, shift = _rigid_motion(p, q)
+    error = np.abs(rotation * q + shift - p)
+    return bool((np.maximum(error[1:], error[:-1]) <= _MAX_EDGE_MISMATCH * length).all())
 
 
-def _joined(a: Chart, b: Chart, hinge: _Edges) -> Chart:
-    """Two charts, the second moved to the first, with common corners along a hinge."""
+def _merge(a: Chart, b: Chart, hinge: _Edges) -> Chart:
+    """Merge two charts: the second is moved to the first, and corners along the hinge become one."""
     p, q = a.uv @ [1, 1j], b.uv @ [1, 1j]
     one, two = np.append(hinge.one[:, 0], hinge.one[-1, 1]), np.append(hinge.two[:, 0], hinge.two[-1, 1])
-    turn, way = _moved(p[one], q[two])
-    N, both = len(p), np.concatenate([p, turn * q + way])
+    rotation, shift = _rigid_motion(p[one], q[two])
+    N, both = len(p), np.concatenate([p, rotation * q + shift])
     both[one] = 0.5 * (both[one] + both[N + two])
     number = together(len(both), one, N + two)
     kept, place = np.unique(number, return_inverse=True)

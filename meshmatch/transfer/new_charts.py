@@ -1,4 +1,4 @@
-"""New texture coordinates: charts with little stretch, side by side."""
+"""New texture coordinates: charts with little stretch, packed into one image."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.transfer.chart_regions import chart_regions
-from meshmatch.transfer.pack_charts import packed
+from meshmatch.transfer.pack_charts import pack_charts
 
 
 def new_charts(
@@ -18,11 +18,11 @@ def new_charts(
 ) -> Float[Floats, "F 3 2"]:
     """Coordinates in 0..1 of the corners of each face, for an image of `size` with `padding` texels between charts.
 
-    `verts` in units of sqrt(area). No seam crosses one of the `polygons` that triangles are parts of.
+    `verts` are in units of sqrt(area). No seam crosses one of the `polygons` (F,) that triangles belong to.
     """
     polygons = np.arange(len(faces)) if polygons is None else polygons
     charts = chart_regions(verts, faces, polygons)
     out = np.empty((len(faces), 3, 2))
-    for chart, uv in zip(charts, packed(charts, padding / size), strict=True):
+    for chart, uv in zip(charts, pack_charts(charts, padding / size), strict=True):
         out[chart.members] = uv[chart.corners]
     return out

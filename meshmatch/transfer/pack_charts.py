@@ -1,8 +1,8 @@
-"""Charts side by side in a square image, as large as they fit.
+"""Packing of charts into a square image, as large as they fit.
 
-Each is put where most of what is there is close to it, in the best of four turns; all places are tried at once by Fourier
-transforms of images of what is taken. In a finer image they are then moved closer together. Crumbs are put on shelves first,
-in one block.
+Charts are placed one by one, each where its surroundings are most occupied, in the best of four orientations; all places are
+scored at once by FFT correlations. The places are then tightened in a finer image. Small charts are first put on shelves, in
+one block.
 """
 
 from __future__ import annotations
@@ -19,127 +19,128 @@ from scipy.spatial import ConvexHull, QhullError
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import flat_areas
 from meshmatch.transfer.texels import texels_in
-from meshmatch.transfer.tighten_charts import tightened
+from meshmatch.transfer.tighten_charts import tighten
 
 # All of these were set by hand.
-_GRID, _FINE = 256, 4  # texels of the image in which places are looked for; how much finer they are at last
-_ALIKE = 1e-6  # what is closer is the same
-_MOST = 80  # charts that are moved one by one
-_TIGHTENED = 12  # moves of each piece that are tried at last
-_SHRINK, _STEPS = 0.995, 4  # of lengths, in which the largest with room for all charts is looked for; of them at once
-_DENSE = 0.78  # of the image, that the charts and half of what is between them fill at the first try
-_RINGS, _FADING = (
-    5,
-    0.7,
-)  # texels around a piece in which others count as close, each ring so much less than the one before
-_COUNTS = np.array([1.0, *_FADING ** np.arange(_RINGS), 0.0], np.float32)  # so many texels further than others may be
-_LOW = 0.3  # how much it counts to lie low in the image, beside the share of the rings that is taken
-_BETWEEN = 0.2  # of the image at most: what lies between crumbs, and between charts
+_GRID, _REFINEMENT = 256, 4  # texels of the image in which places are searched; how much finer the last one is
+_TOLERANCE = 1e-6  # relative; smaller differences are ties
+_MAX_PIECES = 80  # charts that are placed one by one
+_MOVES_PER_PIECE = 12  # moves that are tried at the end, per piece on average
+# Factor of lengths between scales, in the search for the largest one that fits; steps at once while none has fit.
+_SHRINK, _STEPS = 0.995, 4
+_FIRST_FILL = 0.78  # share of the image that charts and half of the gaps fill at the first scale tried
+# Rings of texels around a piece in which others count as close, and the weight of each ring relative to the one before.
+_RINGS, _RING_DECAY = 5, 0.7
+_RING_WEIGHTS = np.array([1.0, *_RING_DECAY ** np.arange(_RINGS), 0.0], np.float32)  # by distance beyond the padding
+_LOW_WEIGHT = 0.3  # weight of a low place in the image, relative to the occupied share of the rings
+_MAX_GAP_SHARE = 0.2  # share of the image at most for gaps between small charts, and between charts
 
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Triangles of a surface that lie flat together."""
+    """Triangles of a surface that are flattened together."""
 
     members: Int[Ints, " n"]
     uv: Float[Floats, "M 2"]  # in the unit of the surface
     corners: Int[Ints, "n 3"]
 
 
-def tightest(uv: Float[Floats, "M 2"]) -> tuple[float, float]:
-    """The angle in radians at which the smallest rectangle around points lies, its long side along x; and its area."""
+def smallest_rectangle(uv: Float[Floats, "M 2"]) -> tuple[float, float]:
+    """Angle in radians, 0 to pi, of the long side of the smallest rectangle around points, and the rectangle's area."""
     try:
-        hull = uv[ConvexHull(uv).vertices]
+        hull_area = uv[ConvexHull(uv).vertices]
     except QhullError:  # all on a line
-        hull = uv
-    edges = np.roll(hull, -1, axis=0) - hull
+        hull_area = uv
+    edges = np.roll(hull_area, -1, axis=0) - hull_area
     angle = np.arctan2(edges[:, 1], edges[:, 0])
     cosine, sine = np.cos(angle), np.sin(angle)
-    wide = np.ptp(np.outer(cosine, hull[:, 0]) + np.outer(sine, hull[:, 1]), axis=1)
-    high = np.ptp(np.outer(cosine, hull[:, 1]) - np.outer(sine, hull[:, 0]), axis=1)
-    angle = np.where(wide >= high * (1 - _ALIKE), angle, angle + np.pi / 2) % np.pi
-    angle = np.where(angle > np.pi - _ALIKE, 0.0, angle)
+    wide = np.ptp(np.outer(cosine, hull_area[:, 0]) + np.outer(sine, hull_area[:, 1]), axis=1)
+    high = np.ptp(np.outer(cosine, hull_area[:, 1]) - np.outer(sine, hull_area[:, 0]), axis=1)
+    angle = np.where(wide >= high * (1 - _TOLERANCE), angle, angle + np.pi / 2) % np.pi
+    angle = np.where(angle > np.pi - _TOLERANCE, 0.0, angle)
     least = float((wide * high).min())
-    ties = np.flatnonzero(wide * high <= least * (1 + _ALIKE))  # rounding is not to decide
+    ties = np.flatnonzero(wide * high <= least * (1 + _TOLERANCE))  # rounding must not decide
     return float(angle[ties].min()), least
 
 
-def hull(uv: Float[Floats, "M 2"]) -> float:
-    """The area of the convex hull."""
+def hull_area(uv: Float[Floats, "M 2"]) -> float:
+    """Area of the convex hull; 0 for points on a line."""
     try:
         return float(ConvexHull(uv).volume)
     except QhullError:
         return 0.0
 
 
-def packed(charts: list[Chart], padding: float, seed: int = 0) -> list[Float[Floats, "M 2"]]:
-    """Coordinates in 0..1 of each chart, all of one density and at least `padding` of the image apart, or less where there
-    are so many that little else would be left.
+def pack_charts(charts: list[Chart], padding: float, seed: int = 0) -> list[Float[Floats, "M 2"]]:
+    """Coordinates in 0..1 of each chart, at one scale and at least `padding` of the image apart; less where so many charts
+    would leave little room for anything else.
     """
     pieces = [_Piece(chart.uv, chart.corners) for chart in charts]
     order = sorted(range(len(pieces)), key=lambda k: (-pieces[k].area, k))
-    large, crumbs = order[:_MOST], order[_MOST:]
+    large, crumbs = order[:_MAX_PIECES], order[_MAX_PIECES:]
     moved = [pieces[k] for k in large]
     shelves: list[Floats] = []
     if crumbs:
         total = sum(piece.area for piece in pieces)
-        between = min(padding, np.sqrt(_BETWEEN / len(crumbs))) * np.sqrt(2 * total)
-        shelves, size = _on_shelves([pieces[k] for k in crumbs], between)
+        gap = min(padding, np.sqrt(_MAX_GAP_SHARE / len(crumbs))) * np.sqrt(2 * total)
+        shelves, size = _put_on_shelves([pieces[k] for k in crumbs], gap)
         moved.append(_Piece(np.array([[0, 0], [size[0], 0], size, [0, size[1]]]), np.array([[0, 1, 2], [0, 2, 3]])))
-    padding = min(padding, np.sqrt(_BETWEEN / len(moved)))
+    padding = min(padding, np.sqrt(_MAX_GAP_SHARE / len(moved)))
     scale, places = _search(moved, padding, np.random.default_rng(seed))
     out: list[Floats] = [np.empty(0)] * len(charts)
     for k, piece, place in zip(large, moved, places, strict=False):
-        out[k] = place.of(piece.uv * scale)
+        out[k] = place.apply(piece.uv * scale)
     for k, at in zip(crumbs, shelves, strict=True):
-        out[k] = places[-1].of(moved[-1].turned(pieces[k].uv + at) * scale)
+        out[k] = places[-1].apply(moved[-1].align(pieces[k].uv + at) * scale)
     return out
 
 
 @dataclass(frozen=True, eq=False)
-class _Turned:
-    """A piece as an image, after quarter turns; with what must stay free around it; that with the rings, by what they count;
-    and what all rings count together.
+class _RotatedPiece:
+    """A rotated piece as images: itself, with the padding that must stay free, with rings by their weights; and the sum of
+    the weights of all rings.
     """
 
     quarters: int
     image: Bools
     room: Bools
     rings: NDArray[np.float32]
-    around: float
+    ring_total: float
 
 
 class _Piece:
+    """A chart aligned with its smallest rectangle."""
+
     def __init__(self, uv: Floats, corners: Ints) -> None:
-        angle = tightest(uv)[0]
-        self.turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        self.low = (uv @ self.turn).min(axis=0)
-        self.uv, self.corners = self.turned(uv), corners
+        angle = smallest_rectangle(uv)[0]
+        self.rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        self.low = (uv @ self.rotation).min(axis=0)
+        self.uv, self.corners = self.align(uv), corners
         self.size = self.uv.max(axis=0)
         self.area = float(flat_areas(self.uv[corners]).sum())
         edges = corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         key = edges.min(axis=1) * len(uv) + edges.max(axis=1)
         first, count = np.unique(key, return_index=True, return_counts=True)[1:]
         self.border = edges[first[count == 1]]
-        self._known: tuple[float, int, list[_Turned]] = 0.0, 0, []
+        self._cache: tuple[float, int, list[_RotatedPiece]] = 0.0, 0, []
 
-    def turned(self, uv: Floats) -> Floats:
-        return np.asarray(uv @ self.turn - self.low)
+    def align(self, uv: Floats) -> Floats:
+        return np.asarray(uv @ self.rotation - self.low)
 
-    def turns(self, scale: float, apart: int) -> list[_Turned]:
-        """Its image in four turns; those of the last scale are kept."""
-        if self._known[:2] != (scale, apart):
+    def rotations(self, scale: float, gap: int) -> list[_RotatedPiece]:
+        """Images in four rotations; those of the last scale are cached."""
+        if self._cache[:2] != (scale, gap):
             mask = self.mask(scale)
-            away = distance_transform_cdt(~np.pad(mask, apart + _RINGS), "chessboard")
-            rings = _COUNTS[np.clip(away - apart, 0, _RINGS + 1)]
-            grown = away[_RINGS:-_RINGS, _RINGS:-_RINGS] <= apart
-            around = float(rings.sum()) - int(grown.sum())
-            turned = ((np.rot90(mask, k), np.rot90(grown, k), np.rot90(rings, k)) for k in range(4))
-            self._known = scale, apart, [_Turned(k, *images, around) for k, images in enumerate(turned)]
-        return self._known[2]
+            away = distance_transform_cdt(~np.pad(mask, gap + _RINGS), "chessboard")
+            rings = _RING_WEIGHTS[np.clip(away - gap, 0, _RINGS + 1)]
+            grown = away[_RINGS:-_RINGS, _RINGS:-_RINGS] <= gap
+            ring_total = float(rings.sum()) - int(grown.sum())
+            rotated = ((np.rot90(mask, k), np.rot90(grown, k), np.rot90(rings, k)) for k in range(4))
+            self._cache = scale, gap, [_RotatedPiece(k, *images, ring_total) for k, images in enumerate(rotated)]
+        return self._cache[2]
 
     def mask(self, scale: float) -> Bools:
-        """The texels that it touches."""
+        """The texels that the piece touches."""
         uv = self.uv * scale
         wide, high = np.floor(uv.max(axis=0)).astype(np.int64) + 1
         out = np.zeros((high, wide), bool)
@@ -156,7 +157,9 @@ class _Piece:
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """Quarter turns, and then the way, of a piece whose image is `size` texels wide and high; of an image of `grid`."""
+    """Quarter turns, then a translation in texels, of a piece whose image is `size` texels wide and high; in an image of
+    `grid` texels.
+    """
 
     quarters: int
     size: tuple[int, int]
@@ -164,7 +167,7 @@ class _Place:
     y: int
     grid: int
 
-    def of(self, uv: Floats) -> Floats:
+    def apply(self, uv: Floats) -> Floats:
         wide, high = self.size
         for _ in range(self.quarters):  # as rot90 turns an image
             uv = np.stack([uv[:, 1], wide - uv[:, 0]], axis=1)
@@ -173,75 +176,79 @@ class _Place:
 
 
 def _search(pieces: list[_Piece], padding: float, rng: np.random.Generator) -> tuple[float, list[_Place]]:
-    """Texels per unit, and the places, at about the largest scale with room for all."""
+    """Texels per unit, and the places, at about the largest scale at which all pieces fit."""
     longest = np.array([piece.size[0] * np.sqrt(piece.area) for piece in pieces])
     order = np.argsort(-np.round(longest / max(float(longest.max()), 1e-300), 6), kind="stable")
-    scale, most, larger = _first(pieces, padding), np.inf, 0  # steps up that are too many, and that are not
-    while (last := _placed(pieces, order, scale, padding)) is None:
-        scale, most = scale * _SHRINK**_STEPS, _STEPS
-    while most - larger > 1:
-        step = larger + 1 if np.isinf(most) else int(larger + most) // 2
-        if (places := _placed(pieces, order, scale / _SHRINK**step, padding)) is None:
-            most = step
+    scale, too_large, fits = _initial_scale(pieces, padding), np.inf, 0  # steps up that are too many, and that fit
+    while (last := _place_all(pieces, order, scale, padding)) is None:
+        scale, too_large = scale * _SHRINK**_STEPS, _STEPS
+    while too_large - fits > 1:
+        step = fits + 1 if np.isinf(too_large) else int(fits + too_large) // 2
+        if (places := _place_all(pieces, order, scale / _SHRINK**step, padding)) is None:
+            too_large = step
         else:
-            last, larger = places, step
-    scale *= _FINE / _SHRINK**larger
-    return scale, _tightened(pieces, last, scale, padding, rng)
+            last, fits = places, step
+    scale *= _REFINEMENT / _SHRINK**fits
+    return scale, _tighten_places(pieces, last, scale, padding, rng)
 
 
-def _tightened(
+def _tighten_places(
     pieces: list[_Piece], places: list[_Place], scale: float, padding: float, rng: np.random.Generator
 ) -> list[_Place]:
-    """Places in a finer image, closer together, which is cut where the pieces end."""
+    """Tighten places in a finer image, which is then cropped to the pieces."""
     masks = [piece.mask(scale) for piece in pieces]
     images = [np.rot90(mask, place.quarters) for mask, place in zip(masks, places, strict=True)]
-    low = [place.of(piece.uv * (scale / _FINE)).min(axis=0)[::-1] for piece, place in zip(pieces, places, strict=True)]
-    at = np.floor(np.array(low) * (_GRID * _FINE) + 1e-6).astype(np.int64)
-    corners, end = tightened(images, at, int(np.ceil(padding * _GRID * _FINE)), _TIGHTENED * len(pieces), rng)
+    low = [
+        place.apply(piece.uv * (scale / _REFINEMENT)).min(axis=0)[::-1]
+        for piece, place in zip(pieces, places, strict=True)
+    ]
+    at = np.floor(np.array(low) * (_GRID * _REFINEMENT) + 1e-6).astype(np.int64)
+    corners, end = tighten(images, at, int(np.ceil(padding * _GRID * _REFINEMENT)), _MOVES_PER_PIECE * len(pieces), rng)
     return [
         _Place(place.quarters, (mask.shape[1], mask.shape[0]), int(x), int(y), end)
         for place, mask, (y, x) in zip(places, masks, corners.tolist(), strict=True)
     ]
 
 
-def _first(pieces: list[_Piece], padding: float) -> float:
+def _initial_scale(pieces: list[_Piece], padding: float) -> float:
+    """A scale at which pieces and gaps fill the intended share of the image."""
     area = sum(piece.area for piece in pieces)
     around = sum(2 * float(piece.size.sum()) for piece in pieces) * padding * _GRID / 2
     # scale^2 area + scale around = dense grid^2
-    return float((np.sqrt(around**2 + 4 * area * _DENSE * _GRID**2) - around) / (2 * area))
+    return float((np.sqrt(around**2 + 4 * area * _FIRST_FILL * _GRID**2) - around) / (2 * area))
 
 
-def _placed(pieces: list[_Piece], order: Ints, scale: float, padding: float) -> list[_Place] | None:
-    """Places in this order; None if one finds none."""
-    grid, apart = _GRID, int(np.ceil(padding * _GRID))
-    span = next_fast_len(grid + 2 * apart + 2 * _RINGS, real=True)
-    taken = np.zeros((span, span), np.float32)  # behind what may lie before a piece: its rings
-    inside = taken[apart + _RINGS :, apart + _RINGS :]
+def _place_all(pieces: list[_Piece], order: Ints, scale: float, padding: float) -> list[_Place] | None:
+    """Place the pieces in this order; None if one does not fit."""
+    grid, gap = _GRID, int(np.ceil(padding * _GRID))
+    span = next_fast_len(grid + 2 * gap + 2 * _RINGS, real=True)
+    occupancy = np.zeros((span, span), np.float32)  # offset, as the rings of a piece may reach over the image's border
+    inside = occupancy[gap + _RINGS :, gap + _RINGS :]
     places: list[_Place | None] = [None] * len(pieces)
     for k in order.tolist():
-        turns = pieces[k].turns(scale, apart)
-        shape = turns[0].image.shape
+        rotations = pieces[k].rotations(scale, gap)
+        shape = rotations[0].image.shape
         if max(shape) > grid:
             return None
         best, found = -np.inf, None
-        known, transforms = rfft2(taken), []
-        for turned in turns:
+        occupied, transforms = rfft2(occupancy), []
+        for turned in rotations:
             high, wide = turned.image.shape
             rows, columns = grid - high + 1, grid - wide + 1
             if turned.quarters < 2:
                 transforms.append([_transform(each, span) for each in (turned.room, turned.rings)])
             room, rings = transforms[turned.quarters % 2]
-            free = _sums(known, room, turned.quarters, turned.room.shape, _RINGS, rows, columns) < 0.5
+            free = _correlate(occupied, room, turned.quarters, turned.room.shape, _RINGS, rows, columns) < 0.5
             if not free.any():
                 continue
-            close = _sums(known, rings, turned.quarters, turned.rings.shape, 0, rows, columns)
+            close = _correlate(occupied, rings, turned.quarters, turned.rings.shape, 0, rows, columns)
             for ring in range(min(_RINGS, rows, columns)):  # the border of the image counts as taken
-                close[[ring, -1 - ring]] += wide * _FADING**ring
-                close[:, [ring, -1 - ring]] += high * _FADING**ring
-            low = (np.arange(rows) + high) * (_LOW / grid)
-            score = np.where(free, close / turned.around - low[:, None], -np.inf)
+                close[[ring, -1 - ring]] += wide * _RING_DECAY**ring
+                close[:, [ring, -1 - ring]] += high * _RING_DECAY**ring
+            low = (np.arange(rows) + high) * (_LOW_WEIGHT / grid)
+            score = np.where(free, close / turned.ring_total - low[:, None], -np.inf)
             at = int(np.round(score, 4).argmax())
-            if score.flat[at] > best + _ALIKE:
+            if score.flat[at] > best + _TOLERANCE:
                 best, found = float(score.flat[at]), (turned, *divmod(at, score.shape[1]))
         if found is None:
             return None
@@ -252,7 +259,7 @@ def _placed(pieces: list[_Piece], order: Ints, scale: float, padding: float) -> 
 
 
 def _transform(image: NDArray[Any], span: int) -> NDArray[np.complex64]:
-    """Of an image at the corner of an empty one."""
+    """Real FFT of an image in the corner of an empty one."""
     rows = np.zeros((len(image), span), np.float32)
     rows[:, : image.shape[1]] = image
     whole = np.zeros((span, span // 2 + 1), np.complex64)
@@ -260,8 +267,8 @@ def _transform(image: NDArray[Any], span: int) -> NDArray[np.complex64]:
     return np.asarray(fft(whole, axis=0, overwrite_x=True))
 
 
-def _sums(
-    known: NDArray[np.complex64],
+def _correlate(
+    occupied: NDArray[np.complex64],
     image: NDArray[np.complex64],
     quarters: int,
     size: tuple[int, ...],
@@ -269,16 +276,18 @@ def _sums(
     rows: int,
     columns: int,
 ) -> Float[Floats, "R C"]:
-    """What is taken of an image at every place from the ``first``, by transforms: its own, or those before half a turn."""
-    span = len(known)
+    """Correlation of the occupied texels with an image, at all places from ``first`` on. ``image`` is the transform of the
+    image, or of the image before a half turn where ``quarters`` is 2 or more.
+    """
+    span = len(occupied)
     begin, left = (first + size[0] - 1, first + size[1] - 1) if quarters >= 2 else (first, first)
-    product = ifft(known * (image if quarters >= 2 else np.conj(image)), axis=0, overwrite_x=True)
+    product = ifft(occupied * (image if quarters >= 2 else np.conj(image)), axis=0, overwrite_x=True)
     return np.asarray(irfft(product[begin : begin + rows], span, axis=1)[:, left : left + columns])
 
 
-def _on_shelves(pieces: list[_Piece], between: float) -> tuple[list[Floats], Floats]:
-    """Where pieces stand in rows, and the size of all, nearly a square."""
-    sizes = np.array([piece.size for piece in pieces]) + between
+def _put_on_shelves(pieces: list[_Piece], gap: float) -> tuple[list[Floats], Floats]:
+    """Positions of pieces in rows, and the size of the whole block, which is nearly a square."""
+    sizes = np.array([piece.size for piece in pieces]) + gap
     order = np.argsort(-sizes[:, 1], kind="stable")
     width = max(float(np.sqrt(sizes.prod(axis=1).sum())), float(sizes[:, 0].max()))
     ends = np.cumsum(sizes[order, 0])
@@ -290,4 +299,4 @@ def _on_shelves(pieces: list[_Piece], between: float) -> tuple[list[Floats], Flo
         at[row, 0], at[row, 1] = ends[begin:end] - sizes[row, 0] - done, y
         y += float(sizes[row, 1].max())
         begin, done = end, float(ends[end - 1])
-    return list(at), np.array([width, max(y, 1e-300)]) - between
+    return list(at), np.array([width, max(y, 1e-300)]) - gap

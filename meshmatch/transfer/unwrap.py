@@ -11,7 +11,7 @@ from meshmatch.arrays import Brief, Float, Floats, Int, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.triangles import flat_areas
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.flat_layout import joined
+from meshmatch.transfer.flat_layout import weld
 from meshmatch.transfer.new_charts import new_charts
 from meshmatch.transfer.texels import MOST_ROWS, faces_on, rows_of
 
@@ -201,7 +201,7 @@ def unwrapped(shape: Shape, size: int, padding: int, polygons: Ints | None = Non
     if np.sqrt((edges**2).sum(axis=2).max()) > _MAX_EDGE:
         problem = f"{shape.name or 'the target'} cannot be unwrapped (it has triangles as thin as a thread)"
         raise InputError(problem, "unwrap it in a modelling program, and use --uv keep")
-    corners = joined(verts, corners)
+    corners = weld(verts, corners)
     if (whole := (corners != corners[:, [1, 2, 0]]).all(axis=1)).any():
         real, corners = real[whole], corners[whole]
     uv = new_charts(verts, corners, size, padding, None if polygons is None else polygons[real])

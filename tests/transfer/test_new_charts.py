@@ -12,12 +12,12 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.transfer import chart_regions as chart_regions_module
 from meshmatch.transfer import hinged_charts
 from meshmatch.transfer.chart_regions import chart_regions
-from meshmatch.transfer.flat_layout import Layout, laid_flat
+from meshmatch.transfer.flat_layout import Layout, flatten_faces
 from meshmatch.transfer.new_charts import new_charts
-from meshmatch.transfer.pack_charts import Chart, packed, tightest
+from meshmatch.transfer.pack_charts import Chart, pack_charts, smallest_rectangle
 from meshmatch.transfer.texels import faces_on
-from meshmatch.transfer.tighten_charts import tightened
-from meshmatch.transfer.whole_polygons import unfolded_polygon
+from meshmatch.transfer.tighten_charts import tighten
+from meshmatch.transfer.whole_polygons import unfold_polygon
 from tests.conftest import icosphere
 from tests.growth import grows_with_size
 
@@ -39,17 +39,17 @@ def scaled(shape: Shape) -> np.ndarray:
 @pytest.mark.parametrize("bend", [0.01, 3.0])
 def test_what_can_be_unrolled_is_laid_flat_without_stretch(bend: float) -> None:
     shape = sheet(bend=bend)
-    laid = laid_flat(shape.verts, shape.faces, 1.5, 128)
+    laid = flatten_faces(shape.verts, shape.faces, 1.5, 128)
     assert laid is not None and not len(laid.bad)
     np.testing.assert_allclose(np.linalg.det(np.diff(laid.uv[laid.corners], axis=1)) / 2, shape.face_areas, rtol=0.01)
 
 
 def test_what_cannot_lie_flat_is_told() -> None:
     ball, two = icosphere(2), sheet(2)
-    assert laid_flat(ball.verts, ball.faces, 1.5, 128) is None
-    assert laid_flat(two.verts, two.faces[[0, 7]], 1.5, 128) is None  # they do not hang together
+    assert flatten_faces(ball.verts, ball.faces, 1.5, 128) is None
+    assert flatten_faces(two.verts, two.faces[[0, 7]], 1.5, 128) is None  # they do not hang together
     spiral = sheet(40, bend=0.01)
-    whole = laid_flat(spiral.verts, spiral.faces, 1.5, 128)
+    whole = flatten_faces(spiral.verts, spiral.faces, 1.5, 128)
     assert whole is not None
     uv = whole.uv.copy()
     uv[:, 0] = np.abs(uv[:, 0] - uv[:, 0].mean())  # folded in the middle
@@ -117,10 +117,10 @@ def test_borders_on_fine_surfaces_are_smoothed_by_way_of_a_copy_between(monkeypa
         done.append((len(surface.faces), steps))
         return smooth(surface, region, steps)
 
-    smooth = chart_regions_module._smooth
-    monkeypatch.setattr(chart_regions_module, "_smooth", counted)
-    monkeypatch.setattr(chart_regions_module, "_COARSE", 100)
-    monkeypatch.setattr(chart_regions_module, "_MOST_STEPS", 40)
+    smooth = chart_regions_module._smooth_regions
+    monkeypatch.setattr(chart_regions_module, "_smooth_regions", counted)
+    monkeypatch.setattr(chart_regions_module, "_COARSE_FACES", 100)
+    monkeypatch.setattr(chart_regions_module, "_MAX_SMOOTHING", 40)
     ball = icosphere(4)  # 5,120 triangles
     charts = chart_regions(scaled(ball), ball.faces, np.arange(ball.F))
     np.testing.assert_array_equal(np.sort(np.concatenate([chart.members for chart in charts])), np.arange(ball.F))
@@ -173,7 +173,7 @@ def test_a_polygon_of_thousands_of_corners_is_unfolded() -> None:
         disc = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
         low, high = np.arange(count // 2 - 1), count - 1 - np.arange(count // 2 - 1)
         faces = np.concatenate([np.stack([low, low + 1, high], 1), np.stack([low + 1, high - 1, high], 1)])
-        return lambda: (disc, faces, *unfolded_polygon(disc, faces))
+        return lambda: (disc, faces, *unfold_polygon(disc, faces))
 
     disc, faces, laid, corners = grows_with_size(prepared, 16_000)
     sides = [np.linalg.norm(each[:, [1, 2, 0]] - each, axis=2) for each in (laid[corners], disc[faces])]
@@ -206,7 +206,7 @@ def test_pairs_that_both_bend_are_laid_flat_again(monkeypatch: pytest.MonkeyPatc
     for chart in charts:
         layout = Layout.of(chart.uv, chart.corners, np.ones(len(chart.members), bool), 512)
         assert not len(layout.bad)
-    monkeypatch.setattr(hinged_charts, "_MANY", len(faces))
+    monkeypatch.setattr(hinged_charts, "_MIN_CHARTS_REFLATTEN", len(faces))
     assert len(chart_regions(verts, faces, np.arange(len(faces)))) > 60
 
 
@@ -221,7 +221,7 @@ def test_pieces_come_closer_and_stay_apart() -> None:
             image = ((y - high / 2 + 0.5) / high) ** 2 + ((x - wide / 2 + 0.5) / wide) ** 2 < 0.25
         images.append(image)
         at.append((32 * (k // 5), 32 * (k % 5)))
-    found, end = tightened(images, np.array(at), 2, 400, np.random.default_rng(0))
+    found, end = tighten(images, np.array(at), 2, 400, np.random.default_rng(0))
     assert end < 130  # from 4 * 32 and a piece
     where = np.zeros((end, end), int)
     for number, (image, (y, x)) in enumerate(zip(images, found.tolist(), strict=True), 1):
@@ -230,7 +230,7 @@ def test_pieces_come_closer_and_stay_apart() -> None:
     for number in range(1, 26):
         near = where[maximum_filter(where == number, 5)]  # two texels around
         assert set(near.tolist()) <= {0, number}
-    assert tightened(images, np.array(at), 2, 0, np.random.default_rng(0))[1] > end + 10
+    assert tighten(images, np.array(at), 2, 0, np.random.default_rng(0))[1] > end + 10
 
 
 def test_packed_rectangles_are_apart() -> None:
@@ -240,7 +240,7 @@ def test_packed_rectangles_are_apart() -> None:
         Chart(np.array([2 * k, 2 * k + 1]), np.array([[0, 0], [w, 0], [w, h], [0, h]]), corners)
         for k, (w, h) in enumerate(rng.uniform(0.2, 1.0, (12, 2)))
     ]
-    places = packed(charts, 8 / 512)
+    places = pack_charts(charts, 8 / 512)
     low, high = (np.array([getattr(each, end)(axis=0) for each in places]) * 512 for end in ("min", "max"))
     for one in range(12):
         for two in range(one):
@@ -257,14 +257,14 @@ def test_packed_rectangles_are_apart() -> None:
 def test_the_smallest_rectangle() -> None:
     angle = 0.3
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    found, area = tightest(np.array([[0, 0], [3, 0], [3, 1], [0, 1], [1, 0.5]]) @ turn)
+    found, area = smallest_rectangle(np.array([[0, 0], [3, 0], [3, 1], [0, 1], [1, 0.5]]) @ turn)
     assert found == pytest.approx(angle) and area == pytest.approx(3.0)
 
 
 def test_padding_that_leaves_no_room_is_less() -> None:
     square, corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]), np.array([[0, 1, 2], [0, 2, 3]])
     charts = [Chart(np.arange(2), square, corners) for _ in range(70)]
-    found = packed(charts, 0.125)  # an eighth of the image around each of 70
+    found = pack_charts(charts, 0.125)  # an eighth of the image around each of 70
     assert all(uv.min() >= 0 and uv.max() <= 1 for uv in found)
     low, high = (np.array([edge(uv, axis=0) for uv in found]) for edge in (np.min, np.max))
     assert (high - low).min() > 0.01

@@ -7,7 +7,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.triangles import face_parts
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer import unwrap
-from meshmatch.transfer.flat_layout import joined
+from meshmatch.transfer.flat_layout import weld
 from meshmatch.transfer.texels import faces_on, grow
 from meshmatch.transfer.unwrap import atlas_of, tiles_of, unwrapped
 from tests.conftest import icosphere
@@ -81,9 +81,9 @@ def test_ends_of_open_edges_at_one_place_are_one_vertex() -> None:
     corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (1, 1, 1e-12), (2, 0, 0), (0, 0, 1)]
     verts = np.array([corners[k] for k in (0, 1, 2, 1, 2, 3, 4, 5, 1, 2, 6)], float)
     faces = np.array([[0, 1, 2], [3, 5, 4], [3, 6, 5], [3, 7, 6]])
-    np.testing.assert_array_equal(joined(verts, faces), [[0, 1, 2], [1, 5, 2], [1, 5, 5], [1, 7, 5]])
+    np.testing.assert_array_equal(weld(verts, faces), [[0, 1, 2], [1, 5, 2], [1, 5, 5], [1, 7, 5]])
     three = np.array([[0, 1, 2], [3, 5, 4], [8, 10, 9]])
-    np.testing.assert_array_equal(joined(verts, three), three)
+    np.testing.assert_array_equal(weld(verts, three), three)
 
 
 def test_size_and_place_of_a_shape_do_not_matter(cube: Shape) -> None:
