@@ -18,7 +18,7 @@ from meshmatch.geometry.triangles import same_rows, vertex_normals
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.colors import INVISIBLE
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.texels import pyramids_of
+from meshmatch.transfer.texels import build_pyramids
 
 AnyFloats = NDArray[np.floating[Any]]
 Rows = Int[Ints, " N"]
@@ -67,7 +67,7 @@ class TexturePaint:
     def __init__(self, look: Appearance, shape: Shape, scale: float) -> None:
         self._look, self._faces = look, shape.faces
         self._colors = None if look.colors is None else np.nan_to_num(look.colors).astype(np.float32)
-        self._pyramids = pyramids_of(look)
+        self._pyramids = build_pyramids(look)
         texels = np.array([0.0 if m.image is None else m.image[..., 0].size for m in look.materials])
         self._most = [1.0 if m.image is None else float(m.image[..., 3].max(initial=0)) / 255.0 for m in look.materials]
         # Texels per unit of length on each face: a pixel averages as many as it is wide.
@@ -88,7 +88,7 @@ class TexturePaint:
             if number in self._pyramids:
                 uv = np.einsum("nk,nkc->nc", weights[rows], self._look.uv[faces[rows]]).astype(np.float32)
                 wide = np.float32(footprint) * self._density[faces[rows]]
-                out[rows] = self._pyramids[number].look(uv[:, 0], uv[:, 1], wide).T
+                out[rows] = self._pyramids[number].sample(uv[:, 0], uv[:, 1], wide).T
             own = tint[rows] * np.array(material.factor, np.float32)
             out[rows, :3] *= own[:, :3]
             out[rows, 3] = _solid(material, out[rows, 3], own[:, 3], self._most[number])

@@ -1,5 +1,5 @@
-"""Transfer of what lies on one shape to another, along a map. Arrays in, arrays out; no torch.
+"""Transfer of data from one shape to another along a map. Arrays in, arrays out; no torch.
 
-Values, labels, weights and textures are pulled back: a map from the target to the source says for each vertex of the
-target where on the source its value comes from. Landmarks alone are pushed forward, by a map from source to target.
+Values, labels, weights and textures are pulled back: a map from target to source gives, for each vertex of the target, the
+place on the source that its value is taken from. Only landmarks are pushed forward, by a map from source to target.
 """

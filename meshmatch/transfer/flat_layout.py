@@ -14,7 +14,7 @@ from scipy.sparse.linalg import SuperLU
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.smoothing import factors
 from meshmatch.geometry.triangles import flat_areas, same_rows, signed_areas, together, triangle_areas, unit
-from meshmatch.transfer.texels import faces_on
+from meshmatch.transfer.texels import draw_triangles
 
 # All of these were set by hand.
 _MAX_CONFORMAL_STRETCH = 1e6  # times the allowed stretch: a conformal layout with more is given up
@@ -108,9 +108,9 @@ def _find_bad(
     low, high = positions.min(axis=(0, 1)), positions.max(axis=(0, 1))
     image = (0.01 + 0.98 * (positions - low) / (high - low).max()) * grid
     image[~visible] = 0.0
-    found, twice = faces_on(image, grid)
+    found, twice = draw_triangles(image, grid)
     if twice:
-        other = F - 1 - faces_on(image[::-1], grid)[0]
+        other = F - 1 - draw_triangles(image[::-1], grid)[0]
         differ = (found >= 0) & (found != other)
         edges = np.sort(corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         number = same_rows(edges)

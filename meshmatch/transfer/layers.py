@@ -1,8 +1,8 @@
-"""What is baked besides colors: the layers of a source's finish, each an image on the same coordinates.
+"""Baking of the layers besides color: those of a source's finish, each an image on the same coordinates.
 
-Normals are directions in the frame of a surface: along u, against v, and outwards. From the source to the target the part
-along the surface is turned, from the frame at the point of the source to that at the point of the target as the map lays it
-on the source (the nearest rotation, or reflection where the coordinates of one of them are mirrored).
+Normals are directions in a tangent frame: along u, against v, and outwards. From source to target the tangential part is
+rotated from the frame at the point of the source to that of the target's point, pushed onto the source by the map (the
+nearest rotation, or reflection where the coordinates of one of them are mirrored).
 """
 
 from __future__ import annotations
@@ -19,48 +19,52 @@ from meshmatch.shapes.appearance import Appearance, Finish, Pixels
 from meshmatch.shapes.colors import bytes_of
 from meshmatch.shapes.formats.gltf_out import smooth_normals
 from meshmatch.shapes.formats.seams import split_at_seams, vertex_tangents
-from meshmatch.transfer.surface_walk import SurfaceWalker, weighted
+from meshmatch.transfer.surface_walk import SurfaceWalker, weighted_sum
 from meshmatch.transfer.texel_colors import MaterialSampler, TexelLocator
 
 
 @dataclass(frozen=True, eq=False)
-class Spots:
-    """Points of the target (N,): triangle and weights (3, N) there; face and weights (3, N) on the source; the size (N,)
-    of each on the source.
+class Samples:
+    """N points of the target and their places on the source.
+
+    ``triangle`` (N,) and ``weights`` (3, N) on the target; ``face`` (N,) and ``source_weights`` (3, N) on the source;
+    ``reach`` (N,) the size of each on the source.
     """
 
     triangle: Ints32
     weights: Floats32
     face: Ints32
-    held: Floats32
+    source_weights: Floats32
     reach: Floats32
 
 
 class Painter(Protocol):
     """Paints one image of a baked material."""
 
-    linear: bool  # its bytes are numbers, not colors
+    linear: bool  # bytes are plain numbers, not sRGB colors
     samplers: list[MaterialSampler]
 
-    def seen(self, spots: Spots) -> Floats32:
-        """(4, N) amounts and alpha."""
+    def sample(self, samples: Samples) -> Floats32:
+        """(4, N) amounts and alpha at the samples."""
 
 
 class ColorPainter:
-    """Colors and alpha of a source, in linear light."""
+    """Samples colors and alpha of a source, in linear light."""
 
     def __init__(self, look: Appearance, walker: SurfaceWalker) -> None:
         self.sampler = MaterialSampler(look, walker)
         self.samplers = [self.sampler]
         self.linear = look.materials[0].linear
 
-    def seen(self, spots: Spots) -> Floats32:
-        """(4, N) amounts and alpha."""
-        return self.sampler.colors(spots.face, spots.held, self.sampler.footprint(spots.face, spots.reach))
+    def sample(self, samples: Samples) -> Floats32:
+        """(4, N) colors and alpha at the samples."""
+        return self.sampler.colors(
+            samples.face, samples.source_weights, self.sampler.footprint(samples.face, samples.reach)
+        )
 
 
 class SurfacePainter:
-    """Occlusion, roughness and metal as red, green and blue."""
+    """Samples occlusion, roughness and metalness, as red, green and blue."""
 
     linear = True
 
@@ -70,36 +74,36 @@ class SurfacePainter:
         self.strength = np.ones(0, np.float32) if occlusion is None else strengths(occlusion)
         self.samplers = [each.sampler for each in (self.surface, self.occlusion) if each is not None]
 
-    def seen(self, spots: Spots) -> Floats32:
-        """(4, N) amounts and alpha."""
-        out = self.surface.seen(spots)
+    def sample(self, samples: Samples) -> Floats32:
+        """(4, N) amounts and alpha at the samples."""
+        out = self.surface.sample(samples)
         out[0] = 1.0
         if self.occlusion is not None:
-            share = self.strength.take(spots.face)
-            out[0] += share * (self.occlusion.seen(spots)[0] - 1)
+            strength = self.strength.take(samples.face)
+            out[0] += strength * (self.occlusion.sample(samples)[0] - 1)
         return out
 
 
 class NormalPainter:
-    """Normals in the frames of the target."""
+    """Samples normals in the tangent frames of the target."""
 
     linear = True
 
     def __init__(self, look: Appearance, walker: SurfaceWalker, locator: TexelLocator, uv: Floats) -> None:
         self.colors, self.strength = ColorPainter(look, walker), strengths(look)
         self.samplers = self.colors.samplers
-        self.source = _columns(_frames(walker.verts, walker.faces, look.uv))
-        self.target = _columns(locator.laid(_frames(locator.verts, locator.faces, uv)))
+        self.source = _as_columns(_tangent_frames(walker.verts, walker.faces, look.uv))
+        self.target = _as_columns(locator.push_directions(_tangent_frames(locator.verts, locator.faces, uv)))
 
-    def seen(self, spots: Spots) -> Floats32:
-        """(4, N) amounts and alpha."""
-        out = self.colors.seen(spots)
-        share = self.strength.take(spots.face)
-        x, y = ((2 * out[k] - 1) * share for k in (0, 1))
+    def sample(self, samples: Samples) -> Floats32:
+        """(4, N) encoded normals (0.5 + 0.5 n) and alpha at the samples."""
+        out = self.colors.sample(samples)
+        strength = self.strength.take(samples.face)
+        x, y = ((2 * out[k] - 1) * strength for k in (0, 1))
         z = 2 * out[2] - 1
-        ours = _interpolated(self.source, spots.face, spots.held)
-        theirs = _interpolated(self.target, spots.triangle, np.clip(spots.weights, 0, 1))
-        (a, b), (c, d) = ([weighted(one, other) for other in theirs] for one in ours)
+        ours = _interpolate_frames(self.source, samples.face, samples.source_weights)
+        theirs = _interpolate_frames(self.target, samples.triangle, np.clip(samples.weights, 0, 1))
+        (a, b), (c, d) = ([weighted_sum(one, other) for other in theirs] for one in ours)
         mirrored = a * d < b * c
         cosine, sine = np.where(mirrored, a - d, a + d), np.where(mirrored, c + b, c - b)
         length = np.maximum(np.sqrt(cosine * cosine + sine * sine), np.float32(1e-20))
@@ -113,12 +117,12 @@ class NormalPainter:
 
 
 def strengths(look: Appearance) -> Floats32:
-    """(F,) how much the layer's image counts on each face."""
+    """(F,) strength of the layer's image on each face."""
     return np.array([made.strength for made in look.materials], np.float32)[look.material]
 
 
-def _frames(verts: Floats, faces: Ints, uv: Floats) -> Floats:
-    """(F, 3, 2, 3) at each corner of each face the directions along u and against v."""
+def _tangent_frames(verts: Floats, faces: Ints, uv: Floats) -> Floats:
+    """(F, 3, 2, 3) directions along u and against v, at each corner of each face."""
     vertex, coordinates, corners = split_at_seams(len(verts), faces, uv)
     normals = smooth_normals(verts, faces)[vertex]
     tangents = vertex_tangents(verts[vertex], normals, corners, coordinates)
@@ -126,21 +130,23 @@ def _frames(verts: Floats, faces: Ints, uv: Floats) -> Floats:
     return np.stack([tangents[:, :3], up], axis=1)[corners]
 
 
-def _columns(frames: Floats) -> list[list[list[Floats32]]]:
+def _as_columns(frames: Floats) -> list[list[list[Floats32]]]:
     """Frames (F, 3, 2, 3) as columns: by direction, axis and corner."""
     table = frames.transpose(2, 3, 1, 0).astype(np.float32, order="C")
     return [[list(axis) for axis in direction] for direction in table]
 
 
-def _interpolated(
+def _interpolate_frames(
     columns: list[list[list[Floats32]]], face: NDArray[np.integer], weights: Floats32
 ) -> list[list[Floats32]]:
     """Both directions (3, N) at points of faces (N,) with weights (3, N)."""
-    return [[weighted(weights, [corner.take(face) for corner in axis]) for axis in direction] for direction in columns]
+    return [
+        [weighted_sum(weights, [corner.take(face) for corner in axis]) for axis in direction] for direction in columns
+    ]
 
 
 def painted_bytes(painter: Painter, amounts: Floats32) -> Pixels:
-    """(N, 4) bytes of an image for amounts and alpha (4, N)."""
+    """(N, 4) image bytes of amounts and alpha (4, N)."""
     out = np.empty((amounts.shape[1], 4), np.uint8)
     shares = np.round(np.clip(amounts, 0, 1) * 255)
     out[:, :3] = shares[:3].T if painter.linear else bytes_of(amounts[:3]).T

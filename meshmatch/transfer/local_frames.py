@@ -1,4 +1,4 @@
-"""How a map turns and scales the source around each of its vertices."""
+"""Local rotation and scale of a map around each vertex of the source."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from meshmatch.maps.mapped_mesh import length_of
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
-# Set by hand, in units of sqrt(area): over this distance turns and scales are averaged.
-_SMOOTH = 0.06
-_INSIDE_OUT = -0.5  # three quarters of the surface are turned over
+# Set by hand, in units of sqrt(area): distance over which rotations and scales are averaged.
+_AVERAGING = 0.06
+_INSIDE_OUT = -0.5  # mean cosine of normals: three quarters of the surface are flipped
 
 
 def local_frames(
     forward: VertexMap, source: Shape, target: Shape
 ) -> tuple[Float[Floats, "V 3 3"], Float[Floats, " V"]]:
-    """Of each vertex of the source, the rotation from the source to the target there, and the scale; both averaged over
-    the surface around, so that an error of the map at one vertex counts for little.
+    """Rotations (V, 3, 3) from source to target and scales (V,) at each vertex of the source, averaged over the surface
+    around it, so that an error of the map at one vertex counts for little.
 
     `InputError`: the source is a point cloud. `OptionError`: the map turns it inside out.
     """
@@ -37,20 +37,20 @@ def local_frames(
         raise OptionError(f"{name} matches as a mirror image: what is carried would be inside out", hint)
     edges = source.edges.vertices.astype(np.int64)
     here, there = (place[edges[:, 1]] - place[edges[:, 0]] for place in (source.verts, image))
-    length, now = edge_lengths(source.verts, edges), edge_lengths(image, edges)
-    torn = is_discontinuous(now / length_of(target), length / length_of(source)) | (length == 0)
-    trust = np.where(torn, 0.0, forward.assumed_confidence[edges].min(axis=1)) + 1e-6
+    length, image_length = edge_lengths(source.verts, edges), edge_lengths(image, edges)
+    discontinuous = is_discontinuous(image_length / length_of(target), length / length_of(source)) | (length == 0)
+    trust = np.where(discontinuous, 0.0, forward.assumed_confidence[edges].min(axis=1)) + 1e-6
     weight = trust / np.maximum(length, 1e-12 * length_of(source))
     products = weight[:, None, None] * there[:, :, None] * here[:, None, :]
-    sums = np.zeros((source.V, 11))  # products, and lengths now and before
-    rows = np.column_stack([products.reshape(-1, 9), trust * now, trust * length])
+    sums = np.zeros((source.V, 11))  # products (9), and sums of lengths after and before
+    rows = np.column_stack([products.reshape(-1, 9), trust * image_length, trust * length])
     for end in edges.T:
         np.add.at(sums, end, rows)
     scale = float(sums[:, 9].sum() / max(sums[:, 10].sum(), 1e-300))
     outwards = 0.5 * scale * sums[:, 10, None, None] * normals[:, :, None] * source.vertex_normals[:, None, :]
     sums[:, :9] += outwards.reshape(-1, 9)
-    sums = averaged(sums, np.ones(source.V), edges, length, _SMOOTH * length_of(source))
+    sums = averaged(sums, np.ones(source.V), edges, length, _AVERAGING * length_of(source))
     around = sums[:, :9].reshape(-1, 3, 3)
-    turns = nearest_rotations(around, np.broadcast_to(np.eye(3), around.shape))
+    rotations = nearest_rotations(around, np.broadcast_to(np.eye(3), around.shape))
     ratio = np.maximum(sums[:, 9], 0.0) / np.maximum(sums[:, 10], 1e-300)
-    return turns, np.where(ratio > 0, ratio, scale)
+    return rotations, np.where(ratio > 0, ratio, scale)

@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import flat_areas
-from meshmatch.transfer.texels import texels_in
+from meshmatch.transfer.texels import covered_texels
 from meshmatch.transfer.tighten_charts import tighten
 
 # All of these were set by hand.
@@ -144,7 +144,7 @@ class _Piece:
         uv = self.uv * scale
         wide, high = np.floor(uv.max(axis=0)).astype(np.int64) + 1
         out = np.zeros((high, wide), bool)
-        for _, x, y in texels_in(uv[self.corners]):
+        for _, x, y in covered_texels(uv[self.corners]):
             out[np.minimum(y, high - 1), np.minimum(x, wide - 1)] = True
         begin, along = uv[self.border[:, 0]], uv[self.border[:, 1]] - uv[self.border[:, 0]]
         steps = np.maximum(np.ceil(2 * np.abs(along).max(axis=1)), 1).astype(np.int64)

@@ -1,7 +1,7 @@
-"""Closest points on the surface that colors are taken from, by walking over it.
+"""Closest points on the source's surface, by walking over it.
 
-A search begins at a known face, and goes from face to face over shared edges. So it never changes to another sheet that
-merely passes by, and neighbouring points end at neighbouring places, which a search in a tree does not grant.
+A search begins at a known face and moves from face to face over shared edges. Unlike a search in a tree, it never jumps to
+another sheet that merely passes nearby, and neighboring points end at neighboring places.
 """
 
 from __future__ import annotations
@@ -15,119 +15,121 @@ from meshmatch.geometry.triangles import blend, closest_on_triangles, same_rows,
 from meshmatch.maps.mapped_mesh import length_of
 from meshmatch.shapes.shape import Shape
 
-_INSIDE = np.float32(-1e-5)
-_STEPS, _STEPS_AGAIN = 32, 12
+_MIN_WEIGHT = np.float32(-1e-5)
+_MAX_STEPS, _MAX_STEPS_AGAIN = 32, 12
 
 
 class SurfaceWalker:
-    """A mesh arranged for walks; lengths in units of `unit`, seen from `center`."""
+    """A mesh prepared for walks; `verts` are relative to `center` and in units of `unit`."""
 
     def __init__(self, shape: Shape) -> None:
         self.center = shape.bounds.mean(axis=0)
         self.unit = length_of(shape)
         self.verts = (shape.verts - self.center) / self.unit
         self.faces = shape.faces
-        self.same = same_rows(shape.verts)[shape.faces]  # corners by position: seams do not separate
-        self.opposite, self.opposite_edge = _neighbours(shape.faces, self.same)
+        self.welded = same_rows(shape.verts)[shape.faces]  # welded by position: seams do not separate
+        self.opposite, self.opposite_edge = _face_neighbors(shape.faces, self.welded)
         corners = self.verts[shape.faces]
         self.areas = triangle_areas(self.verts, shape.faces)
         first, second = duals(corners)
-        self._flat = (first == 0).all(axis=1) & (second == 0).all(axis=1)
+        self._degenerate = (first == 0).all(axis=1) & (second == 0).all(axis=1)
         self._table = list(np.concatenate([corners[:, 0], first, second], axis=1).T.astype(np.float32, order="C"))
         self._opposite = list(np.ascontiguousarray(self.opposite.T))
-        self.face_of_vertex = np.full(shape.V, -1, np.int64)  # a face at each vertex; -1 where there is none
+        self.face_of_vertex = np.full(shape.V, -1, np.int64)  # some face at each vertex; -1 if there is none
         self.face_of_vertex[shape.faces[::-1].ravel()] = np.repeat(np.arange(shape.F - 1, -1, -1), 3)
-        self._unfit = self._flat | ~shape.valid_faces
+        self._unusable = self._degenerate | ~shape.valid_faces
         self._tree: cKDTree | None = None
 
     def closest(self, points: Floats32, face: Ints32) -> tuple[Ints32, Floats32, Floats32]:
-        """The closest place on the surface that a walk reaches from points (3, N), beginning on faces (N,), -1 where
-        that is not known: a face (N,), weights (3, N), and the distance (N,), 0 for all whose foot lies inside its face.
+        """The closest places on the surface that walks from faces (N,) towards points (3, N) reach.
+
+        Walks from face -1 start at the face with the nearest center. Returns faces (N,), weights (3, N), and distances
+        (N,), which are 0 for all points whose projection lies inside its face.
         """
-        lost = np.flatnonzero(face < 0)
-        if len(lost):
+        unknown = np.flatnonzero(face < 0)
+        if len(unknown):
             face = face.copy()
-            face[lost] = self._nearest_center(points[:, lost])
-        face, weights, outside, unfinished = self._walk(points, face, _STEPS)
-        if self._flat.any():  # a walk cannot cross a face without area
-            unfinished = np.union1d(unfinished, np.flatnonzero(self._flat[face]))
-        if len(unfinished):  # a long walk, or a circular one: start near its end
-            some = points[:, unfinished]
-            again = self._walk(some, self._nearest_center(some), _STEPS_AGAIN)
+            face[unknown] = self._nearest_center(points[:, unknown])
+        face, weights, outside, unfinished = self._walk(points, face, _MAX_STEPS)
+        if self._degenerate.any():  # a walk cannot cross a face without area
+            unfinished = np.union1d(unfinished, np.flatnonzero(self._degenerate[face]))
+        if len(unfinished):  # a long or circular walk: start again near its end
+            rest = points[:, unfinished]
+            again = self._walk(rest, self._nearest_center(rest), _MAX_STEPS_AGAIN)
             face[unfinished], weights[:, unfinished], out, _ = again
             outside = np.concatenate([np.setdiff1d(outside, unfinished), unfinished[out]])
         distance = np.zeros(len(face), np.float32)
         if len(outside):
             corners = self.verts[self.faces[face[outside]]]
-            asked = points[:, outside].T.astype(np.float64)
-            held = closest_on_triangles(asked, *corners.swapaxes(0, 1))
-            foot = blend(corners, held)
-            weights[:, outside] = held.T
-            distance[outside] = np.sqrt(squared_lengths(foot - asked))
+            queries = points[:, outside].T.astype(np.float64)
+            inside = closest_on_triangles(queries, *corners.swapaxes(0, 1))
+            foot = blend(corners, inside)
+            weights[:, outside] = inside.T
+            distance[outside] = np.sqrt(squared_lengths(foot - queries))
         np.maximum(weights, 0, out=weights)
         weights /= weights[0] + weights[1] + weights[2]
         return face, weights, distance
 
     def cut(self, edges: Bools) -> None:
-        """Let no walk cross these edges (F, 3), each by the corner opposite to it."""
+        """Forbid walks over these edges (F, 3), each given by the opposite corner."""
         self.opposite[edges] = -1
         self._opposite = list(np.ascontiguousarray(self.opposite.T))
 
     def reach(self, points: Floats32, face: Ints32) -> tuple[Ints32, Floats32]:
-        """Where walks from faces (N,) to points (3, N) end: faces (N,), and weights (N, 3) that continue the plane of a face
-        beyond an edge that cannot be crossed.
+        """Faces (N,) where walks from faces (N,) towards points (3, N) end, and weights (N, 3), which extrapolate the plane
+        of a face beyond an edge that cannot be crossed.
         """
-        face, weights, _, _ = self._walk(points, face, _STEPS)
+        face, weights, _, _ = self._walk(points, face, _MAX_STEPS)
         return face, np.ascontiguousarray(weights.T)
 
     def _walk(self, points: Floats32, face: Ints32, steps: int) -> tuple[Ints32, Floats32, Ints, Ints]:
-        """Face and weights where each walk ended; those that ended at an edge; those that did not end.
+        """Face and weights where each walk ended; the walks that ended at an edge; those that did not end.
 
-        Column by column: reductions over three numbers take NumPy fifty times as long.
+        Computed column by column: reductions over three numbers are fifty times slower in NumPy.
         """
         N = len(face)
         face = face.copy()
         weights = np.empty((3, N), np.float32)
-        active, before = np.arange(N), np.full(N, -1, np.int32)
-        at, standing = points, face
+        active, previous = np.arange(N), np.full(N, -1, np.int32)
+        at, current = points, face
         ended: list[Ints] = []
         for step in range(steps):
-            away = [at[k] - self._table[k].take(standing) for k in range(3)]
-            second = weighted(away, [column.take(standing) for column in self._table[3:6]])
-            third = weighted(away, [column.take(standing) for column in self._table[6:9]])
+            offset = [at[k] - self._table[k].take(current) for k in range(3)]
+            second = weighted_sum(offset, [column.take(current) for column in self._table[3:6]])
+            third = weighted_sum(offset, [column.take(current) for column in self._table[6:9]])
             held = [1 - second - third, second, third]
             here = np.s_[:] if step == 0 else active
             for k in range(3):
                 weights[k, here] = held[k]
-            face[here] = standing
-            go = np.flatnonzero(np.minimum(np.minimum(held[0], second), third) < _INSIDE)
+            face[here] = current
+            go = np.flatnonzero(np.minimum(np.minimum(held[0], second), third) < _MIN_WEIGHT)
             if not len(go):
                 return face, weights, np.concatenate([active[:0], *ended]), active[:0]
-            standing, before = standing[go], before[go]
-            least = np.full(len(go), _INSIDE)
+            current, previous = current[go], previous[go]
+            least = np.full(len(go), _MIN_WEIGHT)
             onward = np.full(len(go), -1, np.int32)
             for k in range(3):
-                over, weight = self._opposite[k].take(standing), held[k][go]
-                better = (weight < least) & (over >= 0) & (over != before)
+                over, weight = self._opposite[k].take(current), held[k][go]
+                better = (weight < least) & (over >= 0) & (over != previous)
                 least = np.where(better, weight, least)
                 onward = np.where(better, over, onward)
             on = onward >= 0
             ended.append(active[go[~on]])
-            go, before, standing = go[on], standing[on], onward[on]
+            go, previous, current = go[on], current[on], onward[on]
             active, at = active[go], at[:, go]
         return face, weights, np.concatenate([*ended, active]), active
 
     def _nearest_center(self, points: Floats32) -> Ints32:
         if self._tree is None:
             centers = self.verts[self.faces].mean(axis=1)
-            centers[self._unfit] = 1e6
+            centers[self._unusable] = 1e6
             self._tree = cKDTree(centers)
         return np.asarray(self._tree.query(points.T)[1], np.int32)
 
 
 class PointWalker(SurfaceWalker):
-    """A point cloud as a walker: each point with its two nearest neighbours stands for a face, a walk is a search for
-    the nearest point, and weights fall with the square of the distance.
+    """The same interface for a point cloud: each point with its two nearest neighbors acts as a face, walks are
+    nearest-point searches, and weights fall with the squared distance.
     """
 
     def __init__(self, shape: Shape) -> None:
@@ -142,21 +144,21 @@ class PointWalker(SurfaceWalker):
         self._valid, self._points = valid, cKDTree(self.verts[valid])
 
     def closest(self, points: Floats32, face: Ints32) -> tuple[Ints32, Floats32, Floats32]:
-        """The nearest points, wherever the search began; see `SurfaceWalker.closest`."""
+        """The nearest points, whatever the start; see `SurfaceWalker.closest`."""
         place = self._valid[self._points.query(points.T)[1]].astype(np.int32)
         away = self.verts[self.faces[place]] - points.T[:, None]
         near = 1.0 / np.maximum(np.einsum("nkd,nkd->kn", away, away), 1e-18)
         return place, (near / near.sum(axis=0)).astype(np.float32), np.zeros(len(place), np.float32)
 
 
-def weighted(a: list[Floats32] | Floats32, b: list[Floats32]) -> Floats32:
-    """(N,) products of columns, three each, added up."""
+def weighted_sum(a: list[Floats32] | Floats32, b: list[Floats32]) -> Floats32:
+    """(N,) sum of the products of three pairs of columns."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def duals(corners: Floats) -> tuple[Floats, Floats]:
-    """Vectors (F, 3) whose products with a point of a triangle (F, 3, 3), seen from its first corner, are the weights of
-    its second and third; zeros for a triangle without area.
+    """Dual vectors (F, 3) of the edges at the first corner of triangles (F, 3, 3): their products with a point relative to
+    that corner are the weights of the second and third corner. Zeros for a triangle without area.
     """
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     a, b, c = squared_lengths(first), np.einsum("ni,ni->n", first, second), squared_lengths(second)
@@ -166,13 +168,14 @@ def duals(corners: Floats) -> tuple[Floats, Floats]:
     return share * (c[:, None] * first - b[:, None] * second), share * (a[:, None] * second - b[:, None] * first)
 
 
-def _neighbours(faces: Ints, same: Ints) -> tuple[Ints32, NDArray[np.int8]]:
-    """The face across each edge (F, 3), -1 for none, and which of its edges that is; edge k is opposite corner k. Edges
-    of two faces by their vertices come before those by their places; where more than two meet, none goes on.
+def _face_neighbors(faces: Ints, welded: Ints) -> tuple[Ints32, NDArray[np.int8]]:
+    """The face across each edge (F, 3), -1 for none, and the number of the edge there; edge k is opposite to corner k.
+
+    Edges are matched by vertices first, then by positions; edges of more than two faces cannot be crossed.
     """
     F = len(faces)
     opposite = np.full(3 * F, -1, np.int64)
-    for corners in (faces, same):
+    for corners in (faces, welded):
         start, end = corners[:, [1, 2, 0]].ravel(), corners[:, [2, 0, 1]].ravel()
         free = np.flatnonzero((opposite < 0) & (start != end))
         stride = int(corners.max()) + 1 if F else 1

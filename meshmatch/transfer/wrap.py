@@ -1,4 +1,4 @@
-"""A mesh that lies near a scan, laid onto its surface: projected with a smooth displacement, which gets finer by rounds."""
+"""Wrapping: a mesh that lies near a scan is projected onto it, with a smooth displacement that gets finer in rounds."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from meshmatch.maps.named_places import corners_of
 from meshmatch.shapes.shape import Shape
 
 # All set by hand; lengths in units of sqrt(area).
-# Displacements are averaged over these distances, one after the other.
+# Distances over which displacements are averaged, in order.
 _RADII = (0.03, 0.015, 0.008, 0.004, 0.002)
-# A point of the scan that is further away counts little: 1/e here.
+# Distance from the scan at which a target point counts 1/e.
 _REACH = 0.03
-# What counts where nothing is known, so that everything follows what is around it.
-_FLOOR = 1e-4
-# Vertices that a free part follows where it hangs on nothing else.
-_AROUND = 24
+# Weight of points without a target, so that they follow their surroundings.
+_MIN_WEIGHT = 1e-4
+# Vertices that a disconnected free part follows.
+_N_AROUND = 24
 
 
 @dataclass(frozen=True, eq=False)
 class Wrapped:
-    """A base on a scan.
+    """A base mesh wrapped onto a scan.
 
-    ``verts`` (V, 3) in the frame and unit of the scan; ``turns`` (V, 3, 3) how each vertex was turned; ``distance`` (V,) of
-    each vertex to the scan's surface.
+    ``verts`` (V, 3) in the frame and unit of the scan; ``turns`` (V, 3, 3) rotation of each vertex; ``distance`` (V,) from the
+    scan's surface.
     """
 
     verts: Float[Floats, "V 3"]
@@ -44,19 +44,19 @@ class Wrapped:
 def wrap_onto(
     base: Shape, near: Float[Floats, "V 3"], scan: Shape, free: Bool[Bools, " V"], workers: int = 1
 ) -> Wrapped:
-    """Lay a base, whose vertices are ``near`` a scan already, onto it; ``free`` ones keep their shape and follow the others.
+    """Wrap a base whose vertices are already ``near`` a scan onto it; ``free`` vertices keep their shape and follow others.
 
-    A vertex is drawn to the closest point of the scan that faces as it does, unless that is on the rim of a hole.
+    A vertex is drawn to the closest point of the scan with a similar normal, unless that is on the rim of a hole.
     """
-    own, back = np.unique(same_rows(base.verts), return_inverse=True)  # seams stay closed
+    own, back = np.unique(same_rows(base.verts), return_inverse=True)  # welded, so that seams stay closed
     faces, bound = back[base.faces], ~free[own]
     mesh = Shape(base.verts[own], faces, base.name)
     edges = mesh.edges.vertices.astype(np.int64)
     surface, unit_length = _Scan(scan, workers), length_of(scan)
     verts = near[own]
     for radius in _RADII:
-        step, trust = surface.towards(verts, vertex_normals(verts, faces))
-        trust = np.where(bound & mesh.valid, trust, 0.0) + _FLOOR
+        step, trust = surface.steps_towards(verts, vertex_normals(verts, faces))
+        trust = np.where(bound & mesh.valid, trust, 0.0) + _MIN_WEIGHT
         verts = verts + averaged(step, trust, edges, edge_lengths(verts, edges), radius * unit_length)
     if not bound.all():
         verts = _with_free_parts(mesh, near[own], verts, bound)
@@ -65,7 +65,7 @@ def wrap_onto(
 
 
 class _Scan:
-    """The surface that is wrapped."""
+    """Surface of the scan, with closest points."""
 
     def __init__(self, scan: Shape, workers: int) -> None:
         self._scan, self._mesh, self._workers = scan, MappedMesh.of(scan), workers
@@ -74,8 +74,8 @@ class _Scan:
         self._rim[scan.edges.vertices[scan.edges.sizes == 1]] = True
         self._reach = _REACH * length_of(scan)
 
-    def towards(self, points: Floats, normals: Floats) -> tuple[Floats, Floats]:
-        """Steps (N, 3) onto the surface, and how far each is to be trusted (N,)."""
+    def steps_towards(self, points: Floats, normals: Floats) -> tuple[Floats, Floats]:
+        """Steps (N, 3) to the surface, and their weights (N,)."""
         found = self._mesh.query(points, normals, self._workers)
         corners = corners_of(self._scan.faces, found.face, found.vertex)
         foot = interpolate(self._scan.verts, corners, found.barycentric)
@@ -92,23 +92,23 @@ class _Scan:
 
 
 def _with_free_parts(mesh: Shape, near: Floats, verts: Floats, bound: Bools) -> Floats:
-    """Vertices of which the free ones keep the shape that they had before the projection.
+    """Restore the shape of free vertices, as before the projection.
 
-    Those that hang on others have followed these already; a part that is wholly free, such as an eyeball, moves as the
-    nearest vertices that are not: turned, scaled and shifted as a whole from where the base has it.
+    Those connected to others have followed these already. A wholly free part, such as an eyeball, follows the nearest bound
+    vertices by a similarity (rotation, scale, translation) from the base.
     """
     verts = verts.copy()
     known = np.flatnonzero(bound)
-    alone = np.setdiff1d(np.unique(mesh.vertex_parts), mesh.vertex_parts[known])
+    free_parts = np.setdiff1d(np.unique(mesh.vertex_parts), mesh.vertex_parts[known])
     if not len(known):
         return near
     tree = cKDTree(mesh.verts[known])
-    for part in alone.tolist():
+    for part in free_parts.tolist():
         rows = np.flatnonzero(mesh.vertex_parts == part)
-        around: Ints = known[np.unique(tree.query(mesh.verts[rows], min(_AROUND, len(known)))[1])]
+        around: Ints = known[np.unique(tree.query(mesh.verts[rows], min(_N_AROUND, len(known)))[1])]
         here, there = mesh.verts[around], verts[around]
         a, b = here - here.mean(axis=0), there - there.mean(axis=0)
-        turn = nearest_rotations((b.T @ a)[None], np.eye(3)[None])[0]
+        rotation = nearest_rotations((b.T @ a)[None], np.eye(3)[None])[0]
         scale = np.sqrt(np.square(b).sum() / max(np.square(a).sum(), 1e-300))
-        verts[rows] = scale * (mesh.verts[rows] - here.mean(axis=0)) @ turn.T + there.mean(axis=0)
+        verts[rows] = scale * (mesh.verts[rows] - here.mean(axis=0)) @ rotation.T + there.mean(axis=0)
     return verts

@@ -19,7 +19,7 @@ from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance
 from meshmatch.templates.location import bundled_folder
-from meshmatch.transfer.texels import faces_on
+from meshmatch.transfer.texels import draw_triangles
 from meshmatch.transfer.unwrap import unwrapped
 from tests.cli.conftest import Answer, Run, refused, well
 from tests.conftest import icosphere
@@ -240,7 +240,7 @@ def test_size_samples_and_padding(run: Run, pair: Path) -> None:
     assert (image("--samples 1") != image("--samples 3")).any()
     assert image("--padding 4")[..., :3].max(axis=2).min() > 0
     bare = image("--padding 0")
-    off = faces_on(load_appearance("out.glb", load_shape("out.glb")).uv * 64, 64)[0] < 0
+    off = draw_triangles(load_appearance("out.glb", load_shape("out.glb")).uv * 64, 64)[0] < 0
     assert (bare[off, :3] == 0).all()
 
 

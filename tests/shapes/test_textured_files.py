@@ -123,7 +123,7 @@ def test_trimesh_sees_the_same_colors(tmp_path: Path, ball: tuple[Textured, np.n
     pyramid = Pyramid(look.materials[0])
     # it mixes bytes where we mix light: compare at the centers of texels, where there is nothing to mix
     middle = (np.floor(ours * 16) + 0.5) / 16
-    light = pyramid.look(*middle.T.astype(np.float32), np.zeros(500, np.float32))
+    light = pyramid.sample(*middle.T.astype(np.float32), np.zeros(500, np.float32))
     column, row = np.floor(ours * 16).astype(int).clip(0, 15).T
     np.testing.assert_allclose(light[:3].T, LINEAR_OF_BYTE[image[row, column, :3]], atol=1e-4)
     # its texels lie at whole multiples of 1 / 15, so ours are asked there

@@ -17,7 +17,7 @@ from meshmatch.shapes.colors import to_linear, to_srgb
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer import texel_colors
 from meshmatch.transfer.bake import Baked, BakeOptions, colors_of_vertices, transfer_texture
-from meshmatch.transfer.texels import faces_on
+from meshmatch.transfer.texels import draw_triangles
 from meshmatch.transfer.unwrap import Atlas, atlas_of, unwrapped
 from tests.conftest import icosphere
 from tests.maps.solids import grid
@@ -126,7 +126,7 @@ def test_texels_against_a_slow_oracle(sphere: Shape, make_sphere: Callable[[int]
     look, uv = wearing(smooth(64), charted(64, 2)), charted(48, 2, 1)
     back = nearest_map(coarse, sphere)
     image = worn(sphere, look, coarse, back, uv, replace(SMALL, size=48, samples=1)).image
-    faces = faces_on(uv * 48, 48)[0]
+    faces = draw_triangles(uv * 48, 48)[0]
     row, column = np.argwhere(faces >= 0)[::7].T
     face = faces[row, column]
     matrices = np.concatenate([uv[face].swapaxes(1, 2) * 48, np.ones((len(face), 1, 3))], axis=1)
@@ -153,7 +153,7 @@ def test_a_finer_mesh_of_the_same_surface_shows_the_same(sphere: Shape) -> None:
     uv = np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))])
     image = noise(64)
     found = worn(sphere, wearing(image, own), fine, back, uv, replace(SMALL, size=64, samples=1))
-    inside = faces_on(uv * 64, 64)[0] >= 0
+    inside = draw_triangles(uv * 64, 64)[0] >= 0
     assert (np.abs(found.image[inside].astype(int) - image[inside]).max(axis=1) <= 2).mean() > 0.98
 
 
@@ -164,7 +164,7 @@ def islands(uv: np.ndarray, size: int) -> np.ndarray:
     """Bright charts on black, nothing painted past their edges."""
     image = noise(size, 5)
     image[..., :3] = 150 + image[..., :3] // 3
-    image[faces_on(uv * size, size)[0] < 0] = (0, 0, 0, 255)
+    image[draw_triangles(uv * size, size)[0] < 0] = (0, 0, 0, 255)
     return image
 
 
@@ -199,7 +199,7 @@ def test_no_background_along_any_seam_at_any_mip_level(sphere: Shape, size: int)
     for level in range(5):
         assert surface_light(padded.image, new, level).min() > least
         assert surface_light(bare.image, new, level).min() < 0.6 * least  # the check sees a seam
-    assert (bare.image[faces_on(new * size, size)[0] < 0] == 0).all()
+    assert (bare.image[draw_triangles(new * size, size)[0] < 0] == 0).all()
 
 
 def test_both_sides_of_a_new_seam_show_the_same(sphere: Shape) -> None:
@@ -220,7 +220,7 @@ def test_both_sides_of_a_new_seam_show_the_same(sphere: Shape) -> None:
 def test_a_source_without_padding_is_not_darker_at_its_seams(sphere: Shape) -> None:
     uv = charted(64, 1)
     plain = islands(uv, 64)
-    plain[faces_on(uv * 64, 64)[0] >= 0] = (220, 220, 220, 255)
+    plain[draw_triangles(uv * 64, 64)[0] >= 0] = (220, 220, 220, 255)
     found = worn(sphere, wearing(plain, uv), sphere, uv=charted(32, 2))
     assert found.image[..., :3].min() >= 219
 
@@ -456,7 +456,7 @@ def test_a_cloud_as_source(sphere: Shape) -> None:
     back = VertexMap.between(sphere, cloud, np.arange(sphere.V))
     uv = charted(64, 2)
     found = worn(cloud, look, sphere, back, uv, replace(SMALL, size=64))
-    face = faces_on(uv * 64, 64)[0]
+    face = draw_triangles(uv * 64, 64)[0]
     rows = np.argwhere(face >= 0)
     middle = sphere.verts[sphere.faces[face[face >= 0]]].mean(axis=1)
     seen = to_linear(found.image[rows[:, 0], rows[:, 1], :3] / 255.0)

@@ -15,7 +15,7 @@ from meshmatch.transfer.chart_regions import chart_regions
 from meshmatch.transfer.flat_layout import Layout, flatten_faces
 from meshmatch.transfer.new_charts import new_charts
 from meshmatch.transfer.pack_charts import Chart, pack_charts, smallest_rectangle
-from meshmatch.transfer.texels import faces_on
+from meshmatch.transfer.texels import draw_triangles
 from meshmatch.transfer.tighten_charts import tighten
 from meshmatch.transfer.whole_polygons import unfold_polygon
 from tests.conftest import icosphere
@@ -53,7 +53,7 @@ def test_what_cannot_lie_flat_is_told() -> None:
     assert whole is not None
     uv = whole.uv.copy()
     uv[:, 0] = np.abs(uv[:, 0] - uv[:, 0].mean())  # folded in the middle
-    folded = type(whole).of(uv, whole.corners, whole.seen, 512)
+    folded = type(whole).of(uv, whole.corners, whole.visible, 512)
     assert len(folded.bad) > spiral.F / 3
 
 
@@ -84,7 +84,7 @@ def test_what_lies_on_itself_is_found(turns: float, wider: float, closed: bool, 
     layout = Layout.of(uv, corners, np.ones(len(corners), bool), 256)
     assert bool(len(layout.bad)) == covered and (layout.pair is not None) == covered
     image = (uv[corners] / np.abs(uv).max() + 1) * 512
-    assert bool(faces_on(image, 1024)[1]) == covered
+    assert bool(draw_triangles(image, 1024)[1]) == covered
 
 
 def test_two_pieces_on_one_another_are_found() -> None:
@@ -131,7 +131,7 @@ def test_borders_on_fine_surfaces_are_smoothed_by_way_of_a_copy_between(monkeypa
 def test_charts_fill_the_image(torus: Shape) -> None:
     uv = new_charts(scaled(torus), torus.faces, 1024, 4)
     assert flat_areas(uv).sum() > 0.55
-    assert faces_on(uv * 2048, 2048)[1] == 0
+    assert draw_triangles(uv * 2048, 2048)[1] == 0
 
 
 def test_loose_triangles_end_soon() -> None:
@@ -142,7 +142,7 @@ def test_loose_triangles_end_soon() -> None:
     uv = new_charts(scaled(Shape(verts, faces)), faces, 1024, 8)
     assert uv.min() >= 0 and uv.max() <= 1
     assert (flat_areas(uv) > 0).all()
-    assert faces_on(uv * 4096, 4096)[1] == 0
+    assert draw_triangles(uv * 4096, 4096)[1] == 0
 
 
 def test_small_closed_pieces_are_unfolded() -> None:
@@ -162,7 +162,7 @@ def test_small_closed_pieces_are_unfolded() -> None:
         one, two = laid[:, 1] - laid[:, 0], laid[:, 2] - laid[:, 0]
         assert (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0] > 0).all()
         image = (laid - laid.min(axis=(0, 1))) / np.ptp(laid, axis=(0, 1)).max()
-        assert faces_on(image * 512, 512)[1] == 0
+        assert draw_triangles(image * 512, 512)[1] == 0
 
 
 def test_a_polygon_of_thousands_of_corners_is_unfolded() -> None:

@@ -5,14 +5,14 @@ import pytest
 
 from meshmatch.shapes.appearance import Material, Wrap
 from meshmatch.shapes.colors import LINEAR_OF_BYTE, to_linear, to_srgb
-from meshmatch.transfer.texels import Pyramid, fill, wrapped
+from meshmatch.transfer.texels import Pyramid, fill, wrap_index
 from tests.shapes.painted import quarters
 
 
 def look(pyramid: Pyramid, u: float, v: float, footprint: float = 0.0) -> list[float]:
     """Color and alpha in 0..1 at one place, as a screen shows it."""
     one = [np.array([x], np.float32) for x in (u, v, footprint)]
-    found = pyramid.look(*one)[:, 0].astype(float)
+    found = pyramid.sample(*one)[:, 0].astype(float)
     return [*to_srgb(found[:3]).tolist(), float(found[3])]
 
 
@@ -118,9 +118,11 @@ def test_wrapping_against_the_slow_way() -> None:
     for size in (1, 3, 4):
         row = list(range(size))
         there_and_back = row + row[::-1]
-        np.testing.assert_array_equal(wrapped(index, size, "repeat"), [row[i % size] for i in index])
-        np.testing.assert_array_equal(wrapped(index, size, "mirror"), [there_and_back[i % (2 * size)] for i in index])
-        np.testing.assert_array_equal(wrapped(index, size, "clamp"), [row[min(max(i, 0), size - 1)] for i in index])
+        np.testing.assert_array_equal(wrap_index(index, size, "repeat"), [row[i % size] for i in index])
+        np.testing.assert_array_equal(
+            wrap_index(index, size, "mirror"), [there_and_back[i % (2 * size)] for i in index]
+        )
+        np.testing.assert_array_equal(wrap_index(index, size, "clamp"), [row[min(max(i, 0), size - 1)] for i in index])
 
 
 def test_a_wide_step_sees_the_mean() -> None:

@@ -15,7 +15,7 @@ from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.source_layout import check_layout, source_layout
 from meshmatch.transfer.surface_walk import SurfaceWalker
-from meshmatch.transfer.texel_colors import charts_of
+from meshmatch.transfer.texel_colors import find_charts
 from meshmatch.transfer.unwrap import shared_texels, unwrapped
 from tests.conftest import icosphere
 from tests.shapes.painted import encoded, quarters, write_gltf
@@ -49,7 +49,7 @@ def test_on_the_source_itself_it_is_its_own(ball: tuple[Shape, Appearance]) -> N
     shape, look = ball
     uv, charts = source_layout(shape, look, shape, VertexMap.identity(shape))
     assert np.abs(uv - look.uv).max() < 1e-4
-    assert charts == len(np.unique(charts_of(SurfaceWalker(shape), look)))
+    assert charts == len(np.unique(find_charts(SurfaceWalker(shape), look)))
 
 
 def test_a_finer_mesh_gets_the_points_between(ball: tuple[Shape, Appearance]) -> None:

@@ -8,7 +8,7 @@ from meshmatch.maps.mapped_mesh import MappedMesh
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.surface_walk import SurfaceWalker
-from meshmatch.transfer.texel_colors import TexelLocator, bends_of
+from meshmatch.transfer.texel_colors import TexelLocator, edge_bends
 
 
 def grid(N: int) -> Shape:
@@ -56,34 +56,34 @@ def missed(bends: np.ndarray | None) -> np.ndarray:
 
 
 def test_the_way_there_bends_the_images_of_triangles(forward: VertexMap) -> None:
-    straight, curved = missed(None), missed(bends_of(SOURCE, TARGET, forward, BACK))
+    straight, curved = missed(None), missed(edge_bends(SOURCE, TARGET, forward, BACK))
     assert straight.max() > 0.003
     assert curved.mean() < 0.4 * straight.mean()
     assert curved.max() < 0.5 * straight.max()
 
 
 def test_a_map_that_is_straight_bends_nothing() -> None:
-    found = bends_of(SOURCE, TARGET, put(SOURCE, TARGET, SOURCE.verts), put(TARGET, SOURCE, TARGET.verts))
+    found = edge_bends(SOURCE, TARGET, put(SOURCE, TARGET, SOURCE.verts), put(TARGET, SOURCE, TARGET.verts))
     np.testing.assert_allclose(found, 0.0, atol=1e-6)
 
 
 def test_maps_that_disagree_bend_no_more_than_one_of_them(forward: VertexMap) -> None:
     shifted = put(TARGET, SOURCE, bent(TARGET.verts + np.array([0.02, 0, 0])))
-    found, alone = bends_of(SOURCE, TARGET, forward, shifted), bends_of(SOURCE, TARGET, forward, BACK)
+    found, alone = edge_bends(SOURCE, TARGET, forward, shifted), edge_bends(SOURCE, TARGET, forward, BACK)
     assert found is not None and alone is not None
     same = (found == alone).all(axis=2)
     assert same.mean() > 0.9 and (found[~same] == 0).all()
     far = put(TARGET, SOURCE, bent(TARGET.verts + np.array([0.15, 0, 0])))
-    assert (bends_of(SOURCE, TARGET, forward, far) == 0).mean() > 0.9
+    assert (edge_bends(SOURCE, TARGET, forward, far) == 0).mean() > 0.9
 
 
 def test_what_the_way_there_does_not_know_bends_nothing(forward: VertexMap, monkeypatch: pytest.MonkeyPatch) -> None:
     elsewhere = put(SOURCE, TARGET, SOURCE.verts[::-1])  # turned about: the middles belong far from the ends
-    turned = bends_of(SOURCE, TARGET, elsewhere, BACK)
+    turned = edge_bends(SOURCE, TARGET, elsewhere, BACK)
     assert np.linalg.norm(turned, axis=2).max() < 0.5 * 0.25
     cloud = Shape(SOURCE.verts, np.empty((0, 3), int))
-    assert bends_of(cloud, TARGET, forward, BACK) is None
+    assert edge_bends(cloud, TARGET, forward, BACK) is None
     rounded = VertexMap.between(SOURCE, TARGET, forward.index)  # to vertices: it would bend by what it is wrong
-    assert bends_of(SOURCE, TARGET, rounded, BACK) is None
-    monkeypatch.setattr("meshmatch.transfer.texel_colors._FEW", TARGET.F - 1)
-    assert bends_of(SOURCE, TARGET, forward, BACK) is None
+    assert edge_bends(SOURCE, TARGET, rounded, BACK) is None
+    monkeypatch.setattr("meshmatch.transfer.texel_colors._MAX_BEND_FACES", TARGET.F - 1)
+    assert edge_bends(SOURCE, TARGET, forward, BACK) is None

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import Delaunay
 
 from meshmatch.transfer import texels
-from meshmatch.transfer.texels import beside_another, faces_on, grow, rows_of, texels_in
+from meshmatch.transfer.texels import borders_another, count_rows, covered_texels, draw_triangles, grow
 
 SQUARE = np.array([[[0, 0], [4, 0], [4, 4]], [[0, 0], [4, 4], [0, 4]]], float)
 
@@ -20,7 +20,7 @@ def inside(corners: np.ndarray, x: float, y: float) -> bool:
 
 
 def test_a_square_of_two_triangles_by_hand() -> None:
-    found, twice = faces_on(SQUARE, 5)
+    found, twice = draw_triangles(SQUARE, 5)
     # centers on the diagonal go to one of the two, and the texels beyond the square to none
     want = [[1, 0, 0, 0, -1], [1, 1, 0, 0, -1], [1, 1, 1, 0, -1], [1, 1, 1, 1, -1], [-1] * 5]
     on_diagonal = np.eye(5, dtype=bool)
@@ -33,7 +33,7 @@ def test_random_triangles_against_the_slow_way() -> None:
     rng = np.random.default_rng(0)
     corners = rng.uniform(-3, 15, (40, 3, 2))
     for triangle in corners:
-        found, _ = faces_on(triangle[None], 12)
+        found, _ = draw_triangles(triangle[None], 12)
         want = [[inside(triangle, x + 0.5, y + 0.5) for x in range(12)] for y in range(12)]
         np.testing.assert_array_equal(found >= 0, want)
 
@@ -43,31 +43,31 @@ def test_every_texel_of_a_triangulation_is_held_once() -> None:
     points = np.concatenate([rng.uniform(0, 32, (200, 2)), [[0, 0], [32, 0], [0, 32], [32, 32]]])
     points[:100] = np.round(points[:100] * 2) / 2  # many corners and edges on centers
     corners = points[Delaunay(points).simplices]
-    found, twice = faces_on(corners, 32)
+    found, twice = draw_triangles(corners, 32)
     assert twice == 0
     assert (found >= 0).all()
-    assert sum(len(face) for face, _, _ in texels_in(corners)) == 32 * 32
+    assert sum(len(face) for face, _, _ in covered_texels(corners)) == 32 * 32
 
 
 def test_texels_that_are_held_twice_are_counted() -> None:
-    found, twice = faces_on(np.concatenate([SQUARE, SQUARE[:1]]), 4)
-    assert twice == (faces_on(SQUARE[:1], 4)[0] >= 0).sum()
+    found, twice = draw_triangles(np.concatenate([SQUARE, SQUARE[:1]]), 4)
+    assert twice == (draw_triangles(SQUARE[:1], 4)[0] >= 0).sum()
     assert (found >= 0).all()
 
 
 def test_parts_give_the_same_as_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     corners = np.random.default_rng(2).uniform(0, 20, (30, 3, 2))
-    whole = faces_on(corners, 20)
-    monkeypatch.setattr(texels, "_AT_ONCE", 7)
-    parts = faces_on(corners, 20)
+    whole = draw_triangles(corners, 20)
+    monkeypatch.setattr(texels, "_CHUNK", 7)
+    parts = draw_triangles(corners, 20)
     np.testing.assert_array_equal(whole[0], parts[0])
     assert whole[1] == parts[1]
 
 
 def test_triangles_without_area_hold_nothing() -> None:
     flat = np.array([[[1, 1], [3, 3], [5, 5]], [[2, 2], [2, 2], [2, 2]], [[0, 2.5], [4, 2.5], [2, 2.5]]], float)
-    assert not list(texels_in(flat))
-    np.testing.assert_array_equal(rows_of(SQUARE), [4, 4])
+    assert not list(covered_texels(flat))
+    np.testing.assert_array_equal(count_rows(SQUARE), [4, 4])
 
 
 def test_growing_takes_straight_neighbours_before_slanting_ones() -> None:
@@ -85,4 +85,4 @@ def test_growing_takes_straight_neighbours_before_slanting_ones() -> None:
 def test_neighbours_that_differ() -> None:
     values = np.array([[1, 1, 2], [1, -1, 2], [1, 1, 1]], np.int32)
     want = [[False, True, True], [False, False, True], [False, False, True]]
-    np.testing.assert_array_equal(beside_another(values), want)
+    np.testing.assert_array_equal(borders_another(values), want)

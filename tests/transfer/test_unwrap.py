@@ -8,7 +8,7 @@ from meshmatch.geometry.triangles import face_parts
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer import unwrap
 from meshmatch.transfer.flat_layout import weld
-from meshmatch.transfer.texels import faces_on, grow
+from meshmatch.transfer.texels import draw_triangles, grow
 from meshmatch.transfer.unwrap import atlas_of, tiles_of, unwrapped
 from tests.conftest import icosphere
 from tests.shapes.painted import CORNERS, FACES, UV
@@ -32,7 +32,7 @@ def test_new_coordinates_are_an_atlas(request: pytest.FixtureRequest, name: str,
     np.testing.assert_array_equal(unwrapped(shape, 256, padding), uv)
     assert uv.shape == (shape.F, 3, 2)
     assert uv.min() >= 0 and uv.max() <= 1
-    found, twice = faces_on(uv * 256, 256)
+    found, twice = draw_triangles(uv * 256, 256)
     assert twice == 0
     number = charts(uv, shape)
     assert 1 < len(np.unique(number)) < shape.F
@@ -68,7 +68,7 @@ def test_vertices_of_their_own_do_not_part_faces(torus: Shape) -> None:
     loose = Shape(torus.verts[torus.faces].reshape(-1, 3), np.arange(3 * torus.F).reshape(-1, 3))
     uv = unwrapped(loose, 256, 2)
     assert len(np.unique(charts(uv, torus))) <= few + 2
-    assert faces_on(uv * 256, 256)[1] == 0
+    assert draw_triangles(uv * 256, 256)[1] == 0
     new, (a, b, c) = torus.V, torus.faces[0]
     verts = np.concatenate([torus.verts, torus.verts[[a]] + 1e-13])
     split = Shape(verts, np.concatenate([[[new, b, c]], torus.faces[1:], [[b, new, a], [new, c, a]]]))
@@ -146,12 +146,12 @@ def test_new_ones_are_made_where_the_files_own_are_no_atlas() -> None:
     atlas = atlas_of(SQUARE, OWN * 2.0, 64, 2)
     assert not atlas.own
     assert "reach out of range" in atlas.note and "new ones were made" in atlas.note
-    assert faces_on(atlas.uv * 64, 64)[1] == 0
+    assert draw_triangles(atlas.uv * 64, 64)[1] == 0
 
 
 def test_many_faces_on_one_place_are_refused_before_they_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     shape = Shape(CORNERS, np.tile(FACES, (500, 1)), "pile")
-    monkeypatch.setattr(unwrap, "faces_on", lambda *_: pytest.fail("they were drawn"))
+    monkeypatch.setattr(unwrap, "draw_triangles", lambda *_: pytest.fail("they were drawn"))
     with pytest.raises(OptionError, match="overlap"):
         atlas_of(shape, np.tile(OWN, (500, 1, 1)), 64, 2, "keep")
 
@@ -191,7 +191,7 @@ def test_no_seam_crosses_a_polygon() -> None:
     assert cut(unwrapped(shape, 512, 4)) > 0
     whole = unwrapped(shape, 512, 4, polygons)
     assert cut(whole) == 0
-    found, twice = faces_on(whole * 512, 512)
+    found, twice = draw_triangles(whole * 512, 512)
     assert twice < 0.001 * (found >= 0).sum() and len(np.unique(found)) == shape.F + 1
 
 
