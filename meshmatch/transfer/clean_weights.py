@@ -1,6 +1,6 @@
-"""Skin weights that a character can be animated with: without strays, holes and tears, four joints a vertex.
+"""Cleaning of transferred skin weights for animation: without strays, holes and tears, four joints per vertex.
 
-Where limbs touch, a map takes some vertices to the wrong one; a single vertex that follows another limb is a spike.
+Where limbs touch, a map takes some vertices to the wrong one, and a single vertex that follows another limb is a spike.
 """
 
 from __future__ import annotations
@@ -17,60 +17,60 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import joint_table, largest_weights
 from meshmatch.transfer.low_confidence import replace_low_weights, vertex_graph
 
-# All set by hand. Weights below the first do not join vertices; of a joint's regions on one part of a mesh, those of less
-# than this share of the largest one are strays; a vertex that keeps less than this of its weight is a hole.
-_JOINING, _STRAY, _HOLE = 0.02, 0.25, 0.5
-# Two neighbours of which less than this part of the weight is common are a tear, mended in so many steps.
-_TEAR, _STEPS = 0.1, 3
-_LEAST = 1e-3  # of the weight of a vertex: less moves nothing that can be seen
-# What lies further off a source than this, in diagonals of the target's box, is lacking there; where more than this share
-# of the vertices does, the map is wrong.
-_BEYOND, _MOST = 0.01, 0.25
+# All set by hand. Smaller weights do not connect vertices to a region; regions of a joint with less than this share of its
+# largest one on the same part of a mesh are strays; a vertex that keeps less than this share of its weight is a hole.
+_MIN_CONNECTING, _MIN_REGION, _MIN_KEPT = 0.02, 0.25, 0.5
+# Neighbors with less than this share of their weights in common are a tear; steps of smoothing tears.
+_MIN_COMMON, _SMOOTHING_STEPS = 0.1, 3
+_MIN_WEIGHT = 1e-3  # smaller weights move nothing visibly
+# Vertices farther from the source than this, in diagonals of the target's box, have no counterpart; where more than this
+# share are, the map is wrong.
+_MAX_DISTANCE, _MAX_SHARE = 0.01, 0.25
 
 
 def clean_weights(
     weights: csr_array, target: Shape, influences: int = 4, unknown: Bool[Bools, " V"] | None = None
 ) -> csr_array:
-    """Weights (V, J) of the target; every row sums to 1. Vertices of a seam at one place get the same.
+    """Clean skin weights (V, J) of the target; every row sums to 1. Vertices at one position along seams get equal weights.
 
-    Of each joint the main region stays on every connected part of the mesh, holes are filled in from their surroundings, and
-    neighbours that have nearly nothing in common are smoothed. Vertices that no joint moves go with the nearest others.
-    Weights of ``unknown`` vertices do not count; those are holes, too.
+    On every connected part of the mesh each joint keeps its main regions; holes are filled in from their surroundings, and
+    neighbors with almost nothing in common are smoothed. Vertices that no joint moves take the weights of the nearest other
+    one. Weights of ``unknown`` vertices are ignored and filled in like holes.
     """
     graph = vertex_graph(target)
     twin = np.arange(target.V) if target.is_cloud else seams(target.verts, target.faces)
     if unknown is not None and not unknown.all():
         weights = csr_array(diags_array((~unknown).astype(np.float64)) @ weights)
     weights = same_at(twin, largest_weights(weights, influences))
-    kept = _without_strays(weights, graph)
+    kept = _remove_strays(weights, graph)
     sums = np.asarray(kept.sum(axis=1)).ravel()
-    filled, _ = replace_low_weights(kept, sums < _HOLE, target, True, influences)
-    smooth = largest_weights(same_at(twin, _mended(same_at(twin, filled), graph)), influences)
-    smooth.data[smooth.data < _LEAST] = 0.0
-    return _nearest_for_empty(largest_weights(smooth, influences), target)
+    filled, _ = replace_low_weights(kept, sums < _MIN_KEPT, target, True, influences)
+    smooth = largest_weights(same_at(twin, _smooth_tears(same_at(twin, filled), graph)), influences)
+    smooth.data[smooth.data < _MIN_WEIGHT] = 0.0
+    return _fill_empty_rows(largest_weights(smooth, influences), target)
 
 
 def beyond(target: Shape, points: Float[Floats, "V_source 3"], faces: Int[Ints, "F 3"]) -> Bool[Bools, " V_target"]:
-    """Which vertices of the target lie off the source's surface as a map lays it, such as long hair that the source lacks.
+    """(V_target,) vertices of the target far from the mapped source's surface, such as long hair that the source lacks.
 
-    The map takes them to what is nearest, which is the back where hair hangs down on it. None, where the map lays the source
-    far from much of the target.
+    A map takes these to whatever is nearest: hair that hangs down, to the back. All False where the map places the source far
+    from much of the target.
     """
     size = float(np.linalg.norm(np.ptp(target.bounds, axis=0)))
-    far = Surface(points, faces).query(target.verts).distance > _BEYOND * size
-    return np.asarray(far & (far.mean() <= _MOST))
+    far = Surface(points, faces).query(target.verts).distance > _MAX_DISTANCE * size
+    return np.asarray(far & (far.mean() <= _MAX_SHARE))
 
 
 def same_at(twin: Int[Ints, " V"], weights: csr_array) -> csr_array:
-    """The mean weights of all vertices with one twin, for each of them."""
+    """Average the weights of all vertices that have the same twin."""
     V = len(twin)
     together = csr_array((np.ones(V), (np.arange(V), twin)), (V, V))
     share = diags_array(1.0 / np.maximum(np.bincount(twin, minlength=V), 1))
     return csr_array(together @ (share @ (together.T @ weights)))
 
 
-def _without_strays(weights: csr_array, graph: csr_array) -> csr_array:
-    """Weights without those regions of a joint that are far smaller than its main one on the same part of the mesh."""
+def _remove_strays(weights: csr_array, graph: csr_array) -> csr_array:
+    """Remove regions of a joint that are far smaller than its largest one on the same part of the mesh."""
     joints, shares = joint_table(weights)
     V, N = joints.shape
     part = connected_components(graph, directed=False)[1]
@@ -80,7 +80,9 @@ def _without_strays(weights: csr_array, graph: csr_array) -> csr_array:
     for a in range(N):
         for b in range(N):
             joined = (
-                (joints[rows, a] == joints[columns, b]) & (shares[rows, a] > _JOINING) & (shares[columns, b] > _JOINING)
+                (joints[rows, a] == joints[columns, b])
+                & (shares[rows, a] > _MIN_CONNECTING)
+                & (shares[columns, b] > _MIN_CONNECTING)
             )
             begins.append(N * rows[joined] + a)
             ends.append(N * columns[joined] + b)
@@ -92,18 +94,18 @@ def _without_strays(weights: csr_array, graph: csr_array) -> csr_array:
     _, place = np.unique(where, return_inverse=True)
     largest = np.zeros(int(place.max(initial=0)) + 1)
     np.maximum.at(largest, place, amount[region])
-    good = (amount[region] >= _STRAY * largest[place]) & (shares.ravel() > 0)
+    good = (amount[region] >= _MIN_REGION * largest[place]) & (shares.ravel() > 0)
     at = np.flatnonzero(good)
     return csr_array((shares.ravel()[at].astype(np.float64), (at // N, joints.ravel()[at])), weights.shape)
 
 
-def _mended(weights: csr_array, graph: csr_array) -> csr_array:
-    """Weights smoothed around edges whose ends have nearly nothing in common."""
+def _smooth_tears(weights: csr_array, graph: csr_array) -> csr_array:
+    """Smooth weights around edges whose ends have almost nothing in common."""
     edges = coo_array(graph)
-    apart = 0.5 * np.asarray(abs(weights[edges.row] - weights[edges.col]).sum(axis=1)).ravel() > 1.0 - _TEAR
-    torn = np.zeros(weights.shape[0])
-    torn[edges.row[apart]] = 1.0
-    around = (torn > 0) | (np.asarray(graph @ torn) > 0)
+    apart = 0.5 * np.asarray(abs(weights[edges.row] - weights[edges.col]).sum(axis=1)).ravel() > 1.0 - _MIN_COMMON
+    is_torn = np.zeros(weights.shape[0])
+    is_torn[edges.row[apart]] = 1.0
+    around = (is_torn > 0) | (np.asarray(graph @ is_torn) > 0)
     rows = np.flatnonzero(around)
     if not len(rows):
         return weights
@@ -114,13 +116,13 @@ def _mended(weights: csr_array, graph: csr_array) -> csr_array:
     blend = csr_array(own + mean)
     back = csr_array((np.ones(len(rows)), (rows, np.arange(len(rows)))), (weights.shape[0], len(rows)))
     others = diags_array((~around).astype(np.float64))
-    for _ in range(_STEPS):
+    for _ in range(_SMOOTHING_STEPS):
         weights = csr_array(others @ weights + back @ (blend @ weights))
     return weights
 
 
-def _nearest_for_empty(weights: csr_array, target: Shape) -> csr_array:
-    """The same, and in empty rows those of the nearest vertex that has weights."""
+def _fill_empty_rows(weights: csr_array, target: Shape) -> csr_array:
+    """Fill empty rows with those of the nearest vertex that has weights."""
     empty = np.diff(weights.indptr) == 0
     if not empty.any() or empty.all():
         return weights
@@ -131,8 +133,8 @@ def _nearest_for_empty(weights: csr_array, target: Shape) -> csr_array:
 
 
 def rigid(weights: csr_array, groups: list[tuple[Int[Ints, " N"], Int[Ints, " M"]]]) -> csr_array:
-    """The same, but each group of vertices moves as one: with the joint that has most of the weight of those that it goes
-    with, or of its own where there are none.
+    """Move groups of vertices rigidly: each with the joint that has most of the weight of the vertices ``beside`` it, or of
+    its own vertices where there are none. ``groups`` are pairs of (own vertices, vertices beside).
     """
     rows = np.arange(weights.shape[0])
     chosen = np.full(len(rows), -1)

@@ -16,7 +16,7 @@ from meshmatch.shapes.shape import Shape
 
 # Set by hand, in units of sqrt(area): distance over which rotations and scales are averaged.
 _AVERAGING = 0.06
-_INSIDE_OUT = -0.5  # mean cosine of normals: three quarters of the surface are flipped
+_INSIDE_OUT = -0.5  # lower limit of `facing`, -1 to 1: three quarters of the surface are flipped
 
 
 def local_frames(

@@ -32,8 +32,8 @@ _N_AROUND = 24
 class Wrapped:
     """A base mesh wrapped onto a scan.
 
-    ``verts`` (V, 3) in the frame and unit of the scan; ``turns`` (V, 3, 3) rotation of each vertex; ``distance`` (V,) from the
-    scan's surface.
+    ``verts`` (V, 3) in the scan's frame and unit; ``turns`` (V, 3, 3) rotation of each vertex; ``distance`` (V,) of each
+    vertex from the scan's surface.
     """
 
     verts: Float[Floats, "V 3"]
