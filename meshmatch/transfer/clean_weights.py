@@ -51,10 +51,10 @@ def clean_weights(
 
 
 def beyond(target: Shape, points: Float[Floats, "V_source 3"], faces: Int[Ints, "F 3"]) -> Bool[Bools, " V_target"]:
-    """(V_target,) vertices of the target far from the mapped source's surface, such as long hair that the source lacks.
+    """(V_target,) vertices far from the mapped surface of the source, such as long hair that the source lacks.
 
-    A map takes these to whatever is nearest: hair that hangs down, to the back. All False where the map places the source far
-    from much of the target.
+    A map takes these to whatever is nearest: hair that hangs down, to the back. All False where the map places the source
+    far from much of the target.
     """
     size = float(np.linalg.norm(np.ptp(target.bounds, axis=0)))
     far = Surface(points, faces).query(target.verts).distance > _MAX_DISTANCE * size

@@ -145,8 +145,8 @@ class _Cloth:
         start, end = edges.T
         kept = np.einsum("nij,nj->ni", 0.5 * (jacobians[start] + jacobians[end]), rest[end] - rest[start])
         self._pull = np.zeros_like(rest)
-        np.add.at_points(self._pull, end, kept)
-        np.add.at_points(self._pull, start, -kept)
+        np.add.at(self._pull, end, kept)
+        np.add.at(self._pull, start, -kept)
         self._laplacian = laplacian(edges, np.ones(len(edges)), len(rest))
 
     def at_points(self, values: Floats) -> Floats:

@@ -1,6 +1,6 @@
-"""Labels of vertices or faces, from files and to files: "Data on a shape" in docs/formats.md says how.
+"""Reading and writing of labels of vertices or faces: "Data on a shape" in docs/formats.md.
 
-A label is a whole number or a word. Files of shapes with labels, .ply and .vtp, are written only.
+A label is a whole number or a word. Shape files with labels, .ply and .vtp, are written only.
 """
 
 from __future__ import annotations
@@ -34,34 +34,34 @@ _HINT = "one label for each vertex or triangle of the source, in the order of it
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Labels(Brief):
-    """Which label each vertex or face has."""
+    """Labels of the vertices or faces of a shape."""
 
-    codes: Int[Ints, " N"]  # a place in `names`; -1 for none
-    names: tuple[Label, ...]  # the labels themselves, all of one kind, none twice
+    codes: Int[Ints, " N"]  # index into `names`; -1 for none
+    names: tuple[Label, ...]  # the labels, all of one type, without duplicates
     on: On
 
     @property
     def values(self) -> NDArray[np.generic]:
-        """(N,) the label itself of each vertex or face; -1 or an empty word for none."""
+        """(N,) label of each vertex or face; -1 or an empty word for none."""
         table = np.array([*self.names, "" if self.are_words else -1])
         return table[self.codes]
 
     @property
     def are_words(self) -> bool:
-        """True if labels are text."""
+        """Whether labels are text."""
         return any(isinstance(name, str) for name in self.names)
 
     def check_blank(self, text: str) -> Label:
-        """The label that `text` names, of the kind that these are; `OptionError` if it cannot be one."""
+        """The label in `text`, of the type of these labels; `OptionError` if it cannot be one."""
         if self.are_words:
             return text
-        if (number := _whole(text)) is None:
+        if (number := _parse_whole(text)) is None:
             raise OptionError(f"--blank {text}: labels are whole numbers here", "such as --blank -1")
         return number
 
 
 def named(codes: Ints, given: Labels, on: On, blank: str | None) -> Labels:
-    """Labels of a target by the names of `given`; others are `blank`, by default -1 among numbers, "" among words."""
+    """Labels of a target, with the names of `given`; others become `blank`, by default -1 among numbers, "" among words."""
     empty: Label = given.check_blank(blank) if blank is not None else ("" if given.are_words else -1)
     if (codes >= 0).all():
         return Labels(codes, given.names, on)
@@ -70,11 +70,11 @@ def named(codes: Ints, given: Labels, on: On, blank: str | None) -> Labels:
 
 
 def load_labels(path: str | Path, shape: Shape, on: On | None = None) -> Labels:
-    """Labels of the vertices or faces of `shape`; their count tells which, unless the file or `on` does. `InputError`
-    if it fits neither, `OptionError` if it fits both.
+    """Labels of the vertices or faces of `shape`; decided by their number, unless the file or `on` says which. `InputError`
+    if the number fits neither, `OptionError` if it fits both.
     """
     readers = {
-        ".npy": lambda path: (_listed(read_npy(path)), None),
+        ".npy": lambda path: (_check_list(read_npy(path)), None),
         ".csv": lambda path: _read_csv(path, (shape.V, shape.F)),
         ".txt": lambda path: _read_txt(path, (shape.V, shape.F)),
         ".json": lambda path: _read_json(path, shape, on),
@@ -83,23 +83,23 @@ def load_labels(path: str | Path, shape: Shape, on: On | None = None) -> Labels:
     name = Path(path).name
     if on is not None and written is not None and on != written:
         raise OptionError(f"{name} says that it holds labels of {written}, not of {on}", "leave out --on")
-    return _labels(name, values, shape, on or written)
+    return _parse_labels(name, values, shape, on or written)
 
 
 def labels_of(values: ArrayLike, shape: Shape) -> Labels:
-    """Labels of the vertices or faces of `shape` from an array of whole numbers or words; see `load_labels`."""
-    return _labels("the array", _listed(np.asarray(values)), shape, None)
+    """Labels of the vertices or faces of `shape`, from an array of whole numbers or words; see `load_labels`."""
+    return _parse_labels("the array", _check_list(np.asarray(values)), shape, None)
 
 
-def _listed(array: NDArray[Any]) -> list[Any]:
+def _check_list(array: NDArray[Any]) -> list[Any]:
     if array.ndim != 1 or array.dtype.kind not in "iufbUO":
         raise InputError(f"labels must be a list of (N,), not an array of {array.shape} {array.dtype}", _HINT)
     labels: list[Any] = array.tolist()
     return labels
 
 
-def _labels(name: str, values: Sequence[Any], shape: Shape, on: str | None) -> Labels:
-    """Labels from what a file or an array has; empty entries and nan are none, and among numbers NA and the like."""
+def _parse_labels(name: str, values: Sequence[Any], shape: Shape, on: str | None) -> Labels:
+    """Labels from entries of a file or an array. Empty entries and nan are no labels; nor is NA among numbers."""
     sizes: dict[On, int] = {"vertices": shape.V, "faces": shape.F}
     fits = [kind for kind, size in sizes.items() if size == len(values) and on in (None, kind)]
     owner = shape.name or "the source"
@@ -110,8 +110,8 @@ def _labels(name: str, values: Sequence[Any], shape: Shape, on: str | None) -> L
         asked = f": they cannot be of its {on}" if on else ""
         problem = f"{name} has {len(values)} labels, but {owner} has {shape.V} vertices and {shape.F} faces{asked}"
         raise InputError(problem, _HINT)
-    cells: list[Any] = [_whole(value) for value in values]
-    others = [raw for cell, raw in zip(cells, values, strict=True) if cell is None and not _is_none(raw)]
+    cells: list[Any] = [_parse_whole(value) for value in values]
+    others = [raw for cell, raw in zip(cells, values, strict=True) if cell is None and not _is_missing(raw)]
     if others or all(cell is None for cell in cells):
         _check_decimals(name, others)
         cells = [_word(name, raw) for raw in values]
@@ -122,13 +122,13 @@ def _labels(name: str, values: Sequence[Any], shape: Shape, on: str | None) -> L
     return Labels(np.array([place[cell] for cell in cells], np.int64), names, fits[0])
 
 
-def _is_none(value: Any) -> bool:
-    """Whether an entry has no label, in a list whose other labels are numbers."""
+def _is_missing(value: Any) -> bool:
+    """Whether an entry is no label, in a list whose other labels are numbers."""
     return value is None or value != value or (isinstance(value, str) and is_missing(value))
 
 
-def _whole(value: Any) -> int | None:
-    """A whole number, also one written as text: in plain digits, or as NumPy and pandas write it, with a decimal point."""
+def _parse_whole(value: Any) -> int | None:
+    """A whole number, also as text in plain digits or with a decimal point, as NumPy and pandas write it; else None."""
     try:
         if isinstance(value, str):
             if re.fullmatch(r"\s*[+-]?[0-9]+\s*", value):
@@ -142,14 +142,14 @@ def _whole(value: Any) -> int | None:
 
 
 def _check_decimals(name: str, others: Sequence[Any]) -> None:
-    """`InputError` if the labels that are not whole are all numbers with a decimal comma."""
+    """Raise `InputError` if the labels that are not whole numbers are all numbers with a decimal comma."""
     if others and all(isinstance(raw, str) and "," in raw and is_number(raw) for raw in others):
         problem = f"{name}: {others[0]} is not a label: a number with a decimal comma, or two columns?"
         raise InputError(problem, "for two columns, vertex and label: put semicolons between them, or name them")
 
 
 def _word(name: str, raw: Any) -> str | None:
-    """A label of one line; None if it is empty."""
+    """A text label on one line; None if it is empty."""
     if isinstance(raw, float):
         raise InputError(f"{name}: {raw} is not a label", "transfer-color interpolates numbers")
     if not isinstance(raw, str | int | None):
@@ -162,29 +162,29 @@ def _read_csv(path: Path, counts: tuple[int, int]) -> tuple[list[str], str | Non
 
 
 def _read_txt(path: Path, counts: tuple[int, int]) -> tuple[list[str], str | None]:
-    """A label on each line, whatever it is; two columns if the first one says so, or counts the lines."""
+    """One label per line, whatever it is; or two columns, if the first is named vertex or face or counts the lines."""
     lines = [line.strip() for line in read_text(path, 480).rstrip().splitlines()]
-    for mark in ("\t", ";", ",", None):
-        rows = [[unquoted(cell.strip()) for cell in line.split(mark, 1)] for line in lines]
+    for separator in ("\t", ";", ",", None):
+        rows = [[unquoted(cell.strip()) for cell in line.split(separator, 1)] for line in lines]
         if all(len(row) == 2 for row in rows):
-            numbers = [row[0] for row in rows[_owner(rows[0]) is not None :]]
-            if _owner(rows[0]) or (len(rows) > 2 and tables.is_numbered(numbers)):
+            numbers = [row[0] for row in rows[_owner_of_header(rows[0]) is not None :]]
+            if _owner_of_header(rows[0]) or (len(rows) > 2 and tables.is_numbered(numbers)):
                 return _from_rows(rows, counts)
     quoted = all(unquoted(line) != line for line in lines)
     return _from_rows([[unquoted(line) if quoted else line] for line in lines], counts)
 
 
-def _owner(head: list[str]) -> On | None:
-    """What the first column numbers, by its name in a table of several columns."""
+def _owner_of_header(head: list[str]) -> On | None:
+    """Whether the first column numbers vertices or faces, by its name in a table of several columns; else None."""
     owners: dict[str, On] = {"vertex": "vertices", "face": "faces"}
     return owners.get(head[0].lower().lstrip("# ")) if len(head) > 1 else None
 
 
 def _from_rows(rows: list[list[str]], counts: tuple[int, int]) -> tuple[list[str], str | None]:
-    """The labels in a table, and what they belong to if it says so."""
+    """The labels in a table, and what they belong to if its header says so."""
     if not rows:
         raise InputError("it holds no label at all")
-    head, written = [cell.lower() for cell in rows[0]], _owner(rows[0])
+    head, written = [cell.lower() for cell in rows[0]], _owner_of_header(rows[0])
     has_names = written is not None or (len(head) > 1 and "label" in head)
     if has_names or (len(rows) - 1 in counts and len(rows) not in counts):
         rows = rows[1:]
@@ -194,7 +194,7 @@ def _from_rows(rows: list[list[str]], counts: tuple[int, int]) -> tuple[list[str
     if re.fullmatch(r"(vertex|face)\W+label", head[0]):
         raise InputError(f"{rows[0][0]!r} names two columns", "put a comma, a semicolon or a tab between columns")
     if head == ["", "label"] and tables.is_numbered(["0", *(row[0] for row in rows)]):
-        return [row[1] for row in rows], written  # as R numbers rows
+        return [row[1] for row in rows], written  # R's row numbers
     if written is not None or (len(head) == 2 and column == 1):
         tables.check_numbered([row[0] for row in rows])
     return [row[column] for row in rows], written
@@ -211,7 +211,7 @@ def _read_json(path: Path, shape: Shape, on: On | None) -> tuple[list[Any], str 
         if written not in (None, "vertices", "faces"):
             raise InputError(f"labels are on vertices or on faces, not on {written!r}")
         return record["labels"], written
-    # Lists of the members of each part. Where two parts share a member the first keeps it.
+    # Lists of the members of each part. A member of several parts belongs to the first.
     members_are = on or "vertices"
     labels: list[Any] = [None] * (shape.F if on == "faces" else shape.V)
     for part, members in record.items():
@@ -225,10 +225,10 @@ def _read_json(path: Path, shape: Shape, on: On | None) -> tuple[list[Any], str 
 
 
 def save_labels(path: Path, labels: Labels, shape: Shape, file: Path | None = None) -> bool:
-    """Write labels of `shape`, each with a name; a .ply or .vtp ``file`` that it was read from keeps all else. Returns
-    whether it does.
+    """Write labels of `shape`, each with a name; a .ply or .vtp ``file`` that it was read from keeps all its other data.
 
-    `OptionError` for another suffix than `LABEL_SUFFIXES`, or too large a number for the format.
+    Returns whether other data could be kept. `OptionError` for a suffix that is not one of `LABEL_SUFFIXES`, or for a number
+    too large for the format.
     """
     suffix = check_labels_suffix(path)
     largest = {".npy": 2**63, ".ply": 2**31, ".vtp": 2**63}.get(suffix)
@@ -251,7 +251,7 @@ def save_labels(path: Path, labels: Labels, shape: Shape, file: Path | None = No
 
 
 def _write_shape(path: Path, labels: Labels, shape: Shape, suffix: str, file: Path | None) -> bool:
-    """Whole numbers as they are; words by their number, which comments at the beginning explain."""
+    """Write a shape file. Whole numbers are written unchanged; words as numbers, which comments in the header explain."""
     from meshmatch.shapes.formats import ply, vtk, vtk_xml
     from meshmatch.shapes.formats.ply_edit import PlyFile
     from meshmatch.shapes.formats.vtp_edit import VtpFile

@@ -1,5 +1,5 @@
-"""Landmarks, named points on a shape: pushed forward along a map, read from files and written: "Data on a shape" in
-docs/formats.md says how.
+"""Landmarks (named points on a shape): pushing forward along a map, reading and writing. "Data on a shape" in
+docs/formats.md describes the files.
 """
 
 from __future__ import annotations
@@ -36,12 +36,13 @@ from meshmatch.shapes.landmark_files import (
 )
 from meshmatch.shapes.shape import Shape
 
-# A landmark this far from the surface, in diagonals of the shape, belongs to another shape.
-_ELSEWHERE = 0.25
-_FAR = 0.02  # one this far from it, in the same unit, is worth a warning
-_OTHER_FRAME = np.array([-1.0, -1.0, 1.0])  # of 3D Slicer: LPS or RAS
-# Landmarks are in the other frame if they lie this far from the surface, in diagonals of it, and then so many times nearer.
-_ASTRAY, _MUCH_NEARER = 0.01, 4.0
+# A landmark farther from the surface than this, in diagonals of the shape, belongs to another shape.
+_MAX_DISTANCE = 0.25
+_FAR = 0.02  # distance, in the same unit, that is worth a warning
+_OTHER_FRAME = np.array([-1.0, -1.0, 1.0])  # from LPS to RAS, or back (3D Slicer)
+# Landmarks are in the other frame if they lie farther from the surface than this, in its diagonals, and this many times
+# nearer after the change.
+_MIN_DISTANCE, _MIN_RATIO = 0.01, 4.0
 LANDMARK_SUFFIXES = (".csv", ".json", ".pp", ".fcsv", ".mrk.json", ".tps")
 check_landmarks_suffix = partial(tables.check_suffix, suffixes=LANDMARK_SUFFIXES, what="landmarks")
 check_table_suffix = partial(
@@ -52,7 +53,7 @@ _HINT = "a row each: name,vertex or name,x,y,z; MeshLab's .pp, 3D Slicer's .mrk.
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Landmarks(Brief):
-    """Named points on a shape, in its own frame and unit. What is missing on it has the position nan, and vertex -1."""
+    """Named points on a shape, in its frame and unit. Missing ones have position nan, and vertex and face -1."""
 
     names: tuple[str, ...]
     points: Float[Floats, "N 3"]
@@ -60,16 +61,16 @@ class Landmarks(Brief):
     face: Int[Ints, " N"]  # -1 where the point is the vertex itself (always on a cloud)
     barycentric: Float[Floats, "N 3"]  # weights of the face's corners; (1, 0, 0) where the face is -1
     confidence: Float[Floats, " N"]  # 0 (a guess) to 1 (certain)
-    notes: tuple[str, ...] = ()  # what was left out or turned while they were read
-    lists: tuple[Markup, ...] = ()  # the list of 3D Slicer that each is in, such as a curve; of other files none
+    notes: tuple[str, ...] = ()  # what was left out or converted when they were read
+    lists: tuple[Markup, ...] = ()  # 3D Slicer's list of each, such as a curve; empty for other files
 
     @property
     def missing(self) -> Bool[Bools, " N"]:
-        """Which are missing on the shape."""
+        """(N,) which landmarks are missing on the shape."""
         return np.asarray(np.isnan(self.points).any(axis=1))
 
     def without(self, lost: Bool[Bools, " N"]) -> Landmarks:
-        """The same, with some (N,) missing; how little they were trusted stays."""
+        """A copy with some landmarks (N,) missing; their confidence is kept."""
         nowhere = np.where(lost[:, None], np.nan, 0.0)
         vertex, face = np.where(lost, -1, self.vertex), np.where(lost, -1, self.face)
         points, weights = self.points + nowhere, self.barycentric + nowhere
@@ -77,50 +78,53 @@ class Landmarks(Brief):
 
 
 def at_vertices(shape: Shape, vertex: Int[Ints, " N"], names: tuple[str, ...] = ()) -> Landmarks:
-    """Landmarks that are vertices (N,) of `shape`; `InputError` for one that it does not have."""
+    """Landmarks at vertices (N,) of `shape`; `InputError` for a vertex that does not exist."""
     vertex = np.asarray(vertex, np.int64)
     N, held = len(vertex), f"{shape.name or 'the source'} has {shape.V} vertices"
     hint = "vertices are counted from 0; are they landmarks of the source?"
-    _refuse((vertex < 0) | (vertex >= shape.V), names, lambda k: f" is vertex {vertex[k]}, but {held}", hint)
+    _check_none((vertex < 0) | (vertex >= shape.V), names, lambda k: f" is vertex {vertex[k]}, but {held}", hint)
     return _on_surface(shape, names, vertex, np.full(N, -1), np.tile([1.0, 0.0, 0.0], (N, 1)))
 
 
 def at_points(
     shape: Shape, points: Float[Floats, "N 3"], names: tuple[str, ...] = ()
 ) -> tuple[Landmarks, Float[Floats, " N"]]:
-    """Landmarks at the points of a surface (or cloud) nearest to points of its frame, and how far these are from it;
-    `InputError` if a point is not finite, or lies far from the shape.
+    """Landmarks at the points of a surface (or cloud) nearest to given points of its frame, and the distances (N,).
+
+    `InputError` if a point is not finite, or is far from the shape.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
     usable = (np.abs(points) < 1e60).all(axis=1)
-    _refuse(~usable, names, lambda k: f" has no position: {points[k].tolist()}")
+    _check_none(~usable, names, lambda k: f" has no position: {points[k].tolist()}")
     places = MappedMesh.of(shape).query(points)
-    elsewhere = places.distance > _ELSEWHERE * max(shape.diagonal, 1e-30)
+    too_far = places.distance > _MAX_DISTANCE * max(shape.diagonal, 1e-30)
     there = f"{shape.name or 'the source'}, whose diagonal is {shape.diagonal:.4g}"
     hint = "landmarks must be in the frame and unit of the source's file"
-    _refuse(elsewhere, names, lambda k: f" lies {places.distance[k]:.4g} away from {there}", hint)
+    _check_none(too_far, names, lambda k: f" lies {places.distance[k]:.4g} away from {there}", hint)
     return _on_surface(shape, names, places.vertex, places.face, places.barycentric), places.distance
 
 
 def at_faces(
     shape: Shape, face: Int[Ints, " N"], barycentric: Float[Floats, "N 3"], names: tuple[str, ...] = ()
 ) -> Landmarks:
-    """Landmarks in faces, by weights of corners; `InputError` if there is no such face, or they do not sum to 1."""
+    """Landmarks in faces, at barycentric weights; `InputError` for a face that does not exist, or invalid weights."""
     face, weights = np.asarray(face, np.int64), np.asarray(barycentric, np.float64).reshape(-1, 3)
     held = f"{shape.name or 'the source'} has {shape.F} faces"
     hint = "faces are counted from 0; are they landmarks of the source?"
-    _refuse((face < 0) | (face >= shape.F), names, lambda k: f" is in face {face[k]}, but {held}", hint)
+    _check_none((face < 0) | (face >= shape.F), names, lambda k: f" is in face {face[k]}, but {held}", hint)
     hint = "the weights of a face's corners are 0 or more, and sum to 1"
     negative, sums = (weights < -1e-9).any(axis=1), weights.sum(axis=1)
-    _refuse(negative, names, lambda k: f": one of its weights {weights[k].tolist()} is negative", hint)
-    _refuse(~(np.abs(sums - 1.0) < 1e-4), names, lambda k: f": its weights {weights[k].tolist()} do not sum to 1", hint)
+    _check_none(negative, names, lambda k: f": one of its weights {weights[k].tolist()} is negative", hint)
+    _check_none(
+        ~(np.abs(sums - 1.0) < 1e-4), names, lambda k: f": its weights {weights[k].tolist()} do not sum to 1", hint
+    )
     weights = np.clip(weights, 0.0, None)
     weights /= weights.sum(axis=1, keepdims=True)
     return _on_surface(shape, names, shape.faces[face, weights.argmax(axis=1)], face, weights)
 
 
-def _refuse(bad: ArrayLike, names: tuple[str, ...], why: Callable[[int], str], hint: str = "") -> None:
-    """`InputError` with the name of the first bad landmark, if there is one."""
+def _check_none(bad: ArrayLike, names: tuple[str, ...], why: Callable[[int], str], hint: str = "") -> None:
+    """Raise `InputError` for the first bad landmark, if there is one."""
     for k in np.flatnonzero(bad)[:1].tolist():
         raise InputError(f"landmark {names[k] if names else k}{why(k)}", hint)
 
@@ -128,14 +132,14 @@ def _refuse(bad: ArrayLike, names: tuple[str, ...], why: Callable[[int], str], h
 def _on_surface(
     shape: Shape, names: tuple[str, ...], vertex: Ints, face: Ints, weights: Floats, confidence: Floats | None = None
 ) -> Landmarks:
-    """Landmarks at these places, named by number unless they have names."""
+    """Landmarks at these places, named by number if ``names`` is empty."""
     points = interpolate(shape.verts, corners_of(shape.faces, face, vertex), weights)
     names = names or tuple(str(k) for k in range(len(vertex)))
     return Landmarks(names, points, vertex, face, weights, np.ones(len(vertex)) if confidence is None else confidence)
 
 
-def joined(parts: Sequence[Landmarks], order: Ints | None = None) -> Landmarks:
-    """Landmarks of one shape, one after the other; then put into an order."""
+def join_landmarks(parts: Sequence[Landmarks], order: Ints | None = None) -> Landmarks:
+    """Concatenate landmarks of one shape, then reorder them."""
     names = [name for part in parts for name in part.names]
     order = np.arange(len(names)) if order is None else order
     fields = ("points", "vertex", "face", "barycentric", "confidence")
@@ -146,9 +150,10 @@ def joined(parts: Sequence[Landmarks], order: Ints | None = None) -> Landmarks:
 
 
 def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: Landmarks) -> Landmarks:
-    """Landmarks of the source on the surface of the target, along a map from source to target. A point of a face goes
-    nearest to the mean of where its corners go; where the map is discontinuous there, with its heaviest corner. What is
-    missing stays so.
+    """Landmarks of the source on the surface of the target, along a map from source to target.
+
+    A point of a face goes to the surface point nearest to the mean of its corners' images; where the map is discontinuous,
+    to the image of its heaviest corner. Missing landmarks stay missing.
     """
     at = landmarks.vertex
     vertex, face, weights = forward.index[at], forward.face[at], forward.barycentric[at]
@@ -168,39 +173,39 @@ def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: 
 
 
 def load_landmarks(path: str | Path, shape: Shape, space: Space = "") -> tuple[Landmarks, float]:
-    """Landmarks in a file, on `shape`.
+    """Read landmarks of `shape` from a file.
 
     Parameters
     ----------
     path
-        The file; `meshmatch.shapes.landmark_files.LANDMARK_READERS` has the suffixes.
+        The file; see `meshmatch.shapes.landmark_files.LANDMARK_READERS` for the suffixes.
     shape
         The shape that they are on.
     space
-        The frame that 3D Slicer gave the shape's file (`mesh_space`): landmarks in its other frame are turned. Where it is
-        not known, landmarks that state theirs are turned if they lie on the surface only then.
+        The frame that 3D Slicer gave the shape's file (`mesh_space`); landmarks in its other frame are converted. Where it
+        is unknown, landmarks that state their frame are converted if only that brings them onto the surface.
 
     Returns
     -------
     tuple[Landmarks, float]
-        Landmarks in the order of the file, without the missing ones, which `Landmarks.notes` names; and the largest
-        distance from a position to the surface.
+        Landmarks in the order of the file, without missing ones, which `Landmarks.notes` lists; and the largest distance
+        of a position from the surface.
 
     Raises
     ------
     InputError
-        The file holds no landmark, or one is not on `shape`.
+        The file contains no landmark, or one is not on `shape`.
     """
 
     def read(path: Path) -> tuple[Landmarks, float]:
         found = read_landmark_file(path, shape.name, space)
-        return _on_shape(found if space else _in_frame_of(shape, found, path.name), shape)
+        return _on_shape(found if space else _in_frame_of_shape(shape, found, path.name), shape)
 
     return tables.read_by_suffix(path, dict.fromkeys(LANDMARK_READERS, read), "landmarks", _HINT)
 
 
 def landmarks_with_warnings(path: str | Path, shape: Shape, space: Space = "") -> Landmarks:
-    """As `load_landmarks`, which warns of landmarks that are missing, of turned ones, and of such as lie off the surface."""
+    """As `load_landmarks`, with warnings about landmarks that are missing, converted, or far from the surface."""
     found, furthest = load_landmarks(path, shape, space)
     for note in found.notes:
         warn(note)
@@ -211,16 +216,18 @@ def landmarks_with_warnings(path: str | Path, shape: Shape, space: Space = "") -
 def known_pairs(
     files: tuple[Path, Path], shapes: tuple[Shape, Shape], spaces: Sequence[Space] = ("", "")
 ) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
-    """The same landmarks on two shapes, by their names, or in their order where no name is in both files: the vertices
-    nearest to them, for a truth. `InputError` as `load_landmarks`; warns of those that are in one file alone.
+    """Pair the landmarks of two shapes by name, or in order where no name occurs in both files; for ground truth.
+
+    Returns the vertices nearest to each pair. `InputError` as in `load_landmarks`; landmarks in only one file are left out
+    with a warning.
     """
     read = [landmarks_with_warnings(*each) for each in zip(files, shapes, spaces, strict=True)]
     rows = [{name: row for row, name in enumerate(each.names)} for each in read]
     if both := [name for name in rows[0] if name in rows[1]]:
         for k in range(2):
             if alone := [name for name in rows[k] if name not in rows[1 - k]]:
-                told = ", ".join(alone[:5]) + ", ..." * (len(alone) > 5)
-                warn(f"{files[k].name}: {files[1 - k].name} has no {told}: left out")
+                message = ", ".join(alone[:5]) + ", ..." * (len(alone) > 5)
+                warn(f"{files[k].name}: {files[1 - k].name} has no {message}: left out")
         first, second = (each.vertex[[row[name] for name in both]] for each, row in zip(read, rows, strict=True))
         return first, second
     if len(read[0].names) != len(read[1].names):
@@ -231,23 +238,24 @@ def known_pairs(
 
 
 def warn_of_far_ones(shape: Shape, furthest: float) -> None:
-    """Warn where the landmark that lies furthest from a shape is clearly not on it."""
+    """Warn if the landmark farthest from the shape is clearly not on it."""
     if furthest > _FAR * shape.diagonal:
         share = f"{100 * furthest / shape.diagonal:.0f} % of its diagonal"
         name = shape.name or "the source"
         warn(f"a landmark lies {furthest:.4g} from {name}, {share}: the nearest point of the surface was taken")
 
 
-def _in_frame_of(shape: Shape, found: LandmarkFile, name: str) -> LandmarkFile:
-    """Landmarks that state a frame of 3D Slicer, on a mesh that states none: in the other one if that brings them to its
-    surface."""
+def _in_frame_of_shape(shape: Shape, found: LandmarkFile, name: str) -> LandmarkFile:
+    """Convert landmarks that state a frame of 3D Slicer, for a mesh that states none, to the other frame if that brings them
+    onto the mesh's surface.
+    """
     given = np.array([place.where for place in found.places if place.kind == "position"], np.float64)
     if not found.space or not len(given) or not (np.abs(given) < 1e60).all():
         return found
     as_they_are, turned = (
         MappedMesh.of(shape).query(points).distance.max() for points in (given, given * _OTHER_FRAME)
     )
-    if as_they_are < _ASTRAY * shape.diagonal or as_they_are < _MUCH_NEARER * turned:
+    if as_they_are < _MIN_DISTANCE * shape.diagonal or as_they_are < _MIN_RATIO * turned:
         return found
     places = tuple(
         replace(place, where=(place.where * _OTHER_FRAME).tolist()) if place.kind == "position" else place
@@ -267,10 +275,10 @@ def _on_shape(found: LandmarkFile, shape: Shape) -> tuple[Landmarks, float]:
         else:
             by_kind.setdefault(place.kind, []).append((k, place.name, place.where))
     if missing:
-        told = missing[0] + (f", and {len(missing) - 1} more are missing" if len(missing) > 1 else "")
+        message = missing[0] + (f", and {len(missing) - 1} more are missing" if len(missing) > 1 else "")
         if not by_kind:
-            raise InputError(told)
-        notes.append(f"{told}: left out")
+            raise InputError(message)
+        notes.append(f"{message}: left out")
     parts: list[Landmarks] = []
     rows: list[int] = []
     largest = 0.0
@@ -287,20 +295,20 @@ def _on_shape(found: LandmarkFile, shape: Shape) -> tuple[Landmarks, float]:
             parts.append(on_surface)
             largest = float(distance.max())
     lists = tuple(place.markup for place in found.places if place.kind != "missing")
-    return replace(joined(parts, np.argsort(rows)), notes=tuple(notes), lists=lists), largest
+    return replace(join_landmarks(parts, np.argsort(rows)), notes=tuple(notes), lists=lists), largest
 
 
 def save_landmarks(path: Path, landmarks: Landmarks, space: Space = "LPS", name: str = "", specimen: str = "") -> None:
     """Write landmarks, and which are missing; `OptionError` if the suffix is not one of `LANDMARK_SUFFIXES`.
 
-    `space` is the frame that a file for 3D Slicer (.fcsv, .mrk.json) states; it takes a mesh that states none to be in
-    LPS. `name` is what the file will be called, where `path` is a temporary name. `specimen` is what a .tps file calls
-    the shape, by default as the file.
+    `space` is the frame to state in a file for 3D Slicer (.fcsv, .mrk.json), which takes a mesh that states none to be in
+    LPS. `name` is the final name of the file, where `path` is temporary. `specimen` is the shape's name in a .tps file, by
+    default the file's.
     """
     suffix = check_landmarks_suffix(path)
     columns = (landmarks.vertex, landmarks.points, landmarks.face, landmarks.barycentric)
-    sure = tables.short_floats(landmarks.confidence)
-    rows = list(zip(landmarks.names, *(column.tolist() for column in columns), sure, strict=True))
+    confidence = tables.short_floats(landmarks.confidence)
+    rows = list(zip(landmarks.names, *(column.tolist() for column in columns), confidence, strict=True))
     points = zip(landmarks.names, landmarks.points.tolist(), landmarks.confidence.tolist(), strict=True)
     missing = landmarks.missing.tolist()
     if suffix == ".tps":
@@ -322,7 +330,7 @@ def save_landmarks(path: Path, landmarks: Landmarks, space: Space = "LPS", name:
     else:
         root = ElementTree.Element("PickedPoints")
         for (name, _, xyz, *_), lost in zip(rows, missing, strict=True):
-            # MeshLab has points of a template that are not placed.
+            # MeshLab has the points of a template that are not placed yet.
             x, y, z = ("0", "0", "0") if lost else map(repr, xyz)
             ElementTree.SubElement(root, "point", x=x, y=y, z=z, name=name, active="0" if lost else "1")
         ElementTree.indent(root, " ")
@@ -331,9 +339,7 @@ def save_landmarks(path: Path, landmarks: Landmarks, space: Space = "LPS", name:
 
 
 def landmark_positions(path: Path) -> Float[Floats, "L 3"]:
-    """The positions of landmarks in a file that `save_landmarks` wrote and others may have corrected since; nan where one
-    is missing.
-    """
+    """(L, 3) positions of landmarks in a file that `save_landmarks` wrote, possibly edited since; nan for missing ones."""
 
     def read(path: Path) -> Floats:
         reader = LANDMARK_READERS[path.suffix.lower()]
@@ -344,7 +350,7 @@ def landmark_positions(path: Path) -> Float[Floats, "L 3"]:
 
 
 def size_beside(points: Float[Floats, "L 3"], others: Float[Floats, "L 3"]) -> float:
-    """How many times as far apart landmarks are as the same ones of another shape; 0 where fewer than two are on both."""
+    """Size of a set of landmarks relative to the same ones on another shape; 0 if fewer than two are on both."""
     both = np.isfinite(points + others).all(axis=1)
     size, other = (
         np.linalg.norm(each[both] - each[both].mean(axis=0)) if both.any() else 0.0 for each in (points, others)
@@ -353,9 +359,11 @@ def size_beside(points: Float[Floats, "L 3"], others: Float[Floats, "L 3"]) -> f
 
 
 def save_specimens(path: Path, specimens: Mapping[str, Float[Floats, "L 3"]], names: Sequence[str]) -> None:
-    """Write one table of the same landmarks of several specimens, for R and other programs; `OptionError` if it has another
-    suffix than .csv (specimen,landmark,x,y,z), .tps, .txt (Morphologika), .npz (points (S, L, 3), specimens, landmarks);
-    `InputError` if a specimen has more or fewer landmarks. Missing ones are empty cells, NA in .tps and .txt, nan in .npz.
+    """Write one table of the same landmarks on several specimens, for R and other programs.
+
+    The suffix is .csv (specimen,landmark,x,y,z), .tps, .txt (Morphologika) or .npz (points (S, L, 3), specimens, landmarks),
+    else `OptionError`; `InputError` if a specimen has more or fewer landmarks. Missing ones are empty cells in .csv, NA in
+    .tps and .txt, nan in .npz.
     """
     suffix = check_table_suffix(path)
     for specimen, points in specimens.items():

@@ -1,5 +1,6 @@
-"""Measurements of a shape, such as girths and lengths, that are defined by landmarks of another: their files, and how they
-are taken. "Measurements" in docs/measurements.md says what each kind is.
+"""Measurements of a shape, such as girths and lengths, defined by landmarks of another: their files, and how they are taken.
+
+"Measurements" in docs/measurements.md describes the kinds.
 """
 
 from __future__ import annotations
@@ -26,17 +27,17 @@ from meshmatch.shapes.faces import seams
 from meshmatch.shapes.input_files import read_json
 from meshmatch.shapes.landmark_files import one_line
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.landmarks import Landmarks, at_faces, joined
+from meshmatch.transfer.landmarks import Landmarks, at_faces, join_landmarks
 
 MeasurementKind = Literal["distance", "girth", "angle"]
 _LANDMARKS = {"distance": "two landmarks or more", "girth": "three landmarks", "angle": "three landmarks"}
 _HINT = "a row each: name,kind,landmark,landmark,...; the kinds are distance, girth and angle"
-_SPACING = 1 / 64  # of a girth: so far apart its points lie at most
-_ENOUGH = 0.75  # share of a girth that must be there
-_TORN = 1 / 5  # of a girth: no neighbours on its line are that far apart
-_STEPS = 4  # nor so many times as far as they are where the points of a cloud are rare
-_FEWEST = 6  # points of a girth: the hull of fewer is shorter by five percent or more
-_MOST_POINTS = 3_000_000  # of all girths
+_SPACING = 1 / 64  # maximum distance between points of a girth, as a share of it
+_MIN_SHARE = 0.75  # share of a girth that must exist
+_MAX_GAP = 1 / 5  # maximum distance between neighbors along a girth, as a share of it;
+_MAX_GAP_STEPS = 4  # or in mean distances, if that is more, where the points of a cloud are sparse
+_MIN_POINTS = 6  # points of a girth: the hull of fewer is shorter by five percent or more
+_MAX_POINTS = 3_000_000  # of all girths
 _COLUMNS = ["name", "kind", "value", "confidence"]
 MEASUREMENT_SUFFIXES = (".csv", ".json")
 check_measurements_suffix = partial(tables.check_suffix, suffixes=MEASUREMENT_SUFFIXES, what="measurements")
@@ -44,18 +45,18 @@ check_measurements_suffix = partial(tables.check_suffix, suffixes=MEASUREMENT_SU
 
 @dataclass(frozen=True)
 class Measurement:
-    """What is measured between which landmarks.
+    """A measurement between landmarks.
 
     Attributes
     ----------
     name
         Such as "waist girth".
     kind
-        ``distance``: along straight lines from landmark to landmark, two or more. ``girth``: around what the first landmark
-        lies on, in the plane through it that the line from the second to the third is perpendicular to, as a tape lies.
-        ``angle``: at the second of three, in degrees.
+        ``distance``: length of the polyline through two landmarks or more. ``girth``: length of a tape around the part that
+        the first landmark lies on, in the plane through it perpendicular to the line from the second to the third.
+        ``angle``: at the second of three landmarks, in degrees.
     landmarks
-        Their names; of such as have none their numbers, from 0 in their order.
+        Names of landmarks; numbers from 0, in order, for landmarks without names.
 
     Examples
     --------
@@ -85,21 +86,21 @@ class Measurement:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Measurements(Brief):
-    """What was measured on a shape.
+    """Results of measurements of a shape.
 
     Attributes
     ----------
     names
-        Of N measurements.
+        Names of the N measurements.
     kinds
         ``distance``, ``girth`` or ``angle``.
     values
-        (N,) in the unit of the shape's file; angles in degrees; nan where the shape is missing, or a map tears a girth.
+        (N,) in the unit of the shape's file, angles in degrees; nan where the shape is missing, or a map tears a girth.
     confidence
-        (N,) of the map where each was taken, from 0 (a guess) to 1 (certain): of a girth the mean along it, else that of
-        the least certain landmark; nan where that is not known.
+        (N,) confidence of the map, from 0 (a guess) to 1 (certain): for a girth the mean along it, else that of the least
+        certain landmark; nan where it is unknown.
     lines
-        The points, (M, 3) each, that a measurement leads through, in the frame of the file; of a girth a closed line.
+        Points (M, 3) of the line that each measurement follows, in the frame of the file; girths are closed.
 
     Examples
     --------
@@ -116,32 +117,32 @@ class Measurements(Brief):
 
 @dataclass(frozen=True, eq=False)
 class MeasuringPoints:
-    """The points of a shape by which measurements are taken: what another shape needs is where they are on it."""
+    """The points of a shape that define its measurements. Their places on another shape give that shape's measurements."""
 
     shape: Shape
     measurements: tuple[Measurement, ...]
-    points: Landmarks  # on the shape; of all, one after the other
-    shares: Float[Floats, " P"]  # of its measurement, that each stands for
-    ends: Int[Ints, " N"]  # where those of each measurement end
+    points: Landmarks  # on the shape; those of all measurements, concatenated
+    shares: Float[Floats, " P"]  # weight of each point within its measurement
+    ends: Int[Ints, " N"]  # end of each measurement's points
 
     @classmethod
     def of(cls, shape: Shape, landmarks: Landmarks, measurements: Sequence[Measurement]) -> MeasuringPoints:
-        """On the shape whose landmarks they are defined by; `InputError` for a landmark that is not one of these, and for
-        what cannot be taken on the shape.
+        """Find the points on the shape whose landmarks define the measurements; `InputError` for an unknown landmark, and
+        for measurements that the shape does not allow.
         """
-        names = _Names(landmarks)
+        names = _LandmarkIndex(landmarks)
         parts, order, shares = [landmarks], [], []
         surface, count = _Surface(shape), len(landmarks.names)
         for each in measurements:
             rows = names.rows(each)
             if each.kind == "girth":
-                loop, share = surface.loop(landmarks.points[rows], each.name)
+                loop, share = surface.cross_section(landmarks.points[rows], each.name)
                 parts.append(loop)
                 rows = count + np.arange(len(share))
                 count += len(share)
-                if count > _MOST_POINTS:
+                if count > _MAX_POINTS:
                     raise InputError(
-                        f"the girths up to {each.name} go through more than {_MOST_POINTS:,} points",
+                        f"the girths up to {each.name} go through more than {_MAX_POINTS:,} points",
                         "measure fewer at a time, or by a source with fewer faces",
                     )
             else:
@@ -153,33 +154,35 @@ class MeasuringPoints:
             order.append(rows)
             shares.append(share)
         ends = np.cumsum([len(rows) for rows in order])
-        return cls(shape, tuple(measurements), joined(parts, np.concatenate(order)), np.concatenate(shares), ends)
+        return cls(
+            shape, tuple(measurements), join_landmarks(parts, np.concatenate(order)), np.concatenate(shares), ends
+        )
 
     def taken(self, places: Landmarks, minimum: float = 0.0) -> Measurements:
-        """By where the points are on a shape; what is less confident than the minimum is not trusted."""
+        """Take the measurements at these places of the points; places with less confidence than ``minimum`` are ignored."""
         values, confidence, lines = [], [], []
         for each, begin, end in zip(self.measurements, [0, *self.ends[:-1]], self.ends, strict=True):
-            points, sure, shares = places.points[begin:end], places.confidence[begin:end], self.shares[begin:end]
-            trusted = ~(sure < minimum) & np.isfinite(points).all(axis=1)  # unknown confidence is none
+            points, confidences, shares = places.points[begin:end], places.confidence[begin:end], self.shares[begin:end]
+            trusted = ~(confidences < minimum) & np.isfinite(points).all(axis=1)  # unknown confidence (nan) passes
             value, line = np.nan, np.empty((0, 3))
-            if trusted.all() or (each.kind == "girth" and shares[trusted].sum() >= _ENOUGH):
+            if trusted.all() or (each.kind == "girth" and shares[trusted].sum() >= _MIN_SHARE):
                 value, line = _MEASURE[each.kind](points[trusted])
             if each.kind == "girth" and _is_torn(points, trusted, self.points.face[begin:end], value):
                 value = np.nan
             values.append(value)
-            confidence.append(float(shares @ sure if each.kind == "girth" else sure.min()))
+            confidence.append(float(shares @ confidences if each.kind == "girth" else confidences.min()))
             lines.append(np.empty((0, 3)) if np.isnan(value) else line)
         names, kinds = zip(*((each.name, each.kind) for each in self.measurements), strict=True)
         return Measurements(names, kinds, np.array(values), np.array(confidence), tuple(lines))
 
 
 def load_measurements(path: str | Path) -> tuple[Measurement, ...]:
-    """The measurements that a table defines, a row each: a name, a kind, and the names of landmarks.
+    """Read measurements from a table, a row each: a name, a kind, and names of landmarks.
 
     Raises
     ------
     InputError
-        It is not such a table, or two are of one name.
+        It is not such a table, or two measurements have the same name.
     """
     return tables.read_by_suffix(path, {".csv": _read, ".txt": _read}, "measurements", _HINT)
 
@@ -199,7 +202,7 @@ def _read(path: Path) -> tuple[Measurement, ...]:
 
 
 def each_once(measurements: Sequence[Measurement]) -> tuple[Measurement, ...]:
-    """The same; `InputError` where two are of one name, or there are none."""
+    """Measurements as a tuple; `InputError` where two have the same name, or there are none."""
     seen: set[str] = set()
     measurements = (measurements,) if isinstance(measurements, Measurement) else tuple(measurements)
     for each in measurements:
@@ -216,7 +219,7 @@ def each_once(measurements: Sequence[Measurement]) -> tuple[Measurement, ...]:
 
 
 def save_measurements(path: Path, found: Measurements) -> None:
-    """Write a .csv with a row for each, or a .json, which also has the lines; `OptionError` for another suffix."""
+    """Write a .csv with a row per measurement, or a .json, which includes the lines; `OptionError` for another suffix."""
     sure = tables.short_floats(found.confidence)
     values = [None if value != value else value for value in found.values.tolist()]
     rows = list(zip(found.names, found.kinds, values, sure, strict=True))
@@ -233,7 +236,7 @@ def save_measurements(path: Path, found: Measurements) -> None:
 
 
 def measured_values(path: Path) -> dict[str, float]:
-    """What a file that `save_measurements` wrote says, by name; nan where something is missing."""
+    """Values by name in a file that `save_measurements` wrote; nan for missing ones."""
     if path.suffix.lower() == ".json":
         records = tables.read_by_suffix(path, {".json": _read_json}, "measurements", _HINT)
         return {str(each["name"]): float("nan" if each["value"] is None else each["value"]) for each in records}
@@ -242,7 +245,7 @@ def measured_values(path: Path) -> dict[str, float]:
 
 
 def _read_csv(path: Path) -> list[list[str]]:
-    with path.open(encoding="utf-8", newline="") as file:  # names may hold what separates cells elsewhere
+    with path.open(encoding="utf-8", newline="") as file:  # names may contain other separators
         rows = list(csv.reader(file))
     return rows if rows[0] == _COLUMNS else tables.read_table(path).rows()
 
@@ -251,21 +254,21 @@ def _read_json(path: Path) -> list[dict[str, Any]]:
     return list(read_json(path)["measurements"])
 
 
-class _Names:
-    """The names of landmarks, however their letters are composed and their words are spaced."""
+class _LandmarkIndex:
+    """Rows of landmarks by name, up to composition of letters (NFC) and spacing."""
 
     def __init__(self, landmarks: Landmarks) -> None:
-        self.missing, self.row, self.several = landmarks.missing, dict[str, int](), set[str]()
+        self.missing, self.row, self.ambiguous = landmarks.missing, dict[str, int](), set[str]()
         for k, name in enumerate(map(self._key, landmarks.names)):
             if self.row.setdefault(name, k) != k:
-                self.several.add(name)
+                self.ambiguous.add(name)
 
     @staticmethod
     def _key(name: str) -> str:
         return normalize("NFC", one_line(name))
 
     def rows(self, measurement: Measurement) -> Int[Ints, " N"]:
-        """(N,) which landmarks are meant; `InputError` if that is not clear, or one is missing."""
+        """(N,) rows of a measurement's landmarks; `InputError` if a name is ambiguous or unknown, or a landmark missing."""
         found = []
         for name in map(self._key, measurement.landmarks):
             row, problem, hint = self.row.get(name), "", ""
@@ -273,7 +276,7 @@ class _Names:
                 near = get_close_matches(name[:80], self.row, 1)
                 hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(list(self.row)[:8])}"
                 problem = f"no landmark is called {name!r}"
-            elif name in self.several:
+            elif name in self.ambiguous:
                 problem, hint = f"two landmarks are called {name!r}", "give each a name of its own"
             elif self.missing[row]:
                 problem = f"landmark {name} is missing on the shape that has the landmarks"
@@ -284,7 +287,7 @@ class _Names:
 
 
 class _Surface:
-    """The faces of a shape, cut by planes."""
+    """The valid faces of a shape, for cross sections."""
 
     def __init__(self, shape: Shape) -> None:
         self.shape, self.rows = shape, np.flatnonzero(shape.valid_faces)
@@ -292,13 +295,15 @@ class _Surface:
 
     @cached_property
     def twin(self) -> Int[Ints, " V"]:
-        """The vertex to use instead of each where the file has copies along seams."""
+        """(V,) the vertex to use instead of each, where the file duplicates vertices along seams."""
         return seams(self.shape.verts, self.faces)
 
-    def loop(self, points: Float[Floats, "3 3"], name: str) -> tuple[Landmarks, Float[Floats, " N"]]:
-        """Points along the line in which the plane through the first point, perpendicular to the way from the second to the
-        third, cuts the surface, and the share of the line that each stands for: of the pieces of that line the one nearest
-        to the point. `InputError` if there is none, or much of it is missing.
+    def cross_section(self, points: Float[Floats, "3 3"], name: str) -> tuple[Landmarks, Float[Floats, " N"]]:
+        """Cross section of the surface for a girth: in the plane through the first point, perpendicular to the direction
+        from the second to the third, the connected line nearest to the first point.
+
+        Returns points along it, and the share of its length that each stands for. `InputError` if there is none, or much of
+        it is missing.
         """
         (at, start, end), verts = points, self.shape.verts
         if not len(self.faces):
@@ -315,32 +320,32 @@ class _Surface:
         if not len(cut):
             raise InputError(f"measurement {name}: the plane through its first landmark does not cut the surface")
         corners, upper, rows = self.faces[cut], upper[cut], np.arange(len(cut))
-        alone = np.where(upper.sum(axis=1) == 1, upper.argmax(axis=1), (~upper).argmax(axis=1))
-        tip = corners[rows, alone]
+        tip_corner = np.where(upper.sum(axis=1) == 1, upper.argmax(axis=1), (~upper).argmax(axis=1))
+        tip = corners[rows, tip_corner]
         weights, keys = np.zeros((len(cut), 2, 3)), np.empty((len(cut), 2), np.int64)
         for side in range(2):  # the two edges of a face that the plane cuts
-            other = (alone + 1 + side) % 3
+            other = (tip_corner + 1 + side) % 3
             far = corners[rows, other]
             share = height[tip] / (height[tip] - height[far])
-            weights[rows, side, alone], weights[rows, side, other] = 1 - share, share
+            weights[rows, side, tip_corner], weights[rows, side, other] = 1 - share, share
             edge = np.sort(np.stack([self.twin[tip], self.twin[far]]), axis=0)
             keys[:, side] = edge[0] * self.shape.V + edge[1]
         pieces = np.einsum("nsk,nkd->nsd", weights, verts[corners])
-        own = np.flatnonzero(_in_one_line(keys, _nearest(pieces, at)))
+        own = np.flatnonzero(_connected_pieces(keys, _nearest_piece(pieces, at)))
         lengths = np.sqrt(squared_lengths(pieces[own, 1] - pieces[own, 0]))
-        row, along, share = _evenly(lengths)
+        row, along, share = _sample_evenly(lengths)
         ends = weights[own[row]]
         found = (1 - along)[:, None] * ends[:, 0] + along[:, None] * ends[:, 1]
         line = at_faces(self.shape, self.rows[cut[own[row]]], found)
-        if not lengths.sum() >= _ENOUGH * _girth(line.points)[0]:
+        if not lengths.sum() >= _MIN_SHARE * _girth(line.points)[0]:
             raise InputError(
                 f"measurement {name}: a quarter of the girth or more is missing, for the surface is open there"
             )
         return line, share
 
 
-def _in_one_line(ends: Int[Ints, "N 2"], first: int) -> Bool[Bools, " N"]:
-    """(N,) which pieces of lines, by the numbers of their ends, hang together with one of them."""
+def _connected_pieces(ends: Int[Ints, "N 2"], first: int) -> Bool[Bools, " N"]:
+    """(N,) which line pieces, given by the numbers of their ends, are connected to piece `first`."""
     number = np.unique(ends, return_inverse=True)[1].reshape(-1, 2)
     count = int(number.max()) + 1
     graph = coo_array((np.ones(len(number), np.int8), (number[:, 0], number[:, 1])), shape=(count, count))
@@ -348,11 +353,12 @@ def _in_one_line(ends: Int[Ints, "N 2"], first: int) -> Bool[Bools, " N"]:
     return np.asarray(line == line[first])
 
 
-def _evenly(lengths: Float[Floats, " N"]) -> tuple[Int[Ints, " M"], Float[Floats, " M"], Float[Floats, " M"]]:
-    """Points on pieces of a line of these lengths: on which each is, where from 0 to 1, and the share of the line that it
-    stands for; the ends of each piece, and more on long ones.
+def _sample_evenly(lengths: Float[Floats, " N"]) -> tuple[Int[Ints, " M"], Float[Floats, " M"], Float[Floats, " M"]]:
+    """Sample a line of pieces with these lengths: the ends of each piece, and more points on long ones.
+
+    Returns for each point its piece, its parameter on it (0 to 1), and the share of the line that it stands for.
     """
-    lengths = lengths if lengths.any() else np.ones(len(lengths))  # all in one point
+    lengths = lengths if lengths.any() else np.ones(len(lengths))  # all points coincide
     whole = float(lengths.sum())
     steps = np.maximum(np.ceil(lengths / (whole * _SPACING)).astype(np.int64), 1)
     row = np.repeat(np.arange(len(lengths)), steps + 1)
@@ -363,20 +369,20 @@ def _evenly(lengths: Float[Floats, " N"]) -> tuple[Int[Ints, " M"], Float[Floats
 
 
 def _is_torn(points: Float[Floats, "N 3"], trusted: Bool[Bools, " N"], face: Int[Ints, " N"], girth: float) -> bool:
-    """Whether neighbours on a girth, which are in one face, lie far apart, as by a map that leads to another limb; or it has
-    a few points only.
+    """Whether neighbors along a girth, which are in one face, lie far apart, as by a map that leads to another limb; or
+    whether it has too few distinct points.
     """
     pairs = np.flatnonzero((face[1:] == face[:-1]) & trusted[1:] & trusted[:-1])
     longest = float(squared_lengths(points[pairs + 1] - points[pairs]).max(initial=0.0)) ** 0.5
-    apart = len(np.unique(points[trusted], axis=0))
-    return longest > girth * max(_TORN, _STEPS / max(apart, 1)) or apart < _FEWEST
+    n_distinct = len(np.unique(points[trusted], axis=0))
+    return longest > girth * max(_MAX_GAP, _MAX_GAP_STEPS / max(n_distinct, 1)) or n_distinct < _MIN_POINTS
 
 
-def _nearest(pieces: Float[Floats, "N 2 3"], point: Float[Floats, " 3"]) -> int:
-    """Which of these pieces of lines is nearest to a point."""
-    begin, way = pieces[:, 0], pieces[:, 1] - pieces[:, 0]
-    share = np.einsum("nd,nd->n", point - begin, way) / np.maximum(squared_lengths(way), 1e-300)
-    return int(squared_lengths(begin + np.clip(share, 0, 1)[:, None] * way - point).argmin())
+def _nearest_piece(pieces: Float[Floats, "N 2 3"], point: Float[Floats, " 3"]) -> int:
+    """Index of the line piece nearest to a point."""
+    begin, direction = pieces[:, 0], pieces[:, 1] - pieces[:, 0]
+    share = np.einsum("nd,nd->n", point - begin, direction) / np.maximum(squared_lengths(direction), 1e-300)
+    return int(squared_lengths(begin + np.clip(share, 0, 1)[:, None] * direction - point).argmin())
 
 
 def _distance(points: Float[Floats, "N 3"]) -> tuple[float, Floats]:
@@ -391,13 +397,13 @@ def _angle(points: Float[Floats, "3 3"]) -> tuple[float, Floats]:
 
 
 def _girth(points: Float[Floats, "N 3"]) -> tuple[float, Floats]:
-    """Around points that lie nearly in one plane, as a tape lies: the convex hull, in the plane nearest to them."""
+    """Tape length around points that lie nearly in one plane: perimeter of their convex hull in the best-fitting plane."""
     middle = points.mean(axis=0)
     axes = np.linalg.svd(points - middle, full_matrices=False)[2][:2]
     flat = (points - middle) @ axes.T
     try:
         line = flat[ConvexHull(flat).vertices]
-    except (QhullError, ValueError):  # they lie in one line: there and back
+    except (QhullError, ValueError):  # collinear points: there and back
         line = flat[[int(flat[:, 0].argmin()), int(flat[:, 0].argmax())]]
     length = np.sqrt(squared_lengths(np.roll(line, -1, axis=0) - line)).sum()
     return float(length), middle + np.concatenate([line, line[:1]]) @ axes

@@ -1,6 +1,6 @@
-"""Numbers and colors of each vertex, from files and to files: "Data on a shape" in docs/formats.md.
+"""Reading and writing of numbers and colors per vertex: "Data on a shape" in docs/formats.md.
 
-Colors are mixed as light; a `Shape` has them as screens show them (sRGB), whatever its file has.
+Colors are interpolated in linear light; those of a `Shape` are sRGB, whatever its file has.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ VALUE_SUFFIXES = (".npy", ".csv", ".ply", ".vtp", ".vtk")
 _COLOR_SUFFIXES = (".ply", ".glb", ".vrm", ".obj", ".off", ".vtp", ".vtk", ".npy", ".csv")
 check_values_suffix = partial(tables.check_suffix, suffixes=VALUE_SUFFIXES, what="values")
 check_color_suffix = partial(tables.check_suffix, suffixes=_COLOR_SUFFIXES, what="vertex colors")
-_VISIBLE = 1e-7  # share of a number, unless it is whole, that a 32-bit one may differ by
+_MAX_ROUNDING = 1e-7  # relative; a larger difference of a 32-bit number, or any of a whole number, is worth a warning
 _HINT = "one row of numbers for each vertex of the source, in the order of its file: .npy, .csv or .vtp"
-# Properties that a ply has already.
+# Names that properties of a ply already have.
 _RESERVED = {"x", "y", "z", "red", "green", "blue", "alpha", "r", "g", "b", "a"}
 
 
 @dataclass(frozen=True, eq=False)
 class Values:
-    """Numbers (V,) or (V, D) of each vertex, and a name for each column (may be empty)."""
+    """Numbers (V,) or (V, D) per vertex, and the names of the columns (may be empty)."""
 
     numbers: Floats
     names: tuple[str, ...] = ()
 
 
 def load_values(path: str | Path, shape: Shape) -> Values:
-    """Read numbers of the vertices of `shape`; `InputError` if there is not one row for each."""
+    """Read numbers of the vertices of `shape`; `InputError` unless there is one row for each."""
     readers = {".npy": _read_npy} | dict.fromkeys((".csv", ".txt"), lambda path: _read_text(path, shape.V))
     readers |= dict.fromkeys(vtk_xml.SUFFIXES, _read_arrays)
     found: Values = tables.read_by_suffix(path, readers, "values", _HINT)
@@ -65,7 +65,7 @@ def _read_npy(path: Path) -> Values:
 
 
 def _read_arrays(path: Path) -> Values:
-    """All arrays of the points, such as those of ParaView and 3D Slicer; of vectors a column for each number."""
+    """All point arrays, such as those of ParaView and 3D Slicer; vectors become a column per component."""
     arrays = vtk_xml.point_arrays(path)
     if not arrays:
         raise InputError(f"{path.name} has no numbers at its points")
@@ -76,11 +76,11 @@ def _read_arrays(path: Path) -> Values:
 
 
 def _read_text(path: Path, count: int) -> Values:
-    """The numbers of a table of text, one row for each of `count` vertices."""
+    """The numbers of a text table with one row for each of `count` vertices."""
     table = read_table(path)
     names, numbers = table.numbers()
-    if not names and len(numbers) == count + 1 and _counts_columns(numbers[0]):
-        names, numbers = ("", *map(str, range(numbers.shape[1] - 1))), numbers[1:]  # as pandas names columns
+    if not names and len(numbers) == count + 1 and _is_pandas_header(numbers[0]):
+        names, numbers = ("", *map(str, range(numbers.shape[1] - 1))), numbers[1:]  # the header of a pandas file
     if not names and numbers.size == 0:
         raise InputError(f"{path.name} is empty")
     if len(numbers) == count:
@@ -93,21 +93,20 @@ def _read_text(path: Path, count: int) -> Values:
     return Values(numbers[:, 0] if numbers.shape[1] == 1 else numbers, names)
 
 
-def _counts_columns(row: Floats) -> bool:
+def _is_pandas_header(row: Floats) -> bool:
+    """Whether a row is pandas' default header: an empty cell, then column numbers from 0."""
     return bool(np.isnan(row[0])) and len(row) > 1 and np.array_equal(row[1:], np.arange(len(row) - 1))
 
 
 def _is_row_number(column: Floats) -> bool:
-    """Whether a column without a name counts the rows, from 0 as pandas or from 1 as R."""
+    """Whether a column counts the rows, from 0 as pandas does or from 1 as R does."""
     return any(np.array_equal(column, np.arange(len(column)) + first) for first in (0, 1))
 
 
 def save_values(path: Path, values: Values, shape: Shape, file: Path | None = None) -> bool:
-    """Write numbers of the vertices of `shape`; a .ply or .vtp ``file`` that it was read from keeps all else.
+    """Write numbers of the vertices of `shape`; a .ply or .vtp ``file`` that it was read from keeps all its other data.
 
-    Returns whether it does.
-
-    `OptionError` if the suffix is not one of `VALUE_SUFFIXES`.
+    Returns whether other data could be kept. `OptionError` if the suffix is not one of `VALUE_SUFFIXES`.
     """
     suffix, numbers = check_values_suffix(path), values.numbers
     table = numbers if numbers.ndim == 2 else numbers[:, None]
@@ -120,7 +119,7 @@ def save_values(path: Path, values: Values, shape: Shape, file: Path | None = No
     elif suffix in (".vtp", ".vtk"):
         as_vtp = VtpFile.of(file, shape) if suffix == ".vtp" else None
         there = vtk_xml.point_arrays(file) if suffix == ".vtp" and as_vtp is None else {}
-        own = _different([name or "value" for name in names], set(there if as_vtp is None else as_vtp.arrays))
+        own = _make_unique([name or "value" for name in names], set(there if as_vtp is None else as_vtp.arrays))
         arrays = dict(zip(own, table.T, strict=True))
         if as_vtp is not None:
             path.write_bytes(as_vtp.with_arrays(arrays, {}))
@@ -129,12 +128,12 @@ def save_values(path: Path, values: Values, shape: Shape, file: Path | None = No
         return as_vtp is not None
     else:
         words = ["".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in name) for name in names]
-        own = _different([word or "value" for word in words], _RESERVED)
-        with np.errstate(over="ignore"):  # which more programs read; VTK, and so ParaView, reads none of a ply
+        own = _make_unique([word or "value" for word in words], _RESERVED)
+        with np.errstate(over="ignore"):  # 32 bits, which more programs read; VTK, and so ParaView, reads no 64-bit ply
             written = table.astype(np.float32)
-            off = np.abs(written - table)
+            difference = np.abs(written - table)
         whole = (table == np.rint(table)) & (np.abs(table) < 2**53)
-        if (off > np.where(whole, 0.0, _VISIBLE * np.abs(table))).any():
+        if (difference > np.where(whole, 0.0, _MAX_ROUNDING * np.abs(table))).any():
             warn(f"{path.name} has 32-bit numbers, which change some of these; .csv, .npy and .vtp keep them")
         columns, as_ply = dict(zip(own, written.T, strict=True)), PlyFile.of(file, shape)
         if as_ply is not None:
@@ -145,8 +144,8 @@ def save_values(path: Path, values: Values, shape: Shape, file: Path | None = No
     return True
 
 
-def _different(names: list[str], taken: set[str]) -> list[str]:
-    """Names of which none is there twice, and none is among those taken: a second a is a_, a third a_2."""
+def _make_unique(names: list[str], taken: set[str]) -> list[str]:
+    """Make names different from each other and from those taken: a second a becomes a_, a third a_2."""
     found: list[str] = []
     used, times = set(taken), Counter[str]()
     for name in names:
@@ -160,12 +159,12 @@ def _different(names: list[str], taken: set[str]) -> list[str]:
 
 
 def parse_blank(text: str, columns: int) -> Float[Floats, " D"]:
-    """What the user's text says: a number, one for each column, or #rrggbb; `OptionError` if it says none of these."""
+    """Numbers of a user's text: one for all columns, one for each, or #rrggbb; `OptionError` if it is none of these."""
     numbers: list[float] = []
     try:
         if re.fullmatch("#[0-9a-fA-F]{6}", text):
             numbers = [byte / 255 for byte in bytes.fromhex(text[1:])]
-        elif text.isascii() and "_" not in text:  # Python's numbers have other digits too
+        elif text.isascii() and "_" not in text:  # float() also accepts other digits and underscores
             numbers = [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
         pass
@@ -179,8 +178,8 @@ def parse_blank(text: str, columns: int) -> Float[Floats, " D"]:
 
 
 def light_of(shape: Shape, colors: ArrayLike | None = None) -> Float[Floats, "V 4"]:
-    """Light of the vertices of a shape, from its own colors (`InputError` if it has none) or from others (V, 3 or 4)
-    as screens show them.
+    """Linear colors and alpha of the vertices of a shape: of its own colors (`InputError` if it has none), or of given sRGB
+    ones (V, 3 or 4).
     """
     if colors is None:
         if shape.colors is None:
@@ -196,7 +195,7 @@ def light_of(shape: Shape, colors: ArrayLike | None = None) -> Float[Floats, "V 
 
 
 def checked_colors(colors: Float[Floats, "*N C"]) -> Float[Floats, "*N C"]:
-    """The same colors; `OptionError` where they are not 3 or 4 numbers within 0..1."""
+    """The same colors; `OptionError` unless they are 3 or 4 numbers within 0..1."""
     if colors.ndim == 0 or colors.shape[-1] not in (3, 4) or not ((colors >= 0) & (colors <= 1)).all():
         hint = "such as 0.5,0.5,0.5 or #808080"
         raise OptionError("a color has 3 or 4 numbers within 0..1: red, green, blue and alpha", hint)
@@ -204,7 +203,7 @@ def checked_colors(colors: Float[Floats, "*N C"]) -> Float[Floats, "*N C"]:
 
 
 def parse_color(text: str | None) -> tuple[float, float, float, float] | None:
-    """The color and alpha (sRGB, 0..1) that a text such as #808080 means; `OptionError` if it means none."""
+    """The sRGB color and alpha (0..1) of a text such as #808080; `OptionError` if it is not a color."""
     if text is None:
         return None
     red, green, blue, alpha = checked_colors(parse_blank(text, 4)).tolist()
@@ -218,9 +217,9 @@ def save_colors(
     file: Path | None = None,
     turn: Float[Floats, "3 3"] | None = None,
 ) -> bool:
-    """Write `shape` with vertex colors as screens show them; or the colors alone.
+    """Write `shape` with sRGB vertex colors; or the colors alone (.npy, .csv).
 
-    `file` and `turn`, and what is returned, as in `save_colored`.
+    `file`, `turn` and the return value are as in `save_colored`.
     """
     if check_color_suffix(path) in (".npy", ".csv"):
         return save_values(path, Values(colors, ("red", "green", "blue", "alpha")), shape)

@@ -1,4 +1,4 @@
-"""Skin weights of each vertex, from files and to files: "Data on a shape" in docs/formats.md."""
+"""Reading and writing of skin weights per vertex: "Data on a shape" in docs/formats.md."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ _MAX_JOINTS = 1 << 20
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SkinWeights(Brief):
-    """How much each joint moves each vertex."""
+    """The influence of each joint on each vertex."""
 
-    matrix: csr_array  # (V, J), not negative; rows sum to 1, or to 0 for a vertex that nothing moves
+    matrix: csr_array  # (V, J), not negative; rows sum to 1, or to 0 for a vertex that no joint moves
     names: tuple[str, ...]  # of the joints
 
 
 def load_weights(path: str | Path, shape: Shape) -> SkinWeights:
-    """Skin weights of the vertices of `shape`, from .npz, .json, or a skin, as of .glb; `InputError` if not its own."""
+    """Skin weights of the vertices of `shape`, from .npz, .json or a skin (.glb); `InputError` if they do not fit it."""
     from meshmatch.shapes.formats.gltf import SUFFIXES
     from meshmatch.shapes.formats.gltf_attributes import read_skin
 
@@ -50,8 +50,8 @@ def load_weights(path: str | Path, shape: Shape) -> SkinWeights:
 
 
 def weights_of(matrix: csr_array | ArrayLike, shape: Shape) -> SkinWeights:
-    """Skin weights of the vertices of `shape` from a table (V, J), dense or sparse, of numbers that are not negative
-    (`InputError`); joints are named by number.
+    """Skin weights of the vertices of `shape` from a dense or sparse (V, J) array of numbers that are not negative, else
+    `InputError`; joints are named by number.
     """
     table: Any = matrix if issparse(matrix) else _table("weights", matrix, np.float64)
     sparse = csr_array(table, dtype=np.float64)
@@ -82,7 +82,7 @@ def _from_record(record: Any) -> tuple[csr_array, tuple[str, ...]]:
 
 
 def _table(key: str, values: ArrayLike, kind: type) -> np.ndarray:
-    """An array (V, N) of finite numbers, whole ones where `kind` is an integer."""
+    """A (V, N) array of finite numbers; integers if `kind` is an integer type."""
     try:
         array = np.asarray(values)
         if array.ndim != 2 or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
@@ -97,7 +97,7 @@ def _table(key: str, values: ArrayLike, kind: type) -> np.ndarray:
 
 
 def _normalized(name: str, matrix: csr_array, shape: Shape) -> csr_array:
-    """Weights (V, J) checked to be of `shape`, and with rows that sum to 1."""
+    """Check that weights (V, J) fit `shape`, and scale rows to sum to 1."""
     if matrix.shape[0] != shape.V:
         problem = f"{name} has weights of {matrix.shape[0]} vertices, but {shape.name or 'the source'} has {shape.V}"
         raise InputError(problem, "one row is needed for each vertex of the source, in the order of its file")
@@ -107,10 +107,10 @@ def _normalized(name: str, matrix: csr_array, shape: Shape) -> csr_array:
     if matrix.nnz and matrix.data.min() < 0:
         raise InputError(f"{name}: a weight is negative ({matrix.data.min():g})", "weights are shares from 0 to 1")
     total = np.asarray(matrix.sum(axis=1)).ravel()
-    some = total > 1 / LARGEST
-    if not some.any():
+    positive = total > 1 / LARGEST
+    if not positive.any():
         raise InputError(f"{name}: all weights are 0", "is it the right file?")
-    scale = np.where(some, 1.0 / np.where(some, total, 1.0), 0.0)
+    scale = np.where(positive, 1.0 / np.where(positive, total, 1.0), 0.0)
     matrix = csr_array(matrix * scale[:, None])
     matrix.eliminate_zeros()
     return matrix

@@ -17,7 +17,7 @@ from meshmatch.transfer.landmarks import (
     at_faces,
     at_points,
     at_vertices,
-    joined,
+    join_landmarks,
     landmark_positions,
     load_landmarks,
     push_landmarks,
@@ -35,7 +35,7 @@ def some() -> Landmarks:
     """Two vertices, two points of faces."""
     rng = np.random.default_rng(0)
     faces = at_faces(COARSE, np.array([3, 60]), rng.dirichlet([1, 1, 1], 2), ("C 7", "Ünde & <so>"))
-    return joined([at_vertices(COARSE, np.array([5, 0]), ("nose", "ear")), faces])
+    return join_landmarks([at_vertices(COARSE, np.array([5, 0]), ("nose", "ear")), faces])
 
 
 def on_surface(shape: Shape, landmarks: Landmarks) -> None:

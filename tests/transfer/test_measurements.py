@@ -13,7 +13,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.transfer import measurements
-from meshmatch.transfer.landmarks import at_points, at_vertices, joined, load_landmarks
+from meshmatch.transfer.landmarks import at_points, at_vertices, join_landmarks, load_landmarks
 from meshmatch.transfer.measurements import (
     Measurement,
     Measurements,
@@ -184,10 +184,10 @@ def test_it_is_clear_which_landmarks_are_meant() -> None:
 def test_each_landmark_is_looked_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """However many there are, and distances between them."""
     shape, calls = tube(circle(1.0)), []
-    monkeypatch.setattr(measurements, "joined", lambda *given: calls.append(1) or joined(*given))
+    monkeypatch.setattr(measurements, "join_landmarks", lambda *given: calls.append(1) or join_landmarks(*given))
     points_on(shape, [replace(ALONG, name=str(k)) for k in range(9)])
     assert len(calls) == 1
-    monkeypatch.setattr(measurements, "_MOST_POINTS", 400)
+    monkeypatch.setattr(measurements, "_MAX_POINTS", 400)
     with pytest.raises(InputError, match="the girths up to 2 go through more than 400 points"):
         points_on(shape, [replace(AROUND, name=str(k)) for k in range(9)])
 
