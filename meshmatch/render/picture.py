@@ -1,4 +1,4 @@
-"""Shapes side by side on a common ground in a PNG, each with its name, and a legend."""
+"""Pictures (PNG) of shapes side by side on a common ground, with their names and a legend."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ VIEWS = {
     "back": (180.0, 8.0),
     "above": (0.0, 65.0),
 }
-"""Named views: turn and tilt in degrees. Left and right are the sides of the shape itself."""
+"""Named views: turn and tilt in degrees. Left and right are the shape's own sides."""
 HEIGHT = 800
-"""Of a picture whose size is not given, in pixels; its width is what the shapes need."""
+"""Height in pixels of a picture whose size is not given; its width is what the shapes need."""
 _GAP = 0.16  # minimum distance between two figures, in units of sqrt(area)
-_WIDEST, _NARROWEST = 2000, 0.62  # pixels; share of the height
-_MARGIN = 0.045  # of the height, free around the shapes
+_MAX_WIDTH, _MIN_ASPECT = 2000, 0.62  # of a picture whose size is not given: pixels, and width over `HEIGHT`
+_MARGIN = 0.045  # free space around the shapes, as a share of the height
 MAX_SIDE, MAX_PIXELS = 8192, 36_000_000
-_GLASS = 0.34  # opacity of glass seen straight on
-_HIDDEN = 0.006  # glass further behind a surface than this is hidden by it
+_GLASS_OPACITY = 0.34  # of glass seen straight on
+_HIDDEN_DEPTH = 0.006  # glass farther behind a surface than this is hidden by it
 BACKGROUNDS: dict[str, Ink | None] = {"white": (255, 255, 255), "dark": (24, 26, 31), "transparent": None}
 
 
@@ -44,12 +44,12 @@ BACKGROUNDS: dict[str, Ink | None] = {"white": (255, 255, 255), "dark": (24, 26,
 class Look:
     """How shapes are drawn; `OptionError` for a size that is too small or too large, or an invalid background.
 
-    ``size`` is width and height of the picture in pixels; by default `HEIGHT` high and as wide as the shapes need.
+    ``size`` is the width and height of the picture in pixels; by default it is `HEIGHT` high and as wide as the shapes need.
     ``background`` is "white", "dark", "transparent", or a color as #rrggbb. ``up`` and ``front`` are the file's axes that
-    point up and to the front of the shape: x, y, z, -x, -y or -z; by default guessed from the extents (tall is up, flat
-    is to the front; the sign cannot be guessed). ``turn`` and ``tilt`` are degrees by which shapes are rotated to their
-    own left, and tilted towards the viewer; 0, 0 is the front. ``ground``: the shapes cast a shadow there. ``legend`` is
-    what the colors mean.
+    point up and to the front of the shape: x, y, z, -x, -y or -z. By default they are guessed from the extents (the longest
+    points up, the shortest to the front; signs cannot be guessed). ``turn`` and ``tilt`` are degrees by which shapes are
+    rotated to their own left, and tilted towards the viewer; 0, 0 is the front. ``ground``: whether shapes cast a shadow on
+    the ground. ``legend`` explains the colors.
     """
 
     size: tuple[int, int] | None = None
@@ -94,25 +94,24 @@ def check_picture(path: str | Path) -> None:
 def render_shapes(
     panels: Sequence[Panel | tuple[object, ArrayLike | None]], path: str | Path, look: Look | None = None
 ) -> tuple[int, int]:
-    """Draw shapes side by side into a PNG, all on one ground and as large as the picture allows; its width and height.
+    """Draw shapes side by side into a PNG, on one ground and as large as the picture allows; return its width and height.
 
-    ``panels`` are `Panel` objects, or pairs ``(shape, colors or None)``. `OptionError` where there is nothing to draw, for
-    a suffix other than .png, an invalid axis, or colors of the wrong shape; `OutputError` for a file that cannot be
-    written.
+    ``panels`` are `Panel` objects, or pairs ``(shape, colors or None)``. `OptionError` if there is nothing to draw, or for a
+    suffix other than .png, an invalid axis, or colors of the wrong shape; `OutputError` for a file that cannot be written.
     """
     check_picture(path)
     wanted = [panel if isinstance(panel, Panel) else Panel(*panel) for panel in panels]  # type: ignore[arg-type]
     if not wanted:
         raise OptionError("a picture needs a shape")
-    with replace_on_success(path) as temporary:  # what cannot be written is told before the work
-        image = _image(wanted, look or Look())
+    with replace_on_success(path) as temporary:  # opened first, so that a path that cannot be written fails early
+        image = _render(wanted, look or Look())
         image.save(temporary, format="PNG", compress_level=9)
     return image.size
 
 
 def draw_apart(panels: Sequence[Panel], side: int, look: Look = Look()) -> list[UInts8]:
-    """Pictures (H, W, 4) in sRGB of shapes, each alone on nothing, without their labels: all in one scale, in which the
-    longest side of the largest has ``side`` pixels. Errors as `render_shapes`.
+    """Pictures (H, W, 4) in sRGB of single shapes, transparent, without labels and ground. All are at one scale, at which
+    the longest side of the largest has ``side`` pixels. Errors as in `render_shapes`.
     """
     figures = [build_figure(panel, look.up, look.front, look.turn, look.tilt) for panel in panels]
     pixel = max([1e-9, *(float(np.ptp(figure.box, axis=0).max()) for figure in figures)]) / (side - 2)
@@ -125,7 +124,7 @@ def draw_apart(panels: Sequence[Panel], side: int, look: Look = Look()) -> list[
     return pictures
 
 
-def _image(panels: list[Panel], look: Look) -> Image.Image:
+def _render(panels: list[Panel], look: Look) -> Image.Image:
     figures = [build_figure(panel, look.up, look.front, look.turn, look.tilt) for panel in panels]
     names = [panel.label for panel in panels]
     page = lay_out([figure.box for figure in figures], any(names), look.legend, look.size)
@@ -157,8 +156,8 @@ def _trace(figures: list[Figure], feet: Float[Floats, " N"], viewport: raster.Vi
     if solid:
         layer = raster.draw(Scene(solid, None if hollow else ground), viewport)
     if glass:
-        veil = raster.draw(Scene(glass, ground if hollow else None, _GLASS), viewport)
-        layer = veil if layer is None else raster.composite(veil, layer, _HIDDEN)
+        veil = raster.draw(Scene(glass, ground if hollow else None, _GLASS_OPACITY), viewport)
+        layer = veil if layer is None else raster.composite(veil, layer, _HIDDEN_DEPTH)
     assert layer is not None
     return layer
 
@@ -166,7 +165,7 @@ def _trace(figures: list[Figure], feet: Float[Floats, " N"], viewport: raster.Vi
 def _on_background(layer: raster.Layer, background: Ink | None) -> UInts8:
     """Bytes (H, W, 3) on a background, or (H, W, 4) without one."""
     rows = []
-    for first in range(0, len(layer.alpha), 256):  # in parts: float64 of a large picture is much
+    for first in range(0, len(layer.alpha), 256):  # in parts, to limit the memory for float64
         light, alpha = layer.light[first : first + 256], layer.alpha[first : first + 256, :, None]
         if background is None:
             clear = np.concatenate([to_srgb(light / np.maximum(alpha, 1e-6)), alpha], axis=2)
@@ -177,9 +176,9 @@ def _on_background(layer: raster.Layer, background: Ink | None) -> UInts8:
 
 
 @dataclass(frozen=True, eq=False)
-class Page:
-    """A laid-out picture: what of the view coordinates it shows, and x of each figure's foot there; in pixels, the font
-    size, the middle of each name and the width for it, and the first row of the legend.
+class PageLayout:
+    """Layout of a picture: the viewport, and x of each figure's foot in view coordinates; in pixels the font size, the
+    center of each name and the width available for it, and the first row of the legend.
     """
 
     viewport: raster.Viewport
@@ -192,37 +191,38 @@ class Page:
 
 def lay_out(
     boxes: list[Float[Floats, "2 2"]], named: bool, legend: Legend | None, size: tuple[int, int] | None
-) -> Page:
-    """Place figures on a page by their boxes (left, bottom; right, top) as they are seen, the foot at 0; `OptionError` where
-    the size leaves no room for the shapes above names and legend.
+) -> PageLayout:
+    """Place figures on a page, by their boxes (left, bottom; right, top) in view coordinates with the foot at 0.
+
+    `OptionError` if the size leaves no room for the shapes above names and legend.
     """
-    seen = np.stack(boxes)
+    stacked = np.stack(boxes)
     shorter = min(size[1], 1.6 * size[0]) if size else HEIGHT
     font_size = float(np.clip(0.027 * shorter, 9, 60))
     names = round(2.3 * font_size) if named else 0
-    width, height = size or _natural_size(seen, names, legend, font_size)
-    under = names + _legend_rows(legend, width, font_size)
+    width, height = size or _natural_size(stacked, names, legend, font_size)
+    below = names + _legend_rows(legend, width, font_size)
     margin = _MARGIN * min(height, 1.5 * width)
-    free = np.array([width - 2 * margin, height - under - (1.6 if under else 2) * margin])
-    if free.min() < 8 and under:
+    available = np.array([width - 2 * margin, height - below - (1.6 if below else 2) * margin])
+    if available.min() < 8 and below:
         raise OptionError(f"{width} x {height} pixels leave no room above names and legend", "make the picture larger")
-    feet, whole = _row(seen, free[0] / free[1])
-    pixel = max(*((whole[1] - whole[0]) / free), 1e-9)
-    middle = whole.mean(axis=0)
-    upper = height - under - (0.3 * margin if under else 0.0)
+    feet, box = _arrange(stacked, available[0] / available[1])
+    pixel = max(*((box[1] - box[0]) / available), 1e-9)
+    middle = box.mean(axis=0)
+    upper = height - below - (0.3 * margin if below else 0.0)
     left = float(middle[0] - width / 2 * pixel)
     viewport = raster.Viewport(width, height, left, float(middle[1] + (upper / 2 + 0.15 * margin) * pixel), pixel)
-    at = (feet + seen[:, :, 0].mean(axis=1) - left) / pixel
-    places = np.stack([at, np.full(len(at), height - under + 0.42 * names)], axis=1)
+    at = (feet + stacked[:, :, 0].mean(axis=1) - left) / pixel
+    places = np.stack([at, np.full(len(at), height - below + 0.42 * names)], axis=1)
     room = 2 * (np.minimum(at, width - at) - 0.4 * margin)  # to the edges of the page
     if len(boxes) > 1:
-        gap = feet[1] + seen[1, 0, 0] - feet[0] - seen[0, 1, 0]
-        room = np.minimum(room, (np.ptp(seen[:, :, 0], axis=1) + 0.8 * gap) / pixel)
-    return Page(viewport, feet, font_size, places, room, height - under + names)
+        gap = feet[1] + stacked[1, 0, 0] - feet[0] - stacked[0, 1, 0]
+        room = np.minimum(room, (np.ptp(stacked[:, :, 0], axis=1) + 0.8 * gap) / pixel)
+    return PageLayout(viewport, feet, font_size, places, room, height - below + names)
 
 
-def _row(boxes: Float[Floats, "N 2 2"], aspect: float) -> tuple[Float[Floats, " N"], Float[Floats, "2 2"]]:
-    """x of each one's foot, and the box of all; wider gaps fill an ``aspect``, width over height: 0 is the narrowest row."""
+def _arrange(boxes: Float[Floats, "N 2 2"], aspect: float) -> tuple[Float[Floats, " N"], Float[Floats, "2 2"]]:
+    """x of each foot, and the box of all; gaps widen to fill an ``aspect`` (width over height), where 0 is the narrowest."""
     widths = boxes[:, 1, 0] - boxes[:, 0, 0]
     bottom, top = boxes[:, 0, 1].min(), boxes[:, 1, 1].max()
     gap = _GAP * max(1.0, float(np.median(widths)))
@@ -239,14 +239,14 @@ def _legend_rows(legend: Legend | None, width: int, font_size: float) -> int:
 def _natural_size(
     boxes: Float[Floats, "N 2 2"], names: int, legend: Legend | None, font_size: float
 ) -> tuple[int, int]:
-    """A legend comes on top of the usual height, so that it takes nothing from the shapes."""
-    _, whole = _row(boxes, 0.0)
+    """Width and height in pixels; a legend adds to the usual height, so that shapes do not get smaller."""
+    _, whole = _arrange(boxes, 0.0)
     wide, tall = whole[1] - whole[0]
     margin = _MARGIN * HEIGHT
     pixel = tall / (HEIGHT - names - 2 * margin)
     width, height = wide / pixel + 2 * margin, float(HEIGHT - names)
-    if width > _WIDEST:
-        pixel = wide / (_WIDEST - 2 * margin)
-        width, height = float(_WIDEST), max(tall / pixel + 2 * margin, 0.25 * HEIGHT)
-    width = max(width, _NARROWEST * HEIGHT)
+    if width > _MAX_WIDTH:
+        pixel = wide / (_MAX_WIDTH - 2 * margin)
+        width, height = float(_MAX_WIDTH), max(tall / pixel + 2 * margin, 0.25 * HEIGHT)
+    width = max(width, _MIN_ASPECT * HEIGHT)
     return round(width), round(height + names + _legend_rows(legend, round(width), font_size))

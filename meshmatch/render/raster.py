@@ -1,7 +1,7 @@
-"""From a scene to pixels: one ray per pixel, and many where that would leave a jagged edge.
+"""Rendering of a scene to pixels, with one ray per pixel, and more where edges would look jagged.
 
-Visibility is computed once per pixel, filtered over neighbors on the same surface, and then shared by all rays of the
-pixel. Work proceeds in bands of rows, so that memory does not grow with the picture.
+Visibility of the lights is computed once per pixel, filtered over neighbors on the same surface, and then shared by all rays
+of the pixel. Rows are processed in bands, so that memory does not grow with the picture.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from meshmatch.render.scene import BLOCK, GROUND_BLOCK, Hits, Scene, Shares, Vec
 from meshmatch.render.surface import Rows
 
 BAND = 100_000
-"""Pixels worked on at once."""
-MOST_POINTS = 6_000_000
-"""Points along each of the three sides of all triangles, at most."""
+"""Pixels that are processed together."""
+MAX_POINTS = 6_000_000
+"""Maximum number of points along each of the three sides of all triangles."""
 _HALO = GROUND_BLOCK // 2 + 2  # rows above and below a band that its filter and its edges need
-_CONTRAST = 0.035  # sRGB difference between neighbors from which an edge gets more rays
+_CONTRAST = 0.035  # sRGB difference between neighbors above which a pixel gets more rays
 
 
 def _lattice(count: int, step: int) -> Float[Floats, "count 2"]:
-    """Places in a pixel around its middle, one in every row and column: no slope of an edge shows steps."""
+    """Offsets from the middle of a pixel, one in every row and column: edges of any slope are anti-aliased well."""
     return (np.stack([np.arange(count), (step * np.arange(count)) % count], axis=1) + 0.5) / count - 0.5
 
 
-_RIM, _INNER = _lattice(16, 7), _lattice(8, 3)  # where an outline runs through a pixel; where colors meet
+_OUTLINE_SAMPLES, _INNER_SAMPLES = _lattice(16, 7), _lattice(8, 3)  # at outlines; where colors meet
 
 
 @dataclass(frozen=True)
 class Viewport:
-    """The part of the picture plane that the pixels show: the first one's upper left corner, and the size of one."""
+    """The part of the picture plane that is shown: the upper left corner of the first pixel, and the size of a pixel."""
 
     width: int
     height: int
@@ -43,13 +43,13 @@ class Viewport:
     pixel: float
 
     def at(self, column: NDArray[Any], row: NDArray[Any]) -> tuple[Float[Floats, " ..."], Float[Floats, " ..."]]:
-        """x and y of places in the picture, counted in pixels from its upper left corner."""
+        """x and y in the picture plane of positions in pixels from the upper left corner."""
         return self.left + self.pixel * column, self.top - self.pixel * row
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """Linear light times alpha, alpha, and depth: z of what is seen, -inf where nothing is."""
+    """Linear light times alpha, alpha, and depth: z of the visible surface, -inf where there is none."""
 
     light: Float[Floats32, "H W 3"]
     alpha: Float[Floats32, "H W"]
@@ -57,46 +57,51 @@ class Layer:
 
 
 def draw(scene: Scene, viewport: Viewport) -> Layer:
-    """Draw a scene. The same scene gives the same picture, whatever the size of a band."""
+    """Draw a scene. The result does not depend on the size of bands."""
     H, W = viewport.height, viewport.width
     whole = Layer(np.zeros((H, W, 3), np.float32), np.zeros((H, W), np.float32), np.full((H, W), -np.inf, np.float32))
     edges = edge_points(scene, viewport)
     rows = max(1, BAND // W)
     for first in range(0, H, rows):
-        _band(scene, viewport, edges, first, min(H, first + rows), whole)
+        _draw_band(scene, viewport, edges, first, min(H, first + rows), whole)
     return whole
 
 
-def _band(scene: Scene, viewport: Viewport, edges: Vectors, first: int, last: int, whole: Layer) -> None:
-    """Draw rows of a viewport."""
+def _draw_band(scene: Scene, viewport: Viewport, edges: Vectors, first: int, last: int, whole: Layer) -> None:
+    """Draw rows ``first`` to ``last`` of a viewport into ``whole``."""
     low, high = max(0, first - _HALO), min(viewport.height, last + _HALO)
     shape = (high - low, viewport.width)
     row, column = np.divmod(np.arange(shape[0] * shape[1]), viewport.width)
     row += low
-    hits = scene.look(*viewport.at(column + 0.5, row + 0.5), viewport.pixel)
-    met = np.flatnonzero(hits.face != -1)
-    seen = np.ones((len(hits.face), 2), np.float32)
-    seen[met] = visibility(scene, hits, met, row[met], column[met])
+    hits = scene.trace(*viewport.at(column + 0.5, row + 0.5), viewport.pixel)
+    hit_rows = np.flatnonzero(hits.face != -1)
+    visible = np.ones((len(hits.face), 2), np.float32)
+    visible[hit_rows] = visibility(scene, hits, hit_rows, row[hit_rows], column[hit_rows])
     for side, which in ((BLOCK, hits.face >= 0), (GROUND_BLOCK, hits.face == -2)):
-        _smooth(seen.reshape(*shape, 2), hits, which.reshape(shape), viewport.pixel, side)
-    light, alpha = _shaded(scene, hits, seen)
+        _filter_visibility(visible.reshape(*shape, 2), hits, which.reshape(shape), viewport.pixel, side)
+    light, alpha = _shade_hits(scene, hits, visible)
     light, alpha = light.reshape(*shape, 3), alpha.reshape(shape)
     depth = np.where(hits.face >= 0, hits.place[:, 2], -np.inf).reshape(shape).astype(np.float32)
-    kind = hits.face.reshape(shape) >= 0
-    rim = _differs(kind.astype(np.float32)[..., None], 0.5) | _slivers(edges, low, depth, viewport)
-    inner = _differs(np.sqrt(np.clip(np.concatenate([light, alpha[..., None]], axis=2), 0, 1)), _CONTRAST) & ~rim
-    for chosen, places in ((rim, _RIM), (inner, _INNER)):
+    is_surface = hits.face.reshape(shape) >= 0
+    outline = _differs_from_neighbor(is_surface.astype(np.float32)[..., None], 0.5) | _find_slivers(
+        edges, low, depth, viewport
+    )
+    inner = (
+        _differs_from_neighbor(np.sqrt(np.clip(np.concatenate([light, alpha[..., None]], axis=2), 0, 1)), _CONTRAST)
+        & ~outline
+    )
+    for chosen, places in ((outline, _OUTLINE_SAMPLES), (inner, _INNER_SAMPLES)):
         chosen[: first - low] = chosen[last - low :] = False
         found = np.flatnonzero(chosen)
         if len(found):
-            fine = _fine(scene, viewport, hits, seen, low, found, places)
-            light.reshape(-1, 3)[found], alpha.reshape(-1)[found] = fine
+            supersampled = _supersample(scene, viewport, hits, visible, low, found, places)
+            light.reshape(-1, 3)[found], alpha.reshape(-1)[found] = supersampled
     own = slice(first - low, last - low)
     whole.light[first:last], whole.alpha[first:last] = light[own], alpha[own]
     whole.depth[first:last] = depth[own]
 
 
-def _shaded(scene: Scene, hits: Hits, seen: Shares) -> tuple[Vectors, Float[Floats32, " N"]]:
+def _shade_hits(scene: Scene, hits: Hits, seen: Shares) -> tuple[Vectors, Float[Floats32, " N"]]:
     """Light times alpha, and alpha, of all rays."""
     light, alpha = np.zeros((len(hits.face), 3), np.float32), np.zeros(len(hits.face), np.float32)
     solid = np.flatnonzero(hits.face >= 0)
@@ -112,7 +117,7 @@ def _shaded(scene: Scene, hits: Hits, seen: Shares) -> tuple[Vectors, Float[Floa
 
 
 def composite(glass: Layer, base: Layer, reach: float) -> Layer:
-    """Glass over a base layer, which hides it where it lies further behind than ``reach``."""
+    """Put glass over a base layer, which hides it gradually where it lies up to ``reach`` behind."""
     with np.errstate(invalid="ignore"):
         ahead = np.nan_to_num((glass.depth - base.depth) / np.float32(reach) + 1, nan=1.0, posinf=1.0, neginf=0.0)
     shown = np.clip(ahead, 0, 1).astype(np.float32)
@@ -124,8 +129,10 @@ def composite(glass: Layer, base: Layer, reach: float) -> Layer:
     )
 
 
-def _smooth(values: Float[Floats32, "H W 2"], hits: Hits, which: Bool[Bools, "H W"], pixel: float, side: int) -> None:
-    """Filter visibility of pixels ``which`` in place over blocks of this side, as far as they belong to one surface."""
+def _filter_visibility(
+    values: Float[Floats32, "H W 2"], hits: Hits, which: Bool[Bools, "H W"], pixel: float, side: int
+) -> None:
+    """Filter visibility of pixels ``which`` in place over blocks with this side, without mixing different surfaces."""
     if not which.any():
         return
     rows, columns = (np.flatnonzero(which.any(axis=axis)) for axis in (1, 0))
@@ -137,11 +144,11 @@ def _smooth(values: Float[Floats32, "H W 2"], hits: Hits, which: Bool[Bools, "H 
     for axis in (0, 1):
         total, weights = found.copy(), np.ones(which.shape, np.float32)
         for step in (*range(-half, 0), *range(1, half + 1)):
-            here, there = _shifted(step, axis, (len(which), which.shape[1]))
+            here, there = _shifted_slices(step, axis, (len(which), which.shape[1]))
             gap = np.einsum("hwi,hwi->hw", place[there] - place[here], flat[here])
             turn = np.einsum("hwi,hwi->hw", normal[there], normal[here])
             weight = _same_surface(gap, turn, pixel)
-            # Half at both ends: each residue of a block then weighs the same.
+            # Half the weight at both ends: each position in a block then weighs the same.
             weight *= np.float32(0.5 if abs(step) == half else 1.0) * (which[there] & which[here])
             total[here] += weight[..., None] * found[there]
             weights[here] += weight
@@ -150,30 +157,30 @@ def _smooth(values: Float[Floats32, "H W 2"], hits: Hits, which: Bool[Bools, "H 
 
 
 def _same_surface(gap: Floats32, cosine: Floats32, pixel: float) -> Floats32:
-    """0..1: 1 for two places within two pixels of one plane (``gap`` apart), with normals that nearly agree."""
+    """Weight 0..1 of a pair of places: 1 if they are within two pixels of one plane (``gap``) with similar normals."""
     return np.asarray(np.clip(3.0 - np.abs(gap) / np.float32(pixel), 0, 1) * np.clip(4 * cosine - 2.4, 0, 1))
 
 
-def _shifted(step: int, axis: int, shape: tuple[int, int]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    """Two views of an array: each pixel, and the one ``step`` further along the axis."""
+def _shifted_slices(step: int, axis: int, shape: tuple[int, int]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Slices that select each pixel, and the one ``step`` further along the axis."""
     count, before = max(0, shape[axis] - abs(step)), (slice(None),) * axis
     here, there = max(0, -step), max(0, step)
     return (*before, slice(here, here + count)), (*before, slice(there, there + count))
 
 
-def _differs(values: Float[Floats32, "H W C"], by: float) -> Bool[Bools, "H W"]:
-    """Pixels that differ from a neighbor so much that an edge may run through them."""
+def _differs_from_neighbor(values: Float[Floats32, "H W C"], by: float) -> Bool[Bools, "H W"]:
+    """Pixels that differ from a neighbor by more than ``by``, so that an edge may pass through them."""
     shape = values.shape[0], values.shape[1]
     result = np.zeros(shape, bool)
     for axis in (0, 1):
-        here, there = _shifted(1, axis, shape)
+        here, there = _shifted_slices(1, axis, shape)
         differs = (np.abs(values[there] - values[here]) > by).any(axis=2)
         result[here] |= differs
         result[there] |= differs
     return result
 
 
-def _fine(
+def _supersample(
     scene: Scene,
     viewport: Viewport,
     hits: Hits,
@@ -182,39 +189,41 @@ def _fine(
     chosen: Rows,
     places: Float[Floats, "R 2"],
 ) -> tuple[Vectors, Float[Floats32, " N"]]:
-    """Light times alpha, and alpha, of chosen pixels of a band, each the mean over places in it. Visibility is that of
-    the pixels around, where they lie on the same surface.
+    """Light times alpha, and alpha, of chosen pixels of a band, each averaged over places in it. Visibility is taken from
+    surrounding pixels on the same surface, where there are any.
     """
     shape = (len(hits.face) // viewport.width, viewport.width)
     row, column = np.divmod(np.repeat(chosen, len(places)), shape[1])
     right, down = np.tile(places, (len(chosen), 1)).T
     rays = viewport.at(column + 0.5 + right, row + low + 0.5 + down)
-    finer = scene.look(*rays, viewport.pixel / np.sqrt(len(places)))
-    met = np.flatnonzero(finer.face != -1)
-    total, weights = np.zeros((len(met), 2), np.float32), np.zeros(len(met), np.float32)
+    finer = scene.trace(*rays, viewport.pixel / np.sqrt(len(places)))
+    hit_rows = np.flatnonzero(finer.face != -1)
+    total, weights = np.zeros((len(hit_rows), 2), np.float32), np.zeros(len(hit_rows), np.float32)
     for down, right in ((0, 0), (0, 1), (1, 0), (0, -1), (-1, 0)):
-        there = np.clip(row[met] + down, 0, shape[0] - 1) * shape[1] + np.clip(column[met] + right, 0, shape[1] - 1)
-        gap = np.einsum("ni,ni->n", hits.place[there] - finer.place[met], finer.flat[met])
-        turn = np.einsum("ni,ni->n", hits.normal[there], finer.normal[met])
+        there = np.clip(row[hit_rows] + down, 0, shape[0] - 1) * shape[1] + np.clip(
+            column[hit_rows] + right, 0, shape[1] - 1
+        )
+        gap = np.einsum("ni,ni->n", hits.place[there] - finer.place[hit_rows], finer.flat[hit_rows])
+        turn = np.einsum("ni,ni->n", hits.normal[there], finer.normal[hit_rows])
         face = hits.face[there]
-        alike = ((face >= 0) == (finer.face[met] >= 0)) & (face != -1)
-        weight = _same_surface(gap, turn, viewport.pixel) * alike
+        same_kind = ((face >= 0) == (finer.face[hit_rows] >= 0)) & (face != -1)
+        weight = _same_surface(gap, turn, viewport.pixel) * same_kind
         total += weight[:, None] * seen[there]
         weights += weight
     known = weights > 0.05
     light_seen = np.ones((len(row), 2), np.float32)
-    light_seen[met[known]] = total[known] / weights[known, None]
-    missing = met[~known]
-    # Each ray of a pixel uses other directions, whichever band it is in.
+    light_seen[hit_rows[known]] = total[known] / weights[known, None]
+    missing = hit_rows[~known]
+    # Each ray of a pixel uses other directions, independent of the band.
     number = missing % len(places)
     block_row, block_column = (row[missing] + low) * BLOCK + number // BLOCK, column[missing] * BLOCK + number % BLOCK
     light_seen[missing] = visibility(scene, finer, missing, block_row, block_column)
-    light, alpha = _shaded(scene, finer, light_seen)
+    light, alpha = _shade_hits(scene, finer, light_seen)
     return light.reshape(len(chosen), -1, 3).mean(axis=1), alpha.reshape(len(chosen), -1).mean(axis=1)
 
 
 def edge_points(scene: Scene, viewport: Viewport) -> Vectors:
-    """Points along all edges of the scene, not more than a pixel apart: column, row, depth."""
+    """(N, 3) points along all edges of the scene, at most a pixel apart: column, row, depth."""
     column = (scene.verts[:, 0] - np.float32(viewport.left)) / np.float32(viewport.pixel)
     row = (np.float32(viewport.top) - scene.verts[:, 1]) / np.float32(viewport.pixel)
     points = np.stack([column, row, scene.verts[:, 2]], axis=1)
@@ -222,8 +231,8 @@ def edge_points(scene: Scene, viewport: Viewport) -> Vectors:
     for first, second in ((0, 1), (1, 2), (2, 0)):
         a, b = points[scene.faces[:, first]], points[scene.faces[:, second]]
         steps = np.ceil(np.abs(b[:, :2] - a[:, :2]).max(axis=1)) - 1
-        crowd = steps.sum(dtype=np.float64) / MOST_POINTS
-        steps = (steps / max(1.0, crowd)).astype(np.int64)  # millions of long edges hide each other anyway
+        crowd = steps.sum(dtype=np.float64) / MAX_POINTS
+        steps = (steps / max(1.0, crowd)).astype(np.int64)  # among millions of long edges most are hidden anyway
         long = np.flatnonzero(steps > 0)
         count = steps[long]
         which = np.repeat(long, count)
@@ -233,15 +242,17 @@ def edge_points(scene: Scene, viewport: Viewport) -> Vectors:
     return np.concatenate(parts)
 
 
-def _slivers(edges: Vectors, low: int, depth: Float[Floats32, "H W"], viewport: Viewport) -> Bool[Bools, "H W"]:
-    """Pixels, from row ``low`` on, in which an edge lies in front of everything that the rays around it hit."""
+def _find_slivers(edges: Vectors, low: int, depth: Float[Floats32, "H W"], viewport: Viewport) -> Bool[Bools, "H W"]:
+    """Pixels, from row ``low`` on, in which an edge lies in front of everything that the rays around it hit: triangles
+    thinner than a pixel.
+    """
     H, W = depth.shape
     row, column = edges[:, 1] - low, edges[:, 0]
     inside = np.flatnonzero((row >= 0) & (row < H) & (column >= 0) & (column < W))
     row, column = row[inside].astype(np.int64), column[inside].astype(np.int64)
     padded = np.pad(depth, 1, constant_values=-np.inf)
     front = np.max([padded[i : i + H, j : j + W] for i in range(3) for j in range(3)], axis=0)
-    before = edges[inside, 2] > front[row, column] + 1.5 * viewport.pixel
+    in_front = edges[inside, 2] > front[row, column] + 1.5 * viewport.pixel
     result = np.zeros((H, W), bool)
-    result[row[before], column[before]] = True
+    result[row[in_front], column[in_front]] = True
     return result

@@ -1,8 +1,8 @@
-"""What rays hit, and its light: embree finds the triangles, and a hit knows its position, normal and color.
+"""Ray casting and shading: embree finds the triangles that rays hit; hits have position, normal and color.
 
-The camera is orthographic and looks along -z. Light comes from a large soft key lamp, a fill, and a sky with ambient
-occlusion. Nothing is random. Each lamp is a fixed set of directions, dealt out to the pixels in blocks of 4 x 4, on the
-ground of 8 x 8; a filter over such blocks gives every pixel the mean over the whole set: soft shadows without noise.
+The camera is orthographic and looks along -z. Light comes from a large soft key lamp, a fill light, and a sky with ambient
+occlusion. Nothing is random: each lamp is a fixed set of directions, distributed over blocks of 4 x 4 pixels, on the ground
+8 x 8. A filter over such blocks gives every pixel the mean over the whole set, hence soft shadows without noise.
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ from embreex.rtcore_scene import EmbreeScene
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
 from meshmatch.render.surface import Rows, Surface, tangents
 
-# Cosines of the angle between a facet and the smooth normal of a corner: up to here smooth, from there on a crease.
+# Cosines of the angle between a facet and the smooth normal of a corner: smooth up to the first, a crease from the second.
 _SMOOTH, _CREASE = np.cos(np.radians(28.0)), np.cos(np.radians(42.0))
 
-_LIFT = 3e-3
-_LAYERS = 12  # of surfaces with holes behind each other
+_LIFT = 3e-3  # height above the surface at which rays to the lights start
+_MAX_LAYERS = 12  # of surfaces with holes behind each other
 Vectors = Float[Floats32, "N 3"]
 Numbers = Float[Floats, " N"]
 BLOCK, GROUND_BLOCK = 4, 8
-"""Sides of a block of pixels on a surface and on the ground: each pixel of a block uses other directions."""
+"""Side of a block of pixels, on a surface and on the ground: each pixel of a block uses other directions."""
 _SUBSETS = GROUND_BLOCK**2
-_KEY_RAYS = 4  # a pixel
+_KEY_RAYS = 4  # per pixel
 _SKY_RAYS = 8
-_REACH = 0.75  # how far away something may be and still occlude the sky
+_SKY_REACH = 0.75  # maximum distance at which something occludes the sky
 _SHADOW_REACH = 1.6
 Directions = tuple[Float[Floats32, "S R 3"], Float[Floats32, "S R"]]
-"""Unit vectors, and how far each ray looks, in S subsets of R rays."""
+"""Unit vectors, and maximum length of each ray, in S subsets of R rays."""
 Shares = Float[Floats32, "N 2"]
-"""Of lamp and sky, that reach a place."""
-_AT_ONCE = 20_000  # rows: what belongs to them then stays in the processor's cache
+"""Shares of the light of lamp and sky that reach a place."""
+_CHUNK = 20_000  # rows; their data then fit into the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """A plane that only receives shadows: points x with ``x @ normal = height``, within ``spots`` of the picture: ellipses
-    by x, y, half width, half height.
+    """A plane that only receives shadows: points x with ``x @ normal = height``, within ``spots`` of the picture, which are
+    ellipses (x, y, half width, half height).
     """
 
     normal: Float[Floats, " 3"]
@@ -48,7 +48,7 @@ class Ground:
     spots: Float[Floats, "K 4"]
 
     def strength(self, x: Numbers, y: Numbers) -> Float[Floats32, " N"]:
-        """How strongly shadows are drawn at points of the picture, 0 to 1: they fade out towards the rims."""
+        """Strength of shadows, 0 to 1, at points of the picture; it fades out towards the rims of the spots."""
         strength = np.zeros(len(x), np.float32)
         for left, top, width, height in self.spots:
             near = np.clip(1 - ((x - left) / width) ** 2 - ((y - top) / height) ** 2, 0, 1)
@@ -58,12 +58,11 @@ class Ground:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What N rays met. Rows of misses hold nothing of use.
+    """Results of N rays; rows of misses are undefined.
 
-    ``face`` is the triangle in the whole scene, -1 for a miss, -2 for the ground. ``flat`` and ``normal`` are that of
-    the facet and the smooth one; both face the viewer. ``color`` is linear; of the ground the strength of its shadows,
-    three times. ``lift`` is the height above the surface from which light is looked for, so that it does not shade
-    itself.
+    ``face`` is the triangle in the whole scene, -1 for a miss, -2 for the ground. ``flat`` is the facet's normal and
+    ``normal`` the smooth one; both face the viewer. ``color`` is linear; on the ground it is the strength of shadows, three
+    times. ``lift`` is the height above the surface at which rays to the lights start, so that it does not shade itself.
     """
 
     face: Rows
@@ -75,7 +74,7 @@ class Hits:
 
 
 class Scene:
-    """Surfaces, and perhaps a ground, ready for rays."""
+    """Surfaces and optionally a ground, prepared for ray casting."""
 
     def __init__(self, surfaces: list[Surface], ground: Ground | None = None, opacity: float = 1.0) -> None:
         self.surfaces, self.ground, self.opacity = surfaces, ground, opacity
@@ -88,13 +87,13 @@ class Scene:
         corners = self.verts[self.faces]
         flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         self._flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), np.float32(1e-30))
-        self._before = max(part.extent[1, 2] for part in surfaces) + 1.0
+        self._camera_z = max(part.extent[1, 2] for part in surfaces) + 1.0
         self._embree = EmbreeScene()
-        # Kept: embree reads the vertices and triangles of the arrays that it was given.
+        # Referenced here because embree reads the vertices and triangles from these arrays.
         self._mesh = TriangleMesh(self._embree, self.verts, self.faces)
 
     def blocked(self, places: Vectors, directions: Vectors, reach: float) -> Bool[Bools, " N"]:
-        """Whether anything lies within reach of each place along a unit direction."""
+        """Whether anything lies within ``reach`` of each place along a unit direction."""
         found = self._embree.run(
             np.ascontiguousarray(places, np.float32),
             np.ascontiguousarray(directions, np.float32),
@@ -103,14 +102,14 @@ class Scene:
         )
         return np.asarray(found >= 0)
 
-    def look(self, x: Numbers, y: Numbers, pixel: float) -> Hits:
-        """What is seen at points of the picture plane; ``pixel`` is the size of a pixel, for textures."""
+    def trace(self, x: Numbers, y: Numbers, pixel: float) -> Hits:
+        """What is visible at points of the picture plane; ``pixel`` is the size of a pixel, for textures."""
         count = len(x)
         face = np.full(count, -1, np.int64)
         place, flat, normal, color = np.zeros((4, count, 3), np.float32)
         hits = Hits(face, place, flat, normal, color, np.full(count, _LIFT, np.float32))
-        rows, depth = np.arange(count), np.full(count, self._before, np.float32)
-        for _ in range(_LAYERS):  # again where a ray went through a hole that a texture cuts out
+        rows, depth = np.arange(count), np.full(count, self._camera_z, np.float32)
+        for _ in range(_MAX_LAYERS):  # again where a ray passes through a hole in a texture
             origins = np.stack([x[rows], y[rows], depth], axis=1).astype(np.float32)
             directions = np.tile(np.array([0, 0, -1], dtype=np.float32), (len(rows), 1))
             found = self._embree.run(origins, directions, output=1)
@@ -118,7 +117,7 @@ class Scene:
             hit = np.flatnonzero(face[rows] >= 0)
             u, v = found["u"][hit], found["v"][hit]
             weights = np.stack([1 - u - v, u, v], axis=1).astype(np.float32)
-            holes = self._describe(hits, rows[hit], weights, pixel)
+            holes = self._fill_hits(hits, rows[hit], weights, pixel)
             if not holes.any():
                 break
             rows = rows[hit][holes]
@@ -136,23 +135,23 @@ class Scene:
             hits.color[there] = strength[:, None]
         return hits
 
-    def _describe(self, hits: Hits, rows: Rows, weights: Vectors, pixel: float) -> Bool[Bools, " N"]:
-        """Fill in rows of the hits; whether each is a hole in its texture."""
+    def _fill_hits(self, hits: Hits, rows: Rows, weights: Vectors, pixel: float) -> Bool[Bools, " N"]:
+        """Fill in rows of the hits; return which are holes in a texture."""
         face = hits.face[rows]
         holes = np.zeros(len(rows), bool)
         corners = self.faces[face]
         hits.place[rows] = np.einsum("nk,nkc->nc", weights, self.verts[corners])
         flat = self._flat[face]
-        given = self._normals[corners]
-        # A corner whose smooth normal leans far from its facet is a crease: there the facet's own counts.
-        agreement = np.einsum("nkc,nc->nk", given, flat)
-        known = np.abs(agreement) > 1e-6
-        lean = np.clip((np.abs(agreement) - _CREASE) / (_SMOOTH - _CREASE), 0.0, 1.0) * known
-        given = given * np.where(agreement < 0, -1.0, 1.0)[..., None]
-        bent = lean[..., None] * given + (1 - lean[..., None]) * flat[:, None]
+        smooth = self._normals[corners]
+        # A corner whose smooth normal differs much from its facet's is a crease: the facet's normal is used there.
+        agreement = np.einsum("nkc,nc->nk", smooth, flat)
+        usable = np.abs(agreement) > 1e-6
+        smoothness = np.clip((np.abs(agreement) - _CREASE) / (_SMOOTH - _CREASE), 0.0, 1.0) * usable
+        smooth = smooth * np.where(agreement < 0, -1.0, 1.0)[..., None]
+        bent = smoothness[..., None] * smooth + (1 - smoothness[..., None]) * flat[:, None]
         normal = np.einsum("nk,nkc->nc", weights, bent)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.float32(1e-30))
-        # Winding may be wrong, but what is seen faces the viewer.
+        # Winding may be wrong, but what is visible faces the viewer.
         side = np.where(flat[:, 2:] < 0, np.float32(-1), np.float32(1))
         hits.flat[rows] = flat * side
         normal = normal * side
@@ -165,10 +164,10 @@ class Scene:
             hits.color[rows[own]] = color[:, :3]
             if color.shape[1] == 4:
                 holes[own] = color[:, 3] < 0.5
-            hits.lift[rows[own]] += surface.loose
-            if surface.loose:
+            hits.lift[rows[own]] += surface.thickness
+            if surface.thickness:
                 normal[own] = self._normals[corners[own, 0]]
-        normal[:, 2] = np.maximum(normal[:, 2], 0.02)  # a smooth normal may look away at the rim
+        normal[:, 2] = np.maximum(normal[:, 2], 0.02)  # a smooth normal may face away at the outline
         hits.normal[rows] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         return holes
 
@@ -183,15 +182,15 @@ _FILL_COLOR = np.array([0.93, 0.98, 1.08], np.float32)
 _LAMP = 0.40  # radius of the key lamp's disc at distance 1
 
 
-def _spread(count: int) -> Float[Floats, "count 3"]:
-    """Numbers in 0..1, evenly spread, and any run of them too (Roberts' R3 sequence)."""
+def _r3_sequence(count: int) -> Float[Floats, "count 3"]:
+    """(count, 3) evenly distributed numbers in 0..1, also in any run of them (Roberts' R3 sequence)."""
     root = 1.22074408460575947536  # of x^4 = x + 1
     return np.asarray((0.5 + np.arange(1, count + 1)[:, None] * np.array([1 / root, root**-2, root**-3])) % 1.0)
 
 
 def _key_directions() -> Directions:
-    """Towards points of the lamp."""
-    numbers = _spread(_SUBSETS * _KEY_RAYS)
+    """Directions towards points of the key lamp."""
+    numbers = _r3_sequence(_SUBSETS * _KEY_RAYS)
     side = np.cross(_KEY, [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
     angle, radius = 2 * np.pi * numbers[:, 0], _LAMP * np.sqrt(numbers[:, 1])
@@ -201,11 +200,11 @@ def _key_directions() -> Directions:
 
 
 def _sky_directions() -> Directions:
-    """Around +z, distributed by their cosine."""
-    numbers = _spread(_SUBSETS * _SKY_RAYS)
+    """Cosine-distributed directions around +z."""
+    numbers = _r3_sequence(_SUBSETS * _SKY_RAYS)
     angle, radius = 2 * np.pi * numbers[:, 0], np.sqrt(numbers[:, 1])
     local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], axis=1)
-    return _in_subsets(local, _REACH * (0.06 + 0.94 * numbers[:, 2] ** 1.5))
+    return _in_subsets(local, _SKY_REACH * (0.06 + 0.94 * numbers[:, 2] ** 1.5))
 
 
 def _in_subsets(aims: Float[Floats, "N 3"], reaches: Float[Floats, " N"]) -> Directions:
@@ -217,47 +216,48 @@ _SKY_SET, _SKY_FAR = _sky_directions()
 
 
 def visibility(scene: Scene, hits: Hits, rows: Rows, row: Rows, column: Rows) -> Shares:
-    """Shares of the key lamp and of the sky that reach ``rows`` of the hits; their pixels select subsets of directions."""
+    """Shares of key lamp and sky that reach ``rows`` of the hits; pixel ``row`` and ``column`` select their directions."""
     result = np.empty((len(rows), 2), np.float32)
     ground = hits.face[rows] == -2
     side = np.where(ground, GROUND_BLOCK, BLOCK)
     group = row % side * side + column % side + _SUBSETS * ground
     order = np.argsort(group, kind="stable")
     ends = np.cumsum(np.bincount(group, minlength=2 * _SUBSETS))
-    for number, end in enumerate(ends):  # rows of one subset share their directions
+    for number, end in enumerate(ends):  # all of one subset share their directions
         own = order[ends[number - 1] if number else 0 : end]
         subset = number % _SUBSETS
-        few = slice(None, None, 2 if number >= _SUBSETS else 1)  # the larger blocks of the ground need fewer per pixel
-        for first in range(0, len(own), _AT_ONCE):
-            part = own[first : first + _AT_ONCE]
+        rays = slice(None, None, 2 if number >= _SUBSETS else 1)  # the larger blocks of the ground need fewer per pixel
+        for first in range(0, len(own), _CHUNK):
+            part = own[first : first + _CHUNK]
             flat = hits.flat[rows[part]]
             places = hits.place[rows[part]] + hits.lift[rows[part], None] * flat
-            result[part] = _seen(scene, places, flat, hits.normal[rows[part]], subset, few)
+            result[part] = _visible_shares(scene, places, flat, hits.normal[rows[part]], subset, rays)
     return result
 
 
-def _seen(scene: Scene, places: Vectors, flat: Vectors, normal: Vectors, subset: int, few: slice) -> Shares:
-    """Shares of lamp and sky at places on a surface, by ``few`` of the rays of a subset."""
+def _visible_shares(scene: Scene, places: Vectors, flat: Vectors, normal: Vectors, subset: int, rays: slice) -> Shares:
+    """Shares of lamp and sky at places on a surface, by the selected rays of a subset."""
+    # At grazing angles a facet shades its neighbors although the smooth surface is lit: shadows fade out there.
     # At a grazing angle a facet shades its neighbors although the smooth surface is lit: shadows fade there.
     grazing = np.clip((flat @ _KEY) / np.float32(0.3), 0.0, 1.0)
     facing = np.flatnonzero((normal @ _KEY > -0.2) & (grazing > 0))
-    hidden, taken = np.zeros((2, len(places)), np.float32)
-    lamp = _KEY_SET[subset, few]
+    hidden, occluded = np.zeros((2, len(places)), np.float32)
+    lamp = _KEY_SET[subset, rays]
     asked = places[facing]
-    for aim, reach in zip(lamp, _KEY_FAR[subset, few], strict=True):
+    for aim, reach in zip(lamp, _KEY_FAR[subset, rays], strict=True):
         hidden[facing] += scene.blocked(asked, np.broadcast_to(aim, asked.shape), reach)
     side, up = tangents(normal)
-    sky = _SKY_SET[subset, few]
-    for (x, y, z), reach in zip(sky, _SKY_FAR[subset, few], strict=True):
+    sky = _SKY_SET[subset, rays]
+    for (x, y, z), reach in zip(sky, _SKY_FAR[subset, rays], strict=True):
         aim = x * side + y * up + z * normal
         below = np.minimum(2 * np.einsum("ni,ni->n", aim, flat), 0)
-        aim -= below[:, None] * flat  # a ray into the facet is reflected out
-        taken += scene.blocked(places, aim, reach)
-    return np.stack([1.0 - grazing * hidden / len(lamp), 1.0 - taken / len(sky)], axis=1).astype(np.float32)
+        aim -= below[:, None] * flat  # a ray into the facet is mirrored out of it
+        occluded += scene.blocked(places, aim, reach)
+    return np.stack([1.0 - grazing * hidden / len(lamp), 1.0 - occluded / len(sky)], axis=1).astype(np.float32)
 
 
 def shade(hits: Hits, rows: Rows, seen: Shares) -> Vectors:
-    """Linear light that rows of the hits send to the viewer; ``seen`` as from `visibility`."""
+    """Linear light that rows of the hits send to the viewer; ``seen`` are shares by `visibility`."""
     normal, color = hits.normal[rows], hits.color[rows]
     lamp, sky = seen[:, 0], seen[:, 1]
     key = np.clip((normal @ _KEY + 0.15) / 1.15, 0, None) * (0.25 + 0.75 * lamp)
@@ -265,8 +265,8 @@ def shade(hits: Hits, rows: Rows, seen: Shares) -> Vectors:
     above = 0.62 + 0.38 * normal[:, 1]
     # Light that bounces in a hollow takes the color of its walls (Jimenez et al. 2016).
     first, second, third = 2.0404 * color - 0.3324, -4.7951 * color + 0.6417, 2.7552 * color + 0.6903
-    deep = sky[:, None]
-    around = np.maximum(deep, ((deep * first + second) * deep + third) * deep)
+    sky_share = sky[:, None]
+    around = np.maximum(sky_share, ((sky_share * first + second) * sky_share + third) * sky_share)
     light = 0.78 * key[:, None] * _KEY_COLOR + (0.14 * fill)[:, None] * _FILL_COLOR
     light = light + 0.44 * above[:, None] * around
     half = (_KEY + np.array([0, 0, 1.0], np.float32)) / np.linalg.norm(_KEY + np.array([0, 0, 1.0]))
@@ -276,6 +276,6 @@ def shade(hits: Hits, rows: Rows, seen: Shares) -> Vectors:
 
 
 def shadow(seen: Shares) -> Float[Floats32, " N"]:
-    """How dark the ground is, 0 to 1, where shares ``seen`` of lamp and sky reach it."""
+    """Darkness of the ground, 0 to 1, for shares ``seen`` of lamp and sky."""
     dark = 0.30 * (1.0 - seen[:, 0]) + 0.52 * (1.0 - seen[:, 1])
     return np.asarray(np.clip(dark, 0.0, 0.85), np.float32)

@@ -1,4 +1,4 @@
-"""Triangles as the picture needs them: vertices, smooth normals, and paint.
+"""Triangle surfaces for rendering: vertices, smooth normals, and paint (color by face and barycentric weights).
 
 View coordinates: x to the right, y up, z towards the viewer, lengths of about 1. Colors are linear.
 """
@@ -25,20 +25,19 @@ Rows = Int[Ints, " N"]
 Weights = Float[AnyFloats, "N 3"]
 Places = Float[AnyFloats, "K 3"]
 Paint = Callable[[Rows, Weights, float], Float[AnyFloats, "N C"]]
-"""What gives triangles their color: at points of these faces, given by barycentric weights, three or four columns, of
-which a fourth below a half is a hole. The last argument is the size of a pixel in view coordinates: finer detail is
-averaged.
+"""Gives triangles their color: called with faces (N,), barycentric weights (N, 3) and the size of a pixel in view
+coordinates, below which detail is averaged; returns three or four columns. A fourth column below 0.5 is a hole.
 """
 
 
 def corners_of(faces: Int[Ints, "F 3"]) -> Rows:
-    """The vertices of some face, in order."""
+    """Sorted indices of the vertices that any face uses."""
     return np.flatnonzero(np.bincount(faces.ravel()))
 
 
 @dataclass(frozen=True, eq=False)
 class VertexPaint:
-    """Colors of vertices, interpolated in triangles; ``sharp``: each point has that of its nearest corner, for labels."""
+    """Vertex colors, interpolated in triangles; ``sharp``: each point has the color of its nearest corner, for labels."""
 
     colors: Float[AnyFloats, "V 3"]
     faces: Int[Ints, "F 3"]
@@ -61,7 +60,7 @@ def face_paint(colors: Float[AnyFloats, "F 3"]) -> Paint:
 
 class TexturePaint:
     """Paint by the materials of a file, as glTF defines it: image times factor times vertex color. ``scale`` is the length
-    in the file that is 1 in view coordinates.
+    in the file's unit that becomes 1 in view coordinates.
     """
 
     def __init__(self, look: Appearance, shape: Shape, scale: float) -> None:
@@ -69,8 +68,10 @@ class TexturePaint:
         self._colors = None if look.colors is None else np.nan_to_num(look.colors).astype(np.float32)
         self._pyramids = build_pyramids(look)
         texels = np.array([0.0 if m.image is None else m.image[..., 0].size for m in look.materials])
-        self._most = [1.0 if m.image is None else float(m.image[..., 3].max(initial=0)) / 255.0 for m in look.materials]
-        # Texels per unit of length on each face: a pixel averages as many as it is wide.
+        self._max_alpha = [
+            1.0 if m.image is None else float(m.image[..., 3].max(initial=0)) / 255.0 for m in look.materials
+        ]
+        # Texels per unit of length on each face: a pixel averages as many as it covers.
         a, b = look.uv[:, 1] - look.uv[:, 0], look.uv[:, 2] - look.uv[:, 0]
         flat = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
         solid = 2.0 * shape.face_areas / scale**2
@@ -87,57 +88,57 @@ class TexturePaint:
             material = self._look.materials[number]
             if number in self._pyramids:
                 uv = np.einsum("nk,nkc->nc", weights[rows], self._look.uv[faces[rows]]).astype(np.float32)
-                wide = np.float32(footprint) * self._density[faces[rows]]
-                out[rows] = self._pyramids[number].sample(uv[:, 0], uv[:, 1], wide).T
-            own = tint[rows] * np.array(material.factor, np.float32)
-            out[rows, :3] *= own[:, :3]
-            out[rows, 3] = _solid(material, out[rows, 3], own[:, 3], self._most[number])
+                footprints = np.float32(footprint) * self._density[faces[rows]]
+                out[rows] = self._pyramids[number].sample(uv[:, 0], uv[:, 1], footprints).T
+            factors = tint[rows] * np.array(material.factor, np.float32)
+            out[rows, :3] *= factors[:, :3]
+            out[rows, 3] = _is_solid(material, out[rows, 3], factors[:, 3], self._max_alpha[number])
         return out
 
 
-def _solid(
-    material: Material, image: Float[Floats32, " N"], factor: Float[Floats32, " N"], most: float
+def _is_solid(
+    material: Material, image: Float[Floats32, " N"], factor: Float[Floats32, " N"], max_alpha: float
 ) -> Bool[Bools, " N"]:
-    """Whether there is anything, by the alpha of the image and of its factor: half-transparent glass is drawn as if it were
-    solid, what an image cuts out, such as hair from its card, is not. `most` is the largest alpha in the image.
+    """Whether there is any surface, by the alpha of the image and of its factor. Half-transparent glass is drawn solid; what
+    an image cuts out, such as the card around hair, is not drawn. ``max_alpha`` is the largest alpha in the image.
     """
     if material.alpha == "opaque":
         return np.ones(len(image), bool)
     if material.alpha == "mask":
         return np.asarray(image * factor >= material.cutoff)
-    return np.asarray((image >= 0.5 * most) & (factor >= INVISIBLE))
+    return np.asarray((image >= 0.5 * max_alpha) & (factor >= INVISIBLE))
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
     """Triangles in view coordinates with their paint, which is called with indices of these faces.
 
-    ``normals`` are unit, or zero where the triangle's own is to be used. ``loose`` is how far triangles that belong to
-    one surface may lie above each other, as the discs of a cloud do; their normals are then used as they are.
+    ``normals`` are unit vectors, or zero where the facet's normal is to be used. ``thickness`` is the largest distance
+    between overlapping triangles of one surface, such as the discs of a cloud; with it, normals are not interpolated.
     """
 
     verts: Float[AnyFloats, "V 3"]
     faces: Int[Ints, "F 3"]
     normals: Float[AnyFloats, "V 3"]
     paint: Paint
-    loose: float = 0.0
+    thickness: float = 0.0
 
     @cached_property
     def extent(self) -> Float[AnyFloats, "2 3"]:
-        """Lowest and highest corner of all triangles."""
+        """Lower and upper corner of the bounding box of all triangles."""
         drawn = self.verts[corners_of(self.faces)]
         return np.stack([drawn.min(axis=0), drawn.max(axis=0)])
 
     def moved(self, right: float) -> Surface:
-        """The surface farther to the right."""
+        """A copy of the surface, moved to the right."""
         return replace(self, verts=self.verts + np.array([right, 0.0, 0.0]))
 
 
 def mesh_surface(
     verts: Float[AnyFloats, "V 3"], faces: Int[Ints, "F 3"], paint: Paint, chosen: Rows | None = None
 ) -> Surface:
-    """A mesh, or the ``chosen`` of its triangles; normals are smooth, also across the duplicate vertices of texture
-    seams and stl files.
+    """A mesh, or the ``chosen`` of its triangles; normals are smooth, also across duplicate vertices as at texture seams and
+    in stl files.
     """
     twin = same_rows(np.asarray(verts, np.float64))
     if chosen is None:
@@ -147,7 +148,7 @@ def mesh_surface(
 
 
 def balls(centers: Places, radius: float, colors: Places) -> Surface:
-    """A ball around every center in its color; the fewer, the finer."""
+    """A ball around every center, in its color; the fewer balls, the finer their meshes."""
     verts, faces = _ball(4 if len(centers) <= 60 else 3 if len(centers) <= 1_000 else 2 if len(centers) <= 5_000 else 1)
     count = len(centers)
     return Surface(
@@ -159,7 +160,7 @@ def balls(centers: Places, radius: float, colors: Places) -> Surface:
 
 
 def discs(centers: Places, normals: Places, radius: Float[AnyFloats, " K"], colors: Places) -> Surface:
-    """A flat octagon for every center, perpendicular to its normal, with its radius."""
+    """A flat octagon around every center, perpendicular to its normal, with the given radius."""
     turn = 2 * np.pi * np.arange(8) / 8
     first, second = tangents(normals)
     around = np.cos(turn)[:, None] * first[:, None] + np.sin(turn)[:, None] * second[:, None]
@@ -171,7 +172,7 @@ def discs(centers: Places, normals: Places, radius: Float[AnyFloats, " K"], colo
 
 
 def tangents(normal: Places) -> tuple[Places, Places]:
-    """Two unit tangents of each normal (z > -1) that change smoothly with it (Duff et al. 2017)."""
+    """Two unit tangents of each normal (z > -1) that vary smoothly with it (Duff et al. 2017)."""
     x, y, z = normal[:, 0], normal[:, 1], np.maximum(normal[:, 2], -0.999)
     a = -1.0 / (1.0 + z)
     b = x * y * a

@@ -164,7 +164,7 @@ def test_a_square_seen_from_the_front_has_one_color(tmp_path: Path) -> None:
 
 def test_a_large_cloud_is_thinned_not_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     points = np.random.default_rng(0).random((1_500, 3))
-    monkeypatch.setattr("meshmatch.render.figures.MOST_POINTS", 400)
+    monkeypatch.setattr("meshmatch.render.figures.MAX_POINTS", 400)
     seen = something(draw(tmp_path, (Shape(points[np.argsort(points[:, 1])], None), None)))
     assert all(seen[rows, 10:86].mean() > 0.3 for rows in (slice(10, 30), slice(30, 60), slice(60, 86)))
 

@@ -118,7 +118,7 @@ def test_a_hollow_is_darker_than_a_hill() -> None:
 def test_light_that_nothing_blocks_is_whole_and_a_lid_takes_it() -> None:
     open_floor = Scene([square(0.8)])
     x = np.array([0.0, 0.1])
-    hits = open_floor.look(x, x, 0.01)
+    hits = open_floor.trace(x, x, 0.01)
     rows = np.arange(2)
     assert (visibility(open_floor, hits, rows, rows, rows) == 1).all()
     lid = square(8.0, 0.02)
@@ -214,7 +214,7 @@ def test_glass_is_drawn_over_what_it_does_not_lie_behind() -> None:
 
 def test_edges_are_thinned_where_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene([square(0.8)])
-    monkeypatch.setattr(raster, "MOST_POINTS", 10)
+    monkeypatch.setattr(raster, "MAX_POINTS", 10)
     points = raster.edge_points(scene, WINDOW)
     assert len(points) <= 4 + 3 * 10
     monkeypatch.undo()

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from meshmatch.shapes.formats.gltf_rig import Clip, Rig, Track
-from meshmatch.transfer.retarget_clips import _sampled, retargeted, standing_clips
+from meshmatch.transfer.retarget_clips import _sample_track, retargeted, standing_clips
 
 TURNS = Rotation.from_rotvec(np.radians([[0, 0, 0], [0, 0, 170], [0, 0, 190], [0, 0, 350.0]])).as_quat() * [
     [1],
@@ -66,8 +66,8 @@ def test_what_a_clip_leaves_alone_is_held() -> None:
 def test_turns_go_the_shorter_way_round() -> None:
     """q and -q are one rotation."""
     track = Track(1, "rotation", TIMES, TURNS, "LINEAR")
-    found = Rotation.from_quat(_sampled(track, TURNS[0], np.array([0.0, 1.5, 3.0, 9.0])))
+    found = Rotation.from_quat(_sample_track(track, TURNS[0], np.array([0.0, 1.5, 3.0, 9.0])))
     angles = found.as_euler("xyz", degrees=True)[:, 2] % 360
     assert np.allclose(angles, [0, 180, 350, 350])
-    stepped = _sampled(replace(track, interpolation="STEP"), TURNS[0], np.array([-1.0, 0.9, 1.0]))
+    stepped = _sample_track(replace(track, interpolation="STEP"), TURNS[0], np.array([-1.0, 0.9, 1.0]))
     assert np.allclose(stepped, TURNS[[0, 0, 1]])

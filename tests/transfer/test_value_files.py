@@ -17,7 +17,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.label_files import labels_of, save_labels
 from meshmatch.transfer.value_files import (
     Values,
-    _different,
+    _make_unique,
     light_of,
     load_values,
     parse_blank,
@@ -210,8 +210,8 @@ def test_colors_have_their_suffixes(tmp_path: Path) -> None:
 
 
 def test_columns_of_one_name_are_told_apart() -> None:
-    assert _different(["a", "a", "a", "a_", "x"], {"x"}) == ["a", "a_", "a_2", "a__", "x_"]
-    assert len(set(_different(["a"] * 20_000, set()))) == 20_000
+    assert _make_unique(["a", "a", "a", "a_", "x"], {"x"}) == ["a", "a_", "a_2", "a__", "x_"]
+    assert len(set(_make_unique(["a"] * 20_000, set()))) == 20_000
 
 
 def test_numbers_that_a_ply_changes_are_told(tmp_path: Path) -> None:
