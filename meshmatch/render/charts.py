@@ -1,7 +1,7 @@
-"""Charts by matplotlib (extra ``plots``) as PNG, SVG or PDF: the same numbers give the same bytes.
+"""Charts with matplotlib (extra ``plots``) as PNG, SVG or PDF; the same numbers give the same bytes.
 
-Every ``draw_`` function chooses the format by the suffix of ``path``. It raises `OptionError` for another suffix, where
-matplotlib is missing and for numbers that cannot be drawn, and `OutputError` where the file cannot be written.
+Every ``draw_`` function chooses the format by the suffix of ``path``. It raises `OptionError` for another suffix, if
+matplotlib is missing, and for numbers that cannot be drawn; `OutputError` if the file cannot be written.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colors, which color-blind readers can tell apart.
+# Okabe and Ito's palette, which color-blind readers can tell apart.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
-_DASHES = ("-", "--", ":")  # one for each round through the colors
-_GREY, _GRID = "#70747c", "#e6e7ea"  # as in the style
-# The dates and versions that a format would record, left out.
+_DASHES = ("-", "--", ":")  # one for each pass through the colors
+_GREY, _GRID = "#70747c", "#e6e7ea"  # as in the style file
+# Metadata with dates and versions that must be left out of each format.
 _METADATA: dict[str, dict[str, None]] = {
     ".png": {"Software": None},
     ".svg": {"Date": None, "Creator": None},
     ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
 }
-_MOST_TERMS, _MOST_BARS, _MOST_GROUPS = 12, 20, 14
-_END = 58.0  # points: the longest side of the largest picture at the end of an axis
-_FLATTEST = 0.75  # height by width of a chart whose dots lie along a line
-_MARKERS = "os^Dv"  # one for each round through the colors
+_MAX_TERMS, _MAX_BARS, _MAX_GROUPS = 12, 20, 14
+_END_SIZE = 58.0  # points: longest side of the largest picture at the end of an axis
+_MIN_FLATNESS = 0.75  # smallest height over width of a chart whose dots lie along a line
+_MARKERS = "os^Dv"  # one for each pass through the colors
 _STYLE = Path(__file__).with_name("charts.mplstyle")
 
 
 def check_chart(path: str | Path) -> None:
-    """Refuse a file name that is not .png, .svg or .pdf, or a missing matplotlib (`OptionError`)."""
+    """Raise `OptionError` for a file name that is not .png, .svg or .pdf, or if matplotlib is missing."""
     if Path(path).suffix.lower() not in _METADATA:
         raise OptionError(f"{Path(path).name}: unsupported chart format", "end the name in .png, .svg or .pdf")
     if find_spec("matplotlib") is None:
@@ -51,13 +51,11 @@ def check_chart(path: str | Path) -> None:
 
 
 def draw_curves(curves: Mapping[str, Errors], path: str | Path, limit: float = 20.0, *, unit: ErrorUnit = CM) -> None:
-    """Draw cumulative error curves, at least one: the share of points (vertical) with at most this error, up to ``limit``
-    in ``unit``.
-    """
+    """Draw cumulative error curves: the share of points (vertical) with at most this error, up to ``limit`` in ``unit``."""
     if not curves or not limit > 0:
         raise OptionError("a curve needs errors and a positive limit")
     factor = unit.factor
-    with saved(path, 6.0, 4.0) as figure:
+    with saved_figure(path, 6.0, 4.0) as figure:
         axes = figure.subplots()
         at = np.linspace(0.0, limit, 801)
         for number, (name, errors) in enumerate(curves.items()):
@@ -76,11 +74,11 @@ def draw_lines(
     ylabel: str,
     marks: Mapping[float, str],
 ) -> None:
-    """Draw lines by name: places, and values of 0 or more there. ``marks`` are places with a name: vertical lines."""
-    with saved(path, 6.4, 3.6) as figure:
+    """Draw lines by name: x, and y of 0 or more. ``marks`` are named vertical lines at some x."""
+    with saved_figure(path, 6.4, 3.6) as figure:
         axes = figure.subplots()
-        _plot(axes, lines, 40)
-        _mark(axes, marks, np.concatenate([x for x, _ in lines.values()]))
+        _draw_lines(axes, lines, 40)
+        _draw_marks(axes, marks, np.concatenate([x for x, _ in lines.values()]))
         axes.set(xlabel=short(xlabel), ylabel=short(ylabel))
         figure.legend(loc="outside upper left", ncols=max(1, min(len(lines), 88 // (6 + max(map(len, lines))))))
 
@@ -90,13 +88,11 @@ def draw_beside(
     path: str | Path,
     xlabel: str,
 ) -> None:
-    """Draw charts side by side, each with a title, the words at its vertical axis, and lines by name: places, and values of
-    0 or more there.
-    """
-    with saved(path, 3.4 * len(charts), 3.2) as figure:
+    """Draw charts side by side. Each has a title, a label of its vertical axis, and lines by name: x, and y of 0 or more."""
+    with saved_figure(path, 3.4 * len(charts), 3.2) as figure:
         row = figure.subplots(1, len(charts), squeeze=False)[0]
         for axes, (title, (ylabel, lines)) in zip(row, charts.items(), strict=True):
-            _plot(axes, lines, 30)
+            _draw_lines(axes, lines, 30)
             axes.set(xlabel=short(xlabel), ylabel=short(ylabel), title=short(title, 40))
             axes.locator_params(axis="x", nbins=6, integer=True)
             if len(lines) > 1:
@@ -106,20 +102,21 @@ def draw_beside(
 def draw_histogram(
     path: str | Path, values: Sequence[float], xlabel: str, ylabel: str, marks: Mapping[float, str]
 ) -> None:
-    """Draw how often numbers of 0 or more occur, with a stroke for each. ``marks`` are numbers with a name."""
-    with saved(path, 6.4, 3.2) as figure:
+    """Draw a histogram of numbers of 0 or more, with a tick for each. ``marks`` are named vertical lines."""
+    with saved_figure(path, 6.4, 3.2) as figure:
         axes = figure.subplots()
         axes.hist(values, bins="auto", range=(0, max(values)), color=COLORS[0], alpha=0.75, edgecolor="white")
         axes.plot(values, [0] * len(values), "|", color=COLORS[-1], markersize=9, alpha=0.5, clip_on=False)
-        _mark(axes, marks, np.asarray(values))
+        _draw_marks(axes, marks, np.asarray(values))
         axes.set(xlabel=short(xlabel), ylabel=short(ylabel), xlim=(0, None))
         axes.locator_params(axis="y", nbins=6, integer=True)
 
 
 @dataclass(frozen=True, eq=False)
 class Dots:
-    """Places (N,) of dots in a chart, the words at its axes, and names of some of the dots. ``ends`` are pictures (H, W, 4),
-    in one scale and with their names, for the low and the high end of the first axis, then of the second.
+    """Coordinates (N,) of dots in a chart, labels of its axes, and names of some of the dots.
+
+    ``ends`` are named pictures (H, W, 4), at one scale, for the low and the high end of the first axis, then of the second.
     """
 
     x: Sequence[float]
@@ -131,12 +128,12 @@ class Dots:
 
 
 def draw_scree(path: str | Path, shares: Sequence[float], most: int) -> None:
-    """Draw the shares of the variance that modes explain, and those of the pieces of a stick that breaks into ``most`` at
-    random: modes above it say more than chance.
+    """Draw the shares of the variance that modes explain, and those of the broken-stick model: a stick that breaks into
+    ``most`` pieces at random. Modes above it explain more than chance.
     """
-    count = min(len(shares), _MOST_BARS)
+    count = min(len(shares), _MAX_BARS)
     sticks = np.cumsum(1 / np.arange(most, 0, -1))[::-1] / most
-    with saved(path, 4.8, 3.2) as figure:
+    with saved_figure(path, 4.8, 3.2) as figure:
         axes = figure.subplots()
         axes.bar(range(1, count + 1), 100 * np.array(shares[:count]), color=COLORS[0], label="modes")
         known = sticks[:count]
@@ -151,13 +148,13 @@ def draw_dots(
     path: str | Path, charts: Sequence[Dots], groups: Sequence[str], *, hulls: bool, grouped_by: str = ""
 ) -> None:
     """Draw charts of dots side by side, each dot in the color of its group ("" for none), with the convex hull of each
-    group, or its regression line. ``grouped_by`` is what tells the groups apart, above their names.
+    group, or its regression line. ``grouped_by`` is the title of the groups in the legend.
     """
     known = sorted({group for group in groups if group})
     members = {group: np.flatnonzero(np.array(groups) == group) for group in [*known, *([""] if "" in groups else [])]}
-    room = _END / 72 if any(dots.ends for dots in charts) else 0.0
+    room = _END_SIZE / 72 if any(dots.ends for dots in charts) else 0.0
     flat = max((_flatness(dots) for dots in charts), default=1.0) if hulls else 1.0
-    with saved(path, (4.2 + room) * len(charts) + 1.2, 3.8 * flat + 1.6 * room) as figure:
+    with saved_figure(path, (4.2 + room) * len(charts) + 1.2, 3.8 * flat + 1.6 * room) as figure:
         row = figure.subplots(1, len(charts), squeeze=False)[0]
         for axes, dots in zip(row, charts, strict=True):
             points = np.column_stack([dots.x, dots.y])
@@ -177,43 +174,43 @@ def draw_dots(
             named: list[Floats] = []
             for number, name in dots.names.items():
                 at = (points[number] - low) / np.maximum(span, 1e-300)
-                below = any(np.abs(at - other).max() < 0.08 for other in named)  # names of neighbours do not meet
+                below = any(np.abs(at - other).max() < 0.08 for other in named)  # keeps neighboring names apart
                 named.append(at)
                 about = {"textcoords": "offset points", "color": _GREY, "fontsize": 7.5}
                 about |= {"ha": "right" if at[0] > 0.5 else "left"}
                 axes.annotate(short(name, 24), points[number], (-4 if at[0] > 0.5 else 4, -11 if below else 4), **about)
             axes.set(xlabel=short(dots.xlabel), ylabel=short(dots.ylabel))
-            if dots.ends:  # pictures are beside the words
+            if dots.ends:  # pictures are next to the labels
                 axes.xaxis.label.set_size(8.5)
                 axes.yaxis.label.set_size(8.5)
-            _show_ends(axes, dots.ends)
-            if hulls:  # both axes have one scale
+            _draw_ends(axes, dots.ends)
+            if hulls:  # both axes have the same scale
                 reach = 0.55 * float((high - low).max()) or 1.0
                 middle, height = (low + high) / 2, flat * reach
                 axes.set(xlim=middle[0] + [-reach, reach], ylim=middle[1] + [-height, height], box_aspect=flat)
         if len(members) > 1:
             handles, labels = row[0].get_legend_handles_labels()
-            shown = handles[:_MOST_GROUPS], labels[:_MOST_GROUPS]
+            shown = handles[:_MAX_GROUPS], labels[:_MAX_GROUPS]
             figure.legend(*shown, loc="outside right upper", title=short(grouped_by, 24) or None)
 
 
 def _flatness(dots: Dots) -> float:
-    """Height of a chart in which both axes have one scale, by its width: a square at most."""
+    """Height over width, at most 1, of a chart whose axes have the same scale."""
     across, up = float(np.ptp(dots.x)), float(np.ptp(dots.y))
-    return min(1.0, max(_FLATTEST, up / across)) if across > 0 else 1.0
+    return min(1.0, max(_MIN_FLATNESS, up / across)) if across > 0 else 1.0
 
 
-def _show_ends(axes: Axes, ends: Sequence[tuple[str, UInts8]]) -> None:
-    """Pictures at the ends of both axes, outside of them, each beside the words at its axis."""
+def _draw_ends(axes: Axes, ends: Sequence[tuple[str, UInts8]]) -> None:
+    """Draw pictures at the ends of both axes, outside of them, next to the axis labels."""
     from matplotlib.offsetbox import AnnotationBbox, OffsetImage, TextArea, VPacker
 
     most = max((max(picture.shape[:2]) for _, picture in ends), default=1)
     for number, (name, picture) in enumerate(ends):
         second, high = divmod(number, 2)
-        image = OffsetImage(picture, zoom=_END / most)
+        image = OffsetImage(picture, zoom=_END_SIZE / most)
         words = TextArea(short(name, 24), textprops={"color": _GREY, "fontsize": 7.5})
         box = VPacker(children=[image, words], align="center", pad=0, sep=2)
-        # Beside the words, so that the numbers at the axis have the room that they need.
+        # Next to the axis label, so that the numbers at the axis keep the room that they need.
         across: Any = ((1, high), (axes.yaxis.label, "axes fraction"), (1, high))
         along: Any = ((high, 1), ("axes fraction", axes.xaxis.label), (high, 1))
         place, coordinates, alignment = across if second else along
@@ -221,7 +218,7 @@ def _show_ends(axes: Axes, ends: Sequence[tuple[str, UInts8]]) -> None:
 
 
 def _outline(points: Floats) -> Floats | None:
-    """The convex hull of points (N, 2), closed; None where they have no area."""
+    """The convex hull of points (N, 2), as a closed line; None if it has no area."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
@@ -232,7 +229,7 @@ def _outline(points: Floats) -> Floats | None:
 
 
 def _regression(points: Floats) -> Floats | None:
-    """Both ends of the regression line; None where there is none."""
+    """Both ends of the regression line; None if there is none."""
     x = points[:, 0]
     if len(points) < 3 or not np.ptp(x) > 0:
         return None
@@ -244,11 +241,13 @@ def _regression(points: Floats) -> Floats | None:
 def draw_losses(
     path: str | Path, steps: Sequence[int], terms: Mapping[str, Sequence[float]], validation: Mapping[int, float]
 ) -> None:
-    """Draw the losses of a training over its steps (N,) on logarithmic axes: the validation error (on held-out shapes, at
-    some steps) and the error, or the total where there is none, large, the other terms small below. ``terms`` have a name
-    and (N,) values, of which those not positive or not finite are left out.
+    """Draw the losses of a training over its steps (N,) on logarithmic axes.
+
+    The upper, larger chart has the validation error (on held-out shapes, at some steps) and the training error, or the total
+    where there is none; the lower has the other terms. ``terms`` are (N,) values by name; values that are not positive and
+    finite are left out.
     """
-    known = {name: list(zip(steps, values, strict=True)) for name, values in list(terms.items())[:_MOST_TERMS]}
+    known = {name: list(zip(steps, values, strict=True)) for name, values in list(terms.items())[:_MAX_TERMS]}
     known["validation"] = sorted(validation.items())
     positive = {name: [point for point in points if 0 < point[1] < np.inf] for name, points in known.items()}
     lines = {name: np.array(points, float).T for name, points in positive.items() if points}
@@ -258,7 +257,7 @@ def draw_losses(
     large = [name for name in ("validation", main) if name in lines]
     groups = [group for group in (large, [name for name in lines if name not in large]) if group]
     pens = {name: pen(k) for k, name in enumerate(name for group in groups for name in group)}
-    with saved(path, 6.4, 3.4 + 1.6 * (len(groups) - 1)) as figure:
+    with saved_figure(path, 6.4, 3.4 + 1.6 * (len(groups) - 1)) as figure:
         from matplotlib.ticker import LogLocator
 
         column = figure.subplots(len(groups), sharex=True, squeeze=False, height_ratios=(2, 1)[: len(groups)])[:, 0]
@@ -269,7 +268,7 @@ def draw_losses(
                 dot = "o" if above or len(lines[name][0]) == 1 else ""
                 axes.plot(*lines[name], marker=dot, label=short(name, 24), **pens[name], **weight)
             axes.set_yscale("log")
-            # Plain numbers, also between the powers of ten where these are few.
+            # Plain numbers as ticks, also between powers of ten where these are few.
             low, high = np.log10(axes.get_ylim())
             between = (1.0, 2.0, 5.0) if high - low < 2 else (1.0, 3.0) if high - low < 4 else (1.0,)
             axes.yaxis.set_major_locator(LogLocator(subs=between, numticks=12))
@@ -283,15 +282,15 @@ def draw_losses(
         column[-1].xaxis.set_major_formatter("{x:,.0f}")
 
 
-def _plot(axes: Axes, lines: Mapping[str, tuple[Sequence[float], Sequence[float]]], longest: int) -> None:
-    """Lines with a dot at each place; the vertical axis begins at 0."""
+def _draw_lines(axes: Axes, lines: Mapping[str, tuple[Sequence[float], Sequence[float]]], longest: int) -> None:
+    """Draw lines with a dot at each point; the vertical axis begins at 0."""
     for number, (name, (x, y)) in enumerate(lines.items()):
         axes.plot(x, y, marker="o", clip_on=False, label=short(name, longest), **pen(number))
     axes.set_ylim(bottom=0)
 
 
-def _mark(axes: Axes, marks: Mapping[float, str], places: Floats) -> None:
-    """Vertical lines with names, which stay inside the chart of these places."""
+def _draw_marks(axes: Axes, marks: Mapping[float, str], places: Floats) -> None:
+    """Draw named vertical lines; names stay inside the chart of these places."""
     for place, name in marks.items():
         axes.axvline(place, color=_GREY, linewidth=0.9, zorder=1)
         share = (place - places.min()) / max(float(np.ptp(places)), 1e-9)
@@ -301,8 +300,8 @@ def _mark(axes: Axes, marks: Mapping[float, str], places: Floats) -> None:
 
 
 @contextmanager
-def saved(path: str | Path, width: float, height: float) -> Iterator[Figure]:
-    """An empty figure (inches), written when the block ends well; for the block alone our style replaces the user's."""
+def saved_figure(path: str | Path, width: float, height: float) -> Iterator[Figure]:
+    """An empty figure (size in inches), saved when the block succeeds. Inside the block our style replaces the user's."""
     check_chart(path)
     import matplotlib
     from matplotlib.figure import Figure
@@ -317,6 +316,6 @@ def saved(path: str | Path, width: float, height: float) -> Iterator[Figure]:
 
 
 def pen(number: int) -> dict[str, Any]:
-    """Color and dashes of a line."""
+    """Color and line style of the line with this number."""
     rounds, color = divmod(number, len(COLORS))
     return {"color": COLORS[color], "linestyle": _DASHES[rounds % len(_DASHES)]}

@@ -1,6 +1,6 @@
-"""What a picture shows: from shapes, maps, numbers, labels, points, textures and fits to panels with a legend.
+"""Composition of pictures: panels with a legend, from shapes, maps, numbers, labels, points, textures and fits.
 
-Colors are sRGB in 0..1 unless they are called linear. Maps go from the source, the first shape, to the target.
+Colors are sRGB in 0..1 unless called linear. Maps go from the source, the first shape, to the target.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from meshmatch.templates.template import Template
 from meshmatch.transfer.attributes import pull_values
 from meshmatch.transfer.label_files import Labels
 
-# A target vertex whose confidence is a smaller share of that of its match than this is unmatched.
-_MATCHED = 0.05
-# Known points closer than this (units of sqrt(area)) are interpolated over the surface between them.
-_CLOSE = 0.06
-_MOST_DOTS = 5000  # that a line is drawn by
+# A target vertex is unmatched if its confidence is a smaller share of its match's confidence than this.
+_MIN_RELATIVE_CONFIDENCE = 0.05
+# Known points at most this far apart (units of sqrt(area)) are interpolated over the surface between them.
+_MAX_SPACING = 0.06
+_MAX_DOTS = 5000  # dots that a line is drawn with
 PALE = (0.88, 0.88, 0.89)
-"""Color of a shape that only shows points."""
+"""Color of a shape on which only points matter."""
 
 
 @dataclass(frozen=True, eq=False)
 class Composition:
-    """Panels side by side and the meaning of their colors, ready to be rendered; ``caption`` says what is shown, and
-    ``record`` holds numbers about it for JSON.
+    """Panels side by side and the legend of their colors, ready to be rendered; ``caption`` says what is shown, and
+    ``record`` has numbers about it for JSON.
     """
 
     panels: tuple[Panel, ...]
@@ -50,24 +50,24 @@ class Composition:
     record: dict[str, Any] = field(default_factory=dict)
 
     def named(self, names: Sequence[str]) -> Composition:
-        """With these names below the panels."""
+        """A copy with these labels of the panels."""
         panels = [replace(panel, label=name) for panel, name in zip(self.panels, names, strict=True)]
         return replace(self, panels=tuple(panels))
 
     def rotated(self, rotations: Sequence[Float[Floats, "3 3"] | None]) -> Composition:
-        """With these rotations into y up, z to the viewer."""
+        """A copy with these rotations of the panels, into y up and z to the viewer."""
         panels = [replace(panel, rotation=turn) for panel, turn in zip(self.panels, rotations, strict=True)]
         return replace(self, panels=tuple(panels))
 
     def render(self, path: str | Path, look: Look = Look()) -> tuple[int, int]:
-        """Draw it as a PNG; width and height in pixels. See `render_shapes` for the errors."""
+        """Draw the picture as a PNG; return width and height in pixels. See `render_shapes` for errors."""
         return render_shapes(self.panels, path, replace(look, legend=self.legend))
 
 
 def compose_shapes(
     subjects: Sequence[tuple[Shape | Template, Appearance | None]], *, plain: bool = False
 ) -> Composition:
-    """Shapes with their textures or colors, and templates as glass around their nodes; ``plain``: all of them in clay."""
+    """Shapes with their textures or colors, and templates as glass around their nodes; with ``plain`` all in clay."""
     panels = []
     for subject, look in subjects:
         shape = subject.shape if isinstance(subject, Template) else subject
@@ -84,34 +84,37 @@ def compose_shapes(
 def compose_match(
     source: Shape, target: Shape, vertex_map: VertexMap, rotations: Rotations = (None, None), look: Look = Look()
 ) -> Composition:
-    """The source colored by position, the target as the map transfers that; grey: unmatched. `InputError`: a foreign map."""
+    """The source colored by position, and the target with these colors transferred by the map; unmatched parts are grey.
+
+    `InputError` for a map that is not of these shapes.
+    """
     turns = same_side(source, target, vertex_map, rotations, look.up, look.front)
     here = position_colors(source, turns[0])
     there = matched_colors(here, vertex_map, invert_map(vertex_map, source, target), source)
-    panels = _painted((source, target), (here, there))
+    panels = _colored_panels((source, target), (here, there))
     return Composition(panels, caption="matched places in one color").rotated(turns)
 
 
-def _painted(shapes: Sequence[Shape], colors: Iterable[Float[Floats, "V C"]]) -> tuple[Panel, ...]:
+def _colored_panels(shapes: Sequence[Shape], colors: Iterable[Float[Floats, "V C"]]) -> tuple[Panel, ...]:
     return tuple(Panel(shape, own, shape.name) for shape, own in zip(shapes, colors, strict=True))
 
 
 def matched_colors(
     colors: Float[Floats, "V 3"], forward: VertexMap, back: VertexMap, source: Shape
 ) -> Float[Floats, "V_target 3"]:
-    """Colors of the target from those of the source's vertices; grey where nothing was matched nearby."""
-    matched = back.assumed_confidence > _MATCHED * forward.assumed_confidence[back.index]
+    """Colors (V_source, 3) of the source's vertices transferred to the target; grey where nothing was matched nearby."""
+    matched = back.assumed_confidence > _MIN_RELATIVE_CONFIDENCE * forward.assumed_confidence[back.index]
     return np.where(matched[:, None], pull_values(back, colors), UNKNOWN)
 
 
 def compose_confidence(source: Shape, target: Shape, vertex_map: VertexMap, look: Look = Look()) -> Composition:
-    """Source and target colored by the confidence of the map: low is dark. `OptionError` if it is not known."""
+    """Source and target colored by the map's confidence, dark where it is low. `OptionError` if it is unknown."""
     if np.isnan(vertex_map.confidence).any():
         hint = "maps that `meshmatch match` wrote as .npz, .mat, .json or .csv have it"
         raise OptionError("the confidence of this map is not known", hint)
     scale = Scale(0.0, 1.0, "confidence of the map", reverse=True)
     maps = vertex_map, invert_map(vertex_map, source, target)
-    panels = _painted((source, target), [scale.colors(each.confidence) for each in maps])
+    panels = _colored_panels((source, target), [scale.colors(each.confidence) for each in maps])
     record = {"confidence_mean": float(vertex_map.confidence.mean())}
     shown = Composition(panels, scale, "the confidence of the map", record)
     return shown.rotated(same_side(source, target, vertex_map, up=look.up, front=look.front))
@@ -130,7 +133,7 @@ def compose_errors(
     """Source and target colored by the errors at ``known`` points, given as vertices of source and target."""
     values = np.asarray(errors.values, np.float64) * unit.factor
     scale = Scale.of(values, f"error ({unit.words})", limits)
-    panels = [_painted_points(shape, at, values, scale) for shape, at in zip((source, target), known, strict=True)]
+    panels = [_value_panel(shape, at, values, scale) for shape, at in zip((source, target), known, strict=True)]
     gaps = any((np.asarray(panel.colors) == UNKNOWN).all(axis=1).any() for panel in panels)
     record = {"points": int(values.size), "unit": unit.name, "mean": unit.factor * errors.mean}
     record |= {"mean_cm": errors.mean_cm, "mean_x100": 100 * errors.mean}
@@ -138,22 +141,22 @@ def compose_errors(
     return shown.rotated(same_side(source, target, vertex_map, up=look.up, front=look.front))
 
 
-def _painted_points(shape: Shape, vertices: Int[Ints, " N"], values: Float[Floats, " N"], scale: Scale) -> Panel:
-    """A shape with numbers at some of its vertices, drawn as balls. Where these lie close together, the others take the
-    weighted mean of the nearest instead; one far from all has no value.
+def _value_panel(shape: Shape, vertices: Int[Ints, " N"], values: Float[Floats, " N"], scale: Scale) -> Panel:
+    """A shape with values at some of its vertices. Sparse values are drawn as balls; dense ones color the surface, where
+    other vertices take a weighted mean of the nearest values, or are grey if they are far from all.
     """
-    own, row, count = np.unique(vertices, return_inverse=True, return_counts=True)
+    vertex, row, count = np.unique(vertices, return_inverse=True, return_counts=True)
     means = np.bincount(row, values) / count
     unit = float(np.sqrt(shape.area)) or 1.0
-    tree = cKDTree(shape.verts[own])
-    spacing = float(np.median(tree.query(shape.verts[own], 2)[0][:, 1])) if len(own) > 3 else np.inf
-    if spacing >= _CLOSE * unit:
-        return _with_points(shape, shape.verts[own], scale.colors(means), 0.016 * unit)
+    tree = cKDTree(shape.verts[vertex])
+    spacing = float(np.median(tree.query(shape.verts[vertex], 2)[0][:, 1])) if len(vertex) > 3 else np.inf
+    if spacing >= _MAX_SPACING * unit:
+        return _points_panel(shape, shape.verts[vertex], scale.colors(means), 0.016 * unit)
     distance, place = tree.query(shape.verts, 4)
     weight = 1.0 / (distance + 1e-3 * unit) ** 2
-    painted = (weight * means[place]).sum(axis=1) / weight.sum(axis=1)
-    painted[own] = means
-    return Panel(shape, scale.colors(np.where(distance[:, 0] < 2 * spacing, painted, np.nan)), shape.name)
+    interpolated = (weight * means[place]).sum(axis=1) / weight.sum(axis=1)
+    interpolated[vertex] = means
+    return Panel(shape, scale.colors(np.where(distance[:, 0] < 2 * spacing, interpolated, np.nan)), shape.name)
 
 
 def compose_fit(
@@ -163,7 +166,7 @@ def compose_fit(
     limits: tuple[float, float] | None = None,
     what: str = "the template",
 ) -> Composition:
-    """A fitted mesh (same frame and unit) as blue glass over the shape, and the shape colored by its distance."""
+    """A fitted mesh (same frame and unit) as blue glass over the shape, and the shape colored by the distance to it."""
     distance = distances(shape, fitted)
     scale = Scale.of(distance, f"distance to {what} (unit of the file)", limits)
     record = {"distance_mean": float(np.nanmean(distance)), "distance_max": float(np.nanmax(distance))}
@@ -176,7 +179,7 @@ def compose_fit(
 
 
 def distances(shape: Shape, fitted: Shape) -> Float[Floats, " V"]:
-    """Distance of each vertex of a shape to the surface of another; nan where it has no position."""
+    """Distance of each vertex of a shape from another shape's surface; nan for vertices without a position."""
     return np.where(shape.valid, MappedMesh.of(fitted).query(shape.verts).distance, np.nan)
 
 
@@ -186,14 +189,15 @@ def compose_values(
     title: str = "",
     limits: tuple[float, float] | None = None,
 ) -> Composition:
-    """Shapes colored by a number per vertex on one scale, or in given colors: three or four numbers in 0..1 per vertex.
-    `InputError` where they are neither of these, `OptionError` for ``title`` or ``limits`` with colors.
+    """Shapes colored by one number per vertex on a common scale, or in given colors: three or four numbers in 0..1.
+
+    `InputError` if the values are neither of these, `OptionError` for ``title`` or ``limits`` with colors.
     """
     tables = [table[:, 0] if table.ndim == 2 and table.shape[1] == 1 else table for table in values]
     if all(table.ndim == 1 for table in tables):
         scale = Scale.of(np.concatenate(tables), title, limits)
         caption = f"numbers from {scale.low:g} to {scale.high:g}"
-        panels = _painted(shapes, map(scale.colors, tables))
+        panels = _colored_panels(shapes, map(scale.colors, tables))
         return Composition(panels, scale, caption, {"range": [scale.low, scale.high]})
     for shape, table in zip(shapes, tables, strict=True):
         columns = 1 if table.ndim == 1 else table.shape[1]
@@ -202,7 +206,7 @@ def compose_values(
             raise InputError(f"{shape.name}: {columns} numbers per vertex are neither a scale nor colors", hint)
     if title or limits is not None:
         raise OptionError("colors have no scale", "leave out the title and the range")
-    return Composition(_painted(shapes, tables), caption="the colors of a file")
+    return Composition(_colored_panels(shapes, tables), caption="the colors of a file")
 
 
 def compose_labels(
@@ -211,7 +215,7 @@ def compose_labels(
     names: Sequence[str],
     on_faces: Sequence[bool] | None = None,
 ) -> Composition:
-    """Shapes with one color per label: each vertex, or face, has its index in ``names``; negative: no label."""
+    """Shapes with one color per label; each vertex, or face, has an index into ``names``, negative for no label."""
     colors = [label_colors(own) for own in codes]
     panels = [
         Panel(shape, None if faces else own, shape.name, sharp=True, face_colors=own if faces else None)
@@ -222,7 +226,7 @@ def compose_labels(
 
 
 def merge_labels(labels: Sequence[Labels]) -> tuple[list[Int[Ints, " N"]], list[str]]:
-    """Labels of several shapes by one list of names, sorted, so that a name has one color: codes of each, and names."""
+    """Merge labels of several shapes into one sorted list of names: codes of each shape, and the names."""
     found = {str(name) for own in labels for name in own.names}
     numbers = {name for name in found if name.removeprefix("-").isdecimal()}
     names = [*sorted(sorted(numbers), key=int), *sorted(found - numbers)]
@@ -231,35 +235,35 @@ def merge_labels(labels: Sequence[Labels]) -> tuple[list[Int[Ints, " N"]], list[
 
 
 def compose_points(shapes: Sequence[Shape], points: Sequence[Float[Floats, "N 3"]]) -> Composition:
-    """Points on each shape as balls, in the frame of its file; those of one index have one color."""
+    """Points on each shape as balls, in the frame of its file; points with the same index have the same color."""
     colors = [label_colors(np.arange(len(own))) for own in points]
     radii = [0.02 * float(np.sqrt(shape.area)) or None for shape in shapes]
-    return Composition(tuple(map(_with_points, shapes, points, colors, radii)))
+    return Composition(tuple(map(_points_panel, shapes, points, colors, radii)))
 
 
 def compose_lines(shapes: Sequence[Shape], lines: Sequence[Sequence[Float[Floats, "M 3"]]]) -> Composition:
-    """Lines on each shape, in the frame of its file; those of one index have one color."""
+    """Lines on each shape, in the frame of its file; lines with the same index have the same color."""
     panels = []
     for shape, own in zip(shapes, lines, strict=True):
         radius = 0.006 * float(np.sqrt(shape.area) or shape.diagonal)
-        dots = [_along(line, radius) for line in own]
+        dots = [_sample_line(line, radius) for line in own]
         colors = label_colors(np.repeat(np.arange(len(dots)), [len(each) for each in dots]))
-        panels.append(_with_points(shape, np.concatenate([np.empty((0, 3)), *dots]), colors, radius))
+        panels.append(_points_panel(shape, np.concatenate([np.empty((0, 3)), *dots]), colors, radius))
     return Composition(tuple(panels))
 
 
-def _along(line: Float[Floats, "M 3"], step: float) -> Float[Floats, "N 3"]:
-    """Points along a line, at most a step apart."""
+def _sample_line(line: Float[Floats, "M 3"], step: float) -> Float[Floats, "N 3"]:
+    """Points along a line, at most a step apart, unless that takes more than the maximum number of dots."""
     if len(line) < 2:
         return line
     lengths = np.linalg.norm(np.diff(line, axis=0), axis=1)
     at = np.concatenate([[0.0], np.cumsum(lengths)])
-    wanted = np.linspace(0.0, at[-1], min(int(at[-1] / step) + 2, _MOST_DOTS))
+    wanted = np.linspace(0.0, at[-1], min(int(at[-1] / step) + 2, _MAX_DOTS))
     return np.column_stack([np.interp(wanted, at, line[:, axis]) for axis in range(3)])
 
 
 def compose_worn(bodies: Sequence[Shape], worn: Sequence[Shape]) -> Composition:
-    """Each body with what it wears: grey, and in the first color of labels."""
+    """Each body in grey, with what it wears in the first color of labels."""
     cloth = label_colors(np.zeros(1, np.int64))
     panels = []
     for body, over in zip(bodies, worn, strict=True):
@@ -269,7 +273,7 @@ def compose_worn(bodies: Sequence[Shape], worn: Sequence[Shape]) -> Composition:
     return Composition(tuple(panels))
 
 
-def _with_points(
+def _points_panel(
     shape: Shape, points: Float[Floats, "N 3"], colors: Float[Floats, "N 3"], radius: float | None
 ) -> Panel:
     plain = np.tile(PALE, (shape.V, 1))

@@ -1,7 +1,7 @@
 """Guess which way is up and which side is the front, where the user does not say.
 
-A shape that is tall and would not fall over stands on its feet: its chest gives the lateral axis, its feet the front.
-Everything else stands on the axis that modelling programs call up, with a broad side to the viewer.
+A shape that is tall and would not fall over stands on its feet: its chest gives the lateral axis, its feet the front. Any
+other shape stands on the axis that usually points up in modelling programs, with a broad side to the viewer.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ Rotation = Float[Floats, "3 3"]
 Direction = Float[Floats, " 3"]
 Points = Float[Floats, "N 3"]
 Rotations = tuple[Rotation | None, Rotation | None]
-"""Of source and target into y up, z to the viewer; None where unknown."""
+"""Of source and target, into y up and z to the viewer; None where unknown."""
 
 _AXES = {sign + name: (-1.0 if sign else 1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in ("", "-")}
-_MAX_POINTS = 20_000  # a larger shape is thinned to so many
+_MAX_POINTS = 20_000  # larger shapes are thinned out to this
 # Lengths in units of sqrt(area), tuned on bodies in many poses, quadrupeds and furniture.
-_TALL = 1.05  # minimum height of a standing body
-_BALANCE = -0.03  # how far the center of mass may lie outside the feet: scans are cut
-_BALANCE_USUAL = -0.2  # the same where y or z, the usual axes, point up: people lean while they move
-_SOLE = 0.035  # what is this near the ground carries the shape
+_MIN_HEIGHT = 1.05  # of a standing body
+_MIN_SUPPORT = -0.03  # of the center of mass, negative outside the feet: scans are cut off
+_MIN_SUPPORT_USUAL = -0.2  # where y or z points up, the usual axes: people lean while they move
+_SOLE_HEIGHT = 0.035  # what is this near the ground carries the shape
 _NEAR_AXIS = np.cos(np.radians(35.0))
-_TORSO = 0.2  # half width of the chest without arms
+_TORSO_RADIUS = 0.2  # half width of the chest without arms
 
 
 def facing(shape: Shape, up: str | None = None, front: str | None = None) -> Rotation:
-    """Rotation into y up, z front, by named axes of the file; what is not named is guessed. `OptionError` for an axis
-    other than x, y, z, -x, -y, -z, or the same axis twice.
+    """Rotation into y up, z to the front, by named axes of the file; axes that are not named are guessed. `OptionError` for
+    an axis other than x, y, z, -x, -y, -z, or the same axis twice.
     """
     axes = {name: axis.lstrip("+").lower() for name, axis in (("up", up), ("front", front)) if axis is not None}
     for name, axis in axes.items():
         if axis not in _AXES:
             raise OptionError(f"{name}: invalid axis '{axis}'", f"choose from {', '.join(_AXES)}")
     ahead = _AXES[axes["front"]] if front is not None else None
-    points, weights = _samples(shape)
-    upward, stands = (_AXES[axes["up"]], False) if up is not None else _upward(points, ahead)
+    points, weights = _surface_samples(shape)
+    upward, stands = (_AXES[axes["up"]], False) if up is not None else _guess_up(points, ahead)
     if ahead is None and stands:
-        ahead = _chest(points, weights, upward)
+        ahead = _guess_front(points, weights, upward)
     if ahead is None:
         extents = np.ptp(points, axis=0)
         free = [k for k in range(3) if upward[k] == 0]
@@ -53,12 +53,12 @@ def facing(shape: Shape, up: str | None = None, front: str | None = None) -> Rot
 
 
 def upright(rotation: Rotation) -> Rotation:
-    """The rotation with its up direction snapped to an axis of the file, if it lies near one: the frame of a fit follows
-    the torso, which may lean; files nearly always have an axis that points up.
+    """The rotation with its up direction snapped to an axis of the file, if one is near. The frame of a fit follows the
+    torso, which may lean, but files nearly always have an axis that points up.
     """
     axis = int(np.abs(rotation[1]).argmax())
     upward = np.sign(rotation[1, axis]) * np.eye(3)[axis]
-    return rotation if rotation[1] @ upward < _NEAR_AXIS else _standing(upward, rotation[2])
+    return rotation if rotation[1] @ upward < _NEAR_AXIS else _rotation_from(upward, rotation[2])
 
 
 def same_side(
@@ -69,8 +69,10 @@ def same_side(
     up: str | None = None,
     front: str | None = None,
 ) -> tuple[Rotation, Rotation]:
-    """Rotations of source and target into y up, z to the viewer that show both from the same side: those of fits
-    (`Frame.rotation`), if known; else by the named axes; else the source's by its own shape, the target's by the map.
+    """Rotations of source and target into y up, z to the viewer that show both from the same side.
+
+    Rotations of fits (`Frame.rotation`) are used if known; else the named axes; else the source's follows from its own
+    shape, and the target's from the map.
     """
     first, second = (None if rotation is None else upright(rotation) for rotation in rotations)
     if first is None:
@@ -82,7 +84,7 @@ def same_side(
 
 
 def facing_matched(source: Shape, target: Shape, vertex_map: VertexMap, rotation: Rotation) -> Rotation:
-    """Rotation that shows the target from the side from which ``rotation`` shows the source; that if nothing tells."""
+    """Rotation that shows the target from the side from which ``rotation`` shows the source; ``rotation`` if unknown."""
     known = source.valid
     if not known.any():
         return rotation
@@ -91,7 +93,7 @@ def facing_matched(source: Shape, target: Shape, vertex_map: VertexMap, rotation
     if not (source.is_cloud or target.is_cloud):
         there = target.vertex_normals[vertex_map.index[known]]
         normals = there, source.vertex_normals[known] @ rotation.T
-    # By surface: hands, where vertices are dense, would outweigh the trunk.
+    # Weighted by area: otherwise hands, where vertices are dense, would outweigh the trunk.
     return facing_alike(target, points, seen, source.vertex_areas[known], normals)
 
 
@@ -102,29 +104,30 @@ def facing_alike(
     weights: Float[Floats, " N"] | None = None,
     normals: tuple[Points, Points] | None = None,
 ) -> Rotation:
-    """Rotation that shows a shape from the side from which another one is seen; if it stands by itself, upright. ``points``
-    are of this shape, in its file's frame; ``seen`` the same of the other one, y up and z to the viewer; ``weights`` say
-    how much each counts. Where ``normals`` of both are known these decide: an arm that moves has them on all sides, while
-    its places would turn a body around.
+    """Rotation that shows a shape from the side from which another one is seen; upright, if the shape stands by itself.
+
+    ``points`` are of this shape, in its file's frame; ``seen`` are the corresponding points of the other one, y up and z to
+    the viewer, with ``weights``. Where ``normals`` of both are known these decide: a raised arm has normals on all sides,
+    while its positions would turn a body around.
     """
     weights = (
         np.full(len(points), 1 / len(points)) if weights is None or not weights.sum() > 0 else weights / weights.sum()
     )
     a, b = (each - np.average(each, axis=0, weights=weights) for each in (points, seen))
-    places = (b * weights[:, None]).T @ a
-    sizes = np.linalg.svd(places, compute_uv=False)
+    correlation = (b * weights[:, None]).T @ a
+    sizes = np.linalg.svd(correlation, compute_uv=False)
     if not sizes[1] > 1e-9 * sizes[0]:  # everything was matched to a line or a point
         return facing(shape)
     if normals is None:
-        turn = _nearest_rotation(places)
+        turn = _nearest_rotation(correlation)
     else:
         sides = (normals[1] * weights[:, None]).T @ normals[0]
-        # of two meshes one may be inside out
+        # one of the two meshes may be inside out
         turn = max(
-            (_nearest_rotation(each) for each in (sides, -sides)), key=lambda found: float((found * places).sum())
+            (_nearest_rotation(each) for each in (sides, -sides)), key=lambda found: float((found * correlation).sum())
         )
-    upward, stands = _upward(_samples(shape)[0], None)
-    return _standing(upward, turn[2]) if stands and upward @ turn[1] >= 0.5 else np.asarray(turn)
+    upward, stands = _guess_up(_surface_samples(shape)[0], None)
+    return _rotation_from(upward, turn[2]) if stands and upward @ turn[1] >= 0.5 else np.asarray(turn)
 
 
 def _nearest_rotation(matrix: Float[Floats, "3 3"]) -> Rotation:
@@ -132,15 +135,15 @@ def _nearest_rotation(matrix: Float[Floats, "3 3"]) -> Rotation:
     return np.asarray(left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right)) or 1.0]) @ right)
 
 
-def _standing(upward: Direction, ahead: Direction) -> Rotation:
-    """The rotation whose y is ``upward`` and whose z is the nearest to ``ahead``."""
+def _rotation_from(upward: Direction, ahead: Direction) -> Rotation:
+    """The rotation whose y is ``upward`` and whose z is nearest to ``ahead``."""
     ahead = ahead - (ahead @ upward) * upward
     ahead = ahead / np.linalg.norm(ahead)
     return np.stack([np.cross(upward, ahead), upward, ahead])
 
 
-def _samples(shape: Shape) -> tuple[Points, Float[Floats, " N"]]:
-    """Points all over the surface, centered, in units of sqrt(area), and the share of the area around each."""
+def _surface_samples(shape: Shape) -> tuple[Points, Float[Floats, " N"]]:
+    """Points all over the surface, centered, in units of sqrt(area), and each one's share of the area."""
     if shape.is_cloud:
         points = shape.verts[shape.valid]
         weights = np.ones(len(points))
@@ -155,14 +158,14 @@ def _samples(shape: Shape) -> tuple[Points, Float[Floats, " N"]]:
     return (points - np.average(points, axis=0, weights=weights)) / unit, weights / weights.sum()
 
 
-def _upward(points: Points, ahead: Direction | None) -> tuple[Direction, bool]:
+def _guess_up(points: Points, ahead: Direction | None) -> tuple[Direction, bool]:
     """The axis that points up, and whether the shape stands on it by itself."""
     extents = np.ptp(points, axis=0)
     free = [k for k in range(3) if ahead is None or ahead[k] == 0]
     for axis in sorted(free, key=lambda k: -extents[k] * (1.1 if k == 1 else 1.0)):
         for sign in (1.0, -1.0):
-            minimum = _BALANCE_USUAL if sign > 0 and axis != 0 else _BALANCE
-            if extents[axis] >= _TALL and _support(points, sign * np.eye(3)[axis]) > minimum:
+            minimum = _MIN_SUPPORT_USUAL if sign > 0 and axis != 0 else _MIN_SUPPORT
+            if extents[axis] >= _MIN_HEIGHT and _support(points, sign * np.eye(3)[axis]) > minimum:
                 return sign * np.eye(3)[axis], True
     usual = {1: 0.1, 2: 0.0, 0: -0.4}
     score = {k: usual[k] + 0.3 * extents[k] + float(np.clip(_support(points, np.eye(3)[k]), -0.3, 0.15)) for k in free}
@@ -170,11 +173,11 @@ def _upward(points: Points, ahead: Direction | None) -> tuple[Direction, bool]:
 
 
 def _support(points: Points, upward: Direction) -> float:
-    """How far inside the footprint the center of mass lies; negative: outside."""
+    """Distance of the center of mass from the border of the footprint: positive inside, negative outside."""
     from scipy.spatial import ConvexHull, QhullError
 
     height = points @ upward
-    sole = points[height < height.min() + _SOLE][:, upward == 0]
+    sole = points[height < height.min() + _SOLE_HEIGHT][:, upward == 0]
     try:
         hull = ConvexHull(sole)
     except (QhullError, ValueError):  # a point, or a line
@@ -182,15 +185,15 @@ def _support(points: Points, upward: Direction) -> float:
     return float(-hull.equations[:, 2].max())
 
 
-def _chest(points: Points, weights: Float[Floats, " N"], upward: Direction) -> Direction | None:
-    """Unit vector to the front of a standing body; None if its chest is round."""
+def _guess_front(points: Points, weights: Float[Floats, " N"], upward: Direction) -> Direction | None:
+    """Unit vector to the front of a standing body, by its chest and feet; None if its chest is round."""
     level = np.flatnonzero(upward == 0)
     height = points @ upward
     share = (height - height.min()) / np.ptp(height)
     flat = points[:, level]
     chest = (share > 0.5) & (share < 0.8)
     if chest.sum() >= 20:
-        chest &= np.linalg.norm(flat - np.median(flat[chest], axis=0), axis=1) < _TORSO
+        chest &= np.linalg.norm(flat - np.median(flat[chest], axis=0), axis=1) < _TORSO_RADIUS
     if chest.sum() < 20:
         return None
     spread, axes = np.linalg.eigh(np.cov(flat[chest].T, aweights=weights[chest]))

@@ -16,7 +16,7 @@ from meshmatch.errors import OptionError
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.render import raster
 from meshmatch.render.figures import Figure, Panel, build_figure, rotation_about_x
-from meshmatch.render.scales import Ink, Legend, draw_legend, fitting, legend_height, write
+from meshmatch.render.scales import Ink, Legend, draw_legend, draw_text, fit_text, legend_height
 from meshmatch.render.scene import Ground, Scene
 from meshmatch.shapes.colors import to_linear, to_srgb
 
@@ -133,10 +133,10 @@ def _render(panels: list[Panel], look: Look) -> Image.Image:
     dark = background is not None and np.dot(background, (0.3, 0.59, 0.11)) < 110
     ink: Ink = (226, 228, 232) if dark else (52, 54, 60)
     places = list(zip(names, page.names.tolist(), page.room.tolist(), strict=True))
-    size = min(fitting(name, page.font_size, room)[1] for name, _, room in places)
+    size = min(fit_text(name, page.font_size, room)[1] for name, _, room in places)
     for name, (x, y), room in places:
         if name:
-            write(image, (x, y), fitting(name, size, room)[0], size, ink)
+            draw_text(image, (x, y), fit_text(name, size, room)[0], size, ink)
     if look.legend is not None:
         draw_legend(image, look.legend, page.legend, 0.9 * page.font_size, ink)
     return image

@@ -6,7 +6,16 @@ from PIL import Image
 
 from meshmatch.render import scales as module
 from meshmatch.render.picture import HEIGHT, lay_out
-from meshmatch.render.scales import Scale, Swatches, draw_legend, fitting, legend_height, readable, width_of, write
+from meshmatch.render.scales import (
+    Scale,
+    Swatches,
+    draw_legend,
+    draw_text,
+    fit_text,
+    legend_height,
+    readable,
+    text_width,
+)
 from meshmatch.shapes.colors import label_colors
 
 INK = (10, 20, 30)
@@ -31,24 +40,24 @@ def test_only_letters_that_the_font_has_are_written(given: str, shown: str) -> N
 
 
 def test_long_words_become_small_and_then_short() -> None:
-    text, size = fitting("a name", 20, 1000)
+    text, size = fit_text("a name", 20, 1000)
     assert (text, size) == ("a name", 20)
-    text, size = fitting("a name", 20, width_of("a name", 20) * 0.8)
+    text, size = fit_text("a name", 20, text_width("a name", 20) * 0.8)
     assert text == "a name"
     assert 9 < size < 20
-    text, size = fitting("beginning and some middle and the end" * 3, 20, 100)
+    text, size = fit_text("beginning and some middle and the end" * 3, 20, 100)
     assert size <= 9
-    assert width_of(text, size) <= 100
+    assert text_width(text, size) <= 100
     assert text.startswith("beg")
     assert text.endswith("end")
     assert "…" in text
-    assert width_of(*fitting("w" * 10_000, 20, 100)) <= 100
+    assert text_width(*fit_text("w" * 10_000, 20, 100)) <= 100
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA"])
 def test_letters_have_their_ink(mode: str) -> None:
     image = Image.new(mode, (60, 30), (255, 255, 255) if mode == "RGB" else (0, 0, 0, 0))
-    write(image, (30, 15), "HHH", 20, INK)
+    draw_text(image, (30, 15), "HHH", 20, INK)
     pixels = np.asarray(image)
     solid = (pixels[..., :3] == INK).all(axis=2)
     assert solid.sum() > 30
@@ -61,12 +70,12 @@ def bar(scale: Scale, size: tuple[int, int] = (400, 100)) -> tuple[np.ndarray, l
     """The pixels of a legend, and its words with their x."""
     image = Image.new("RGB", size, "white")
     written: list[tuple[str, float]] = []
-    real = module.write
+    real = module.draw_text
     try:
-        module.write = lambda image, place, text, *rest: written.append((text, place[0]))  # type: ignore[assignment]
+        module.draw_text = lambda image, place, text, *rest: written.append((text, place[0]))  # type: ignore[assignment]
         draw_legend(image, scale, 0, 16, INK)
     finally:
-        module.write = real
+        module.draw_text = real
     return np.asarray(image), written
 
 

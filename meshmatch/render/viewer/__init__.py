@@ -1,1 +1,1 @@
-"""A page that shows two shapes and the map between them; three.js comes with it (see README.md here)."""
+"""HTML pages that show two shapes and the map between them, or one that changes; three.js is included (see README.md)."""

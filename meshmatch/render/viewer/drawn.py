@@ -1,4 +1,4 @@
-"""What a page draws of two shapes, which is less of a large one, and where: both upright and in one scale."""
+"""What a page draws of two shapes (less of a large one), and where: both upright and at one scale."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from meshmatch.shapes.faces import seams
 from meshmatch.shapes.shape import Shape
 
 MOST = 150_000
-"""Vertices up to which a shape is drawn whole."""
+"""Maximum number of vertices of a shape that is drawn completely."""
 _NONE = np.empty(0, np.int64)
-_LEAN = 2 / 3  # of `MOST` is drawn of a larger one
-_NORMAL_WEIGHT = 3.0  # mean edges of the drawn mesh that an opposite normal pushes a vertex away
-_PAIRS = 20_000
-_ODD = 3.0  # more than this between the sizes drawn, and the map is no guide to them
+_REDUCED_SHARE = 2 / 3  # share of `MOST` that is drawn of a larger shape
+_NORMAL_WEIGHT = 3.0  # distance of opposite normals in the search for the nearest vertex, in mean edges drawn
+_MAX_PAIRS = 20_000
+_MAX_RATIO = 3.0  # between the sizes drawn; beyond, the map is not used for them
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """The part of a shape that is drawn, in the file's own frame and unit.
+    """The part of a shape that is drawn, in the file's frame and unit.
 
-    ``faces`` is empty where points are drawn. ``normals`` are the same on both sides of a texture seam, zeros where there
-    is none. ``vertex`` is the vertex of the file that each row stands for, ``file_face`` the face of the file that each
-    triangle is: empty where the surface is drawn coarser. ``note`` says what was left out, if anything.
+    ``faces`` is empty where points are drawn. ``normals`` are equal on both sides of a texture seam, zeros where there is
+    none. ``vertex`` is the vertex of the file for each row; ``file_face`` the face of the file for each triangle, empty
+    where a decimated surface is drawn. ``note`` says what was left out, if anything.
     """
 
     verts: Float[Floats, "N 3"]
@@ -43,7 +43,7 @@ class Drawn:
 
     @property
     def radius(self) -> float:
-        """Half the way from a point to its sixth nearest: balls that nearly touch. 0 for triangles."""
+        """Half the median distance to the fifth neighbor, for balls that nearly touch; 0 for triangles."""
         if len(self.faces) or len(self.verts) < 2:
             return 0.0
         some = self.verts[:: max(1, len(self.verts) // 2_000)]
@@ -52,19 +52,19 @@ class Drawn:
 
     @cached_property
     def used(self) -> Int[Ints, " U"]:
-        """Rows that can be seen: those of a face, or every point."""
+        """Rows that are visible: those of a face, or every point."""
         return corners_of(self.faces) if len(self.faces) else np.arange(len(self.verts))
 
 
 def draw(shape: Shape, most: int = MOST) -> Drawn:
-    """What to draw of a shape: no vertex without a position, and of more than `most` a coarser surface."""
+    """Select what to draw of a shape: no vertices without a position, and a decimated surface above `most` vertices."""
     valid = shape.valid
-    if not valid.any():  # nothing but stand-ins: still a page
+    if not valid.any():  # placeholders only: still write a page
         valid[:] = True
     sound = np.flatnonzero(valid[shape.faces].all(axis=1))
     faces = shape.faces[sound]
     if len(faces) == 0:
-        return _some_points(shape, np.flatnonzero(valid), most)
+        return _draw_points(shape, np.flatnonzero(valid), most)
     joined = seams(shape.verts, faces)
     smooth = Shape(shape.verts, joined[faces]).vertex_normals[joined]
     if shape.V <= most:
@@ -72,11 +72,11 @@ def draw(shape: Shape, most: int = MOST) -> Drawn:
     kept = corners_of(joined[faces])
     number = np.empty(shape.V, np.int64)
     number[kept] = np.arange(len(kept))
-    coarse = decimate(Shape(shape.verts[kept], number[joined[faces]]), 2 * int(_LEAN * most))
+    coarse = decimate(Shape(shape.verts[kept], number[joined[faces]]), 2 * int(_REDUCED_SHARE * most))
     used = corners_of(faces)
-    if coarse.V > most:  # nothing that holds together: a heap of single triangles
-        return _some_points(shape, used, most)
-    # Each vertex of the coarse mesh stands for the nearest one of the file that faces the same way.
+    if coarse.V > most:  # single triangles that are not connected cannot be decimated
+        return _draw_points(shape, used, most)
+    # Each vertex of the coarse mesh stands for the nearest one of the file with a similar normal.
     edges = coarse.verts[coarse.faces] - coarse.verts[np.roll(coarse.faces, 1, axis=1)]
     weight = _NORMAL_WEIGHT * float(np.linalg.norm(edges, axis=2).mean()) / 2
     tree = cKDTree(np.hstack([shape.verts[used], weight * smooth[used]]))
@@ -85,10 +85,10 @@ def draw(shape: Shape, most: int = MOST) -> Drawn:
     return Drawn(coarse.verts, coarse.faces, coarse.vertex_normals, vertex, _NONE, note)
 
 
-def _some_points(shape: Shape, rows: Int[Ints, " N"], most: int) -> Drawn:
+def _draw_points(shape: Shape, rows: Int[Ints, " N"], most: int) -> Drawn:
     note, count = "", len(rows)
     if count > most:
-        rows = rows[np.linspace(0, count - 1, int(_LEAN * most)).astype(np.int64)]
+        rows = rows[np.linspace(0, count - 1, int(_REDUCED_SHARE * most)).astype(np.int64)]
         note = f"drawn with {len(rows):,} of {count:,} points"
     none = np.empty((0, 3), np.int64)
     verts = shape.verts[rows]
@@ -97,7 +97,7 @@ def _some_points(shape: Shape, rows: Int[Ints, " N"], most: int) -> Drawn:
 
 
 def span(points: Float[Floats, "N 3"]) -> tuple[Float[Floats, " 3"], float, dict[str, list[float]]]:
-    """The lowest corner of the cube around points, its edge, and its words on a page where the edge is 1 long."""
+    """The lowest corner of the cube around points, its edge, and its description for a page where the edge is 1 long."""
     low, extent = points.min(axis=0), np.ptp(points, axis=0)
     edge = float(extent.max()) or 1.0
     return low, edge, {"low": (-extent / edge / 2).round(6).tolist(), "extent": (extent / edge).round(6).tolist()}
@@ -107,8 +107,8 @@ def span(points: Float[Floats, "N 3"]) -> tuple[Float[Floats, " 3"], float, dict
 class Box:
     """The cube in which a shape is drawn.
 
-    ``rotation`` is from the file's axes to y up, z to the front; ``low`` its lowest corner, turned, and ``edge`` its
-    edge, both in the file's unit; ``size`` its edge on the page, where one unit is the same for both shapes.
+    ``rotation`` leads from the file's axes to y up, z to the front; ``low`` is the lowest corner, rotated, and ``edge`` the
+    edge, both in the file's unit; ``size`` is the edge on the page, in a unit that is the same for both shapes.
     """
 
     rotation: Float[Floats, "3 3"]
@@ -117,37 +117,39 @@ class Box:
     size: float
 
     def place(self, points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
-        """Points of the file, 0..1 in the cube; what lies outside comes to its side."""
+        """Points of the file as 0..1 in the cube, clipped to it."""
         return np.asarray(np.clip((points @ self.rotation.T - self.low) / self.edge, 0.0, 1.0))
 
 
 def boxes(
     shapes: tuple[Shape, Shape], drawn: tuple[Drawn, Drawn], there: VertexMap, rotations: tuple[Floats, Floats]
 ) -> list[Box]:
-    """A cube for each of two shapes, in one scale as far as the map can tell."""
+    """A cube for each of two shapes, at a common scale as far as the map gives it."""
     ratio = relative_size(*shapes, there)
     if there.verdict == "poor":
         ratio = float(np.sqrt(shapes[1].area / shapes[0].area)) if min(s.area for s in shapes) > 0 else 1.0
     turned = [part.verts[part.used] @ turn.T for part, turn in zip(drawn, rotations, strict=True)]
     edges = [float(np.ptp(verts, axis=0).max()) or 1.0 for verts in turned]
     sizes = [edges[0], edges[1] / ratio]
-    if not 1 / _ODD < sizes[0] / sizes[1] < _ODD:
+    if not 1 / _MAX_RATIO < sizes[0] / sizes[1] < _MAX_RATIO:
         sizes = [1.0, 1.0]
     lows = [(verts.min(axis=0) + verts.max(axis=0)) / 2 - edge / 2 for verts, edge in zip(turned, edges, strict=True)]
     return [Box(rotations[k], lows[k], edges[k], sizes[k] / max(sizes)) for k in (0, 1)]
 
 
 def relative_size(source: Shape, target: Shape, there: VertexMap) -> float:
-    """Length on the target of what has length 1 on the source: by short distances, which a pose hardly changes, where the
-    map is confident, without those that it has torn; 1 where no pair of vertices tells.
+    """Length on the target of what has length 1 on the source; 1 if that is unknown.
+
+    It is measured over short distances, which poses hardly change, weighted by the map's confidence, without those that the
+    map tears.
     """
     if source.is_cloud:
-        some = np.arange(source.V)[:: max(1, source.V // _PAIRS)]
-        near = cKDTree(source.verts).query(source.verts[some], k=min(9, source.V))[1].reshape(len(some), -1)
-        pairs = np.stack([some, near[:, -1]], axis=1)
+        sample = np.arange(source.V)[:: max(1, source.V // _MAX_PAIRS)]
+        near = cKDTree(source.verts).query(source.verts[sample], k=min(9, source.V))[1].reshape(len(sample), -1)
+        pairs = np.stack([sample, near[:, -1]], axis=1)
     else:
         pairs = source.edges.vertices
-        pairs = pairs[:: max(1, len(pairs) // _PAIRS)]
+        pairs = pairs[:: max(1, len(pairs) // _MAX_PAIRS)]
     points = there.points(target)
     own = np.linalg.norm(source.verts[pairs[:, 0]] - source.verts[pairs[:, 1]], axis=1)
     image = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
@@ -157,8 +159,8 @@ def relative_size(source: Shape, target: Shape, there: VertexMap) -> float:
 
 
 def upright(source: Shape, target: Shape, there: VertexMap, given: Rotations = (None, None)) -> tuple[Floats, Floats]:
-    """Rotations (3, 3) of both shapes to y up, z front. Unless they are given, the source's is guessed, and the target's
-    shows matched points from the same side; with a poor map it is that of the source.
+    """Rotations (3, 3) of both shapes to y up, z front. Unless given, the source's is guessed, and the target's shows
+    matched points from the same side; with a poor map it is the source's.
     """
     own = np.asarray(facing(source) if given[0] is None else given[0], np.float64)
     if given[1] is not None:

@@ -1,4 +1,4 @@
-"""The looks of two shapes on a page: the one that a file has, and the same transferred to the other shape by the map."""
+"""Appearance of two shapes on a page: that of one file, on its shape and transferred to the other by the map."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ Arrays = dict[str, NDArray[Any]]
 TEXELS = 1024
 """Width and height of a texture that is baked for a page."""
 MOST_FACES = 40_000
-"""A finer mesh has vertex colors instead: they show nearly as much, and unwrapping it would take a minute."""
+"""A finer mesh gets vertex colors instead: they show nearly as much, and unwrapping it would take a minute."""
 LARGEST = 2048
-"""Pixels along an image's longer side; a larger one is made smaller."""
+"""Maximum length in pixels of an image's longer side; larger images are reduced."""
 MOST_PIXELS = 3 * LARGEST**2
-"""Of all images of one look together."""
-_DRAWN = 256  # pixels along a side up to which an image is kept without loss: it may be drawn by hand
+"""Maximum number of pixels of all images of one look together."""
+_LOSSLESS_SIZE = 256  # pixels along a side up to which an image is kept without loss: it may be drawn by hand
 
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """The look of the shape on ``side`` as both are ``shown`` with it; ``own`` is the other's, if its file has one."""
+    """The look of the shape on ``side``, as ``shown`` on both shapes; ``own`` is the other shape's, if its file has one."""
 
     side: Literal["source", "target"]
     shown: tuple[Appearance, Appearance]
@@ -44,13 +44,13 @@ class Looks:
 
     @property
     def words(self) -> dict[str, Any]:
-        """What the page's buttons and legend say."""
+        """What the page's buttons and legend say, as JSON."""
         textured = self.shown[self.side == "target"].textured
         kind = "texture" if textured else "colors"
         return {"look": {"kind": kind, "side": self.side}, "own": self.own is not None}
 
     def of(self, k: int) -> list[tuple[str, Appearance]]:
-        """The looks of one shape (0 the source, 1 the target), each with its name in the page."""
+        """The looks of one shape (0 the source, 1 the target), each with its key in the page."""
         found = [("look", self.shown[k])]
         if self.own is not None:
             found.append(("own", self.shown[k] if k == (self.side == "target") else self.own))
@@ -66,23 +66,24 @@ def share_look(
     coordinates: tuple[Floats | None, Floats | None] = (None, None),
     workers: int = 1,
 ) -> Looks | None:
-    """The source's look on both shapes; the target's if the source has none; None if neither has one. ``own`` is what
-    source and target have in their files, and ``coordinates`` (F, 3, 2) the texture coordinates there, which are baked
-    to where they serve. The maps are from source to target, and from target to source.
+    """The source's look on both shapes; the target's if the source has none; None if neither has one.
+
+    ``own`` are the looks of source and target in their files, and ``coordinates`` (F, 3, 2) their texture coordinates, which
+    are baked to where they are valid. The maps go from source to target, and from target to source.
     """
     source, target = shapes
     first, second = own
     if first is not None:
-        return Looks("source", (first, _transferred(first, source, target, back, coordinates[1], workers)), second)
+        return Looks("source", (first, _transfer_look(first, source, target, back, coordinates[1], workers)), second)
     if second is not None:
-        return Looks("target", (_transferred(second, target, source, there, coordinates[0], workers), second))
+        return Looks("target", (_transfer_look(second, target, source, there, coordinates[0], workers), second))
     return None
 
 
-def _transferred(
+def _transfer_look(
     look: Appearance, source: Shape, target: Shape, back: VertexMap, coordinates: Floats | None, workers: int
 ) -> Appearance:
-    """The source's look on the target, by a map from target to source: baked, or as colors of vertices."""
+    """The source's look on the target, by a map from target to source: as a baked texture, or as vertex colors."""
     material = np.zeros(target.F, np.int64)
     if look.textured and 0 < target.F <= MOST_FACES:
         options = BakeOptions(size=TEXELS, padding=4, workers=workers)
@@ -92,16 +93,24 @@ def _transferred(
         except InputError:  # it has no area, or cannot be unwrapped
             pass
         else:
-            made = baked.material
-            texture = Material("", made.color, wrap=("clamp", "clamp"), alpha=made.alpha, cutoff=made.cutoff)
+            baked_material = baked.material
+            texture = Material(
+                "",
+                baked_material.color,
+                wrap=("clamp", "clamp"),
+                alpha=baked_material.alpha,
+                cutoff=baked_material.cutoff,
+            )
             return Appearance((texture,), material, atlas.uv)
     colors = colors_of_vertices(source, look, target, back)
     return Appearance((Material(),), material, np.zeros((target.F, 3, 2)), colors)
 
 
 def look_arrays(look: Appearance, shape: Shape, part: Drawn) -> tuple[Arrays, dict[str, Any] | None]:
-    """Arrays and words of a look on what is drawn of a shape: a textured mesh where there is an image and the triangles
-    are the file's own; else ``paint`` (N, 3), a color for each vertex that is drawn, without words.
+    """Arrays and words of a look for the drawn part of a shape.
+
+    A textured mesh if there are several materials or an image, and the triangles are the file's own; else only ``paint``
+    (N, 3), a color for each drawn vertex, without words.
     """
     if len(part.file_face) and (look.textured or len(look.materials) > 1):
         return _textured_mesh(look, part)
@@ -113,10 +122,11 @@ def look_arrays(look: Appearance, shape: Shape, part: Drawn) -> tuple[Arrays, di
 
 
 def _textured_mesh(look: Appearance, part: Drawn) -> tuple[Arrays, dict[str, Any]]:
-    """A textured mesh as the page has it. Arrays: ``vertex`` (S,) the row of the shape that is drawn, ``uv`` (S, 2),
-    ``face`` (M, 3) of these S, by material; ``paint`` (S, 3) where vertex colors are to be multiplied; ``image0``,
-    ``image1``...: bytes of files. Words: ``groups``, which faces have which material, and ``images``, the kinds of the
-    files.
+    """A textured mesh for a page.
+
+    Arrays: ``vertex`` (S,) the drawn row of the shape, ``uv`` (S, 2), ``face`` (M, 3) indices of these S, sorted by
+    material; ``paint`` (S, 3) vertex colors to multiply with, if any; ``image0``, ``image1``...: bytes of files. Words:
+    ``groups``, the faces of each material, and ``images``, the media types of the files.
     """
     material = look.material[part.file_face]
     order = np.argsort(material, kind="stable")
@@ -159,7 +169,7 @@ def _textured_mesh(look: Appearance, part: Drawn) -> tuple[Arrays, dict[str, Any
 
 
 def _encoded(pixels: Pixels, shrink: float, opaque: bool) -> tuple[str, bytes]:
-    """Media type and bytes of an image file: PNG where it is small or has alpha, else JPEG."""
+    """Media type and bytes of an image file: PNG if it is small or has alpha, else JPEG."""
     height, width = pixels.shape[:2]
     scale = shrink * min(1.0, LARGEST / max(height, width))
     if opaque:
@@ -167,7 +177,7 @@ def _encoded(pixels: Pixels, shrink: float, opaque: bool) -> tuple[str, bytes]:
     if scale < 1.0:
         size = max(1, round(width * scale)), max(1, round(height * scale))
         pixels = np.asarray(Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS))
-    if not opaque or max(pixels.shape[:2]) <= _DRAWN:
+    if not opaque or max(pixels.shape[:2]) <= _LOSSLESS_SIZE:
         return "image/png", png_bytes(pixels)
     out = BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels[..., :3])).save(out, format="JPEG", quality=90)

@@ -23,7 +23,7 @@ SCRIPTS = ("data", "picking", "materials", "drawing", "cameras", "points", "word
 
 @dataclass(frozen=True, eq=False)
 class PageReport:
-    """What went into a page: how many vertices of each shape are drawn, what was left out, its bytes."""
+    """What went into a page: vertices drawn of each shape, notes on what was left out, and the size in bytes."""
 
     drawn: tuple[int, int]
     notes: tuple[str, ...]
@@ -43,12 +43,12 @@ def write_page(
 ) -> PageReport:
     """Write a page that shows two shapes side by side, and for each point of one its match on the other.
 
-    The source is colored by position, the target by its colors carried along the map. The same input gives the same
-    bytes. ``rotations`` are as `Frame.rotation` of a fit; the source's is guessed if not given, and the target's then
-    follows from the map. ``names`` are shown instead of the shapes' own, and ``looks`` by a button.
+    The source is colored by position, the target by the source's colors transferred along the map. The same input gives the
+    same bytes. ``rotations`` are as the `Frame.rotation` of fits; by default the source's is guessed, and the target's
+    follows from the map. ``names`` are shown instead of the shapes' own, and ``looks`` can be switched on by a button.
 
-    `OptionError` for a suffix that is no page's, `InputError` for a map that is not of these shapes, `OutputError` where
-    the file cannot be written.
+    `OptionError` for a suffix other than of pages, `InputError` for a map that is not of these shapes, `OutputError` if the
+    file cannot be written.
     """
     check_page(path)
     there, back = there.for_shapes(source, target), back.for_shapes(target, source, "the map back")
@@ -63,7 +63,7 @@ def write_page(
     words: dict[str, Any] = {}
     for k, side in enumerate(("source", "target")):
         part, box, rows = parts[k], cubes[k], parts[k].vertex
-        own = {  # a row for each vertex that is drawn (see `drawing.js`)
+        own = {  # a row for each drawn vertex (see `drawing.js`)
             "position": scaled(box.place(part.verts), np.uint16),
             "normal": scaled(part.normals @ box.rotation.T, np.int8),
             "color": scaled(tints[k][rows], np.uint8),
@@ -80,7 +80,7 @@ def write_page(
             own |= {f"{name}.{key}": array for key, array in shown_arrays.items()}
         arrays |= {f"{side}.{name}": array for name, array in own.items()}
     words |= {"look": None, "own": False} if looks is None else looks.words
-    # Files of indices alone were once read as confident everywhere: that says nothing.
+    # Files with indices alone were once read with confidence 1 everywhere, which means that it is unknown.
     known = not np.isnan(there.confidence).any() and (there.verdict != "unknown" or bool((there.confidence < 1).any()))
     words |= {
         "verdict": there.verdict,
@@ -94,7 +94,7 @@ def write_page(
 
 
 def _words(shape: Shape, name: str, part: Drawn, box: Box) -> dict[str, Any]:
-    """Sizes are in units of the page, the same for both shapes."""
+    """Description of one shape for the page; sizes are in units of the page, the same for both shapes."""
     scale = box.size / box.edge
     extent = np.ptp(part.verts[part.used] @ box.rotation.T, axis=0) * scale
     return {

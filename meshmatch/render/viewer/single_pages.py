@@ -1,4 +1,4 @@
-"""Pages of one shape that changes: in motion, or by a slider for each of its modes of variation."""
+"""Pages of one shape that changes: in motion, or with a slider for each of its modes of variation."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from meshmatch.shapes.faces import seams
 from meshmatch.shapes.shape import Shape
 
 MOST_MODES = 12
-"""Of an atlas with more modes the page shows the first."""
+"""A page shows only the first modes of an atlas with more."""
 MOST_PLACES = 4_000_000
-"""Vertices times frames, or modes, up to which a shape is drawn whole."""
-_RAMP = 33  # colors
+"""Maximum number of vertices, times frames or modes, of a shape that is drawn completely."""
+_RAMP = 33  # number of colors
 
 
 def write_motion(
@@ -36,13 +36,13 @@ def write_motion(
     title: str = "",
     most: int = MOST,
 ) -> int:
-    """Write a page on which a shape goes through frames; how many bytes it has. The same input gives the same bytes.
+    """Write a page on which a shape moves through frames; return its size in bytes. The same input gives the same bytes.
 
-    The ``frames`` are at least two shapes with the same vertices and faces, in one frame and unit, each with its time,
-    which increase; the first gives the colors. ``rotation`` leads from there into y up, z to the front. ``met`` are names
-    to show at some of the times. Up to ``most`` vertices are drawn, and fewer where there are many frames.
+    ``frames`` are at least two shapes with the same vertices and faces, in one frame and unit, with increasing ``times``;
+    the first gives the colors. ``rotation`` leads into y up, z to the front. ``met`` are names to show at some of the times.
+    Up to ``most`` vertices are drawn, and fewer with many frames.
 
-    `OptionError` for a suffix that is no page's, and for other frames or times; `OutputError` where the file cannot be
+    `OptionError` for a suffix other than of pages, and for invalid frames or times; `OutputError` if the file cannot be
     written.
     """
     check_page(path)
@@ -55,8 +55,8 @@ def write_motion(
     rows, faces = part.vertex, part.faces
     turned = [shape.verts[rows] @ rotation.T for shape in frames]
     low, edge, cube = span(np.concatenate([verts[part.used] for verts in turned]))
-    normals = [np.zeros_like(verts) for verts in turned]  # of points, which then face the viewer
-    if len(faces):  # the same on both sides of a seam
+    normals = [np.zeros_like(verts) for verts in turned]  # of points, which face the viewer then
+    if len(faces):  # equal on both sides of a seam
         joined = seams(turned[0], faces)
         normals = [Shape(verts, joined[faces]).vertex_normals[joined] for verts in turned]
     colors = np.tile(CLAY, (first.V, 1)) if first.colors is None else first.colors[:, :3]
@@ -77,9 +77,11 @@ def write_motion(
 
 @dataclass(frozen=True, eq=False)
 class Varying:
-    """A mean shape and how it varies: M modes, each a displacement (V, 3) by one standard deviation, and which ``shares``
-    (M,) of the variance they explain; the ``scores`` (S, M) of known shapes, in standard deviations, and their names.
-    ``figures`` are files (.png, .svg) of pictures and charts of it.
+    """A mean shape and how it varies.
+
+    ``modes`` are displacements (M, V, 3) by one standard deviation each, and ``shares`` (M,) the shares of the variance that
+    they explain; ``scores`` (S, M) are those of known shapes, in standard deviations, with their ``names``. ``figures`` are
+    files (.png, .svg) of pictures and charts to show.
     """
 
     mean: Shape
@@ -93,11 +95,11 @@ class Varying:
 def write_atlas_page(
     path: str | Path, atlas: Varying, *, rotation: Float[Floats, "3 3"], title: str = "", most: int = MOST
 ) -> int:
-    """Write a page on which sliders vary a shape, colored by its distance from the mean; how many bytes it has.
+    """Write a page on which sliders vary a shape, colored by its distance from the mean; return its size in bytes.
 
-    The same input gives the same bytes. ``rotation`` leads into y up, z to the front. Up to ``most`` vertices are drawn,
-    fewer of a shape with many modes. `OptionError` for a suffix that is no page's, and for a mean that has no surface or
-    no modes; `OutputError` where the file cannot be written.
+    The same input gives the same bytes. ``rotation`` leads into y up, z to the front. Up to ``most`` vertices are drawn, and
+    fewer with many modes. `OptionError` for a suffix other than of pages, and for a mean without a surface or without modes;
+    `OutputError` if the file cannot be written.
     """
     check_page(path)
     count = min(len(atlas.modes), MOST_MODES)
@@ -108,7 +110,7 @@ def write_atlas_page(
     modes = atlas.modes[:count, part.vertex] @ rotation.T
     low, edge, cube = span(np.concatenate([mean, *(mean + sign * mode for mode in modes for sign in (-2, 2))]))
     reach = np.abs(modes).max(axis=(1, 2))
-    # Colors reach as far as two standard deviations of the first mode do.
+    # The color scale reaches to two standard deviations of the first mode.
     scale = Scale.of(2 * np.linalg.norm(atlas.modes[0], axis=1))
     arrays: dict[str, NDArray[Any]] = {
         "position": scaled((mean - low) / edge, np.uint16),
@@ -126,14 +128,14 @@ def write_atlas_page(
         "high": f"{scale.high:.4g}",
         "ramp": Scale(0.0, 1.0).colors(np.linspace(0, 1, _RAMP)).round(4).tolist(),
         "clay": list(CLAY),
-        "figures": [[plain_text(figure.stem), _address(figure)] for figure in atlas.figures],
+        "figures": [[plain_text(figure.stem), _data_url(figure)] for figure in atlas.figures],
     }
     note = f"{len(atlas.names):,} shapes, {part.note or f'{atlas.mean.V:,} vertices'}"
     return _write(path, "atlas", title, note, words | cube, arrays)
 
 
-def _address(figure: Path) -> str:
-    """A picture as an address that holds it."""
+def _data_url(figure: Path) -> str:
+    """A picture file as a data URL."""
     kind = {".png": "image/png", ".svg": "image/svg+xml"}[figure.suffix]
     return f"data:{kind};base64,{base64.b64encode(figure.read_bytes()).decode('ascii')}"
 
