@@ -46,8 +46,8 @@ class Look:
 
     ``size`` is the width and height of the picture in pixels; by default it is `HEIGHT` high and as wide as the shapes need.
     ``background`` is "white", "dark", "transparent", or a color as #rrggbb. ``up`` and ``front`` are the file's axes that
-    point up and to the front of the shape: x, y, z, -x, -y or -z. By default they are guessed from the extents (the longest
-    points up, the shortest to the front; signs cannot be guessed). ``turn`` and ``tilt`` are degrees by which shapes are
+    point up and to the front of the shape: x, y, z, -x, -y or -z. By default they are guessed from the shape (see
+    `meshmatch.render.facing`); name them where the guess is wrong. ``turn`` and ``tilt`` are degrees by which shapes are
     rotated to their own left, and tilted towards the viewer; 0, 0 is the front. ``ground``: whether shapes cast a shadow on
     the ground. ``legend`` explains the colors.
     """

@@ -197,7 +197,7 @@ def transfer_tiles(
 
 
 def contradicted(source: Shape, look: Appearance, target: Shape, back: VertexMap, atlas: Atlas) -> float:
-    """Share of the surface that contradicts its image, of what shares its places there with other parts of the surface."""
+    """Share, by area, of the faces that share their place in the image with another one, whose colors differ from its."""
     walker, look = _prepare_source(source, look)
     locator, sampler = TexelLocator(walker, target, back, atlas.uv * _COMPARE_SIZE), MaterialSampler(look, walker)
     face_at = draw_triangles(atlas.uv * _SEARCH_SIZE, _SEARCH_SIZE)[0]
@@ -244,18 +244,18 @@ def _apply_finish(plain: BakedMaterial, look: Appearance, images: dict[Layer, Pi
     finish = look.finish
     if finish is None:
         return plain
-    made = replace(plain, double_sided=finish.double_sided, unlit=finish.unlit, normal=images.get("normal"))
+    material = replace(plain, double_sided=finish.double_sided, unlit=finish.unlit, normal=images.get("normal"))
     if "surface" in images:
-        made = replace(made, surface=images["surface"], occluded=finish.occluded, roughness=1.0, metal=1.0)
+        material = replace(material, surface=images["surface"], occluded=finish.occluded, roughness=1.0, metal=1.0)
     if finish.even:
         _, roughness, metal, _ = _factor(finish.layers["surface"])
-        made = replace(made, even="surface" in images, roughness=roughness, metal=metal)
+        material = replace(material, even="surface" in images, roughness=roughness, metal=metal)
     if "glow" in images:
-        return replace(made, glow=images["glow"], light=(finish.light,) * 3)
+        return replace(material, glow=images["glow"], light=(finish.light,) * 3)
     if "glow" in finish.layers:
         red, green, blue = (finish.light * share for share in _factor(finish.layers["glow"])[:3])
-        return replace(made, light=(red, green, blue))
-    return made
+        return replace(material, light=(red, green, blue))
+    return material
 
 
 def _factor(layer: Appearance) -> tuple[float, float, float, float]:
@@ -319,12 +319,8 @@ def _paint_rows(
     size = options.size
     samplers = [sampler for painter in painters for sampler in painter.samplers]
     above, below = max(rows.start - 1, 0), min(rows.stop + 1, size)  # with the adjacent rows, to detect seams
-    offset, n_texels = above * size, (below - above) * size
-    chart, start_face, is_coarse = (
-        np.full(n_texels, -1, np.int32),
-        np.full(n_texels, -1, np.int32),
-        np.zeros(n_texels, bool),
-    )
+    offset, N = above * size, (below - above) * size
+    chart, start_face, is_coarse = (np.full(N, -1, np.int32), np.full(N, -1, np.int32), np.zeros(N, bool))
     texels = offset + np.flatnonzero(face_at[offset : below * size] >= 0)
     inner = (texels >= rows.start * size) & (texels < rows.stop * size)
 

@@ -162,8 +162,8 @@ def _smooth_regions(surface: _Surface, region: Ints, steps: int) -> Int[Ints, " 
     """Smooth the borders of regions: shares diffuse over edges, and each triangle takes the region with the largest."""
     F = len(region)
     graph = surface.graph(surface.length)
-    around = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1e-300)
-    spread = coo_array((0.5 / around, (np.arange(F), np.arange(F)))).tocsr() @ graph
+    perimeter = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1e-300)
+    spread = coo_array((0.5 / perimeter, (np.arange(F), np.arange(F)))).tocsr() @ graph
     share = coo_array((np.ones(F), (np.arange(F), region)), shape=(F, int(region.max()) + 1)).tocsr()
     for _ in range(steps):
         share = 0.5 * share + spread @ share
@@ -222,11 +222,11 @@ def _connect_regions(surface: _Surface, region: Ints, most: float = np.inf) -> I
     return part
 
 
-def _heaviest_column(shares: coo_array, now: Ints) -> Int[Ints, " N"]:
-    """The column with the largest sum in each row; `now` where a row is empty."""
+def _heaviest_column(shares: coo_array, default: Ints) -> Int[Ints, " N"]:
+    """The column with the largest sum in each row; `default` where a row is empty."""
     sums = shares.tocsr()
     sums.sum_duplicates()
-    out, rows = now.copy(), np.repeat(np.arange(len(now)), np.diff(sums.indptr))
+    out, rows = default.copy(), np.repeat(np.arange(len(default)), np.diff(sums.indptr))
     order = np.lexsort((sums.data, rows))
     last = np.flatnonzero(np.append(rows[order][1:] != rows[order][:-1], True)) if len(order) else order
     out[rows[order][last]] = sums.indices[order][last]
@@ -270,7 +270,7 @@ def _split_until_flat(surface: _Surface, region: Ints, max_stretch: float, polyg
         elif len(bad):
             new[bad] = new.max() + 1
         if (new == region).all() and not len(bad):
-            return [Chart(members, own.uv, own.corners) for members, own in zip(parts, layouts, strict=True) if own]
+            return [Chart(members, flat.uv, flat.corners) for members, flat in zip(parts, layouts, strict=True) if flat]
         iteration, region = (
             iteration + 1,
             _connect_regions(surface, new, 0.0 if iteration >= _REASSIGN_ROUNDS else 0.5 * _CRUMB_AREA * surface.total),
@@ -287,17 +287,17 @@ class _LayoutCache:
 
     def layout(self, members: Ints) -> Layout | None:
         """Flatten a region; None if that fails. A single polygon is unfolded triangle by triangle."""
-        whole = self.polygons[members]
-        if (whole == whole[0]).all():
+        polygon = self.polygons[members]
+        if (polygon == polygon[0]).all():
             unfolded = unfold_polygon(self.surface.verts, self.surface.faces[members])
             return Layout(*unfolded, np.ones(len(members), bool), np.empty(0, np.int64))
         home = int(self.home[members[0]])
         if home >= 0 and (self.home[members] == home).all():
-            whole, known = self.layouts[home]
-            if len(whole) == len(members):
+            polygon, known = self.layouts[home]
+            if len(polygon) == len(members):
                 return known
             if known is not None:
-                return self._keep(members, known.only(np.searchsorted(whole, members), self.surface.texels))
+                return self._keep(members, known.only(np.searchsorted(polygon, members), self.surface.texels))
         return self._keep(members, self.surface.flatten(members, self.max_stretch))
 
     def _keep(self, members: Ints, layout: Layout | None) -> Layout | None:
@@ -318,9 +318,9 @@ def _add_rings(surface: _Surface, region: Ints, faces: Ints, rings: int) -> Ints
     same = region[surface.face_a] == region[surface.face_b]
     one, two = surface.face_a[same], surface.face_b[same]
     for _ in range(rings):
-        beside = np.zeros(len(region), bool)
-        beside[one[marked[two]]] = beside[two[marked[one]]] = True
-        marked |= beside
+        neighbors = np.zeros(len(region), bool)
+        neighbors[one[marked[two]]] = neighbors[two[marked[one]]] = True
+        marked |= neighbors
     return np.flatnonzero(marked)
 
 
@@ -328,17 +328,17 @@ def _reassign(surface: _Surface, region: Ints, faces: Ints, polygons: Ints) -> I
     """Give faces, a polygon at a time, to the neighboring region across their longest border, where there is one."""
     one, two = (np.concatenate(ends) for ends in ((surface.face_a, surface.face_b), (surface.face_b, surface.face_a)))
     length = np.concatenate([surface.length, surface.length])
-    left = np.zeros(len(region), bool)
-    left[faces] = True
+    remaining = np.zeros(len(region), bool)
+    remaining[faces] = True
     K = int(polygons.max()) + 1, int(region.max()) + 1
     for _ in range(_REASSIGN_ROUNDS):
-        meets = left[one] & ~left[two] & (region[one] != region[two])
+        meets = remaining[one] & ~remaining[two] & (region[one] != region[two])
         shares = coo_array((length[meets], (polygons[one[meets]], region[two[meets]])), shape=K)
-        taker = _heaviest_column(shares, np.full(K[0], -1))[polygons]
-        taken = left & (taker >= 0)
-        if not taken.any():
+        new_region = _heaviest_column(shares, np.full(K[0], -1))[polygons]
+        reassigned = remaining & (new_region >= 0)
+        if not reassigned.any():
             break
-        region, left = np.where(taken, taker, region), left & ~taken
+        region, remaining = np.where(reassigned, new_region, region), remaining & ~reassigned
     return region
 
 
@@ -353,15 +353,15 @@ def _bisect(surface: _Surface, members: Ints, polygons: Ints, pair: tuple[int, i
         return np.arange(len(members))
     part = _Surface(surface.verts, surface.faces[members], surface.texels)
     if pair is not None:
-        away = np.linalg.norm(part.centers[part.face_a] - part.centers[part.face_b], axis=1)
-        source = dijkstra(part.graph(away + 1e-9), indices=pair, min_only=True, return_predecessors=True)[2]
+        length = np.linalg.norm(part.centers[part.face_a] - part.centers[part.face_b], axis=1)
+        source = dijkstra(part.graph(length + 1e-9), indices=pair, min_only=True, return_predecessors=True)[2]
         half = np.asarray(source == pair[0]).astype(np.int64)[first][number]
         if half.min() < half.max():
             return half
     for values, least in ((part.normals, 0.1), (part.centers, 1e-3)):
-        about = values - np.average(values, axis=0, weights=part.areas)
-        along = about @ np.linalg.eigh((about * part.areas[:, None]).T @ about)[1][:, 2]
-        half = _smooth_regions(part, (along > 0).astype(np.int64), _COPY_SMOOTHING)[first][number]
+        centered = values - np.average(values, axis=0, weights=part.areas)
+        projection = centered @ np.linalg.eigh((centered * part.areas[:, None]).T @ centered)[1][:, 2]
+        half = _smooth_regions(part, (projection > 0).astype(np.int64), _COPY_SMOOTHING)[first][number]
         if half.min() < half.max() and np.bincount(half, part.areas).max() < (1 - least) * part.total:
             return np.asarray(half)
     return np.asarray(number > number.max() // 2).astype(np.int64)
@@ -372,9 +372,9 @@ class _ChartMerger:
 
     def __init__(self, surface: _Surface, charts: list[Chart], max_stretch: float, crumbs_only: bool = False) -> None:
         self.surface, self.max_stretch, self.crumbs_only, K = surface, max_stretch, crumbs_only, len(charts)
-        self.by_number = dict(enumerate(charts))
+        self.by_id = dict(enumerate(charts))
         region = np.empty(len(surface.faces), np.int64)
-        for number, chart in self.by_number.items():
+        for number, chart in self.by_id.items():
             region[chart.members] = number
         self.area = (np.bincount(region, surface.areas) / surface.total).tolist()
         edges = surface.verts[surface.faces] - surface.verts[np.roll(surface.faces, -1, axis=1)]
@@ -382,7 +382,7 @@ class _ChartMerger:
         same = region[surface.face_a] == region[surface.face_b]
         border -= 2 * np.bincount(region[surface.face_a[same]], surface.length[same], K)
         self.border = np.maximum(border, 1e-300).tolist()
-        self.shared: dict[int, dict[int, float]] = {k: {} for k in self.by_number}
+        self.shared: dict[int, dict[int, float]] = {k: {} for k in self.by_id}
         for one, two, length in zip(
             region[surface.face_a].tolist(), region[surface.face_b].tolist(), surface.length.tolist(), strict=True
         ):
@@ -398,12 +398,12 @@ class _ChartMerger:
     def charts(self) -> list[Chart]:
         """Merge until the queue is empty, and return the charts."""
         while self.queue:
-            _, one, two, *grown = heappop(self.queue)
-            if [self.version[one], self.version[two]] == grown and (chart := self._merge_if_flat(one, two)):
-                self._join(one, two, chart)
-                for other in self.shared[one]:
-                    self._enqueue(min(one, other), max(one, other))
-        return list(self.by_number.values())
+            _, one, two, *versions = heappop(self.queue)
+            if [self.version[one], self.version[two]] == versions and (chart := self._merge_if_flat(one, two)):
+                self._replace(one, two, chart)
+                for neighbor in self.shared[one]:
+                    self._enqueue(min(one, neighbor), max(one, neighbor))
+        return list(self.by_id.values())
 
     def _enqueue(self, one: int, two: int) -> None:
         shared, area = self.shared[one][two], self.area[one] + self.area[two]
@@ -411,7 +411,7 @@ class _ChartMerger:
         crumb = min(self.area[one], self.area[two]) < _CRUMB_AREA
         if not crumb and (self.crumbs_only or area > _MAX_CHART_AREA or removed < _MIN_SHARED):
             return
-        if self.crumbs_only and len(self.by_number[one].members) + len(self.by_number[two].members) > _MAX_CRUMB_FACES:
+        if self.crumbs_only and len(self.by_id[one].members) + len(self.by_id[two].members) > _MAX_CRUMB_FACES:
             return
         border = self.border[one] + self.border[two] - 2 * shared
         roundness = border / np.sqrt(area)
@@ -422,7 +422,7 @@ class _ChartMerger:
 
     def _merge_if_flat(self, one: int, two: int) -> Chart | None:
         members, least = (
-            np.concatenate([self.by_number[k].members for k in (one, two)]),
+            np.concatenate([self.by_id[k].members for k in (one, two)]),
             min(self.area[one], self.area[two]),
         )
         layout = self.surface.flatten(members, self.max_stretch)
@@ -437,14 +437,14 @@ class _ChartMerger:
         )
         return Chart(members, layout.uv, layout.corners) if filled else None
 
-    def _join(self, one: int, two: int, chart: Chart) -> None:
-        self.by_number[one] = chart
-        del self.by_number[two]
+    def _replace(self, one: int, two: int, chart: Chart) -> None:
+        self.by_id[one] = chart
+        del self.by_id[two]
         self.border[one] += self.border[two] - 2 * self.shared[one][two]
         self.area[one] += self.area[two]
         self.version[one] += 1
         self.version[two] = -1
-        for other, length in self.shared.pop(two).items():
-            del self.shared[other][two]
-            if other != one:
-                self.shared[one][other] = self.shared[other][one] = self.shared[one].get(other, 0.0) + length
+        for neighbor, length in self.shared.pop(two).items():
+            del self.shared[neighbor][two]
+            if neighbor != one:
+                self.shared[one][neighbor] = self.shared[neighbor][one] = self.shared[one].get(neighbor, 0.0) + length

@@ -69,9 +69,9 @@ def flatten_faces(
     layout
         None for faces that are not connected, that would be stretched more, or whose system is singular.
     """
-    corners, whole = _weld_corners(faces)
+    corners, connected = _weld_corners(faces)
     count = int(corners.max()) + 1
-    if not whole:
+    if not connected:
         return None
     points = np.empty((count, 3))
     points[corners.ravel()] = verts[faces.ravel()]
@@ -101,25 +101,25 @@ def _find_bad(
 ) -> tuple[Int[Ints, " K"], tuple[int, int] | None]:
     """Flipped visible faces, and of two that share a texel the one closer to the border; and two overlapping faces."""
     F, positions = len(corners), uv[corners]
-    over, pair = (signed_areas(positions) <= 0) & visible, None
-    if not over.any() and _has_simple_border(uv, corners[visible]):
+    is_bad, pair = (signed_areas(positions) <= 0) & visible, None
+    if not is_bad.any() and _has_simple_border(uv, corners[visible]):
         return np.empty(0, np.int64), None
     grid = int(np.clip(_TEXELS_PER_ROW * np.sqrt(F), min_texels, _MAX_GRID))
     low, high = positions.min(axis=(0, 1)), positions.max(axis=(0, 1))
     image = (0.01 + 0.98 * (positions - low) / (high - low).max()) * grid
     image[~visible] = 0.0
-    found, twice = draw_triangles(image, grid)
-    if twice:
+    found, overlaps = draw_triangles(image, grid)
+    if overlaps:
         other = F - 1 - draw_triangles(image[::-1], grid)[0]
         differ = (found >= 0) & (found != other)
         edges = np.sort(corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         number = same_rows(edges)
         open_edges = (np.bincount(number, minlength=len(edges))[number] == 1).reshape(F, 3).sum(axis=1)
         one, two = found[differ], other[differ]
-        over[np.where(open_edges[one] > open_edges[two], one, two)] = True
+        is_bad[np.where(open_edges[one] > open_edges[two], one, two)] = True
         if len(one):
             pair = int(one[len(one) // 2]), int(two[len(two) // 2])
-    return np.flatnonzero(over), pair
+    return np.flatnonzero(is_bad), pair
 
 
 def _has_simple_border(uv: Floats, corners: Ints) -> bool:
@@ -144,10 +144,10 @@ def _has_simple_border(uv: Floats, corners: Ints) -> bool:
     # On which side of each edge the other edges begin and end.
     one = along[:, None, 0] * other[..., 1] - along[:, None, 1] * other[..., 0]
     two = one + along[:, None, 0] * along[None, :, 1] - along[:, None, 1] * along[None, :, 0]
-    beside = (one > 0) == (two > 0)
-    meets = ~(beside | beside.T)
-    near = (begin[:, None] == end) | np.eye(len(begin), dtype=bool)
-    return not (meets & ~(near | near.T)).any()
+    same_side = (one > 0) == (two > 0)
+    crosses = ~(same_side | same_side.T)
+    adjacent = (begin[:, None] == end) | np.eye(len(begin), dtype=bool)
+    return not (crosses & ~(adjacent | adjacent.T)).any()
 
 
 def weld(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, "F 3"]:
@@ -201,8 +201,8 @@ def _weld_corners(faces: Int[Ints, "F 3"]) -> tuple[Int[Ints, "F 3"], bool]:
     corner = np.arange(3 * F)
     begin, end = corner, corner.reshape(F, 3)[:, [1, 2, 0]].ravel()
     welded = together(3 * F, np.concatenate([begin[one], end[one]]), np.concatenate([end[two], begin[two]]))
-    whole = not together(F, one // 3, two // 3).any()
-    return np.unique(welded, return_inverse=True)[1].reshape(F, 3), whole
+    connected = not together(F, one // 3, two // 3).any()
+    return np.unique(welded, return_inverse=True)[1].reshape(F, 3), connected
 
 
 def _conformal_layout(points: Floats, corners: Ints, flat: Floats, areas: Floats) -> Float[Floats, "M 2"]:
@@ -241,12 +241,13 @@ def _rigid_layouts(uv: Floats, corners: Ints, flat: Floats) -> Iterator[Float[Fl
     solver = _factorize(values, rows, columns, np.arange(M) > 0)
     complex_edges = (edges[..., 0] + 1j * edges[..., 1]) * weights
     for _ in range(_RIGID_ROUNDS):
-        now = uv[corners[:, [2, 0, 1]]] - uv[corners[:, [1, 2, 0]]]
-        turned = ((now[..., 0] + 1j * now[..., 1]) * complex_edges.conj()).sum(axis=1)
-        size = np.abs(turned)
-        turn = (np.where(size > 0, turned, 1.0) / np.where(size > 0, size, 1.0))[:, None] * complex_edges
+        current = uv[corners[:, [2, 0, 1]]] - uv[corners[:, [1, 2, 0]]]
+        correlation = ((current[..., 0] + 1j * current[..., 1]) * complex_edges.conj()).sum(axis=1)
+        size = np.abs(correlation)
+        target = (np.where(size > 0, correlation, 1.0) / np.where(size > 0, size, 1.0))[:, None] * complex_edges
         pull = [
-            np.bincount(end, part, M) - np.bincount(begin, part, M) for part in (turn.real.ravel(), turn.imag.ravel())
+            np.bincount(end, part, M) - np.bincount(begin, part, M)
+            for part in (target.real.ravel(), target.imag.ravel())
         ]
         uv = np.zeros((M, 2))
         uv[1:] = solver.solve(np.stack(pull, axis=1)[1:])
@@ -269,10 +270,10 @@ def _untangle(uv: Floats, corners: Ints) -> Floats:
     edges = corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     key, number = np.unique(edges.min(axis=1) * M + edges.max(axis=1), return_inverse=True)
     forward = edges[:, 0] < edges[:, 1]
-    once = np.bincount(number, forward) != np.bincount(number, ~forward)
+    on_border = np.bincount(number, forward) != np.bincount(number, ~forward)
     one, two = key // M, key % M
     border = np.zeros(M, bool)
-    border[one[once]] = border[two[once]] = True
+    border[one[on_border]] = border[two[on_border]] = True
     begin, end = np.concatenate([one, two]), np.concatenate([two, one])
     degree = np.bincount(begin, minlength=M)
     uv, moved = uv.copy(), np.zeros(M, bool)
@@ -302,10 +303,10 @@ def _stretch(positions: Float[Floats, "F 3 2"], flat: Float[Floats, "F 3 2"], ar
     along = one / flat[:, 1, :1]  # images of the axes
     up = (two - along * flat[:, 2, :1]) / flat[:, 2, 1:]
     determinant = along[:, 0] * up[:, 1] - along[:, 1] * up[:, 0]
-    right = determinant > 0
-    if right @ areas < 0.5 * areas.sum():
+    upright = determinant > 0
+    if upright @ areas < 0.5 * areas.sum():
         return np.inf
-    along, up, determinant, areas = along[right], up[right], determinant[right], areas[right]
+    along, up, determinant, areas = along[upright], up[upright], determinant[upright], areas[upright]
     squares = (along**2 + up**2).sum(axis=1)
-    most = (np.sqrt(squares + 2 * determinant) + np.sqrt(np.maximum(squares - 2 * determinant, 0))) / 2
-    return float(np.maximum(most, most / determinant) @ areas / areas.sum())
+    largest = (np.sqrt(squares + 2 * determinant) + np.sqrt(np.maximum(squares - 2 * determinant, 0))) / 2
+    return float(np.maximum(largest, largest / determinant) @ areas / areas.sum())

@@ -23,7 +23,7 @@ Complexes: TypeAlias = NDArray[np.complex128]
 
 # All of these were set by hand; areas are shares of the whole surface.
 _MIN_CHARTS = 40  # charts below which merging stops
-_MAX_SMALLER_AREA = 0.02  # of the smaller chart of a pair
+_MAX_SMALLER_AREA = 0.02  # largest area of the smaller chart of a pair
 _MAX_EDGE_MISMATCH = 0.1  # as a fraction of the edge's length, between an edge of the hinge and its counterpart
 # Smallest share of its convex hull that a merged chart fills: in all, and of what the two charts fill of theirs.
 _MIN_FILL, _MIN_FILL_KEPT = 0.72, 0.95
@@ -32,10 +32,8 @@ _MAX_HINGES = 4  # hinges that are tried for a pair of charts
 _MIN_CHARTS_REFLATTEN = 60  # charts below which none are flattened again
 _REFLATTEN_FILL, _REFLATTEN_FILL_KEPT, _REFLATTEN_ANY_FORM = 0.7, 0.9, 0.02  # the same limits for these
 _MAX_CHAINS, _CHAIN_PARTS = 3, (1.0, 0.6, 0.35)  # stretches of a common border that are tried, and shares of each
-_MAX_FACES_PARTS, _MAX_FACES = (
-    2_500,
-    8_000,
-)  # triangles: above the first only whole stretches are tried, above both none
+# Triangles of a pair: above the first number only whole stretches are tried, above the second none.
+_MAX_FACES_PARTS, _MAX_FACES = 2_500, 8_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,21 +78,21 @@ class HingeMerger:
             float(areas.sum()),
         )
         self.reflatten = False  # whether pairs are flattened again
-        self.by_number: dict[int, Chart] = dict(enumerate(charts))
+        self.by_id: dict[int, Chart] = dict(enumerate(charts))
         self.area = [float(areas[chart.members].sum()) / self.total for chart in charts]
         region, corner = np.empty(len(faces), np.int64), np.empty((len(faces), 3), np.int64)
-        for number, chart in self.by_number.items():
+        for number, chart in self.by_id.items():
             region[chart.members], corner[chart.members] = number, chart.corners
         edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         local = corner[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         one, two = opposite_edges(edges)
-        apart = region[one // 3] != region[two // 3]
-        one, two = one[apart], two[apart]
+        on_border = region[one // 3] != region[two // 3]
+        one, two = one[on_border], two[on_border]
         first, second = region[one // 3], region[two // 3]
         swap = first > second
         one, two = np.where(swap, two, one), np.where(swap, one, two)
         key = np.minimum(first, second) * len(charts) + np.maximum(first, second)
-        self.shared: dict[int, dict[int, _Edges]] = {k: {} for k in self.by_number}
+        self.shared: dict[int, dict[int, _Edges]] = {k: {} for k in self.by_id}
         order = np.argsort(key, kind="stable")
         for rows in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
             if len(rows):
@@ -106,34 +104,30 @@ class HingeMerger:
         self.shared[a][b], self.shared[b][a] = edges, _Edges(edges.two[::-1, ::-1], edges.one[::-1, ::-1])
 
     def charts(self) -> list[Chart]:
-        """Merge along hinges, then by flattening again, while there are more charts than needed; return the charts."""
-        for self.reflatten, enough in ((False, _MIN_CHARTS), (True, _MIN_CHARTS_REFLATTEN)):
-            if len(self.by_number) > enough:
+        """Merge along hinges, then by flattening again, while there are more charts than wanted; return the charts."""
+        for self.reflatten, min_charts in ((False, _MIN_CHARTS), (True, _MIN_CHARTS_REFLATTEN)):
+            if len(self.by_id) > min_charts:
                 for one, others in self.shared.items():
                     for two in others:
                         if one < two:
                             self._enqueue(one, two)
-            while self.queue and len(self.by_number) > enough:
+            while self.queue and len(self.by_id) > min_charts:
                 _, one, two, chart = heappop(self.queue)
-                if (
-                    one in self.by_number
-                    and two in self.by_number
-                    and (joined := chart or self._flatten_pair(one, two))
-                ):
-                    self._replace(one, two, joined)
+                if one in self.by_id and two in self.by_id and (merged := chart or self._flatten_pair(one, two)):
+                    self._replace(one, two, merged)
             self.queue = []
-        return list(self.by_number.values())
+        return list(self.by_id.values())
 
     def _enqueue(self, one: int, two: int) -> None:
         smaller = min(self.area[one], self.area[two])
         if self.reflatten:
             heappush(self.queue, (smaller, one, two, None))
-        elif smaller < _MAX_SMALLER_AREA and (found := self._best_hinge(one, two)):
-            heappush(self.queue, (-found[0], one, two, found[1]))
+        elif smaller < _MAX_SMALLER_AREA and (best := self._best_hinge(one, two)):
+            heappush(self.queue, (-best[0], one, two, best[1]))
 
     def _best_hinge(self, one: int, two: int) -> tuple[float, Chart] | None:
         """The share of its hull that the merged chart fills, and the chart; None if all overlap or are badly formed."""
-        a, b = self.by_number[one], self.by_number[two]
+        a, b = self.by_id[one], self.by_id[two]
         area, best = (self.area[one] + self.area[two]) * self.total, None
         least = (
             max(_MIN_FILL, _MIN_FILL_KEPT * area / max(hull_area(a.uv) + hull_area(b.uv), 1e-300))
@@ -150,7 +144,7 @@ class HingeMerger:
 
     def _flatten_pair(self, one: int, two: int) -> Chart | None:
         """Flatten both as one chart, joined at the hinge that gives the largest share of the hull; None if none is good."""
-        a, b = self.by_number[one], self.by_number[two]
+        a, b = self.by_id[one], self.by_id[two]
         if len(a.members) + len(b.members) > _MAX_FACES:
             return None
         area, best = (self.area[one] + self.area[two]) * self.total, None
@@ -168,15 +162,15 @@ class HingeMerger:
                 best = filled, Chart(chart.members, layout.uv, layout.corners)
         return best and best[1]
 
-    def _replace(self, one: int, two: int, joined: Chart) -> None:
-        a, b = self.by_number[one], self.by_number[two]
+    def _replace(self, one: int, two: int, merged: Chart) -> None:
+        a, b = self.by_id[one], self.by_id[two]
         new = len(self.area)
-        self.by_number[new] = joined
+        self.by_id[new] = merged
         self.area.append(self.area[one] + self.area[two])
         number = {one: np.zeros(len(a.uv), np.int64), two: np.zeros(len(b.uv), np.int64)}  # of corners in the new chart
-        number[one][a.corners.ravel()] = joined.corners[: len(a.members)].ravel()
-        number[two][b.corners.ravel()] = joined.corners[len(a.members) :].ravel()
-        del self.by_number[one], self.by_number[two]
+        number[one][a.corners.ravel()] = merged.corners[: len(a.members)].ravel()
+        number[two][b.corners.ravel()] = merged.corners[len(a.members) :].ravel()
+        del self.by_id[one], self.by_id[two]
         self.shared[new] = {}
         parts: dict[int, list[_Edges]] = {}
         for old in (one, two):
@@ -219,8 +213,8 @@ def _chain_parts(a: Floats, edges: _Edges, parts: tuple[float, ...]) -> list[_Ed
     for k in np.argsort(-lengths, kind="stable")[:_MAX_CHAINS].tolist():
         count, ends = len(chains[k].one), set()
         for part in parts:
-            some = int(np.ceil(part * count))
-            ends |= {(begin, begin + some) for begin in (0, (count - some) // 2, count - some)}
+            n_edges = int(np.ceil(part * count))
+            ends |= {(begin, begin + n_edges) for begin in (0, (count - n_edges) // 2, count - n_edges)}
         found += [_Edges(chains[k].one[begin:end], chains[k].two[begin:end]) for begin, end in sorted(ends)]
     return found
 
@@ -247,7 +241,7 @@ def _merge(a: Chart, b: Chart, hinge: _Edges) -> Chart:
     N, both = len(p), np.concatenate([p, rotation * q + shift])
     both[one] = 0.5 * (both[one] + both[N + two])
     number = together(len(both), one, N + two)
-    kept, place = np.unique(number, return_inverse=True)
-    uv = np.stack([both[kept].real, both[kept].imag], axis=1)
+    kept_corners, place = np.unique(number, return_inverse=True)
+    uv = np.stack([both[kept_corners].real, both[kept_corners].imag], axis=1)
     corners = place[np.concatenate([a.corners, b.corners + N])]
     return Chart(np.concatenate([a.members, b.members]), uv, corners)

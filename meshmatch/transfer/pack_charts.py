@@ -78,20 +78,20 @@ def pack_charts(charts: list[Chart], padding: float, seed: int = 0) -> list[Floa
     pieces = [_Piece(chart.uv, chart.corners) for chart in charts]
     order = sorted(range(len(pieces)), key=lambda k: (-pieces[k].area, k))
     large, crumbs = order[:_MAX_PIECES], order[_MAX_PIECES:]
-    moved = [pieces[k] for k in large]
+    placed = [pieces[k] for k in large]
     shelves: list[Floats] = []
     if crumbs:
         total = sum(piece.area for piece in pieces)
         gap = min(padding, np.sqrt(_MAX_GAP_SHARE / len(crumbs))) * np.sqrt(2 * total)
         shelves, size = _put_on_shelves([pieces[k] for k in crumbs], gap)
-        moved.append(_Piece(np.array([[0, 0], [size[0], 0], size, [0, size[1]]]), np.array([[0, 1, 2], [0, 2, 3]])))
-    padding = min(padding, np.sqrt(_MAX_GAP_SHARE / len(moved)))
-    scale, places = _search(moved, padding, np.random.default_rng(seed))
+        placed.append(_Piece(np.array([[0, 0], [size[0], 0], size, [0, size[1]]]), np.array([[0, 1, 2], [0, 2, 3]])))
+    padding = min(padding, np.sqrt(_MAX_GAP_SHARE / len(placed)))
+    scale, places = _search(placed, padding, np.random.default_rng(seed))
     out: list[Floats] = [np.empty(0)] * len(charts)
-    for k, piece, place in zip(large, moved, places, strict=False):
+    for k, piece, place in zip(large, placed, places, strict=False):
         out[k] = place.apply(piece.uv * scale)
     for k, at in zip(crumbs, shelves, strict=True):
-        out[k] = places[-1].apply(moved[-1].align(pieces[k].uv + at) * scale)
+        out[k] = places[-1].apply(placed[-1].align(pieces[k].uv + at) * scale)
     return out
 
 
@@ -131,9 +131,9 @@ class _Piece:
         """Images in four rotations; those of the last scale are cached."""
         if self._cache[:2] != (scale, gap):
             mask = self.mask(scale)
-            away = distance_transform_cdt(~np.pad(mask, gap + _RINGS), "chessboard")
-            rings = _RING_WEIGHTS[np.clip(away - gap, 0, _RINGS + 1)]
-            grown = away[_RINGS:-_RINGS, _RINGS:-_RINGS] <= gap
+            distance = distance_transform_cdt(~np.pad(mask, gap + _RINGS), "chessboard")
+            rings = _RING_WEIGHTS[np.clip(distance - gap, 0, _RINGS + 1)]
+            grown = distance[_RINGS:-_RINGS, _RINGS:-_RINGS] <= gap
             ring_total = float(rings.sum()) - int(grown.sum())
             rotated = ((np.rot90(mask, k), np.rot90(grown, k), np.rot90(rings, k)) for k in range(4))
             self._cache = scale, gap, [_RotatedPiece(k, *images, ring_total) for k, images in enumerate(rotated)]
@@ -213,9 +213,9 @@ def _tighten_places(
 def _initial_scale(pieces: list[_Piece], padding: float) -> float:
     """A scale at which pieces and gaps fill the intended share of the image."""
     area = sum(piece.area for piece in pieces)
-    around = sum(2 * float(piece.size.sum()) for piece in pieces) * padding * _GRID / 2
+    perimeter = sum(2 * float(piece.size.sum()) for piece in pieces) * padding * _GRID / 2
     # scale^2 area + scale around = dense grid^2
-    return float((np.sqrt(around**2 + 4 * area * _FIRST_FILL * _GRID**2) - around) / (2 * area))
+    return float((np.sqrt(perimeter**2 + 4 * area * _FIRST_FILL * _GRID**2) - perimeter) / (2 * area))
 
 
 def _place_all(pieces: list[_Piece], order: Ints, scale: float, padding: float) -> list[_Place] | None:
@@ -262,9 +262,9 @@ def _transform(image: NDArray[Any], span: int) -> NDArray[np.complex64]:
     """Real FFT of an image in the corner of an empty one."""
     rows = np.zeros((len(image), span), np.float32)
     rows[:, : image.shape[1]] = image
-    whole = np.zeros((span, span // 2 + 1), np.complex64)
-    whole[: len(image)] = rfft(rows, axis=1)
-    return np.asarray(fft(whole, axis=0, overwrite_x=True))
+    padded = np.zeros((span, span // 2 + 1), np.complex64)
+    padded[: len(image)] = rfft(rows, axis=1)
+    return np.asarray(fft(padded, axis=0, overwrite_x=True))
 
 
 def _correlate(
@@ -292,11 +292,11 @@ def _put_on_shelves(pieces: list[_Piece], gap: float) -> tuple[list[Floats], Flo
     width = max(float(np.sqrt(sizes.prod(axis=1).sum())), float(sizes[:, 0].max()))
     ends = np.cumsum(sizes[order, 0])
     at = np.zeros((len(pieces), 2))
-    begin, y, done = 0, 0.0, 0.0
+    begin, y, filled = 0, 0.0, 0.0
     while begin < len(order):
-        end = max(int(np.searchsorted(ends, done + width, side="right")), begin + 1)
+        end = max(int(np.searchsorted(ends, filled + width, side="right")), begin + 1)
         row = order[begin:end]
-        at[row, 0], at[row, 1] = ends[begin:end] - sizes[row, 0] - done, y
+        at[row, 0], at[row, 1] = ends[begin:end] - sizes[row, 0] - filled, y
         y += float(sizes[row, 1].max())
-        begin, done = end, float(ends[end - 1])
+        begin, filled = end, float(ends[end - 1])
     return list(at), np.array([width, max(y, 1e-300)]) - gap

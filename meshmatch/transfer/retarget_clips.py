@@ -48,12 +48,12 @@ def retargeted(clip: Clip, rig: Rig, posed: Rig, lengths: Float[Floats, " N"], l
             values = values / rig.scales[node]
         tracks.append(replace(track, values=values))
     new_tracks = {(track.node, track.moves): track for track in tracks}
-    given = {(track.node, track.moves): track for track in clip.tracks}
+    source_tracks = {(track.node, track.moves): track for track in clip.tracks}
     for node, anchor in list(loose.items())[:_MAX_LOOSE]:
-        times = _key_times(given, _chain(rig, node) | _chain(rig, anchor))
+        times = _key_times(source_tracks, _chain(rig, node) | _chain(rig, anchor))
         if len(times):
             new_tracks[node, "translation"] = _following_track(
-                node, anchor, times, (rig, given), (posed, new_tracks), lengths[anchor]
+                node, anchor, times, (rig, source_tracks), (posed, new_tracks), lengths[anchor]
             )
     return replace(clip, tracks=tuple(new_tracks.values()))
 

@@ -101,27 +101,27 @@ class _Packing:
         """Texels of each other piece within the padded image of this one."""
         found = np.zeros(len(self.images), np.int64)
         for other in self._neighbors(k, 0):
-            own, theirs = self._window(k, 0, other)
-            found[other] = np.count_nonzero(self.padded[k][own] & self.images[other][theirs])
+            window, other_window = self._window(k, 0, other)
+            found[other] = np.count_nonzero(self.padded[k][window] & self.images[other][other_window])
         return found
 
     def _move(self, k: int) -> None:
         """Move a piece to where it overlaps least, within its reach."""
         self.n_moves += 1
         high, wide = (int(side) for side in self.sizes[k] + 2 * (self.gap + _REACH))
-        taken = np.zeros((high, wide), np.float32)
+        occupancy = np.zeros((high, wide), np.float32)
         for other in self._neighbors(k, _REACH):
-            own, theirs = self._window(k, _REACH, other)
-            taken[own] += self.weights[k, other] * self.images[other][theirs]
-        size, ways = _fast_shape(high, wide), np.arange(-_REACH, _REACH + 1)
-        sums = irfft2(rfft2(taken, size) * self.transforms[k], size)[: len(ways), : len(ways)]
-        row, column = self.at[k][:, None] + ways
+            window, other_window = self._window(k, _REACH, other)
+            occupancy[window] += self.weights[k, other] * self.images[other][other_window]
+        size, offsets = _fast_shape(high, wide), np.arange(-_REACH, _REACH + 1)
+        sums = irfft2(rfft2(occupancy, size) * self.transforms[k], size)[: len(offsets), : len(offsets)]
+        row, column = self.at[k][:, None] + offsets
         inside = [
             (place >= 0) & (place <= self.side - side) for place, side in zip((row, column), self.sizes[k], strict=True)
         ]
-        cost = np.round(sums) + _MOVE_COST * (np.abs(ways)[:, None] + np.abs(ways))
+        cost = np.round(sums) + _MOVE_COST * (np.abs(offsets)[:, None] + np.abs(offsets))
         best = int(np.where(inside[0][:, None] & inside[1], cost, np.inf).argmin())
-        self.at[k] = row[best // len(ways)], column[best % len(ways)]
+        self.at[k] = row[best // len(offsets)], column[best % len(offsets)]
         self.overlaps[k] = self.overlaps[:, k] = self._overlaps(k)
 
 
