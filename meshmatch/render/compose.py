@@ -216,10 +216,16 @@ def compose_labels(
     on_faces: Sequence[bool] | None = None,
 ) -> Composition:
     """Shapes with one color per label; each vertex, or face, has an index into ``names``, negative for no label."""
-    colors = [label_colors(own) for own in codes]
+    colors = [label_colors(codes_of_shape) for codes_of_shape in codes]
     panels = [
-        Panel(shape, None if faces else own, shape.name, sharp=True, face_colors=own if faces else None)
-        for shape, own, faces in zip(shapes, colors, on_faces or [False] * len(shapes), strict=True)
+        Panel(
+            shape,
+            None if faces else codes_of_shape,
+            shape.name,
+            sharp=True,
+            face_colors=codes_of_shape if faces else None,
+        )
+        for shape, codes_of_shape, faces in zip(shapes, colors, on_faces or [False] * len(shapes), strict=True)
     ]
     legend = label_swatches(np.concatenate(codes), names)
     return Composition(tuple(panels), legend, f"{len(names)} labels", {"labels": list(names)})
@@ -258,8 +264,8 @@ def _sample_line(line: Float[Floats, "M 3"], step: float) -> Float[Floats, "N 3"
         return line
     lengths = np.linalg.norm(np.diff(line, axis=0), axis=1)
     at = np.concatenate([[0.0], np.cumsum(lengths)])
-    wanted = np.linspace(0.0, at[-1], min(int(at[-1] / step) + 2, _MAX_DOTS))
-    return np.column_stack([np.interp(wanted, at, line[:, axis]) for axis in range(3)])
+    samples = np.linspace(0.0, at[-1], min(int(at[-1] / step) + 2, _MAX_DOTS))
+    return np.column_stack([np.interp(samples, at, line[:, axis]) for axis in range(3)])
 
 
 def compose_worn(bodies: Sequence[Shape], worn: Sequence[Shape]) -> Composition:

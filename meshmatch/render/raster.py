@@ -59,16 +59,16 @@ class Layer:
 def draw(scene: Scene, viewport: Viewport) -> Layer:
     """Draw a scene. The result does not depend on the size of bands."""
     H, W = viewport.height, viewport.width
-    whole = Layer(np.zeros((H, W, 3), np.float32), np.zeros((H, W), np.float32), np.full((H, W), -np.inf, np.float32))
+    layer = Layer(np.zeros((H, W, 3), np.float32), np.zeros((H, W), np.float32), np.full((H, W), -np.inf, np.float32))
     edges = edge_points(scene, viewport)
     rows = max(1, BAND // W)
     for first in range(0, H, rows):
-        _draw_band(scene, viewport, edges, first, min(H, first + rows), whole)
-    return whole
+        _draw_band(scene, viewport, edges, first, min(H, first + rows), layer)
+    return layer
 
 
-def _draw_band(scene: Scene, viewport: Viewport, edges: Vectors, first: int, last: int, whole: Layer) -> None:
-    """Draw rows ``first`` to ``last`` of a viewport into ``whole``."""
+def _draw_band(scene: Scene, viewport: Viewport, edges: Vectors, first: int, last: int, layer: Layer) -> None:
+    """Draw rows ``first`` to ``last`` of a viewport into ``layer``."""
     low, high = max(0, first - _HALO), min(viewport.height, last + _HALO)
     shape = (high - low, viewport.width)
     row, column = np.divmod(np.arange(shape[0] * shape[1]), viewport.width)
@@ -96,9 +96,9 @@ def _draw_band(scene: Scene, viewport: Viewport, edges: Vectors, first: int, las
         if len(found):
             supersampled = _supersample(scene, viewport, hits, visible, low, found, places)
             light.reshape(-1, 3)[found], alpha.reshape(-1)[found] = supersampled
-    own = slice(first - low, last - low)
-    whole.light[first:last], whole.alpha[first:last] = light[own], alpha[own]
-    whole.depth[first:last] = depth[own]
+    inner_rows = slice(first - low, last - low)
+    layer.light[first:last], layer.alpha[first:last] = light[inner_rows], alpha[inner_rows]
+    layer.depth[first:last] = depth[inner_rows]
 
 
 def _shade_hits(scene: Scene, hits: Hits, seen: Shares) -> tuple[Vectors, Float[Floats32, " N"]]:
@@ -120,11 +120,11 @@ def composite(glass: Layer, base: Layer, reach: float) -> Layer:
     """Put glass over a base layer, which hides it gradually where it lies up to ``reach`` behind."""
     with np.errstate(invalid="ignore"):
         ahead = np.nan_to_num((glass.depth - base.depth) / np.float32(reach) + 1, nan=1.0, posinf=1.0, neginf=0.0)
-    shown = np.clip(ahead, 0, 1).astype(np.float32)
-    through = 1 - glass.alpha * shown
+    visibility_share = np.clip(ahead, 0, 1).astype(np.float32)
+    transmitted = 1 - glass.alpha * visibility_share
     return Layer(
-        glass.light * shown[..., None] + base.light * through[..., None],
-        glass.alpha * shown + base.alpha * through,
+        glass.light * visibility_share[..., None] + base.light * transmitted[..., None],
+        glass.alpha * visibility_share + base.alpha * transmitted,
         np.maximum(glass.depth, base.depth),
     )
 

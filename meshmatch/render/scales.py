@@ -153,12 +153,12 @@ def label_swatches(labels: ArrayLike, names: Sequence[str] = (), most: int = 24)
     present = np.unique(np.asarray(labels, dtype=np.int64))
     present = np.concatenate([present[present >= 0], present[present < 0][:1]])
     shown = present if len(present) <= most else present[: most - 1]
-    words = ["none" if k < 0 else names[k] if k < len(names) else str(k) for k in shown.tolist()]
+    entry_names = ["none" if k < 0 else names[k] if k < len(names) else str(k) for k in shown.tolist()]
     entries = [tuple(color) for color in label_colors(shown).tolist()]
     if len(shown) < len(present):
-        words.append(f"and {len(present) - len(shown)} more")
+        entry_names.append(f"and {len(present) - len(shown)} more")
         entries.append(UNKNOWN)
-    return Swatches(tuple(words), tuple(entries))
+    return Swatches(tuple(entry_names), tuple(entries))
 
 
 Legend = Scale | Swatches
@@ -194,8 +194,8 @@ def short(text: str, most: int = 60) -> str:
 def _has_glyph(letter: str) -> bool:
     if unicodedata.category(letter).startswith("C"):
         return False
-    wanted, missing = (_font(32.0).getmask(part) for part in (letter, _NO_CHARACTER))
-    return (wanted.size, bytes(wanted)) != (missing.size, bytes(missing))
+    glyph, missing_glyph = (_font(32.0).getmask(part) for part in (letter, _NO_CHARACTER))
+    return (glyph.size, bytes(glyph)) != (missing_glyph.size, bytes(missing_glyph))
 
 
 def fit_text(text: str, size: float, room: float) -> tuple[str, float]:

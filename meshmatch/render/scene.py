@@ -228,10 +228,10 @@ def visibility(scene: Scene, hits: Hits, rows: Rows, row: Rows, column: Rows) ->
         subset = number % _SUBSETS
         rays = slice(None, None, 2 if number >= _SUBSETS else 1)  # the larger blocks of the ground need fewer per pixel
         for first in range(0, len(own), _CHUNK):
-            part = own[first : first + _CHUNK]
-            flat = hits.flat[rows[part]]
-            places = hits.place[rows[part]] + hits.lift[rows[part], None] * flat
-            result[part] = _visible_shares(scene, places, flat, hits.normal[rows[part]], subset, rays)
+            chunk = own[first : first + _CHUNK]
+            flat = hits.flat[rows[chunk]]
+            places = hits.place[rows[chunk]] + hits.lift[rows[chunk], None] * flat
+            result[chunk] = _visible_shares(scene, places, flat, hits.normal[rows[chunk]], subset, rays)
     return result
 
 
@@ -243,9 +243,9 @@ def _visible_shares(scene: Scene, places: Vectors, flat: Vectors, normal: Vector
     facing = np.flatnonzero((normal @ _KEY > -0.2) & (grazing > 0))
     hidden, occluded = np.zeros((2, len(places)), np.float32)
     lamp = _KEY_SET[subset, rays]
-    asked = places[facing]
+    places_facing = places[facing]
     for aim, reach in zip(lamp, _KEY_FAR[subset, rays], strict=True):
-        hidden[facing] += scene.blocked(asked, np.broadcast_to(aim, asked.shape), reach)
+        hidden[facing] += scene.blocked(places_facing, np.broadcast_to(aim, places_facing.shape), reach)
     side, up = tangents(normal)
     sky = _SKY_SET[subset, rays]
     for (x, y, z), reach in zip(sky, _SKY_FAR[subset, rays], strict=True):

@@ -54,9 +54,9 @@ def pull_directions(
         raise InputError("directions need meshes, not point clouds", "transfer them as plain numbers")
     points = back.points(source)
     edges = target.edges.vertices
-    here, there = (place[edges[:, 1]] - place[edges[:, 0]] for place in (target.verts, points))
+    target_edges, source_edges = (place[edges[:, 1]] - place[edges[:, 0]] for place in (target.verts, points))
     unit = np.sqrt(target.area * source.area) or 1.0
-    products = np.einsum("ni,nj->nij", here, there) / unit
+    products = np.einsum("ni,nj->nij", target_edges, source_edges) / unit
     sums = np.zeros((target.V, 3, 3))
     np.add.at(sums, edges[:, 0], products)
     np.add.at(sums, edges[:, 1], products)
@@ -96,8 +96,8 @@ def pull_face_labels(
     around = csr_array(corners @ (touched @ occurring))
     found = most_votes(around)
     area = triangle_areas(back.points(source), target.faces)
-    usual = _mean_face_area(source)[back.index[target.faces]].mean(axis=1)
-    undecided = np.flatnonzero((np.diff(around.indptr) != 1) | (area > _MAX_AREA_RATIO * usual))
+    typical_area = _mean_face_area(source)[back.index[target.faces]].mean(axis=1)
+    undecided = np.flatnonzero((np.diff(around.indptr) != 1) | (area > _MAX_AREA_RATIO * typical_area))
     if not len(undecided):
         return found
     votes = csr_array(corners @ _vertex_votes(back, source, labels, on_faces))[undecided]
@@ -152,10 +152,10 @@ def _vertex_votes(back: VertexMap, source: Shape, labels: Ints, on_faces: bool) 
     within = (back.face >= 0) & (back.barycentric.max(axis=1) < 1.0 - 1e-9)
     inside, outside = np.flatnonzero(within), np.flatnonzero(~within)
     direct = _count_matrix(inside, back.face[inside], (len(within), source.F))
-    at = _count_matrix(outside, back.index[outside], (len(within), source.V))
+    vertex_matrix = _count_matrix(outside, back.index[outside], (len(within), source.V))
     area = source.face_areas / max(float(source.face_areas.max()), 1e-300) + 1e-12
     around = csr_array(_corner_matrix(source.faces, source.V, area[:, None]).T)
-    return csr_array(csr_array(direct + at @ around) @ _one_hot(labels))
+    return csr_array(csr_array(direct + vertex_matrix @ around) @ _one_hot(labels))
 
 
 def _corner_matrix(corners: Ints, V: int, weights: Floats | float = 1.0) -> csr_array:

@@ -50,7 +50,7 @@ def carry_moves(
     typical = float(np.median(scale[source.valid]))
     frames = turns * np.clip(scale, typical / _MAX_GROWTH, typical * _MAX_GROWTH)[:, None, None]
     matrix = backward.sparse()
-    found = np.stack([(matrix @ np.einsum("vij,vj->vi", frames, move)).astype(np.float32) for move in moves])
+    moved = np.stack([(matrix @ np.einsum("vij,vj->vi", frames, move)).astype(np.float32) for move in moves])
     graph = vertex_graph(target)
     known = target.valid & (backward.assumed_confidence >= _MIN_CONFIDENCE)
     facing = unit(backward.apply(np.einsum("vij,vj->vi", turns, source.vertex_normals)))
@@ -63,23 +63,23 @@ def carry_moves(
     twin_is_solid = np.bincount(
         part, _solid_parts(source, source_part)[source_part[backward.index]]
     ) >= _MIN_KNOWN * np.bincount(part)
-    for k, move in enumerate(found):
-        found[k] = diffuse(graph, known, np.where(known[:, None], move, 0.0))[0]
+    for k, move in enumerate(moved):
+        moved[k] = diffuse(graph, known, np.where(known[:, None], move, 0.0))[0]
     _move_rigidly(
-        found,
+        moved,
         target,
         part,
         is_solid & has_counterpart & twin_is_solid,
         (is_solid & ~twin_is_solid) | ~has_counterpart,
         known,
     )
-    _close_slits(found, backward, source, target)
+    _close_slits(moved, backward, source, target)
     welded = same_at(seams(target.verts, target.faces), eye_array(target.V, format="csr"))
-    found = np.stack([(welded @ move).astype(np.float32) for move in found])
-    size = np.linalg.norm(found, axis=2)
-    found[size <= _NEGLIGIBLE * size.max(axis=1, keepdims=True)] = 0.0
-    found[:, ~target.valid] = 0.0
-    return found
+    moved = np.stack([(welded @ move).astype(np.float32) for move in moved])
+    size = np.linalg.norm(moved, axis=2)
+    moved[size <= _NEGLIGIBLE * size.max(axis=1, keepdims=True)] = 0.0
+    moved[:, ~target.valid] = 0.0
+    return moved
 
 
 def _connected_parts(graph: csr_array) -> Int[Ints, " V"]:
@@ -107,7 +107,7 @@ def _solid_parts(shape: Shape, part: Int[Ints, " V"]) -> Bool[Bools, " P"]:
 
 
 def _move_rigidly(
-    found: Float[Floats32, "K V 3"],
+    moved: Float[Floats32, "K V 3"],
     target: Shape,
     part: Int[Ints, " V"],
     own: Bool[Bools, " P"],
@@ -121,12 +121,12 @@ def _move_rigidly(
     starts = np.cumsum(counts) - counts
     for number in np.flatnonzero(own | lost).tolist():
         inside = members[starts[number] : starts[number] + counts[number]]
-        around = inside[known[inside]]
+        neighbors = inside[known[inside]]
         if lost[number] and tree is not None:
             distance, near = (np.asarray(each) for each in tree.query(target.verts[inside], min(_N_AROUND, len(rows))))
-            around = rows[np.unique(near[distance <= _NEAR * length_of(target)])]
-        if len(around):
-            found[:, inside] = _rigid_displacements(target.verts[inside], target.verts[around], found[:, around])
+            neighbors = rows[np.unique(near[distance <= _NEAR * length_of(target)])]
+        if len(neighbors):
+            moved[:, inside] = _rigid_displacements(target.verts[inside], target.verts[neighbors], moved[:, neighbors])
 
 
 def _rigid_displacements(
@@ -150,7 +150,7 @@ def _rigid_displacements(
     return np.asarray(np.einsum("kij,knj->kni", rotation, own) - own + shift[:, None], np.float32)
 
 
-def _close_slits(found: Float[Floats32, "K V 3"], backward: VertexMap, source: Shape, target: Shape) -> None:
+def _close_slits(moved: Float[Floats32, "K V 3"], backward: VertexMap, source: Shape, target: Shape) -> None:
     """Keep vertices together that touch across a slit, in place, in those shapes where the source's stay together."""
     other, source_other = _touching(target), _touching(source)
     at, places = corners_of(source.faces, backward.face, backward.index), backward.points(source)
@@ -158,7 +158,7 @@ def _close_slits(found: Float[Floats32, "K V 3"], backward: VertexMap, source: S
     rows = rows[(source_other[at[other[rows]]] >= 0).any(axis=1)]
     near = np.linalg.norm(places[rows] - places[other[rows]], axis=1) < _SAME_PLACE * length_of(source)
     rows = rows[near]
-    for move in found:
+    for move in moved:
         a, b = move[rows], move[other[rows]]
         largest = np.maximum(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1))
         ratio = np.linalg.norm(a - b, axis=1) / np.maximum(largest, 1e-30)

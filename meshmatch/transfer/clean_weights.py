@@ -42,9 +42,9 @@ def clean_weights(
     if unknown is not None and not unknown.all():
         weights = csr_array(diags_array((~unknown).astype(np.float64)) @ weights)
     weights = same_at(twin, largest_weights(weights, influences))
-    kept = _remove_strays(weights, graph)
-    sums = np.asarray(kept.sum(axis=1)).ravel()
-    filled, _ = replace_low_weights(kept, sums < _MIN_KEPT, target, True, influences)
+    cleaned = _remove_strays(weights, graph)
+    sums = np.asarray(cleaned.sum(axis=1)).ravel()
+    filled, _ = replace_low_weights(cleaned, sums < _MIN_KEPT, target, True, influences)
     smooth = largest_weights(same_at(twin, _smooth_tears(same_at(twin, filled), graph)), influences)
     smooth.data[smooth.data < _MIN_WEIGHT] = 0.0
     return _fill_empty_rows(largest_weights(smooth, influences), target)
@@ -57,8 +57,8 @@ def beyond(target: Shape, points: Float[Floats, "V_source 3"], faces: Int[Ints, 
     far from much of the target.
     """
     size = float(np.linalg.norm(np.ptp(target.bounds, axis=0)))
-    far = Surface(points, faces).query(target.verts).distance > _MAX_DISTANCE * size
-    return np.asarray(far & (far.mean() <= _MAX_SHARE))
+    is_far = Surface(points, faces).query(target.verts).distance > _MAX_DISTANCE * size
+    return np.asarray(is_far & (is_far.mean() <= _MAX_SHARE))
 
 
 def same_at(twin: Int[Ints, " V"], weights: csr_array) -> csr_array:
@@ -79,13 +79,13 @@ def _remove_strays(weights: csr_array, graph: csr_array) -> csr_array:
     begins, ends = [], []
     for a in range(N):
         for b in range(N):
-            joined = (
+            linked = (
                 (joints[rows, a] == joints[columns, b])
                 & (shares[rows, a] > _MIN_CONNECTING)
                 & (shares[columns, b] > _MIN_CONNECTING)
             )
-            begins.append(N * rows[joined] + a)
-            ends.append(N * columns[joined] + b)
+            begins.append(N * rows[linked] + a)
+            ends.append(N * columns[linked] + b)
     begin, end = np.concatenate(begins), np.concatenate(ends)
     links = coo_array((np.ones(len(begin), np.int8), (begin, end)), (V * N, V * N))
     region = connected_components(links, directed=False)[1]
@@ -102,9 +102,9 @@ def _remove_strays(weights: csr_array, graph: csr_array) -> csr_array:
 def _smooth_tears(weights: csr_array, graph: csr_array) -> csr_array:
     """Smooth weights around edges whose ends have almost nothing in common."""
     edges = coo_array(graph)
-    apart = 0.5 * np.asarray(abs(weights[edges.row] - weights[edges.col]).sum(axis=1)).ravel() > 1.0 - _MIN_COMMON
+    differ = 0.5 * np.asarray(abs(weights[edges.row] - weights[edges.col]).sum(axis=1)).ravel() > 1.0 - _MIN_COMMON
     is_torn = np.zeros(weights.shape[0])
-    is_torn[edges.row[apart]] = 1.0
+    is_torn[edges.row[differ]] = 1.0
     around = (is_torn > 0) | (np.asarray(graph @ is_torn) > 0)
     rows = np.flatnonzero(around)
     if not len(rows):
@@ -139,8 +139,8 @@ def rigid(weights: csr_array, groups: list[tuple[Int[Ints, " N"], Int[Ints, " M"
     rows = np.arange(weights.shape[0])
     chosen = np.full(len(rows), -1)
     for group, beside in groups:
-        asked = beside if len(beside) else group
-        chosen[group] = int(np.asarray(weights[asked].sum(axis=0)).ravel().argmax())
+        deciding = beside if len(beside) else group
+        chosen[group] = int(np.asarray(weights[deciding].sum(axis=0)).ravel().argmax())
     stiff = chosen >= 0
     others = csr_array(diags_array((~stiff).astype(np.float64)) @ weights)
     one = csr_array((np.ones(int(stiff.sum())), (rows[stiff], chosen[stiff])), weights.shape)

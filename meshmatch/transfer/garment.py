@@ -75,21 +75,21 @@ def carry_garment(garment: Shape, forward: VertexMap, source: Shape, target: Sha
         raise InputError(f"{source.name or 'the source'} is a point cloud: nothing can be bound to it", "give a mesh")
     bound, jacobians = _Body(forward, source, target).bind(garment, workers)
     turns = nearest_rotations(jacobians, np.broadcast_to(np.eye(3), jacobians.shape))
-    own, back = np.unique(same_rows(garment.verts), return_inverse=True)  # welded, so that seams stay closed
-    cloth = _Cloth(garment.verts[own], back[garment.faces], jacobians[own])
-    places = bound[own]
-    before = _Skin(turned_outwards(source)).heights(cloth.at_points(cloth.rest), workers)[0]
-    at = before[: len(own)][back]
+    first, back = np.unique(same_rows(garment.verts), return_inverse=True)  # welded, so that seams stay closed
+    cloth = _Cloth(garment.verts[first], back[garment.faces], jacobians[first])
+    places = bound[first]
+    heights_before = _Skin(turned_outwards(source)).heights(cloth.at_points(cloth.rest), workers)[0]
+    at = heights_before[: len(first)][back]
     sits = float((at < 0).mean()), float((at > _FAR * length_of(source)).mean())
     if target.is_cloud:
-        verts, none = cloth.solve(places, np.full(len(own), _BOUND_WEIGHT)), np.empty(0, np.int64)
+        verts, none = cloth.solve(places, np.full(len(first), _BOUND_WEIGHT)), np.empty(0, np.int64)
         return Carried(verts[back], turns, none, none, *sits)
-    scale = np.cbrt(np.abs(np.linalg.det(jacobians[own])))
-    before = before * cloth.at_points(scale[:, None])[:, 0]
-    min_heights = np.minimum(before, _CLEARANCE * length_of(target))
-    min_heights[before > 0] = np.maximum(min_heights[before > 0], _MIN_HEIGHT * length_of(target))
+    scale = np.cbrt(np.abs(np.linalg.det(jacobians[first])))
+    heights_before = heights_before * cloth.at_points(scale[:, None])[:, 0]
+    min_heights = np.minimum(heights_before, _CLEARANCE * length_of(target))
+    min_heights[heights_before > 0] = np.maximum(min_heights[heights_before > 0], _MIN_HEIGHT * length_of(target))
     verts, pushed, heights = _push_out(cloth, places, min_heights, _Skin(turned_outwards(target)), workers)
-    sunk = (heights < 0) & (before[: len(own)] > 0)
+    sunk = (heights < 0) & (heights_before[: len(first)] > 0)
     return Carried(verts[back], turns, np.flatnonzero(pushed[back]), np.flatnonzero(sunk[back]), *sits)
 
 
@@ -128,10 +128,10 @@ class _Body:
             weight *= np.maximum(facing, 0.0)  # not the arm beside the chest
             weight[:, 0] += 1e-9
             weight /= weight.sum(axis=1, keepdims=True)
-            own = self.jacobians[near]
-            moved = self.image[near] + np.einsum("nkij,nkj->nki", own, queries[:, None] - self.verts[near])
-            places[low : low + _CHUNK] = np.einsum("nk,nkd->nd", weight, moved)
-            jacobians[low : low + _CHUNK] = np.einsum("nk,nkij->nij", weight, own)
+            local_jacobians = self.jacobians[near]
+            images = self.image[near] + np.einsum("nkij,nkj->nki", local_jacobians, queries[:, None] - self.verts[near])
+            places[low : low + _CHUNK] = np.einsum("nk,nkd->nd", weight, images)
+            jacobians[low : low + _CHUNK] = np.einsum("nk,nkij->nij", weight, local_jacobians)
         return places, jacobians
 
 
@@ -143,10 +143,10 @@ class _Cloth:
         self.corners = np.concatenate([np.repeat(np.arange(len(rest))[:, None], 3, axis=1), faces])
         edges = edges_of(faces).vertices.astype(np.int64)
         start, end = edges.T
-        kept = np.einsum("nij,nj->ni", 0.5 * (jacobians[start] + jacobians[end]), rest[end] - rest[start])
+        target_edges = np.einsum("nij,nj->ni", 0.5 * (jacobians[start] + jacobians[end]), rest[end] - rest[start])
         self._pull = np.zeros_like(rest)
-        np.add.at(self._pull, end, kept)
-        np.add.at(self._pull, start, -kept)
+        np.add.at(self._pull, end, target_edges)
+        np.add.at(self._pull, start, -target_edges)
         self._laplacian = laplacian(edges, np.ones(len(edges)), len(rest))
 
     def at_points(self, values: Floats) -> Floats:

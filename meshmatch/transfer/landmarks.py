@@ -71,18 +71,18 @@ class Landmarks(Brief):
 
     def without(self, lost: Bool[Bools, " N"]) -> Landmarks:
         """A copy with some landmarks (N,) missing; their confidence is kept."""
-        nowhere = np.where(lost[:, None], np.nan, 0.0)
+        nans = np.where(lost[:, None], np.nan, 0.0)
         vertex, face = np.where(lost, -1, self.vertex), np.where(lost, -1, self.face)
-        points, weights = self.points + nowhere, self.barycentric + nowhere
+        points, weights = self.points + nans, self.barycentric + nans
         return replace(self, points=points, vertex=vertex, face=face, barycentric=weights)
 
 
 def at_vertices(shape: Shape, vertex: Int[Ints, " N"], names: tuple[str, ...] = ()) -> Landmarks:
     """Landmarks at vertices (N,) of `shape`; `InputError` for a vertex that does not exist."""
     vertex = np.asarray(vertex, np.int64)
-    N, held = len(vertex), f"{shape.name or 'the source'} has {shape.V} vertices"
+    N, count_text = len(vertex), f"{shape.name or 'the source'} has {shape.V} vertices"
     hint = "vertices are counted from 0; are they landmarks of the source?"
-    _check_none((vertex < 0) | (vertex >= shape.V), names, lambda k: f" is vertex {vertex[k]}, but {held}", hint)
+    _check_none((vertex < 0) | (vertex >= shape.V), names, lambda k: f" is vertex {vertex[k]}, but {count_text}", hint)
     return _on_surface(shape, names, vertex, np.full(N, -1), np.tile([1.0, 0.0, 0.0], (N, 1)))
 
 
@@ -109,9 +109,9 @@ def at_faces(
 ) -> Landmarks:
     """Landmarks in faces, at barycentric weights; `InputError` for a face that does not exist, or invalid weights."""
     face, weights = np.asarray(face, np.int64), np.asarray(barycentric, np.float64).reshape(-1, 3)
-    held = f"{shape.name or 'the source'} has {shape.F} faces"
+    count_text = f"{shape.name or 'the source'} has {shape.F} faces"
     hint = "faces are counted from 0; are they landmarks of the source?"
-    _check_none((face < 0) | (face >= shape.F), names, lambda k: f" is in face {face[k]}, but {held}", hint)
+    _check_none((face < 0) | (face >= shape.F), names, lambda k: f" is in face {face[k]}, but {count_text}", hint)
     hint = "the weights of a face's corners are 0 or more, and sum to 1"
     negative, sums = (weights < -1e-9).any(axis=1), weights.sum(axis=1)
     _check_none(negative, names, lambda k: f": one of its weights {weights[k].tolist()} is negative", hint)
@@ -155,9 +155,9 @@ def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: 
     A point of a face goes to the surface point nearest to the mean of its corners' images; where the map is discontinuous,
     to the image of its heaviest corner. Missing landmarks stay missing.
     """
-    at = landmarks.vertex
-    vertex, face, weights = forward.index[at], forward.face[at], forward.barycentric[at]
-    confidence = forward.confidence[at].astype(np.float64)
+    vertex_of = landmarks.vertex
+    vertex, face, weights = forward.index[vertex_of], forward.face[vertex_of], forward.barycentric[vertex_of]
+    confidence = forward.confidence[vertex_of].astype(np.float64)
     inside = np.flatnonzero((landmarks.face >= 0) & (landmarks.barycentric.max(axis=1) < 1.0 - 1e-9))
     if len(inside):
         inside = inside[~discontinuous_faces(forward, source, target)[landmarks.face[inside]]]
@@ -168,8 +168,8 @@ def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: 
         places = MappedMesh.of(target).query(interpolate(forward.points(target), corners, share), facing)
         vertex[inside], face[inside], weights[inside] = places.vertex, places.face, places.barycentric
         confidence[inside] = np.einsum("nk,nk->n", share, forward.confidence[corners])
-    found = _on_surface(target, landmarks.names, vertex, face, weights, np.clip(confidence, 0, 1))
-    return replace(found, lists=landmarks.lists).without(landmarks.missing)
+    pushed = _on_surface(target, landmarks.names, vertex, face, weights, np.clip(confidence, 0, 1))
+    return replace(pushed, lists=landmarks.lists).without(landmarks.missing)
 
 
 def load_landmarks(path: str | Path, shape: Shape, space: Space = "") -> tuple[Landmarks, float]:
@@ -206,11 +206,11 @@ def load_landmarks(path: str | Path, shape: Shape, space: Space = "") -> tuple[L
 
 def landmarks_with_warnings(path: str | Path, shape: Shape, space: Space = "") -> Landmarks:
     """As `load_landmarks`, with warnings about landmarks that are missing, converted, or far from the surface."""
-    found, furthest = load_landmarks(path, shape, space)
-    for note in found.notes:
+    landmarks, furthest = load_landmarks(path, shape, space)
+    for note in landmarks.notes:
         warn(note)
     warn_of_far_ones(shape, furthest)
-    return found
+    return landmarks
 
 
 def known_pairs(
@@ -225,9 +225,9 @@ def known_pairs(
     rows = [{name: row for row, name in enumerate(each.names)} for each in read]
     if both := [name for name in rows[0] if name in rows[1]]:
         for k in range(2):
-            if alone := [name for name in rows[k] if name not in rows[1 - k]]:
-                message = ", ".join(alone[:5]) + ", ..." * (len(alone) > 5)
-                warn(f"{files[k].name}: {files[1 - k].name} has no {message}: left out")
+            if unmatched := [name for name in rows[k] if name not in rows[1 - k]]:
+                listed = ", ".join(unmatched[:5]) + ", ..." * (len(unmatched) > 5)
+                warn(f"{files[k].name}: {files[1 - k].name} has no {listed}: left out")
         first, second = (each.vertex[[row[name] for name in both]] for each, row in zip(read, rows, strict=True))
         return first, second
     if len(read[0].names) != len(read[1].names):
@@ -249,13 +249,13 @@ def _in_frame_of_shape(shape: Shape, found: LandmarkFile, name: str) -> Landmark
     """Convert landmarks that state a frame of 3D Slicer, for a mesh that states none, to the other frame if that brings them
     onto the mesh's surface.
     """
-    given = np.array([place.where for place in found.places if place.kind == "position"], np.float64)
-    if not found.space or not len(given) or not (np.abs(given) < 1e60).all():
+    positions = np.array([place.where for place in found.places if place.kind == "position"], np.float64)
+    if not found.space or not len(positions) or not (np.abs(positions) < 1e60).all():
         return found
-    as_they_are, turned = (
-        MappedMesh.of(shape).query(points).distance.max() for points in (given, given * _OTHER_FRAME)
+    unchanged, turned = (
+        MappedMesh.of(shape).query(points).distance.max() for points in (positions, positions * _OTHER_FRAME)
     )
-    if as_they_are < _MIN_DISTANCE * shape.diagonal or as_they_are < _MIN_RATIO * turned:
+    if unchanged < _MIN_DISTANCE * shape.diagonal or unchanged < _MIN_RATIO * turned:
         return found
     places = tuple(
         replace(place, where=(place.where * _OTHER_FRAME).tolist()) if place.kind == "position" else place

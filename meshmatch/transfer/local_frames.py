@@ -29,7 +29,7 @@ def local_frames(
     """
     name = source.name or "the source"
     if source.is_cloud:
-        raise InputError(f"{name} is a point cloud: its surface turns nothing", "give a mesh")
+        raise InputError(f"{name} is a point cloud, which has no surface", "give a mesh")
     image = forward.points(target)
     normals = normals_at(forward, target)
     if facing(image, normals, source.verts, source.faces[source.valid_faces]) < _INSIDE_OUT:

@@ -191,14 +191,14 @@ def _read(path: Path) -> tuple[Measurement, ...]:
     rows = [[one_line(cell) for cell in row] for row in tables.read_table(path, blanks=False).rows(even=False)]
     if rows and rows[0][1:2] and rows[0][1].lower() == "kind":
         rows = rows[1:]
-    found = []
+    measurements = []
     for row in rows:
         while row and not row[-1]:
             row.pop()
         if row:
             name, kind, *landmarks = [*row, ""] if len(row) < 2 else row
-            found.append(Measurement(name, kind.lower(), tuple(landmarks)))  # type: ignore[arg-type]
-    return each_once(found)
+            measurements.append(Measurement(name, kind.lower(), tuple(landmarks)))  # type: ignore[arg-type]
+    return each_once(measurements)
 
 
 def each_once(measurements: Sequence[Measurement]) -> tuple[Measurement, ...]:
@@ -273,8 +273,8 @@ class _LandmarkIndex:
         for name in map(self._key, measurement.landmarks):
             row, problem, hint = self.row.get(name), "", ""
             if row is None:
-                near = get_close_matches(name[:80], self.row, 1)
-                hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(list(self.row)[:8])}"
+                similar = get_close_matches(name[:80], self.row, 1)
+                hint = f"did you mean {similar[0]!r}?" if similar else f"there are {', '.join(list(self.row)[:8])}"
                 problem = f"no landmark is called {name!r}"
             elif name in self.ambiguous:
                 problem, hint = f"two landmarks are called {name!r}", "give each a name of its own"
@@ -331,12 +331,12 @@ class _Surface:
             edge = np.sort(np.stack([self.twin[tip], self.twin[far]]), axis=0)
             keys[:, side] = edge[0] * self.shape.V + edge[1]
         pieces = np.einsum("nsk,nkd->nsd", weights, verts[corners])
-        own = np.flatnonzero(_connected_pieces(keys, _nearest_piece(pieces, at)))
-        lengths = np.sqrt(squared_lengths(pieces[own, 1] - pieces[own, 0]))
+        line_pieces = np.flatnonzero(_connected_pieces(keys, _nearest_piece(pieces, at)))
+        lengths = np.sqrt(squared_lengths(pieces[line_pieces, 1] - pieces[line_pieces, 0]))
         row, along, share = _sample_evenly(lengths)
-        ends = weights[own[row]]
-        found = (1 - along)[:, None] * ends[:, 0] + along[:, None] * ends[:, 1]
-        line = at_faces(self.shape, self.rows[cut[own[row]]], found)
+        ends = weights[line_pieces[row]]
+        weights_at_points = (1 - along)[:, None] * ends[:, 0] + along[:, None] * ends[:, 1]
+        line = at_faces(self.shape, self.rows[cut[line_pieces[row]]], weights_at_points)
         if not lengths.sum() >= _MIN_SHARE * _girth(line.points)[0]:
             raise InputError(
                 f"measurement {name}: a quarter of the girth or more is missing, for the surface is open there"
@@ -359,13 +359,13 @@ def _sample_evenly(lengths: Float[Floats, " N"]) -> tuple[Int[Ints, " M"], Float
     Returns for each point its piece, its parameter on it (0 to 1), and the share of the line that it stands for.
     """
     lengths = lengths if lengths.any() else np.ones(len(lengths))  # all points coincide
-    whole = float(lengths.sum())
-    steps = np.maximum(np.ceil(lengths / (whole * _SPACING)).astype(np.int64), 1)
+    total = float(lengths.sum())
+    steps = np.maximum(np.ceil(lengths / (total * _SPACING)).astype(np.int64), 1)
     row = np.repeat(np.arange(len(lengths)), steps + 1)
     first = np.cumsum(steps + 1) - steps - 1
     along = (np.arange(len(row)) - first[row]) / steps[row]
     halves = np.where((along == 0) | (along == 1), 1, 2)
-    return row, along, halves * (lengths / (2 * steps * whole))[row]
+    return row, along, halves * (lengths / (2 * steps * total))[row]
 
 
 def _is_torn(points: Float[Floats, "N 3"], trusted: Bool[Bools, " N"], face: Int[Ints, " N"], girth: float) -> bool:
@@ -398,15 +398,15 @@ def _angle(points: Float[Floats, "3 3"]) -> tuple[float, Floats]:
 
 def _girth(points: Float[Floats, "N 3"]) -> tuple[float, Floats]:
     """Tape length around points that lie nearly in one plane: perimeter of their convex hull in the best-fitting plane."""
-    middle = points.mean(axis=0)
-    axes = np.linalg.svd(points - middle, full_matrices=False)[2][:2]
-    flat = (points - middle) @ axes.T
+    center = points.mean(axis=0)
+    axes = np.linalg.svd(points - center, full_matrices=False)[2][:2]
+    flat = (points - center) @ axes.T
     try:
         line = flat[ConvexHull(flat).vertices]
     except (QhullError, ValueError):  # collinear points: there and back
         line = flat[[int(flat[:, 0].argmin()), int(flat[:, 0].argmax())]]
     length = np.sqrt(squared_lengths(np.roll(line, -1, axis=0) - line)).sum()
-    return float(length), middle + np.concatenate([line, line[:1]]) @ axes
+    return float(length), center + np.concatenate([line, line[:1]]) @ axes
 
 
 _MEASURE = {"distance": _distance, "angle": _angle, "girth": _girth}

@@ -40,26 +40,26 @@ def source_layout(
 
     `InputError`: a chart of the source does not fit into one image (tiles).
     """
-    whole, bounded = SurfaceWalker(source), SurfaceWalker(source)
-    charts = find_charts(whole, look)
-    bounded.cut(find_seams(whole, look))
-    own = _in_one_tile(look.uv, charts, source.name or "the source")
-    at, begin = _corner_images(whole, target, back)
-    center = at.mean(axis=1).T.astype(np.float32, order="C")
-    place = whole.closest(center, begin)[0]
+    walker, bounded = SurfaceWalker(source), SurfaceWalker(source)
+    charts = find_charts(walker, look)
+    bounded.cut(find_seams(walker, look))
+    uv_in_tile = _in_one_tile(look.uv, charts, source.name or "the source")
+    images, begin = _corner_images(walker, target, back)
+    center = images.mean(axis=1).T.astype(np.float32, order="C")
+    place = walker.closest(center, begin)[0]
     if polygons is not None:  # all triangles of a polygon take the place of its first
         first, number = np.unique(polygons, return_index=True, return_inverse=True)[1:]
         place = place[first][number.reshape(-1)]
-    size = np.sqrt(flat_areas(own) / np.maximum(whole.areas, 1e-300))  # image length per length on the source
+    size = np.sqrt(flat_areas(uv_in_tile) / np.maximum(walker.areas, 1e-300))  # image length per length on the source
     out = np.empty((target.F, 3, 2))
     for k in range(3):
-        face, weights = bounded.reach(at[:, k].T.astype(np.float32, order="C"), place)
+        face, weights = bounded.reach(images[:, k].T.astype(np.float32, order="C"), place)
         clamped = np.maximum(weights, 0)
         clamped /= clamped.sum(axis=1, keepdims=True)
-        foot, uv = (np.einsum("fk,fkd->fd", each, own[face]) for each in (clamped, weights))
-        away = np.linalg.norm(interpolate(whole.verts, whole.faces[face], clamped) - at[:, k], axis=1)
+        foot, uv = (np.einsum("fk,fkd->fd", each, uv_in_tile[face]) for each in (clamped, weights))
+        distance = np.linalg.norm(interpolate(walker.verts, walker.faces[face], clamped) - images[:, k], axis=1)
         length = np.linalg.norm(uv - foot, axis=1)
-        limit = _MAX_RATE * size[face] * away
+        limit = _MAX_RATE * size[face] * distance
         out[:, k] = foot + (uv - foot) * np.minimum(1.0, limit / np.maximum(length, 1e-300))[:, None]
     return np.clip(_merge_corners(out, target.faces, charts[place]), 0.0, 1.0), len(np.unique(charts))
 
@@ -89,8 +89,8 @@ def _corner_images(walker: SurfaceWalker, target: Shape, back: VertexMap) -> tup
     discontinuous = np.flatnonzero(locator.discontinuous)
     if len(discontinuous):
         faces = target.faces[discontinuous]
-        sure = back.assumed_confidence[faces].argmax(axis=1)
-        vertex = faces[np.arange(len(discontinuous)), sure]
+        most_confident = back.assumed_confidence[faces].argmax(axis=1)
+        vertex = faces[np.arange(len(discontinuous)), most_confident]
         away = target.verts[faces] - target.verts[vertex][:, None]
         at[discontinuous] = image[vertex][:, None] + np.einsum("fij,fkj->fki", locator.jacobian[vertex], away)
         begin[discontinuous] = start[vertex]
@@ -102,6 +102,6 @@ def _merge_corners(uv: Floats, faces: Ints, charts: Ints32) -> Floats:
     key = faces * (int(charts.max()) + 1) + charts[:, None]
     first, back = np.unique(key.ravel(), return_index=True, return_inverse=True)[1:]
     flat = uv.reshape(-1, 2)
-    usual = flat[first][back.reshape(-1)]
-    near = np.abs(flat - usual).max(axis=1) < _TOLERANCE
-    return np.where(near[:, None], usual, flat).reshape(uv.shape)
+    first_uv = flat[first][back.reshape(-1)]
+    near = np.abs(flat - first_uv).max(axis=1) < _TOLERANCE
+    return np.where(near[:, None], first_uv, flat).reshape(uv.shape)

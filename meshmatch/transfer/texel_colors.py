@@ -126,8 +126,8 @@ def known_texels(material: Material, uv: Floats) -> Bools | None:
         small[face] = False
     # Triangles without a texel center mark the texels they lie on, where nothing nearby is known.
     at = _texels_at(corners[small].mean(axis=1), material, known.shape)
-    alone = ~maximum_filter(known, 3)[at]
-    thin = corners[small][alone]
+    isolated = ~maximum_filter(known, 3)[at]
+    thin = corners[small][isolated]
     sides = thin[:, [1, 2, 0]] - thin
     rows, longest = np.arange(len(thin)), np.square(sides).sum(axis=2).argmax(axis=1)
     start, side = thin[rows, longest], sides[rows, longest]
@@ -273,8 +273,12 @@ class TexelLocator:
             points[k] = column[6 + k] + weights[1] * column[9 + k] + weights[2] * column[12 + k]
         if len(column) > 15:  # hat functions: 1 at an edge's middle, 0 at the other middles and corners, linear between
             one, two, three = np.maximum(weights, 0)
-            for at, (left, right, far) in ((15, (two, three, one)), (18, (three, one, two)), (21, (one, two, three))):
-                share = np.maximum(np.minimum(np.minimum(2 * left, 2 * right), 1 - 2 * far), 0)
+            for at, (left, right, too_far) in (
+                (15, (two, three, one)),
+                (18, (three, one, two)),
+                (21, (one, two, three)),
+            ):
+                share = np.maximum(np.minimum(np.minimum(2 * left, 2 * right), 1 - 2 * too_far), 0)
                 for k in range(3):
                     points[k] += share * column[at + k]
         corner = np.where(weights[2] > np.maximum(weights[0], weights[1]), 2, weights[1] > weights[0])
@@ -284,12 +288,12 @@ class TexelLocator:
         begin = self._start_faces(face, corner)
         begin = begin if start is None else np.where(start >= 0, start, begin)
         place, source_weights, distance = self.walker.closest(points, begin)
-        far = np.flatnonzero(distance > _MAX_DISTANCE * self._size.take(face))
-        for k in (1, 2) if len(far) else ():
-            other = self._start_faces(face[far], (corner[far] + k) % 3)
-            there, weigh, gap = self.walker.closest(points[:, far], other)
-            better = gap < distance[far]
-            rows = far[better]
+        too_far = np.flatnonzero(distance > _MAX_DISTANCE * self._size.take(face))
+        for k in (1, 2) if len(too_far) else ():
+            other = self._start_faces(face[too_far], (corner[too_far] + k) % 3)
+            there, weigh, gap = self.walker.closest(points[:, too_far], other)
+            better = gap < distance[too_far]
+            rows = too_far[better]
             place[rows], source_weights[:, rows], distance[rows] = there[better], weigh[:, better], gap[better]
         return weights, place, source_weights
 
@@ -300,15 +304,15 @@ class TexelLocator:
     def confidence(self, face: Ints32, weights: Floats32) -> Floats32:
         """(N,) confidence of the map at weights (3, N) in triangles (N,)."""
         clipped = np.maximum(weights, 0)
-        sure = weighted_sum(clipped, [self._confidence.take(column.take(face)) for column in self._corners])
-        return np.asarray(sure / (clipped[0] + clipped[1] + clipped[2]))
+        weighted = weighted_sum(clipped, [self._confidence.take(column.take(face)) for column in self._corners])
+        return np.asarray(weighted / (clipped[0] + clipped[1] + clipped[2]))
 
     def _extrapolate(self, face: Ints32, weights: Floats32, corner: Ints) -> Floats32:
         """Points (3, N) of discontinuous triangles: extrapolated from the surface around the nearest corner."""
         vertex = self.faces[face, corner]
         corners = self.verts[self.faces[face]]
-        away = np.einsum("kn,nkd->nd", weights, corners) - self.verts[vertex]
-        points = self._image[vertex] + np.einsum("nij,nj->ni", self.jacobian[vertex], away)
+        offset = np.einsum("kn,nkd->nd", weights, corners) - self.verts[vertex]
+        points = self._image[vertex] + np.einsum("nij,nj->ni", self.jacobian[vertex], offset)
         return np.asarray(points.T, np.float32)
 
 
@@ -332,10 +336,10 @@ def edge_bends(source: Shape, target: Shape, forward: VertexMap, back: VertexMap
     start = np.concatenate([start, start[ends[:, 0]]])
     face, weights, _ = there.closest(queries.T.astype(np.float32, order="C"), start.astype(np.int32))
     corners, weights = there.faces[face], weights.T.astype(np.float64)
-    image, off = interpolate(own.verts, corners, weights), interpolate(there.verts, corners, weights) - queries
+    image, error = interpolate(own.verts, corners, weights), interpolate(there.verts, corners, weights) - queries
     bends, (one, two) = image[target.V :] - image[ends].mean(axis=1), ends.T
-    apart = image[: target.V] - known
-    for far, at in ((bends, known), (apart[one], known), (apart[two], known), (off[target.V :], verts)):
+    disagreement = image[: target.V] - known
+    for far, at in ((bends, known), (disagreement[one], known), (disagreement[two], known), (error[target.V :], verts)):
         bends[squared_lengths(far) > _MAX_BEND**2 * squared_lengths(at[two] - at[one])] = 0.0
     return np.asarray(bends[of_face.reshape(-1, 3)])
 

@@ -91,9 +91,9 @@ def grow(found: Ints32, steps: int) -> None:
     height, width = found.shape
     for _ in range(steps):
         known = found >= 0
-        near = np.pad(known, 1)
-        near = near[:-2] | near[1:-1] | near[2:]
-        row, column = np.nonzero((near[:, :-2] | near[:, 1:-1] | near[:, 2:]) & ~known)
+        padded = np.pad(known, 1)
+        padded = padded[:-2] | padded[1:-1] | padded[2:]
+        row, column = np.nonzero((padded[:, :-2] | padded[:, 1:-1] | padded[:, 2:]) & ~known)
         values = np.full(len(row), -1, np.int32)
         for down, right in _NEIGHBORS:
             r, c = row + down, column + right
@@ -141,16 +141,16 @@ def _next_level(pixels: Pixels, weight: UInts8 | Floats32, linear: bool) -> tupl
     total = np.zeros(out.shape[:2], np.float32)
     table = _BYTE_VALUES if linear else LINEAR_OF_BYTE
     for rows, whole in _bands(weight.shape):
-        part, own = _pad_even(pixels[whole]), _pad_even(weight[whole])
-        shares = own if own.dtype == np.float32 else _BYTE_SHARES.take(own)
-        known = _sum_of_quads([shares[at] for at in _QUADS])
-        safe = np.maximum(known, 1e-20)
+        part, part_weights = _pad_even(pixels[whole]), _pad_even(weight[whole])
+        shares = part_weights if part_weights.dtype == np.float32 else _BYTE_SHARES.take(part_weights)
+        weights_sum = _sum_of_quads([shares[at] for at in _QUADS])
+        safe = np.maximum(weights_sum, 1e-20)
         for k in range(4):
             amounts = _BYTE_VALUES if k == 3 else table
             sums = _sum_of_quads([amounts.take(part[(*at, k)]) * shares[at] for at in _QUADS])
             mean = (sums / safe).astype(np.float32)
             out[rows, :, k] = np.round(mean) if amounts is _BYTE_VALUES else bytes_of(mean)
-        total[rows] = np.minimum(known, np.float32(1.0))
+        total[rows] = np.minimum(weights_sum, np.float32(1.0))
     return out, total
 
 

@@ -145,9 +145,9 @@ def _check_coordinates(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str
     if np.abs(uv[real]).max() > 1e6:
         return uv, "some are absurdly large", 0.0
     out = _into_unit_square(uv, shape)
-    beyond = int((out.max(axis=(1, 2)) > 1.0 + 1e-5).sum())
-    if beyond:
-        return out, f"{beyond} faces reach out of range, over the edge of the image", 0.0
+    n_outside = int((out.max(axis=(1, 2)) > 1.0 + 1e-5).sum())
+    if n_outside:
+        return out, f"{n_outside} faces reach out of range, over the edge of the image", 0.0
     uv = np.clip(out, 0.0, 1.0)
     room = flat_areas(uv)
     if room.sum() < _MIN_USED:
@@ -176,12 +176,14 @@ def tiles_of(shape: Shape, uv: Float[Floats, "F 3 2"], size: int) -> Int[Ints, "
     real = shape.face_areas > 0
     if not real.any() or not (np.isfinite(uv[real]).all() and np.abs(uv[real]).max() <= 10.0 + 1e-5):
         return None
-    up = np.where(real[:, None, None], uv * [1.0, -1.0] + [0.0, 1.0], 0.0)
-    place = np.floor(up.min(axis=1) + 1e-5).astype(np.int64)
+    upwards = np.where(real[:, None, None], uv * [1.0, -1.0] + [0.0, 1.0], 0.0)
+    place = np.floor(upwards.min(axis=1) + 1e-5).astype(np.int64)
     number = _FIRST_TILE + place @ [1, 10]
     found = np.unique(number[real])
-    beyond = (up.max(axis=1) > place + 1.0 + 1e-5).any(axis=1) | (place < 0).any(axis=1) | (place > 9).any(axis=1)
-    if beyond[real].any() or len(found) < 2 or len(found) * size**2 > _MAX_TEXELS:
+    crosses_tiles = (
+        (upwards.max(axis=1) > place + 1.0 + 1e-5).any(axis=1) | (place < 0).any(axis=1) | (place > 9).any(axis=1)
+    )
+    if crosses_tiles[real].any() or len(found) < 2 or len(found) * size**2 > _MAX_TEXELS:
         return None
     within = np.clip(_into_unit_square(uv, shape), 0.0, 1.0)
     room, due = flat_areas(within), shape.face_areas / shape.face_areas.sum()
@@ -204,10 +206,10 @@ def too_many_layers(uv: Float[Floats, "F 3 2"], size: int) -> float:
 
 def shared_texels(uv: Float[Floats, "F 3 2"], size: int = 1024) -> float:
     """Share of the used texels of an image that several triangles cover."""
-    found, twice = draw_triangles(uv * size, size)
+    found, n_surplus = draw_triangles(uv * size, size)
     used = found >= 0
-    if twice <= _MAX_OVERLAP * used.sum():
-        return twice / max(int(used.sum()), 1)
+    if n_surplus <= _MAX_OVERLAP * used.sum():
+        return n_surplus / max(int(used.sum()), 1)
     other = draw_triangles(uv[::-1] * size, size)[0]
     return float((other[used] != len(uv) - 1 - found[used]).mean())
 
@@ -224,8 +226,8 @@ def unwrapped(shape: Shape, size: int, padding: int, polygons: Ints | None = Non
         problem = f"{shape.name or 'the target'} cannot be unwrapped (it has triangles as thin as a thread)"
         raise InputError(problem, "unwrap it in a modelling program, and use --uv keep")
     corners = weld(verts, corners)
-    if (whole := (corners != corners[:, [1, 2, 0]]).all(axis=1)).any():
-        real, corners = real[whole], corners[whole]
+    if (is_triangle := (corners != corners[:, [1, 2, 0]]).all(axis=1)).any():
+        real, corners = real[is_triangle], corners[is_triangle]
     uv = new_charts(verts, corners, size, padding, None if polygons is None else polygons[real])
     out = np.zeros((shape.F, 3, 2))
     # A margin at the border too: a repeated image continues there with its opposite side.

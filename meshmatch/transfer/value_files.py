@@ -118,24 +118,26 @@ def save_values(path: Path, values: Values, shape: Shape, file: Path | None = No
         tables.write_rows(path, ["vertex", *names], ([k, *row] for k, row in enumerate(table.tolist())))
     elif suffix in (".vtp", ".vtk"):
         as_vtp = VtpFile.of(file, shape) if suffix == ".vtp" else None
-        there = vtk_xml.point_arrays(file) if suffix == ".vtp" and as_vtp is None else {}
-        own = _make_unique([name or "value" for name in names], set(there if as_vtp is None else as_vtp.arrays))
-        arrays = dict(zip(own, table.T, strict=True))
+        point_arrays = vtk_xml.point_arrays(file) if suffix == ".vtp" and as_vtp is None else {}
+        unique_names = _make_unique(
+            [name or "value" for name in names], set(point_arrays if as_vtp is None else as_vtp.arrays)
+        )
+        arrays = dict(zip(unique_names, table.T, strict=True))
         if as_vtp is not None:
             path.write_bytes(as_vtp.with_arrays(arrays, {}))
         else:
-            (vtk.write_vtp if suffix == ".vtp" else vtk.write_vtk)(path, shape, {**there, **arrays})
+            (vtk.write_vtp if suffix == ".vtp" else vtk.write_vtk)(path, shape, {**point_arrays, **arrays})
         return as_vtp is not None
     else:
-        words = ["".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in name) for name in names]
-        own = _make_unique([word or "value" for word in words], _RESERVED)
+        safe_names = ["".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in name) for name in names]
+        unique_names = _make_unique([word or "value" for word in safe_names], _RESERVED)
         with np.errstate(over="ignore"):  # 32 bits, which more programs read; VTK, and so ParaView, reads no 64-bit ply
             written = table.astype(np.float32)
             difference = np.abs(written - table)
         whole = (table == np.rint(table)) & (np.abs(table) < 2**53)
         if (difference > np.where(whole, 0.0, _MAX_ROUNDING * np.abs(table))).any():
             warn(f"{path.name} has 32-bit numbers, which change some of these; .csv, .npy and .vtp keep them")
-        columns, as_ply = dict(zip(own, written.T, strict=True)), PlyFile.of(file, shape)
+        columns, as_ply = dict(zip(unique_names, written.T, strict=True)), PlyFile.of(file, shape)
         if as_ply is not None:
             path.write_bytes(as_ply.with_columns(columns, {}))
         else:
@@ -146,7 +148,7 @@ def save_values(path: Path, values: Values, shape: Shape, file: Path | None = No
 
 def _make_unique(names: list[str], taken: set[str]) -> list[str]:
     """Make names different from each other and from those taken: a second a becomes a_, a third a_2."""
-    found: list[str] = []
+    unique: list[str] = []
     used, times = set(taken), Counter[str]()
     for name in names:
         own = name
@@ -154,8 +156,8 @@ def _make_unique(names: list[str], taken: set[str]) -> list[str]:
             times[name] += 1
             own = f"{name}_" if times[name] == 1 else f"{name}_{times[name]}"
         used.add(own)
-        found.append(own)
-    return found
+        unique.append(own)
+    return unique
 
 
 def parse_blank(text: str, columns: int) -> Float[Floats, " D"]:

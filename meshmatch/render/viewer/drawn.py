@@ -65,14 +65,14 @@ def draw(shape: Shape, most: int = MOST) -> Drawn:
     faces = shape.faces[sound]
     if len(faces) == 0:
         return _draw_points(shape, np.flatnonzero(valid), most)
-    joined = seams(shape.verts, faces)
-    smooth = Shape(shape.verts, joined[faces]).vertex_normals[joined]
+    welded = seams(shape.verts, faces)
+    smooth = Shape(shape.verts, welded[faces]).vertex_normals[welded]
     if shape.V <= most:
         return Drawn(shape.verts, faces, smooth, np.arange(shape.V), sound)
-    kept = corners_of(joined[faces])
+    kept = corners_of(welded[faces])
     number = np.empty(shape.V, np.int64)
     number[kept] = np.arange(len(kept))
-    coarse = decimate(Shape(shape.verts[kept], number[joined[faces]]), 2 * int(_REDUCED_SHARE * most))
+    coarse = decimate(Shape(shape.verts[kept], number[welded[faces]]), 2 * int(_REDUCED_SHARE * most))
     used = corners_of(faces)
     if coarse.V > most:  # single triangles that are not connected cannot be decimated
         return _draw_points(shape, used, most)
@@ -133,8 +133,10 @@ def boxes(
     sizes = [edges[0], edges[1] / ratio]
     if not 1 / _MAX_RATIO < sizes[0] / sizes[1] < _MAX_RATIO:
         sizes = [1.0, 1.0]
-    lows = [(verts.min(axis=0) + verts.max(axis=0)) / 2 - edge / 2 for verts, edge in zip(turned, edges, strict=True)]
-    return [Box(rotations[k], lows[k], edges[k], sizes[k] / max(sizes)) for k in (0, 1)]
+    corners = [
+        (verts.min(axis=0) + verts.max(axis=0)) / 2 - edge / 2 for verts, edge in zip(turned, edges, strict=True)
+    ]
+    return [Box(rotations[k], corners[k], edges[k], sizes[k] / max(sizes)) for k in (0, 1)]
 
 
 def relative_size(source: Shape, target: Shape, there: VertexMap) -> float:
@@ -153,16 +155,18 @@ def relative_size(source: Shape, target: Shape, there: VertexMap) -> float:
     points = there.points(target)
     own = np.linalg.norm(source.verts[pairs[:, 0]] - source.verts[pairs[:, 1]], axis=1)
     image = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
-    sure = there.assumed_confidence[pairs].min(axis=1) * (image <= np.quantile(image, 0.95))
-    lengths = float(sure @ own), float(sure @ image)
+    weights = there.assumed_confidence[pairs].min(axis=1) * (image <= np.quantile(image, 0.95))
+    lengths = float(weights @ own), float(weights @ image)
     return lengths[1] / lengths[0] if min(lengths) > 0 else 1.0
 
 
-def upright(source: Shape, target: Shape, there: VertexMap, given: Rotations = (None, None)) -> tuple[Floats, Floats]:
+def upright(
+    source: Shape, target: Shape, there: VertexMap, rotations: Rotations = (None, None)
+) -> tuple[Floats, Floats]:
     """Rotations (3, 3) of both shapes to y up, z front. Unless given, the source's is guessed, and the target's shows
     matched points from the same side; with a poor map it is the source's.
     """
-    own = np.asarray(facing(source) if given[0] is None else given[0], np.float64)
-    if given[1] is not None:
-        return own, np.asarray(given[1], np.float64)
+    own = np.asarray(facing(source) if rotations[0] is None else rotations[0], np.float64)
+    if rotations[1] is not None:
+        return own, np.asarray(rotations[1], np.float64)
     return own, own if there.verdict == "poor" else facing_matched(source, target, there, own)

@@ -57,8 +57,8 @@ def write_motion(
     low, edge, cube = span(np.concatenate([verts[part.used] for verts in turned]))
     normals = [np.zeros_like(verts) for verts in turned]  # of points, which face the viewer then
     if len(faces):  # equal on both sides of a seam
-        joined = seams(turned[0], faces)
-        normals = [Shape(verts, joined[faces]).vertex_normals[joined] for verts in turned]
+        welded = seams(turned[0], faces)
+        normals = [Shape(verts, welded[faces]).vertex_normals[welded] for verts in turned]
     colors = np.tile(CLAY, (first.V, 1)) if first.colors is None else first.colors[:, :3]
     arrays: dict[str, NDArray[Any]] = {
         "position": scaled((np.stack(turned) - low) / edge, np.uint16),
