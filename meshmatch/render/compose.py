@@ -18,7 +18,7 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.evaluate import CM, Errors, ErrorUnit
 from meshmatch.maps.mapped_mesh import MappedMesh, invert_map
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.render.facing import Rotations, same_side, upright
+from meshmatch.render.facing import Rotations, same_side, snap_upright
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes
 from meshmatch.render.scales import CLAY, Legend, Scale, label_swatches, position_colors
@@ -174,7 +174,7 @@ def compose_fit(
         Panel(shape, label=f"{shape.name} and {what}", over=fitted),
         Panel(shape, scale.colors(distance), "how far apart they are"),
     )
-    turn = None if rotation is None else upright(rotation)
+    turn = None if rotation is None else snap_upright(rotation)
     return Composition(panels, scale, f"{what} over the shape", record).rotated((turn, turn))
 
 

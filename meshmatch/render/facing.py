@@ -52,7 +52,7 @@ def facing(shape: Shape, up: str | None = None, front: str | None = None) -> Rot
     return np.stack([np.cross(upward, ahead), upward, ahead])
 
 
-def upright(rotation: Rotation) -> Rotation:
+def snap_upright(rotation: Rotation) -> Rotation:
     """The rotation with its up direction snapped to an axis of the file, if one is near. The frame of a fit follows the
     torso, which may lean, but files nearly always have an axis that points up.
     """
@@ -74,7 +74,7 @@ def same_side(
     Rotations of fits (`Frame.rotation`) are used if known; else the named axes; else the source's follows from its own
     shape, and the target's from the map.
     """
-    first, second = (None if rotation is None else upright(rotation) for rotation in rotations)
+    first, second = (None if rotation is None else snap_upright(rotation) for rotation in rotations)
     if first is None:
         first = facing(source, up, front)
     if second is None:

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from meshmatch.errors import OptionError
-from meshmatch.render.viewer.single_pages import MOST_MODES, Varying, write_atlas_page
+from meshmatch.render.viewer.single_pages import MAX_MODES, Varying, write_atlas_page
 from meshmatch.shapes.shape import Shape
 from tests.render.browser import PHONE, nameless, opened
 from tests.render.pages import read
@@ -50,10 +50,10 @@ def test_many_modes_and_vertices_are_fewer_on_the_page(tmp_path: Path, make_sphe
     many = Varying(ball, modes, np.full(20, 0.05), np.zeros((1, 20)), ("a",))
     write_atlas_page(path, many, rotation=np.eye(3), most=200)
     words, arrays = read(path).words, read(path).arrays
-    assert len(words["shares"]) == MOST_MODES
+    assert len(words["shares"]) == MAX_MODES
     assert "12 of 20 modes" in words["kept"]
     assert "of 642 vertices" in words["note"]
-    assert len(arrays["mode"]) == MOST_MODES * len(arrays["position"])
+    assert len(arrays["mode"]) == MAX_MODES * len(arrays["position"])
 
 
 @pytest.mark.parametrize("wrong", ["suffix", "cloud", "modes"])

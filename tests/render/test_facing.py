@@ -8,7 +8,7 @@ import pytest
 
 from meshmatch.errors import OptionError
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.render.facing import facing, facing_alike, facing_matched, upright
+from meshmatch.render.facing import facing, facing_alike, facing_matched, snap_upright
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
@@ -156,13 +156,13 @@ def rotation_about(axis: list[float], degrees: float) -> np.ndarray:
 def test_the_frame_of_a_torso_that_leans_is_made_upright() -> None:
     frame = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0.0]])  # z up, x to the front
     leaning = rotation_about([1, 0, 0], 25) @ frame
-    assert upright(leaning) == pytest.approx(frame)
+    assert snap_upright(leaning) == pytest.approx(frame)
     turned = rotation_about([0, 1, 0], 40) @ frame
-    assert upright(rotation_about([0, 0, 1], -20) @ turned)[1] == pytest.approx([0, 0, 1])
-    assert upright(turned) == pytest.approx(turned)
+    assert snap_upright(rotation_about([0, 0, 1], -20) @ turned)[1] == pytest.approx([0, 0, 1])
+    assert snap_upright(turned) == pytest.approx(turned)
     for lying in (rotation_about([1, 0, 0], 44) @ frame, rotation_about([0, 0, 1], 40) @ frame):
-        assert np.array_equal(upright(lying), lying)  # between two axes: as the fit says
-    assert upright(-np.diag([-1.0, 1, 1])) == pytest.approx(-np.diag([-1.0, 1, 1]))
+        assert np.array_equal(snap_upright(lying), lying)  # between two axes: as the fit says
+    assert snap_upright(-np.diag([-1.0, 1, 1])) == pytest.approx(-np.diag([-1.0, 1, 1]))
 
 
 def test_a_map_to_one_point_says_nothing_about_the_side(torus: Shape) -> None:

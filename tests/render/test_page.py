@@ -17,7 +17,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.facing import facing_alike
 from meshmatch.render.scales import position_colors
 from meshmatch.render.viewer.assembly import pack, small_integers
-from meshmatch.render.viewer.drawn import draw, relative_size, upright
+from meshmatch.render.viewer.drawn import draw, relative_size, view_rotations
 from meshmatch.render.viewer.looks import Looks, look_arrays
 from meshmatch.render.viewer.page import write_page
 from meshmatch.shapes.appearance import Appearance, Material
@@ -63,7 +63,7 @@ def test_the_page_holds_both_shapes_and_the_map(page: Page, pair: Pair) -> None:
         assert np.array_equal(arrays[f"{side}.face"].reshape(-1, 3), shape.faces)
         assert np.array_equal(arrays[f"{side}.match"], found.index)
         assert np.array_equal(arrays[f"{side}.confidence"], np.round(255 * found.confidence))
-    color = position_colors(pair.source, upright(pair.source, pair.target, pair.there)[0])
+    color = position_colors(pair.source, view_rotations(pair.source, pair.target, pair.there)[0])
     carried = np.where(pair.back.confidence[:, None] > 0, color[pair.back.index], UNKNOWN)
     for side, expected in (("source", color), ("target", carried)):
         assert np.abs(arrays[f"{side}.color"].reshape(-1, 3) / 255 - expected).max() < 0.6 / 255
@@ -75,7 +75,7 @@ def test_positions_are_exact_to_sixteen_bits_in_one_scale(page: Page, pair: Pair
     own, other = ((arrays[f"{side}.position"].reshape(-1, 3) / 65535 - 0.5) for side in ("source", "target"))
     edge = np.ptp(pair.source.verts, axis=0).max()
     middle = pair.source.bounds.mean(axis=0)
-    turn = upright(pair.source, pair.target, pair.there)[0]
+    turn = view_rotations(pair.source, pair.target, pair.there)[0]
     assert np.abs(own - (pair.source.verts - middle) @ turn.T / edge).max() < 0.6 / 65535
     assert words["source"]["size"] == words["target"]["size"] == 1.0
     assert np.abs(own - other[pair.there.index]).max() < 1.1 / 65535
@@ -208,7 +208,7 @@ def test_a_large_mesh_is_drawn_coarser_and_says_so(
     assert np.array_equal(page.arrays["source.match"], fine.there.index[rows])
     # each stands for a vertex close by, and its match is the exact one of that vertex
     position = page.arrays["source.position"].reshape(-1, 3) / 65535
-    own = fine.source.verts @ upright(fine.source, fine.target, fine.there)[0].T
+    own = fine.source.verts @ view_rotations(fine.source, fine.target, fine.there)[0].T
     scaled = (own - own.min(axis=0)) / np.ptp(own, axis=0).max()
     gap = position - position.min(axis=0) - scaled[rows]
     assert np.linalg.norm(gap - np.median(gap, axis=0), axis=1).max() < 0.06
@@ -241,16 +241,16 @@ def test_seams_do_not_show_in_the_light(make_sphere: Callable[[int], Shape]) -> 
 
 
 def test_a_target_lies_as_the_source_where_only_the_map_tells(pair: Pair) -> None:
-    own, other = upright(pair.source, pair.target, pair.there)
+    own, other = view_rotations(pair.source, pair.target, pair.there)
     a, b = pair.source.verts @ own.T, pair.target.verts[pair.there.index] @ other.T
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)
     assert np.allclose(3 * a, b)
     far = about(0, 0.9) @ about(1, 0.7)  # a file with no axis up
     away = Shape(pair.source.verts @ far.T, pair.source.faces, "away")
     there = VertexMap.between(pair.source, away, np.arange(away.V))
-    assert np.allclose(upright(pair.source, away, there)[1] @ far, own, atol=1e-6)
+    assert np.allclose(view_rotations(pair.source, away, there)[1] @ far, own, atol=1e-6)
     poor = VertexMap.between(pair.source, away, np.arange(away.V), verdict="poor")
-    assert np.array_equal(upright(pair.source, away, poor)[1], own)
+    assert np.array_equal(view_rotations(pair.source, away, poor)[1], own)
 
 
 def about(axis: int, angle: float) -> np.ndarray:
@@ -272,7 +272,7 @@ def test_a_fit_that_leans_is_levelled_where_the_shape_stands(make_sphere: Callab
 
 def test_given_rotations_are_kept(pair: Pair) -> None:
     turn = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
-    own, other = upright(pair.source, pair.target, pair.there, (turn, np.eye(3)))
+    own, other = view_rotations(pair.source, pair.target, pair.there, (turn, np.eye(3)))
     assert np.array_equal(own, turn)
     assert np.array_equal(other, np.eye(3))
 
@@ -358,7 +358,7 @@ def test_large_images_become_smaller(tmp_path: Path, cube: Shape, monkeypatch: p
     assert page.words["source"]["look"]["images"] == ["image/jpeg"]
     with Image.open(BytesIO(data)) as picture:
         assert (picture.format, picture.size) == ("JPEG", (1024, 2048))
-    monkeypatch.setattr("meshmatch.render.viewer.looks.MOST_PIXELS", 512 * 1024)
+    monkeypatch.setattr("meshmatch.render.viewer.looks.MAX_PIXELS", 512 * 1024)
     page = worn_page(tmp_path, cube, look)
     with Image.open(BytesIO(page.arrays["source.look.image0"].tobytes())) as picture:
         assert picture.size == (512, 1024)

@@ -104,7 +104,7 @@ def test_colors_of_vertices_are_carried_as_such(pair: Pair, cloud: bool) -> None
 def test_where_nothing_can_be_baked_vertices_have_colors(
     pair: Pair, textured: Appearance, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "MOST_FACES", 100 if why == "fine" else 10**6)
+    monkeypatch.setattr(module, "MAX_FACES", 100 if why == "fine" else 10**6)
     other = Shape(pair.target.verts, pair.target.faces if why == "fine" else None, "other")
     back = VertexMap.between(other, pair.source, pair.back.index)
     there = VertexMap.between(pair.source, other, pair.there.index)

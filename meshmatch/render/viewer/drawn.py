@@ -160,7 +160,7 @@ def relative_size(source: Shape, target: Shape, there: VertexMap) -> float:
     return lengths[1] / lengths[0] if min(lengths) > 0 else 1.0
 
 
-def upright(
+def view_rotations(
     source: Shape, target: Shape, there: VertexMap, rotations: Rotations = (None, None)
 ) -> tuple[Floats, Floats]:
     """Rotations (3, 3) of both shapes to y up, z front. Unless given, the source's is guessed, and the target's shows

@@ -25,11 +25,11 @@ from meshmatch.transfer.unwrap import atlas_of
 Arrays = dict[str, NDArray[Any]]
 TEXELS = 1024
 """Width and height of a texture that is baked for a page."""
-MOST_FACES = 40_000
+MAX_FACES = 40_000
 """A finer mesh gets vertex colors instead: they show nearly as much, and unwrapping it would take a minute."""
-LARGEST = 2048
+MAX_SIDE = 2048
 """Maximum length in pixels of an image's longer side; larger images are reduced."""
-MOST_PIXELS = 3 * LARGEST**2
+MAX_PIXELS = 3 * MAX_SIDE**2
 """Maximum number of pixels of all images of one look together."""
 _LOSSLESS_SIZE = 256  # pixels along a side up to which an image is kept without loss: it may be drawn by hand
 
@@ -85,7 +85,7 @@ def _transfer_look(
 ) -> Appearance:
     """The source's look on the target, by a map from target to source: as a baked texture, or as vertex colors."""
     material = np.zeros(target.F, np.int64)
-    if look.textured and 0 < target.F <= MOST_FACES:
+    if look.textured and 0 < target.F <= MAX_FACES:
         options = BakeOptions(size=TEXELS, padding=4, workers=workers)
         try:
             atlas = atlas_of(target, coordinates, options.size, options.padding)
@@ -145,8 +145,8 @@ def _textured_mesh(look: Appearance, part: Drawn) -> tuple[Arrays, dict[str, Any
     used, starts, counts = np.unique(material[order], return_index=True, return_counts=True)
     materials = [look.materials[k] for k in used.tolist()]
     pictures = {id(m.image): m.image for m in materials if m.image is not None}
-    sizes = [min(1.0, LARGEST / max(image.shape[:2])) ** 2 * image[..., 0].size for image in pictures.values()]
-    shrink = min(1.0, float(np.sqrt(MOST_PIXELS / max(sum(sizes), 1.0))))
+    sizes = [min(1.0, MAX_SIDE / max(image.shape[:2])) ** 2 * image[..., 0].size for image in pictures.values()]
+    shrink = min(1.0, float(np.sqrt(MAX_PIXELS / max(sum(sizes), 1.0))))
     kinds = []
     for k, image in enumerate(pictures.values()):
         kind, data = _encoded(image, shrink, all(m.alpha == "opaque" for m in materials if m.image is image))
@@ -171,7 +171,7 @@ def _textured_mesh(look: Appearance, part: Drawn) -> tuple[Arrays, dict[str, Any
 def _encoded(pixels: Pixels, shrink: float, opaque: bool) -> tuple[str, bytes]:
     """Media type and bytes of an image file: PNG if it is small or has alpha, else JPEG."""
     height, width = pixels.shape[:2]
-    scale = shrink * min(1.0, LARGEST / max(height, width))
+    scale = shrink * min(1.0, MAX_SIDE / max(height, width))
     if opaque:
         pixels = np.concatenate([pixels[..., :3], np.full_like(pixels[..., 3:], 255)], axis=2)
     if scale < 1.0:

@@ -14,7 +14,7 @@ from meshmatch.render.compose import matched_colors
 from meshmatch.render.facing import Rotations
 from meshmatch.render.scales import Scale, position_colors
 from meshmatch.render.viewer.assembly import check_page, plain_text, scaled, small_integers, write_html
-from meshmatch.render.viewer.drawn import MOST, Box, Drawn, boxes, draw, upright
+from meshmatch.render.viewer.drawn import MOST, Box, Drawn, boxes, draw, view_rotations
 from meshmatch.render.viewer.looks import Looks, look_arrays
 from meshmatch.shapes.shape import Shape
 
@@ -54,7 +54,7 @@ def write_page(
     there, back = there.for_shapes(source, target), back.for_shapes(target, source, "the map back")
     shapes, maps = (source, target), (there, back)
     parts = draw(source, MOST), draw(target, MOST)
-    turns = upright(source, target, there, rotations)
+    turns = view_rotations(source, target, there, rotations)
     cubes = boxes(shapes, parts, there, turns)
     position = position_colors(source, turns[0])
     tints = position, matched_colors(position, there, back, source)

@@ -19,9 +19,9 @@ from meshmatch.render.viewer.drawn import MOST, draw, span
 from meshmatch.shapes.faces import seams
 from meshmatch.shapes.shape import Shape
 
-MOST_MODES = 12
+MAX_MODES = 12
 """A page shows only the first modes of an atlas with more."""
-MOST_PLACES = 4_000_000
+MAX_PLACES = 4_000_000
 """Maximum number of vertices, times frames or modes, of a shape that is drawn completely."""
 _RAMP = 33  # number of colors
 
@@ -51,7 +51,7 @@ def write_motion(
         raise OptionError("a motion needs two frames or more, each later than the one before")
     if any(shape.V != first.V or not np.array_equal(shape.faces, first.faces) for shape in frames):
         raise OptionError("the frames of a motion have the same vertices and faces")
-    part = draw(first, min(most, MOST_PLACES // len(frames)))
+    part = draw(first, min(most, MAX_PLACES // len(frames)))
     rows, faces = part.vertex, part.faces
     turned = [shape.verts[rows] @ rotation.T for shape in frames]
     low, edge, cube = span(np.concatenate([verts[part.used] for verts in turned]))
@@ -102,10 +102,10 @@ def write_atlas_page(
     `OutputError` if the file cannot be written.
     """
     check_page(path)
-    count = min(len(atlas.modes), MOST_MODES)
+    count = min(len(atlas.modes), MAX_MODES)
     if count == 0 or atlas.mean.is_cloud:
         raise OptionError("a page of modes needs a surface and a mode")
-    part = draw(atlas.mean, min(most, MOST_PLACES // count))
+    part = draw(atlas.mean, min(most, MAX_PLACES // count))
     mean = atlas.mean.verts[part.vertex] @ rotation.T
     modes = atlas.modes[:count, part.vertex] @ rotation.T
     low, edge, cube = span(np.concatenate([mean, *(mean + sign * mode for mode in modes for sign in (-2, 2))]))
