@@ -25,7 +25,7 @@ _MAX_POINTS = 20_000  # larger shapes are thinned out to this
 _MIN_HEIGHT = 1.05  # of a standing body
 _MIN_SUPPORT = -0.03  # of the center of mass, negative outside the feet: scans are cut off
 _MIN_SUPPORT_USUAL = -0.2  # where y or z points up, the usual axes: people lean while they move
-_SOLE_HEIGHT = 0.035  # what is this near the ground carries the shape
+_SOLE_HEIGHT = 0.035  # points up to this height above the lowest one carry the shape
 _NEAR_AXIS = np.cos(np.radians(35.0))
 _TORSO_RADIUS = 0.2  # half width of the chest without arms
 

@@ -85,7 +85,7 @@ def background_color(background: str) -> Ink | None:
 
 
 def check_picture(path: str | Path) -> None:
-    """Refuse a file name that is not .png (`OptionError`)."""
+    """Raise `OptionError` for a file name that is not .png."""
     path = as_path(path)
     if path.suffix.lower() != ".png":
         raise OptionError(f"{path.name}: a picture is a PNG", "end the name in .png")
@@ -163,7 +163,7 @@ def _trace(figures: list[Figure], feet: Float[Floats, " N"], viewport: raster.Vi
 
 
 def _on_background(layer: raster.Layer, background: Ink | None) -> UInts8:
-    """Bytes (H, W, 3) on a background, or (H, W, 4) without one."""
+    """Pixels of a layer: (H, W, 3) bytes on a background, or (H, W, 4) without one."""
     rows = []
     for first in range(0, len(layer.alpha), 256):  # in parts, to limit the memory for float64
         light, alpha = layer.light[first : first + 256], layer.alpha[first : first + 256, :, None]

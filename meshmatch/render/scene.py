@@ -20,7 +20,7 @@ from meshmatch.render.surface import Rows, Surface, tangents
 _SMOOTH, _CREASE = np.cos(np.radians(28.0)), np.cos(np.radians(42.0))
 
 _LIFT = 3e-3  # height above the surface at which rays to the lights start
-_MAX_LAYERS = 12  # of surfaces with holes behind each other
+_MAX_LAYERS = 12  # surfaces with holes, one behind the other, that a ray passes
 Vectors = Float[Floats32, "N 3"]
 Numbers = Float[Floats, " N"]
 BLOCK, GROUND_BLOCK = 4, 8
@@ -184,7 +184,7 @@ _LAMP = 0.40  # radius of the key lamp's disc at distance 1
 
 def _r3_sequence(count: int) -> Float[Floats, "count 3"]:
     """(count, 3) evenly distributed numbers in 0..1, also in any run of them (Roberts' R3 sequence)."""
-    root = 1.22074408460575947536  # of x^4 = x + 1
+    root = 1.22074408460575947536  # positive root of x^4 = x + 1
     return np.asarray((0.5 + np.arange(1, count + 1)[:, None] * np.array([1 / root, root**-2, root**-3])) % 1.0)
 
 

@@ -54,7 +54,7 @@ class VertexPaint:
 
 
 def face_paint(colors: Float[AnyFloats, "F 3"]) -> Paint:
-    """One color per triangle."""
+    """Paint with one color per triangle."""
     return lambda faces, weights, footprint: colors[faces]
 
 

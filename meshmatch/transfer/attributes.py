@@ -88,7 +88,6 @@ def pull_face_labels(
     of its evenly distributed points find on the source.
     """
     # Labels that occur around the places of a face's corners, however small their weight.
-    # Whatever occurs around the places of a face's corners, however small its weight.
     touched = _corner_matrix(corners_of(source.faces, back.face, back.index), source.V)
     occurring, corners = _one_hot(labels), _corner_matrix(target.faces, target.V)
     if on_faces:
@@ -113,7 +112,7 @@ def _sampled_votes(
     back: VertexMap, source: Shape, target: Shape, labels: Ints, on_faces: bool, faces: Ints, workers: int
 ) -> csr_array:
     """(F_target, labels) votes of the sample points of some faces (N,) of the target."""
-    spread = lattice(_SUBDIVISIONS)  # P 3
+    spread = lattice(_SUBDIVISIONS)  # (P, 3)
     corners = target.faces[faces]
     normals = back.apply(known_normals(source))
     points, facing = (

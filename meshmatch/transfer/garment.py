@@ -125,7 +125,7 @@ class _Body:
             reach = _BLEND * distance[:, :1] + self.step
             weight = np.exp((distance[:, :1] ** 2 - distance**2) / (2 * reach**2)) * self.trust[near]
             facing = np.einsum("nkd,nd->nk", self.normals[near], self.normals[near[:, 0]])
-            weight *= np.maximum(facing, 0.0)  # not the arm beside the chest
+            weight *= np.maximum(facing, 0.0)  # so that the chest is not bound to the arm next to it
             weight[:, 0] += 1e-9
             weight /= weight.sum(axis=1, keepdims=True)
             local_jacobians = self.jacobians[near]

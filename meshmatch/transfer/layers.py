@@ -39,7 +39,7 @@ class Samples:
 
 
 class Painter(Protocol):
-    """Paints one image of a baked material."""
+    """Samples the values of one image of a baked material."""
 
     linear: bool  # bytes are plain numbers, not sRGB colors
     samplers: list[MaterialSampler]
@@ -139,7 +139,7 @@ def _as_columns(frames: Floats) -> list[list[list[Floats32]]]:
 def _interpolate_frames(
     columns: list[list[list[Floats32]]], face: NDArray[np.integer], weights: Floats32
 ) -> list[list[Floats32]]:
-    """Both directions (3, N) at points of faces (N,) with weights (3, N)."""
+    """Both frame directions, three columns (N,) each, at weights (3, N) in faces (N,)."""
     return [
         [weighted_sum(weights, [corner.take(face) for corner in axis]) for axis in direction] for direction in columns
     ]

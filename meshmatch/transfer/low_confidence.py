@@ -18,7 +18,7 @@ from meshmatch.geometry.triangles import same_rows
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import NO_LABEL, largest_weights
 
-_N_NEIGHBORS = 8  # of a point of a cloud
+_N_NEIGHBORS = 8  # nearest neighbors of a point of a cloud
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def vertex_graph(shape: Shape) -> csr_array:
 
 
 def face_graph(shape: Shape) -> csr_array:
-    """(F, F) sparse, symmetric: distances between the centers of faces that share an edge."""
+    """(F, F) sparse and symmetric: distances between the centers of faces that share an edge."""
     corners = same_rows(shape.verts)[shape.faces]
     a, b = corners.ravel(), corners[:, [1, 2, 0]].ravel()
     key = np.minimum(a, b) * shape.V + np.maximum(a, b)

@@ -37,7 +37,7 @@ _MIN_SHARE = 0.75  # share of a girth that must exist
 _MAX_GAP = 1 / 5  # maximum distance between neighbors along a girth, as a share of it;
 _MAX_GAP_STEPS = 4  # or in mean distances, if that is more, where the points of a cloud are sparse
 _MIN_POINTS = 6  # points of a girth: the hull of fewer is shorter by five percent or more
-_MAX_POINTS = 3_000_000  # of all girths
+_MAX_POINTS = 3_000_000  # of all girths together
 _COLUMNS = ["name", "kind", "value", "confidence"]
 MEASUREMENT_SUFFIXES = (".csv", ".json")
 check_measurements_suffix = partial(tables.check_suffix, suffixes=MEASUREMENT_SUFFIXES, what="measurements")
@@ -74,9 +74,8 @@ class Measurement:
             raise InputError(f"measurement {self.name}: {self.kind!r} is no kind of measurement", _HINT)
         if isinstance(self.landmarks, str):
             raise InputError(f"measurement {self.name}: its landmarks are one word", f"pass ({self.landmarks!r}, ...)")
-        object.__setattr__(
-            self, "landmarks", tuple(map(str, self.landmarks))
-        )  # also numbers: of vertices, or of an array
+        # Numbers of landmarks, such as indices, are allowed too.
+        object.__setattr__(self, "landmarks", tuple(map(str, self.landmarks)))
         if "" in self.landmarks:
             raise InputError(f"measurement {self.name}: one of its landmarks has no name", _HINT)
         count = len(self.landmarks)

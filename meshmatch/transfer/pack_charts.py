@@ -242,7 +242,7 @@ def _place_all(pieces: list[_Piece], order: Ints, scale: float, padding: float) 
             if not free.any():
                 continue
             close = _correlate(occupied, rings, turned.quarters, turned.rings.shape, 0, rows, columns)
-            for ring in range(min(_RINGS, rows, columns)):  # the border of the image counts as taken
+            for ring in range(min(_RINGS, rows, columns)):  # the image's border counts as occupied
                 close[[ring, -1 - ring]] += wide * _RING_DECAY**ring
                 close[:, [ring, -1 - ring]] += high * _RING_DECAY**ring
             low = (np.arange(rows) + high) * (_LOW_WEIGHT / grid)

@@ -15,7 +15,7 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.shapes.formats.gltf_rig import Clip, Moved, Rig, Track
 
 _TOLERANCE = 1e-9
-_MAX_LOOSE, _MAX_TIMES = 32, 2000  # joints of a clip that follow others, and keys of each
+_MAX_LOOSE, _MAX_TIMES = 32, 2000  # maximum number of following joints in a clip, and of keys of each
 Tracks = dict[tuple[int, Moved], Track]
 
 

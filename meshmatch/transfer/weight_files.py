@@ -32,7 +32,7 @@ class SkinWeights(Brief):
     """The influence of each joint on each vertex."""
 
     matrix: csr_array  # (V, J), not negative; rows sum to 1, or to 0 for a vertex that no joint moves
-    names: tuple[str, ...]  # of the joints
+    names: tuple[str, ...]  # names of the J joints
 
 
 def load_weights(path: str | Path, shape: Shape) -> SkinWeights:
