@@ -46,14 +46,14 @@ def carry_moves(
     moves: Float[Floats32, "K V_source 3"], forward: VertexMap, backward: VertexMap, source: Shape, target: Shape
 ) -> Float[Floats32, "K V_target 3"]:
     """Displacements (K, V_target, 3) of the target's vertices, in its frame and unit."""
-    turns, scale = local_frames(forward, source, target)
+    rotations, scale = local_frames(forward, source, target)
     typical = float(np.median(scale[source.valid]))
-    frames = turns * np.clip(scale, typical / _MAX_GROWTH, typical * _MAX_GROWTH)[:, None, None]
+    frames = rotations * np.clip(scale, typical / _MAX_GROWTH, typical * _MAX_GROWTH)[:, None, None]
     matrix = backward.sparse()
     moved = np.stack([(matrix @ np.einsum("vij,vj->vi", frames, move)).astype(np.float32) for move in moves])
     graph = vertex_graph(target)
     known = target.valid & (backward.assumed_confidence >= _MIN_CONFIDENCE)
-    facing = unit(backward.apply(np.einsum("vij,vj->vi", turns, source.vertex_normals)))
+    facing = unit(backward.apply(np.einsum("vij,vj->vi", rotations, source.vertex_normals)))
     known &= dot(facing, target.vertex_normals) > _MIN_COSINE
     part = _connected_parts(graph)
     has_counterpart = np.bincount(part, known) >= _MIN_KNOWN * np.bincount(part)
@@ -130,24 +130,24 @@ def _move_rigidly(
 
 
 def _rigid_displacements(
-    points: Float[Floats, "N 3"], around: Float[Floats, "M 3"], moves: Float[Floats32, "K M 3"]
+    points: Float[Floats, "N 3"], neighbors: Float[Floats, "M 3"], moves: Float[Floats32, "K M 3"]
 ) -> Floats32:
     """(K, N, 3) displacements of points by the rotation and translation that most points around agree on (robust fit)."""
     weight = np.ones(moves.shape[:2])
     for _ in range(5):
         share = weight / weight.sum(axis=1, keepdims=True)
-        center, shift = share @ around, np.einsum("km,kmd->kd", share, moves)
-        here = around[None] - center[:, None]
-        there = here + moves - shift[:, None]
-        left, _, right = np.linalg.svd(np.einsum("km,kmi,kmj->kij", share, there, here))
+        center, shift = share @ neighbors, np.einsum("km,kmd->kd", share, moves)
+        source_points = neighbors[None] - center[:, None]
+        moved_points = source_points + moves - shift[:, None]
+        left, _, right = np.linalg.svd(np.einsum("km,kmi,kmj->kij", share, moved_points, source_points))
         sign = np.ones((len(moves), 3))
         sign[:, 2] = np.sign(np.linalg.det(left @ right))
         rotation = (left * sign[:, None, :]) @ right
-        error = np.linalg.norm(np.einsum("kij,kmj->kmi", rotation, here) - there, axis=2)
+        error = np.linalg.norm(np.einsum("kij,kmj->kmi", rotation, source_points) - moved_points, axis=2)
         typical = np.median(error, axis=1, keepdims=True)
         weight = 1.0 / (1.0 + (error / np.maximum(2.0 * typical, 1e-12)) ** 2)
-    own = points[None] - center[:, None]
-    return np.asarray(np.einsum("kij,knj->kni", rotation, own) - own + shift[:, None], np.float32)
+    centered = points[None] - center[:, None]
+    return np.asarray(np.einsum("kij,knj->kni", rotation, centered) - centered + shift[:, None], np.float32)
 
 
 def _close_slits(moved: Float[Floats32, "K V 3"], backward: VertexMap, source: Shape, target: Shape) -> None:
@@ -170,10 +170,10 @@ def _touching(shape: Shape) -> Int[Ints, " V"]:
     """(V,) the nearest vertex with an opposite normal that each vertex touches; -1 where there is none."""
     reach = _TOUCH * length_of(shape)
     found = cKDTree(shape.verts).query(shape.verts, min(_N_NEIGHBORS, shape.V), distance_upper_bound=reach)
-    distance, near = (np.asarray(each).reshape(shape.V, -1) for each in found)
+    distance, nearest = (np.asarray(each).reshape(shape.V, -1) for each in found)
     row, column = np.nonzero(np.isfinite(distance))
-    opposed = dot(shape.vertex_normals[row], shape.vertex_normals[near[row, column]]) < _OPPOSED
+    opposed = dot(shape.vertex_normals[row], shape.vertex_normals[nearest[row, column]]) < _OPPOSED
     row, column = row[opposed][::-1], column[opposed][::-1]  # the nearest comes last and counts
     touched = np.full(shape.V, -1)
-    touched[row] = near[row, column]
+    touched[row] = nearest[row, column]
     return touched

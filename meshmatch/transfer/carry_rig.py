@@ -49,14 +49,16 @@ class _Similarity:
         return np.asarray(self.scale * points @ self.pose.rotation.T + self.pose.center)
 
 
-def _similarity(here: Float[Floats, "V 3"], there: Float[Floats, "V 3"], weights: Float[Floats, " V"]) -> _Similarity:
+def _similarity(
+    source_points: Float[Floats, "V 3"], target_points: Float[Floats, "V 3"], weights: Float[Floats, " V"]
+) -> _Similarity:
     """The best similarity by least squares (Umeyama 1991)."""
     share = weights / max(weights.sum(), 1e-300)
-    rotation = kabsch(here, there, weights).rotation
-    a, b = share @ here, share @ there
-    spread = share @ ((here - a) ** 2).sum(axis=1)
-    along = share @ (((here - a) @ rotation.T) * (there - b)).sum(axis=1)
-    scale = float(along / spread) if spread > 0 and along > 0 else 1.0
+    rotation = kabsch(source_points, target_points, weights).rotation
+    a, b = share @ source_points, share @ target_points
+    spread = share @ ((source_points - a) ** 2).sum(axis=1)
+    covariance = share @ (((source_points - a) @ rotation.T) * (target_points - b)).sum(axis=1)
+    scale = float(covariance / spread) if spread > 0 and covariance > 0 else 1.0
     return _Similarity(scale, RigidPose(rotation, b - scale * rotation @ a))
 
 
@@ -94,9 +96,9 @@ def carry(
     source
         The shape that it moves.
     points
-        Places of the source's vertices on the target, which stands along y.
+        Positions of the source's vertices on the target, whose up axis is y.
     trust
-        Weight of each of these.
+        Weight of each position.
     ground
         The lowest y of the target.
     """
@@ -126,21 +128,21 @@ def carry(
     upper = ~skin.body
     scale = _bone_ratio(rig, skin.body, worlds[:, :3, 3], places)
     heading = _heading(_similarity(source.verts, points, trust).pose.rotation)
-    here, there = worlds[skin.first, :3, 3].copy(), places[skin.first].copy()
-    here[UP], there[UP] = source.bounds[0, UP], ground
-    standing = scale * (worlds[:, :3, 3] - here) @ heading.T + there
-    places[upper], target_rotations[upper] = standing[upper], heading
+    source_origin, target_origin = worlds[skin.first, :3, 3].copy(), places[skin.first].copy()
+    source_origin[UP], target_origin[UP] = source.bounds[0, UP], ground
+    upright_places = scale * (worlds[:, :3, 3] - source_origin) @ heading.T + target_origin
+    places[upper], target_rotations[upper] = upright_places[upper], heading
     bind = _with_world_poses(rig, target_rotations @ rotations, places)
 
     # The same skeleton in the source's pose.
-    source_rotations = heading @ rotations
-    source_places = standing.copy()
+    posed_rotations = heading @ rotations
+    posed_places = upright_places.copy()
     for node in skin.order:
         anchor = skin.anchors[node]
         if anchor >= 0:
             offset = (target_rotations[anchor] @ rotations[anchor]).T @ (places[node] - places[anchor])
-            source_places[node] = source_places[anchor] + source_rotations[anchor] @ offset
-    posed = _with_world_poses(rig, source_rotations, source_places)
+            posed_places[node] = posed_places[anchor] + posed_rotations[anchor] @ offset
+    posed = _with_world_poses(rig, posed_rotations, posed_places)
     lengths = scale * np.cbrt(np.abs(np.linalg.det(worlds[:, :3, :3])))
     loose = {node: int(skin.anchors[node]) for node in skin.order if skin.anchors[node] not in (-1, parents[node])}
     clips = tuple(retargeted(clip, rig, posed, lengths, loose) for clip in rig.clips)
@@ -250,11 +252,11 @@ def _near_weights(at: Floats, verts: Floats, weights: Floats, size: float) -> Fl
     return np.asarray(weights * np.exp(-np.square(away)))
 
 
-def _bone_ratio(rig: Rig, body: Bools, here: Floats, there: Floats) -> float:
+def _bone_ratio(rig: Rig, body: Bools, source_places: Floats, target_places: Floats) -> float:
     """Total length of the bones on the target relative to the source, which does not depend on poses."""
     rows = np.flatnonzero(body & (rig.parents >= 0) & body[rig.parents])
     source_length, target_length = (
-        np.linalg.norm(at[rows] - at[rig.parents[rows]], axis=1).sum() for at in (here, there)
+        np.linalg.norm(at[rows] - at[rig.parents[rows]], axis=1).sum() for at in (source_places, target_places)
     )
     return float(target_length / source_length) if source_length > 0 and target_length > 0 else 1.0
 

@@ -101,9 +101,9 @@ class NormalPainter:
         strength = self.strength.take(samples.face)
         x, y = ((2 * out[k] - 1) * strength for k in (0, 1))
         z = 2 * out[2] - 1
-        ours = _interpolate_frames(self.source, samples.face, samples.source_weights)
-        theirs = _interpolate_frames(self.target, samples.triangle, np.clip(samples.weights, 0, 1))
-        (a, b), (c, d) = ([weighted_sum(one, other) for other in theirs] for one in ours)
+        source_frames = _interpolate_frames(self.source, samples.face, samples.source_weights)
+        target_frames = _interpolate_frames(self.target, samples.triangle, np.clip(samples.weights, 0, 1))
+        (a, b), (c, d) = ([weighted_sum(one, other) for other in target_frames] for one in source_frames)
         mirrored = a * d < b * c
         cosine, sine = np.where(mirrored, a - d, a + d), np.where(mirrored, c + b, c - b)
         length = np.maximum(np.sqrt(cosine * cosine + sine * sine), np.float32(1e-20))

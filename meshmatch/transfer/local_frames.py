@@ -36,12 +36,12 @@ def local_frames(
         hint = "mirror one of the files, or match without mirror images (--mirror no)"
         raise OptionError(f"{name} matches as a mirror image: what is carried would be inside out", hint)
     edges = source.edges.vertices.astype(np.int64)
-    here, there = (place[edges[:, 1]] - place[edges[:, 0]] for place in (source.verts, image))
+    source_edges, image_edges = (place[edges[:, 1]] - place[edges[:, 0]] for place in (source.verts, image))
     length, image_length = edge_lengths(source.verts, edges), edge_lengths(image, edges)
     discontinuous = is_discontinuous(image_length / length_of(target), length / length_of(source)) | (length == 0)
     trust = np.where(discontinuous, 0.0, forward.assumed_confidence[edges].min(axis=1)) + 1e-6
     weight = trust / np.maximum(length, 1e-12 * length_of(source))
-    products = weight[:, None, None] * there[:, :, None] * here[:, None, :]
+    products = weight[:, None, None] * image_edges[:, :, None] * source_edges[:, None, :]
     sums = np.zeros((source.V, 11))  # products (9), and sums of lengths after and before
     rows = np.column_stack([products.reshape(-1, 9), trust * image_length, trust * length])
     for end in edges.T:
@@ -50,7 +50,7 @@ def local_frames(
     outwards = 0.5 * scale * sums[:, 10, None, None] * normals[:, :, None] * source.vertex_normals[:, None, :]
     sums[:, :9] += outwards.reshape(-1, 9)
     sums = averaged(sums, np.ones(source.V), edges, length, _AVERAGING * length_of(source))
-    around = sums[:, :9].reshape(-1, 3, 3)
-    rotations = nearest_rotations(around, np.broadcast_to(np.eye(3), around.shape))
+    averaged_products = sums[:, :9].reshape(-1, 3, 3)
+    rotations = nearest_rotations(averaged_products, np.broadcast_to(np.eye(3), averaged_products.shape))
     ratio = np.maximum(sums[:, 9], 0.0) / np.maximum(sums[:, 10], 1e-300)
     return rotations, np.where(ratio > 0, ratio, scale)

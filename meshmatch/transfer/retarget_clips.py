@@ -83,7 +83,7 @@ def _following_track(
     length: float,
 ) -> Track:
     """Translations of a node that stays in place relative to its anchor, up to its relative motion on the source."""
-    before, moving = (
+    rest_offset, offsets = (
         _to_local(
             _world_matrices(source[0], tracks, anchor, at), _world_matrices(source[0], tracks, node, at)[:, :3, 3]
         )
@@ -94,7 +94,7 @@ def _following_track(
     rest_place = _to_local(
         _world_matrices(target[0], {}, anchor, times[:1]), _world_matrices(target[0], {}, node, times[:1])[:, :3, 3]
     )
-    local_place = rest_place + length * (moving - before)
+    local_place = rest_place + length * (offsets - rest_offset)
     place = np.einsum("tij,tj->ti", frames[:, :3, :3], local_place) + frames[:, :3, 3]
     parent = _world_matrices(target[0], target[1], int(target[0].parents[node]), times)
     chains = _chain(source[0], node) | _chain(source[0], anchor)
@@ -143,9 +143,9 @@ def points_at_start(clip: Clip, rig: Rig, node: int, along: Float[Floats, " 3"])
     """Direction at the start of a clip of what is attached to a node and points ``along`` a direction in the rest pose."""
     tracks = {(track.node, track.moves): track for track in clip.tracks}
     begins = min((float(track.times[0]) for track in clip.tracks), default=0.0)
-    there, here = _world_matrices(rig, tracks, node, np.array([begins]))[0], rig.worlds()[node]
-    found = there[:3, :3] @ np.linalg.pinv(here[:3, :3]) @ along
-    return np.asarray(found / max(float(np.linalg.norm(found)), 1e-300))
+    start_matrix, rest_matrix = _world_matrices(rig, tracks, node, np.array([begins]))[0], rig.worlds()[node]
+    direction = start_matrix[:3, :3] @ np.linalg.pinv(rest_matrix[:3, :3]) @ along
+    return np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-300))
 
 
 def standing_clips(bind: Rig, posed: Rig) -> tuple[Clip, ...]:

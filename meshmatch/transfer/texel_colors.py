@@ -199,7 +199,7 @@ def find_charts(walker: SurfaceWalker, look: Appearance) -> Ints32:
     face, edge = np.nonzero(~find_seams(walker, look))
     graph = coo_array((np.ones(len(face), np.int8), (face, walker.opposite[face, edge])), shape=(F, F))
     chart = np.asarray(connected_components(graph, directed=False)[1], np.int32)
-    has_image = np.array([made.image is not None for made in look.materials])[look.material]
+    has_image = np.array([material.image is not None for material in look.materials])[look.material]
     return np.where(has_image, chart, F + look.material).astype(np.int32)
 
 
@@ -266,19 +266,15 @@ class TexelLocator:
         weights[0] = 1 - weights[1] - weights[2]
         outside = np.flatnonzero(np.minimum(np.minimum(weights[0], weights[1]), weights[2]) < -1)
         if len(outside):  # slivers, where one texel spans many triangles
-            source_weights = np.clip(weights[:, outside], 0, 1)
-            weights[:, outside] = source_weights / source_weights.sum(axis=0)
+            barycentric = np.clip(weights[:, outside], 0, 1)
+            weights[:, outside] = barycentric / barycentric.sum(axis=0)
         points = np.empty((3, len(face)), np.float32)
         for k in range(3):
             points[k] = column[6 + k] + weights[1] * column[9 + k] + weights[2] * column[12 + k]
         if len(column) > 15:  # hat functions: 1 at an edge's middle, 0 at the other middles and corners, linear between
             one, two, three = np.maximum(weights, 0)
-            for at, (left, right, too_far) in (
-                (15, (two, three, one)),
-                (18, (three, one, two)),
-                (21, (one, two, three)),
-            ):
-                share = np.maximum(np.minimum(np.minimum(2 * left, 2 * right), 1 - 2 * too_far), 0)
+            for at, (left, right, far) in ((15, (two, three, one)), (18, (three, one, two)), (21, (one, two, three))):
+                share = np.maximum(np.minimum(np.minimum(2 * left, 2 * right), 1 - 2 * far), 0)
                 for k in range(3):
                     points[k] += share * column[at + k]
         corner = np.where(weights[2] > np.maximum(weights[0], weights[1]), 2, weights[1] > weights[0])
@@ -287,15 +283,19 @@ class TexelLocator:
             points[:, cut] = self._extrapolate(face[cut], weights[:, cut], corner[cut])
         begin = self._start_faces(face, corner)
         begin = begin if start is None else np.where(start >= 0, start, begin)
-        place, source_weights, distance = self.walker.closest(points, begin)
-        too_far = np.flatnonzero(distance > _MAX_DISTANCE * self._size.take(face))
-        for k in (1, 2) if len(too_far) else ():
-            other = self._start_faces(face[too_far], (corner[too_far] + k) % 3)
-            there, weigh, gap = self.walker.closest(points[:, too_far], other)
-            better = gap < distance[too_far]
-            rows = too_far[better]
-            place[rows], source_weights[:, rows], distance[rows] = there[better], weigh[:, better], gap[better]
-        return weights, place, source_weights
+        place, barycentric, distance = self.walker.closest(points, begin)
+        far = np.flatnonzero(distance > _MAX_DISTANCE * self._size.take(face))
+        for k in (1, 2) if len(far) else ():
+            other = self._start_faces(face[far], (corner[far] + k) % 3)
+            other_place, other_weights, gap = self.walker.closest(points[:, far], other)
+            better = gap < distance[far]
+            rows = far[better]
+            place[rows], barycentric[:, rows], distance[rows] = (
+                other_place[better],
+                other_weights[:, better],
+                gap[better],
+            )
+        return weights, place, barycentric
 
     def _start_faces(self, face: Ints32, corner: Ints) -> Ints32:
         """A face of the source at the images of these corners (N,)."""
@@ -329,18 +329,23 @@ def edge_bends(source: Shape, target: Shape, forward: VertexMap, back: VertexMap
     ends = np.sort(target.faces[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
     edges, of_face = np.unique(ends[..., 0] * target.V + ends[..., 1], return_inverse=True)
     ends = np.stack(np.divmod(edges, target.V), axis=1)
-    there = SurfaceWalker(Shape(forward.points(target), source.faces, invalid=source.invalid))
-    own, verts = SurfaceWalker(source), (target.verts - there.center) / there.unit
-    known, start = image_points(own, back)
+    mapped = SurfaceWalker(Shape(forward.points(target), source.faces, invalid=source.invalid))
+    walker, verts = SurfaceWalker(source), (target.verts - mapped.center) / mapped.unit
+    known, start = image_points(walker, back)
     queries = np.concatenate([verts, verts[ends].mean(axis=1)])
     start = np.concatenate([start, start[ends[:, 0]]])
-    face, weights, _ = there.closest(queries.T.astype(np.float32, order="C"), start.astype(np.int32))
-    corners, weights = there.faces[face], weights.T.astype(np.float64)
-    image, error = interpolate(own.verts, corners, weights), interpolate(there.verts, corners, weights) - queries
+    face, weights, _ = mapped.closest(queries.T.astype(np.float32, order="C"), start.astype(np.int32))
+    corners, weights = mapped.faces[face], weights.T.astype(np.float64)
+    image, error = interpolate(walker.verts, corners, weights), interpolate(mapped.verts, corners, weights) - queries
     bends, (one, two) = image[target.V :] - image[ends].mean(axis=1), ends.T
     disagreement = image[: target.V] - known
-    for far, at in ((bends, known), (disagreement[one], known), (disagreement[two], known), (error[target.V :], verts)):
-        bends[squared_lengths(far) > _MAX_BEND**2 * squared_lengths(at[two] - at[one])] = 0.0
+    for deviation, at in (
+        (bends, known),
+        (disagreement[one], known),
+        (disagreement[two], known),
+        (error[target.V :], verts),
+    ):
+        bends[squared_lengths(deviation) > _MAX_BEND**2 * squared_lengths(at[two] - at[one])] = 0.0
     return np.asarray(bends[of_face.reshape(-1, 3)])
 
 

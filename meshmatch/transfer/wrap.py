@@ -105,10 +105,10 @@ def _with_free_parts(mesh: Shape, near: Floats, verts: Floats, bound: Bools) -> 
     tree = cKDTree(mesh.verts[known])
     for part in free_parts.tolist():
         rows = np.flatnonzero(mesh.vertex_parts == part)
-        around: Ints = known[np.unique(tree.query(mesh.verts[rows], min(_N_AROUND, len(known)))[1])]
-        here, there = mesh.verts[around], verts[around]
-        a, b = here - here.mean(axis=0), there - there.mean(axis=0)
+        followed: Ints = known[np.unique(tree.query(mesh.verts[rows], min(_N_AROUND, len(known)))[1])]
+        base_points, wrapped_points = mesh.verts[followed], verts[followed]
+        a, b = base_points - base_points.mean(axis=0), wrapped_points - wrapped_points.mean(axis=0)
         rotation = nearest_rotations((b.T @ a)[None], np.eye(3)[None])[0]
         scale = np.sqrt(np.square(b).sum() / max(np.square(a).sum(), 1e-300))
-        verts[rows] = scale * (mesh.verts[rows] - here.mean(axis=0)) @ rotation.T + there.mean(axis=0)
+        verts[rows] = scale * (mesh.verts[rows] - base_points.mean(axis=0)) @ rotation.T + wrapped_points.mean(axis=0)
     return verts
