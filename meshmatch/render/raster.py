@@ -83,12 +83,9 @@ def _draw_band(scene: Scene, viewport: Viewport, edges: Vectors, first: int, las
     light, alpha = light.reshape(*shape, 3), alpha.reshape(shape)
     depth = np.where(hits.face >= 0, hits.place[:, 2], -np.inf).reshape(shape).astype(np.float32)
     is_surface = hits.face.reshape(shape) >= 0
-    outline = _differs_from_neighbor(is_surface.astype(np.float32)[..., None], 0.5) | _find_slivers(
-        edges, low, depth, viewport
-    )
+    outline = _has_contrast(is_surface.astype(np.float32)[..., None], 0.5) | _find_slivers(edges, low, depth, viewport)
     inner = (
-        _differs_from_neighbor(np.sqrt(np.clip(np.concatenate([light, alpha[..., None]], axis=2), 0, 1)), _CONTRAST)
-        & ~outline
+        _has_contrast(np.sqrt(np.clip(np.concatenate([light, alpha[..., None]], axis=2), 0, 1)), _CONTRAST) & ~outline
     )
     for chosen, places in ((outline, _OUTLINE_SAMPLES), (inner, _INNER_SAMPLES)):
         chosen[: first - low] = chosen[last - low :] = False
@@ -120,11 +117,11 @@ def composite(glass: Layer, base: Layer, reach: float) -> Layer:
     """Put glass over a base layer, which hides it gradually where it lies up to ``reach`` behind."""
     with np.errstate(invalid="ignore"):
         ahead = np.nan_to_num((glass.depth - base.depth) / np.float32(reach) + 1, nan=1.0, posinf=1.0, neginf=0.0)
-    visibility_share = np.clip(ahead, 0, 1).astype(np.float32)
-    transmitted = 1 - glass.alpha * visibility_share
+    uncovered = np.clip(ahead, 0, 1).astype(np.float32)
+    transmitted = 1 - glass.alpha * uncovered
     return Layer(
-        glass.light * visibility_share[..., None] + base.light * transmitted[..., None],
-        glass.alpha * visibility_share + base.alpha * transmitted,
+        glass.light * uncovered[..., None] + base.light * transmitted[..., None],
+        glass.alpha * uncovered + base.alpha * transmitted,
         np.maximum(glass.depth, base.depth),
     )
 
@@ -168,7 +165,7 @@ def _shifted_slices(step: int, axis: int, shape: tuple[int, int]) -> tuple[tuple
     return (*before, slice(here, here + count)), (*before, slice(there, there + count))
 
 
-def _differs_from_neighbor(values: Float[Floats32, "H W C"], by: float) -> Bool[Bools, "H W"]:
+def _has_contrast(values: Float[Floats32, "H W C"], by: float) -> Bool[Bools, "H W"]:
     """Pixels that differ from a neighbor by more than ``by``, so that an edge may pass through them."""
     shape = values.shape[0], values.shape[1]
     result = np.zeros(shape, bool)

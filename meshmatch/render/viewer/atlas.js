@@ -1,8 +1,8 @@
-// A mean shape and its modes: every slider adds so many standard deviations of one of them.
+// A mean shape and its modes: each slider adds standard deviations of one mode.
 
-const REACH = 3; // standard deviations, of the sliders
-const SECONDS = 4; // there and back
-const SWING = 2; // standard deviations, when a mode plays
+const REACH = 3; // range of the sliders, in standard deviations
+const SECONDS = 4; // for a mode to play there and back
+const SWING = 2; // amplitude in standard deviations when a mode plays
 const words = readWords();
 const state = { scores: words.shares.map(() => 0), shape: -1, mode: 0, playing: false, colored: true, frames: 0 };
 let geometry, arrays, mean, place, normal, paint;
@@ -66,7 +66,7 @@ function color() {
   }
 }
 
-// Normals, each triangle by its area.
+// Area-weighted vertex normals.
 function shade() {
   const { face } = arrays;
   normal.fill(0);
@@ -104,7 +104,7 @@ function setScore(mode, score) {
   show();
 }
 
-// No shape of the collection any more.
+// Deselect the shape of the collection.
 function own() {
   state.shape = -2;
   $('shape').value = -2;
@@ -134,7 +134,7 @@ function setColored(wanted) {
   show();
 }
 
-// What the sliders say.
+// Show the values of the sliders.
 function write() {
   state.scores.forEach((score, m) => {
     const text = `${score < 0 ? '−' : ''}${Math.abs(score).toFixed(2)} sd`,
@@ -231,7 +231,7 @@ async function begin() {
   document.addEventListener('keydown', keys);
 }
 
-// For tests, and for the curious at the console.
+// For tests, and for use in the browser's console.
 window.meshmatch = {
   state: () => ({ ...state, farthest }),
   place: (vertex) => [...place.subarray(3 * vertex, 3 * vertex + 3)].map((at) => at * words.unit),

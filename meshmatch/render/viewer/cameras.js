@@ -43,7 +43,7 @@ function frame() {
   document.documentElement.dataset.ready = '';
 }
 
-// Pixels that one page unit has at depth 1.
+// Pixels per page unit at depth 1.
 function perUnit(side) {
   return view(side).clientHeight / 2 / Math.tan((VIEW.field * Math.PI) / 360);
 }
@@ -72,7 +72,7 @@ function resize() {
   soon();
 }
 
-// Pixels of a panel that words cover, above and below.
+// Pixels of a panel that text covers, at the top and at the bottom.
 function covered(side) {
   const box = view(side).getBoundingClientRect();
   const spot = panel(side).querySelector('.spot').getBoundingClientRect();
@@ -80,7 +80,7 @@ function covered(side) {
   return [caption.bottom - box.top, spot.top > box.top + box.height / 2 ? box.bottom - spot.top : 8];
 }
 
-// From where both shapes fill their panels.
+// Camera positions from which both shapes fill their panels.
 function fittingDistance() {
   const turn = (VIEW.turn * Math.PI) / 180,
     half = Math.tan((VIEW.field * Math.PI) / 360);
@@ -93,7 +93,7 @@ function fittingDistance() {
     const [top, bottom] = covered(side),
       height = Math.max(box.clientHeight, 1);
     const room = Math.max(height - top - bottom - 16, 40) / height;
-    // Turned, any corner may come to the front: nearer, and so larger.
+    // When rotated, any corner may come to the front, where it is nearer and thus larger.
     const front = Math.hypot(w, d) / 2;
     distance = Math.max(distance, h / 2 / half / room + front, (width / 2 / half / aspect) * 1.1 + d / 2);
   }
@@ -104,7 +104,7 @@ function reset() {
   fitted = fittingDistance();
   const [turn, tilt] = [VIEW.turn, VIEW.tilt].map((degrees) => (degrees * Math.PI) / 180);
   for (const side of SIDES) {
-    controls[side].enableDamping = false; // a swing that has not died down ends here
+    controls[side].enableDamping = false; // stops a movement that is still damped
     controls[side].update();
     controls[side].enableDamping = !calm;
   }

@@ -1,10 +1,10 @@
-// What the page holds: words as JSON, and arrays as zlib in base64.
+// Contents of the page: words as JSON, and arrays as zlib in base64.
 
 function readWords() {
   return JSON.parse(document.getElementById('words').textContent);
 }
 
-// {name: typed array}; the text is let go of afterwards.
+// Return {name: typed array}; the text is released afterwards.
 async function readArrays(table) {
   const element = document.getElementById('packed');
   const packed = fromBase64(element.textContent);
@@ -27,7 +27,7 @@ function fromBase64(text) {
 
 const $ = (id) => document.getElementById(id);
 
-// Open the page by its parts: write the words, prepare the drawing, begin when all is in place.
+// Open the page: write the words, prepare the drawing, then start.
 async function openPage(words, { write, prepare, resize, reset, begin }) {
   try {
     write();

@@ -1,5 +1,4 @@
-// One shape as three.js draws it. Every color scheme is an attribute that is there from the beginning; choosing one
-// sets a number.
+// One shape as three.js draws it. Every color scheme is an attribute from the start; selecting one sets a uniform.
 
 const MODES = { matches: 0, look: 1, own: 1, confidence: 2, plain: 3 };
 
@@ -58,7 +57,7 @@ function rowsOf(array, rows) {
   return out;
 }
 
-// The mean edge, in edges of the cube, of a few hundred triangles.
+// Mean edge length of a few hundred triangles, relative to the cube's edge.
 function usualEdge(position, face) {
   const step = 3 * Math.max(1, Math.floor(face.length / 3 / 500));
   let sum = 0,
@@ -107,7 +106,7 @@ class Drawing {
     this.edge = words.cloud ? 0 : usualEdge(arrays.position, arrays.face) * words.size;
   }
 
-  // Decode the images of what it wears; the drawing is good without it, but for that.
+  // Decode the images of its textures; everything else works without them.
   async dress(name) {
     const words = this.words[name];
     if (!words) return;
@@ -164,7 +163,7 @@ class Drawing {
     if (this.lines) this.lines.visible = wanted;
   }
 
-  // Pixels of a panel that one page unit covers at depth 1 are `pixels`.
+  // `pixels` is the number of pixels of a panel per page unit at depth 1.
   render(renderer, camera, pixels) {
     this.uniforms.pointSize.value = 2 * this.words.radius * pixels * renderer.getPixelRatio();
     if (this.lines) {
@@ -183,7 +182,7 @@ class Drawing {
     return new THREE.Vector3(at(0), at(1), at(2));
   }
 
-  // The number that the file gives to a row, and the row of a number (-1 if it is not drawn).
+  // The file's index of a row, and the row of an index (-1 if it is not drawn).
   vertexOf(row) {
     return this.arrays.vertex ? this.arrays.vertex[row] : row;
   }
@@ -194,7 +193,7 @@ class Drawing {
   }
 }
 
-// Each edge once: pairs of vertices for THREE.LineSegments. Edges are put into a row for each lower vertex; a row is short.
+// Unique edges, as pairs of vertices for THREE.LineSegments; listed per lower vertex, so that searches are short.
 function uniqueEdges(face, count) {
   const start = new Uint32Array(count + 1);
   const next = (h) => (h % 3 === 2 ? h - 2 : h + 1); // the corner after corner h of its triangle

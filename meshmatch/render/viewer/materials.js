@@ -1,4 +1,4 @@
-// How surfaces take light, and textured ones their images.
+// Shading of surfaces, and of textured ones.
 
 const BEHIND_LINES = { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 };
 const WRAPS = {
@@ -7,7 +7,7 @@ const WRAPS = {
   mirror: THREE.MirroredRepeatWrapping,
 };
 
-// `color` is light; the result is written as screens want it.
+// `color` is linear; the result is gamma-encoded (2.2).
 const LIGHT = `
   uniform bool points;
   varying vec3 vNormal, vEye;

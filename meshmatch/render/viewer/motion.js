@@ -1,4 +1,4 @@
-// A shape that moves: between two of its frames every vertex goes straight from one to the next.
+// A shape in motion: vertices are interpolated linearly between frames.
 
 const SECONDS = 4; // from the first frame to the last
 const words = readWords();
@@ -34,7 +34,7 @@ const FRAGMENT = `
     gl_FragColor = vec4(lit(pow(vPaint, vec3(2.2))), 1.0);
   }`;
 
-// The frame before a time, and how far it is to the next one.
+// The frame before a time, and the fraction of the way to the next one.
 function between(time) {
   const { times } = words;
   let k = 0;
@@ -112,7 +112,7 @@ function prepare(arrays) {
   openView(body);
 }
 
-// Names of the shapes that are met, above the slider.
+// Names of the shapes that the motion passes, above the slider.
 function write() {
   const { times, met } = words,
     first = times[0],
@@ -142,7 +142,7 @@ async function begin() {
   document.addEventListener('keydown', keys);
 }
 
-// For tests, and for the curious at the console.
+// For tests, and for use in the browser's console.
 window.meshmatch = {
   state: () => ({ ...state, between: between(state.time) }),
   show,

@@ -1,5 +1,5 @@
-// Which vertex lies under a point of the screen. All vertices are projected once for each view, which takes a
-// millisecond for 100,000; then every triangle is asked whether it covers the point, which takes another two. No tree,
+// Picking: the vertex under a point of the screen. All vertices are projected once for each view, which takes a
+// millisecond for 100,000; then every triangle is tested for the point, which takes another two. This needs no tree,
 // and nothing is read back from the graphics card.
 
 class Picker {
@@ -16,8 +16,8 @@ class Picker {
     this.key = null;
   }
 
-  // Project with `matrix` (column by column, page units to clip space) onto width x height pixels; `pixels` is how many
-  // pixels one unit has at depth 1.
+  // Project with `matrix` (column-major, page units to clip space) onto width x height pixels; `pixels` is the number of
+  // pixels per unit at depth 1.
   look(matrix, width, height, pixels) {
     const key = [...matrix, width, height].join();
     if (key === this.key) return;

@@ -1,4 +1,4 @@
-// Points and their matches: what lies under the pointer, the marks over both panels, the words about them.
+// Points and their matches: picking under the pointer, the marks over both panels, and their text.
 
 function screenPlace(side, place) {
   const box = view(side).getBoundingClientRect();
@@ -18,7 +18,7 @@ function pick(side, x, y) {
   return picker.at(x, y);
 }
 
-// What is to be seen of a point on one side and of its match on the other.
+// Data of a point on one side and of its match on the other, for marks and text.
 function match(point) {
   const own = drawings[point.side],
     other = drawings[OTHER[point.side]];
@@ -98,7 +98,7 @@ function tell(announce) {
   }
   for (const side of SIDES) {
     const input = panel(side).querySelector('input');
-    if (document.activeElement === input && !announce) continue; // somebody is typing
+    if (document.activeElement === input && !announce) continue; // the user is typing
     input.value = found ? (side === found.side ? found.vertex : found.match) : '';
   }
 }
@@ -132,7 +132,7 @@ function pointAt(side, event, reach = [[0, 0]]) {
   return null;
 }
 
-// A finger is less exact than a mouse: a tap just beside the shape counts.
+// Touch is less exact than a mouse: taps just outside the shape count.
 const AROUND = [
   [0, 0],
   ...[8, 16].flatMap((r) => [

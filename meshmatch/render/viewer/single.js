@@ -20,7 +20,7 @@ function soon() {
   });
 }
 
-// From where all of `words.extent` is seen.
+// Camera position from which all of `words.extent` is visible.
 function reset() {
   const [turn, tilt, half] = [VIEW.turn, VIEW.tilt, VIEW.field / 2].map((degrees) => (degrees * Math.PI) / 180);
   const [w, h, d] = words.extent;
@@ -43,7 +43,7 @@ function resize() {
   soon();
 }
 
-// By the arrow keys, plus and minus.
+// Control by the arrow keys, plus and minus.
 function turn(event) {
   const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
   const polar = new THREE.Spherical().setFromVector3(camera.position.clone().sub(control.target));
@@ -63,7 +63,7 @@ function turn(event) {
 function openView(body) {
   const canvas = $('canvas');
   renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
-  renderer.outputColorSpace = THREE.LinearSRGBColorSpace; // the shader writes colors as they are to appear
+  renderer.outputColorSpace = THREE.LinearSRGBColorSpace; // the shader encodes colors itself
   camera = new THREE.PerspectiveCamera(VIEW.field, 1, 0.005, 50);
   scene = new THREE.Scene();
   body.frustumCulled = false;

@@ -1,10 +1,10 @@
-// Opening the page.
+// Start of the page.
 
 function prepare(arrays) {
   const canvas = $('canvas');
   renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
   renderer.autoClear = false;
-  renderer.outputColorSpace = THREE.LinearSRGBColorSpace; // the shader writes colors as they are to appear
+  renderer.outputColorSpace = THREE.LinearSRGBColorSpace; // the shader encodes colors itself
   ((drawings = {}), (cameras = {}), (controls = {}));
   for (const side of SIDES) {
     const own = {};
@@ -38,7 +38,7 @@ async function begin() {
   await dress();
 }
 
-// For tests, and for the curious at the console.
+// For tests, and for use in the browser's console.
 window.meshmatch = {
   state: () => {
     const point = current(),
@@ -46,7 +46,7 @@ window.meshmatch = {
     const { places, ...rest } = found ?? {};
     return { ...state, shown: found ? rest : null };
   },
-  // Where on the screen a vertex is drawn, and whether nothing is in front of it.
+  // Screen position of a vertex, and whether it is unoccluded.
   project: (side, vertex) => {
     cameras[side].updateMatrixWorld();
     const at = screenPlace(side, drawings[side].vertexPlace(drawings[side].rowOf(vertex)));

@@ -1,9 +1,9 @@
-// Words and switches around the panels, and the keys.
+// Text and controls around the panels, and the keys.
 
-// A name within a sentence, whichever way it is written.
+// A name within a sentence, isolated from its writing direction.
 const within = (name) => `\u2068${name}\u2069`;
 
-// Parts of each legend: words, the scale, and what may be left out where there is little room.
+// Parts of each legend: text, the scale, and what may be omitted where there is little room.
 const SCALE = Symbol('scale');
 const LEGENDS = {
   matches: () => ['One color is one place', ': the source by position, the target through the map.'],
