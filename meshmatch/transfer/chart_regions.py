@@ -27,7 +27,7 @@ from meshmatch.transfer.whole_polygons import unfold_polygon
 
 # All of these were set by hand; areas are shares of the whole surface.
 _COARSE_FACES = 2_000  # triangles of the decimated copy
-_MAX_SMOOTHING = 100  # steps that smooth borders on the surface; where more are needed, a finer copy does the rest
+_MAX_SMOOTHING = 100  # steps on the surface; where more are needed, borders are first smoothed on a finer copy
 _N_CELLS = 80
 _BEND_COST = 4.0  # how much longer a path becomes where neighboring triangles face different ways
 _CENTERING_ROUNDS = 4  # rounds in which cells grow again from their centers
