@@ -233,7 +233,7 @@ def known_pairs(
     if len(read[0].names) != len(read[1].names):
         counts = " and ".join(f"{len(each.names)} in {file.name}" for each, file in zip(read, files, strict=True))
         raise InputError(f"no landmark is in both files by its name: {counts}", "give the same names in both")
-    warn(f"{files[0].name} and {files[1].name} have no name in common: their landmarks are taken in order")
+    warn(f"{files[0].name} and {files[1].name} have no name in common: their landmarks are paired in order")
     return read[0].vertex, read[1].vertex
 
 
@@ -242,7 +242,7 @@ def warn_of_far_ones(shape: Shape, furthest: float) -> None:
     if furthest > _FAR * shape.diagonal:
         share = f"{100 * furthest / shape.diagonal:.0f} % of its diagonal"
         name = shape.name or "the source"
-        warn(f"a landmark lies {furthest:.4g} from {name}, {share}: the nearest point of the surface was taken")
+        warn(f"a landmark lies {furthest:.4g} from {name}, {share}: the nearest point of the surface is used")
 
 
 def _in_frame_of_shape(shape: Shape, found: LandmarkFile, name: str) -> LandmarkFile:
@@ -261,7 +261,7 @@ def _in_frame_of_shape(shape: Shape, found: LandmarkFile, name: str) -> Landmark
         replace(place, where=(place.where * _OTHER_FRAME).tolist()) if place.kind == "position" else place
         for place in found.places
     )
-    why = f"{name} is in {found.space}: x and y change their signs, for then its landmarks lie on {shape.name}"
+    why = f"{name} is in {found.space}: x and y change their signs, because its landmarks then lie on {shape.name}"
     return replace(found, places=places, turned=why)
 
 

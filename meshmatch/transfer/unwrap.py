@@ -105,7 +105,7 @@ def atlas_of(
         within, problem, twice = _check_coordinates(own, shape, size)
         if not problem:
             message = f"{name}: its own texture coordinates overlap on {100 * twice:.1f} % of their texels"
-            note = f"{message}, which show one of two places" if twice > _NEGLIGIBLE_OVERLAP else ""
+            note = f"{message}, each of which shows only one of two places" if twice > _NEGLIGIBLE_OVERLAP else ""
             return Atlas(within, True, note, twice if twice > _MAX_OVERLAP else 0.0)
         return new_atlas(shape, size, padding, keep, polygons, problem)
     if keep == "keep":

@@ -343,5 +343,5 @@ def test_landmarks_that_are_missing_or_off_the_surface_are_told(
     with pytest.warns(MeshmatchWarning, match="landmark gone is vertex -1: left out"):
         found = meshmatch.transfer_landmarks(sphere, other, file, true).data
     assert found.names == ("first", "second")
-    with pytest.warns(MeshmatchWarning, match="the nearest point of the surface was taken"):
+    with pytest.warns(MeshmatchWarning, match="the nearest point of the surface is used"):
         meshmatch.transfer_landmarks(sphere, other, 1.2 * sphere.verts[:2], true)

@@ -101,7 +101,7 @@ def test_landmarks_of_both_shapes_are_a_truth(run: Run, folder: Path) -> None:
     Path("other.csv").write_text("name,vertex\nA,0\nB,1\nC,2")
     answer = well(run("evaluate", "map.npy", "a.ply", "b.ply", "--points", "a.fcsv", "other.csv", "--json"))
     assert (
-        json.loads(answer.out)["mean"] == 0.0 and "no name in common: their landmarks are taken in order" in answer.err
+        json.loads(answer.out)["mean"] == 0.0 and "no name in common: their landmarks are paired in order" in answer.err
     )
 
 

@@ -161,7 +161,7 @@ def test_a_mesh_that_states_no_frame_has_that_of_landmarks_on_it(tmp_path: Path,
             save_landmarks(tmp_path / "a.mrk.json", replace(at_vertices(there, VERTICES), points=points * signs), space)
             found, distance = load_landmarks(tmp_path / "a.mrk.json", there)
             assert np.allclose(found.points, points) and distance < 1e-9
-            why = f"a.mrk.json is in {space}: x and y change their signs, for then its landmarks lie on a.ply"
+            why = f"a.mrk.json is in {space}: x and y change their signs, because its landmarks then lie on a.ply"
             assert found.notes == ((why,) if signs[0] < 0 else ())
 
 

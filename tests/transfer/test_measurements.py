@@ -161,7 +161,9 @@ def test_a_girth_of_a_surface_that_is_open_there_is_refused() -> None:
     for least, is_open in ((-0.8, False), (0.0, True)):
         part = Shape(shape.verts, shape.faces[shape.verts[shape.faces][:, :, 0].min(axis=1) > least], "part")
         if is_open:
-            with pytest.raises(InputError, match="a quarter of the girth or more is missing, for the surface is open"):
+            with pytest.raises(
+                InputError, match="a quarter of the girth or more is missing, because the surface is open"
+            ):
                 points_on(part, [AROUND])
         else:
             assert taken(points_on(part, [AROUND])).values[0] == pytest.approx(6.2, rel=0.02)

@@ -113,7 +113,7 @@ def test_a_few_texels_that_are_shared_are_told() -> None:
     uv = 0.1 + 0.8 * OWN
     uv[1] += (0.004, 0.004)
     atlas = atlas_of(SQUARE, uv, 512, 2)
-    assert atlas.own and "of their texels, which show one of two places" in atlas.note
+    assert atlas.own and "of their texels, each of which shows only one of two places" in atlas.note
     assert atlas.shared == 0.0
     uv[1] += (0.02, 0.02)
     assert 0.01 < atlas_of(SQUARE, uv, 512, 2).shared < 0.1
