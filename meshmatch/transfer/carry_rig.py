@@ -218,17 +218,17 @@ class _Skin:
         shared = np.zeros((len(tops), N))
         shared[:, rig.joints] = (groups @ common).toarray()
         shared[:, ~self.moves] = 0.0
-        best, neighbour = np.zeros(len(tops)), np.full(len(tops), -1)
+        best, neighbor = np.zeros(len(tops)), np.full(len(tops), -1)
         pending = set(range(len(tops))) - {int(number[self.first])}
         added = self.order
         while pending:
             nearest = shared[:, added].argmax(axis=1)
             found = shared[np.arange(len(tops)), np.array(added)[nearest]]
-            neighbour = np.where(found > best, np.array(added)[nearest], neighbour)
+            neighbor = np.where(found > best, np.array(added)[nearest], neighbor)
             best = np.maximum(best, found)
             chosen = max(pending, key=lambda k: (best[k], -k))
             pending.remove(chosen)
-            self.anchors[tops[chosen]] = neighbour[chosen]
+            self.anchors[tops[chosen]] = neighbor[chosen]
             added = np.flatnonzero(self.body & (top == tops[chosen])).tolist()
             self.order = self.order + added
 

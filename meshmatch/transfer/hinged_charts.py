@@ -31,8 +31,8 @@ _ANY_FORM_AREA = 0.004  # area of both together below which any form is accepted
 _MAX_HINGES = 4  # hinges that are tried for a pair of charts
 _MIN_CHARTS_REFLATTEN = 60  # charts below which none are flattened again
 _REFLATTEN_FILL, _REFLATTEN_FILL_KEPT, _REFLATTEN_ANY_FORM = 0.7, 0.9, 0.02  # the same limits for these
-_MAX_CHAINS, _CHAIN_PARTS = 3, (1.0, 0.6, 0.35)  # stretches of a common border that are tried, and shares of each
-# Triangles of a pair: above the first number only whole stretches are tried, above the second none.
+_MAX_CHAINS, _CHAIN_PARTS = 3, (1.0, 0.6, 0.35)  # chains of shared edges that are tried, and parts of each
+# Triangles of a pair: above the first number only whole chains are tried, above the second none.
 _MAX_FACES_PARTS, _MAX_FACES = 2_500, 8_000
 
 
@@ -206,7 +206,7 @@ def _find_hinges(a: Floats, b: Floats, edges: _Edges) -> list[_Edges]:
 
 
 def _chain_parts(a: Floats, edges: _Edges, parts: tuple[float, ...]) -> list[_Edges]:
-    """The longest stretches of a common border: each whole, and its beginning, middle and end."""
+    """The longest chains of shared edges: each whole, and its beginning, middle and end."""
     chains = edges.chains()
     lengths = np.array([np.linalg.norm(a[chain.one[:, 0]] - a[chain.one[:, 1]], axis=1).sum() for chain in chains])
     found = []

@@ -102,11 +102,11 @@ def atlas_of(
             return Atlas(
                 np.clip(_into_unit_square(own, shape), 0.0, 1.0), True, f"{message}: an image for each", tiles=tiles
             )
-        within, problem, twice = _check_coordinates(own, shape, size)
+        within, problem, shared = _check_coordinates(own, shape, size)
         if not problem:
-            message = f"{name}: its own texture coordinates overlap on {100 * twice:.1f} % of their texels"
-            note = f"{message}, each of which shows only one of two places" if twice > _NEGLIGIBLE_OVERLAP else ""
-            return Atlas(within, True, note, twice if twice > _MAX_OVERLAP else 0.0)
+            message = f"{name}: its own texture coordinates overlap on {100 * shared:.1f} % of their texels"
+            note = f"{message}, each of which shows only one of two places" if shared > _NEGLIGIBLE_OVERLAP else ""
+            return Atlas(within, True, note, shared if shared > _MAX_OVERLAP else 0.0)
         return new_atlas(shape, size, padding, keep, polygons, problem)
     if keep == "keep":
         raise OptionError(f"{name} has no texture coordinates to keep", _NEW_HINT)
