@@ -1,4 +1,4 @@
-"""Many shapes of one kind: each fitted once, all agreeing on how the template stretches, and a map of any two by look-up."""
+"""Collections of shapes of one kind: each is fitted once, the fits agree jointly, and maps between any two are looked up."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from meshmatch.api.results import MapPair
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.export import Export, Exported, Fits, Place, export
-from meshmatch.collections.fit_all import Fitted, elsewhere_words, files_of, fit_all, fit_all_kinds, with_left_out
+from meshmatch.collections.fit_all import Fitted, elsewhere_words, file_table, fit_all, fit_all_kinds, with_left_out
 from meshmatch.collections.folder import FitsFolder
 from meshmatch.collections.map_all import Pair, map_all
 from meshmatch.collections.named_parts import WHOLE, Masks, parts_of_template
-from meshmatch.collections.registered import Registered, held, matching
-from meshmatch.collections.setting import Record, Setting, forget, template_at
-from meshmatch.collections.settle import settled
-from meshmatch.collections.sources import find_sources, frame_times, in_sequences
+from meshmatch.collections.registered import Registered, load_points, match_names
+from meshmatch.collections.setting import Record, Setting, clear_caches, read_template
+from meshmatch.collections.settle import select_setting
+from meshmatch.collections.sources import find_sources, frame_times, sort_by_sequence
 from meshmatch.collections.stores import Store
 from meshmatch.collections.superimpose import Scale, superimpose
-from meshmatch.collections.workers import hired
+from meshmatch.collections.workers import open_workers
 from meshmatch.errors import InputError, warn
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
@@ -42,19 +42,19 @@ from meshmatch.templates.template import Template
 
 
 class Collection(FitsFolder):
-    """A folder of fits of shapes of one kind; `fit` fills it.
+    """A folder of fits of shapes of one kind, which `fit` fills.
 
-    Fits are read when they are asked for, and some are kept in memory. Of a folder without fits, all but `fit` is an
-    `InputError`.
+    Fits are read on demand, and recently used ones are cached. Everything but `fit` raises `InputError` if the folder has
+    no fits.
 
     Parameters
     ----------
     folder
         Path or URL.
     workers
-        Number of processes, by default one a core; or the address of a Dask scheduler.
+        Number of processes, by default one per core; or the address of a Dask scheduler.
     progress
-        Called with the stage, the folder and the share of the stage that is done (0..1).
+        Called with the stage, the folder and the completed share of the stage (0..1).
 
     Examples
     --------
@@ -88,63 +88,63 @@ class Collection(FitsFolder):
         agree: bool = True,
         tell: Callable[[Record], None] | None = None,
     ) -> Fitted:
-        """Fit every shape once, and let all fits agree on how the template stretches.
+        """Fit every shape once, then refine all fits jointly so that the template stretches alike (the agreement).
 
-        With the model "none" the shapes themselves make a template: one of them is fitted to all others, and then their
-        mean, twice. They are of one kind, in any pose; mirror images and cut ones are found. Nothing agrees then, and
-        five fits or more are judged by comparison with each other. A run that was stopped goes on where it was, bit for
-        bit. Shapes of before stay in the collection as long as their files are there, and those that are added are
-        fitted. A shape that cannot be read or fitted is a record and stops nothing else.
+        With the model "none" the template is made of the shapes, which are of one kind, in any pose: one of them is
+        fitted to all others, and then their mean, twice. Mirror images and cut shapes are found. There is no agreement,
+        and five fits or more are judged by comparison. An interrupted run can be continued, with the same result bit for
+        bit. Shapes fitted before stay in the collection while their files exist; only new ones are fitted. A shape that
+        cannot be read or fitted gets a record and does not stop the others.
 
         Parameters
         ----------
         shapes
             Files, folders, patterns such as ``scans/*.ply``, or URLs of folders.
         model
-            Name, folder, "auto" or "none". With "auto" the first shape decides; shapes of other kinds that the installed
-            models know are fitted by theirs, in a folder of the kind's name within this one.
+            Name, folder, "auto" or "none". With "auto" the first shape decides; shapes of other kinds for which a model
+            is installed are fitted with that model, in a subfolder named after the kind.
         config
-            How all shapes are fitted.
+            Options of all fits.
         only
             As in `load_shape`.
         without
             As in `load_shape`.
         sequence
-            The shapes of a folder are frames, in the natural order of their names, and each fit starts where the last
-            one ended.
+            The shapes of a folder are frames, in the natural order of their names, and each fit starts from that of the
+            previous frame.
         agree
-            Whether fits agree.
+            Whether to run the agreement.
         tell
-            Called with the record of each shape, as they come in.
+            Called with the record of each shape once it is judged.
 
         Returns
         -------
         Fitted
-            What became of each shape.
+            The result for each shape.
 
         Raises
         ------
         MeshmatchError
-            There is no shape, two have the same name, none could be fitted, or the folder holds fits of another model
-            or made in another way, or another process writes to it.
+            There is no shape, two have the same name, none could be fitted, the fits in the folder were made with
+            another model or other options, or another process writes to the folder.
         """
         given, left_out = find_sources(shapes, self.store)
-        wish = Setting(self.store, str(model), config or FitConfig(), tuple(only), tuple(without), sequence)
-        with self.store.alone(), hired(self.workers) as crew:
-            setting = settled(wish, sources := self._with_earlier(given))
+        requested = Setting(self.store, str(model), config or FitConfig(), tuple(only), tuple(without), sequence)
+        with self.store.exclusive(), open_workers(self.workers) as workers:
+            setting = select_setting(requested, sources := self._with_earlier(given))
             if model == AUTO:
-                made = fit_all_kinds(setting, wish, sources, crew, agree, self.progress, tell)
+                made = fit_all_kinds(setting, requested, sources, workers, agree, self.progress, tell)
             else:
-                made = fit_all(setting, sources, crew, agree, self.progress, tell)
+                made = fit_all(setting, sources, workers, agree, self.progress, tell)
             made = with_left_out(made, self.store, left_out)
-        forget()
+        clear_caches()
         return made
 
     @property
     def names(self) -> list[str]:
-        """Names of the fitted shapes, sorted; not of those of another kind, whose fits are in a folder of their own."""
+        """Names of the fitted shapes, sorted; without those of another kind, whose fits are in a subfolder."""
         found = self._fitted
-        elsewhere = self._elsewhere(found)
+        elsewhere = self._fitted_elsewhere(found)
         left = [name for name in found if name not in elsewhere]
         if not left:
             what = f"{self.store.location} holds no fit of its own kind"
@@ -153,26 +153,26 @@ class Collection(FitsFolder):
 
     @property
     def template(self) -> Template:
-        """The template of all fits."""
-        return template_at(self.store)
+        """The template of the fits."""
+        return read_template(self.store)
 
     @property
     def model(self) -> str:
-        """Name or folder of the model of all fits; "none" where there was none."""
-        return str(self._about()["model"])
+        """Name or folder of the model of the fits; "none" if they were made without one."""
+        return str(self._manifest()["model"])
 
     def to_learn(self) -> RegisteredShapes:
-        """The fitted shapes, without poor fits, for `train` to learn from.
+        """The fitted shapes as training data for `train`, without poor fits.
 
         Returns
         -------
         RegisteredShapes
-            In the template's vertices.
+            All shapes with the template's vertices.
 
         Raises
         ------
         InputError
-            Fewer than three are left.
+            Fewer than three fits are left.
         """
         with self.registered() as found:
             name, verts = Path(self.store.location).name, np.array(found.points)
@@ -182,7 +182,7 @@ class Collection(FitsFolder):
             return RegisteredShapes(self.template, verts, name, self.model, "rigid", mirror)
 
     def fit_of(self, name: str) -> Fit:
-        """The fit of a shape, after all have agreed.
+        """The finished fit of a shape.
 
         Parameters
         ----------
@@ -192,13 +192,13 @@ class Collection(FitsFolder):
         Returns
         -------
         Fit
-            It knows where the vertices of the shape belong, but not the shape: its ``verts`` are empty. `Matcher.map` takes
-            it, also together with fits of other shapes by the same model.
+            It has the places of the shape's vertices, but not the shape: its ``verts`` are empty. It can be passed to
+            `Matcher.map`, with the fit of any other shape by the same model.
         """
-        return self._read(name)
+        return self._read_fit(name)
 
     def places_of(self, name: str) -> Places:
-        """Where the vertices of a shape belong on the template.
+        """The places of a shape's vertices on the template.
 
         Parameters
         ----------
@@ -208,12 +208,12 @@ class Collection(FitsFolder):
         Returns
         -------
         Places
-            A point of the template for every vertex.
+            A point of the template for every vertex of the shape.
         """
-        return self._read(name).places
+        return self._read_fit(name).places
 
     def map(self, source: str, target: str) -> VertexMap:
-        """The map between two shapes: nothing is fitted, only looked up.
+        """The map between two shapes, looked up from their fits.
 
         Parameters
         ----------
@@ -227,13 +227,12 @@ class Collection(FitsFolder):
         VertexMap
             From source to target.
         """
-        return map_of_placed(self._read(source), self._read(target))
+        return map_of_placed(self._read_fit(source), self._read_fit(target))
 
     def maps_between(self, source: ShapeLike, target: ShapeLike) -> MapPair:
-        """The maps between two shapes themselves, in both directions, for transfers and `evaluate`.
+        """The maps between two shapes in both directions, together with the shapes, for transfers and `evaluate`.
 
-        They are found among the fits by their vertices and faces; also among those of another kind, which are in a folder
-        of their own.
+        The fits are found by the shapes' vertices and faces, also in the subfolders of other kinds.
 
         Parameters
         ----------
@@ -254,7 +253,7 @@ class Collection(FitsFolder):
         """
         shapes = as_shape(source, "source"), as_shape(target, "target")
         names = {self._hash_of(name): name for name in self._fitted}
-        for other in self._others():
+        for other in self._other_kinds():
             if {shape.hash for shape in shapes} <= {other._hash_of(name) for name in other._fitted}:
                 return other.maps_between(*shapes)
         for shape in shapes:
@@ -263,12 +262,12 @@ class Collection(FitsFolder):
                 raise InputError(f"{self.store.location} holds no fit of {shape.name or 'this shape'}", hint)
         a, b = (names[shape.hash] for shape in shapes)
         there, back = self.map(a, b).for_shapes(*shapes), self.map(b, a).for_shapes(*shapes[::-1])
-        part = self._words(a)["partial"] or self._words(b)["partial"]
+        part = self._metadata(a)["partial"] or self._metadata(b)["partial"]
         there, back = both_unfolded(there, back, *shapes, part)
         return MapPair(*shapes, there, opposite=back)
 
     def holds(self, shape: ShapeLike) -> bool:
-        """Whether a shape is among the fits, or among those of another kind, by its vertices and faces.
+        """Whether a shape is among the fits, those of other kinds included; compared by vertices and faces.
 
         Parameters
         ----------
@@ -278,25 +277,25 @@ class Collection(FitsFolder):
         Returns
         -------
         bool
-            True if `maps_between` can find it.
+            True if `maps_between` would find it.
         """
         digest = as_shape(shape).hash
-        return any(digest == each._hash_of(name) for each in (self, *self._others()) for name in each._fitted)
+        return any(digest == each._hash_of(name) for each in (self, *self._other_kinds()) for name in each._fitted)
 
-    def _names_of_one_kind(self) -> list[str]:
-        """`names`; with a warning about those that it does not have."""
+    def _names_with_warning(self) -> list[str]:
+        """Return `names`, with a warning about shapes of another kind."""
         names = self.names
-        for text in elsewhere_words(self._elsewhere(sorted(set(self._fitted) - set(names)))):
+        for text in elsewhere_words(self._fitted_elsewhere(sorted(set(self._fitted) - set(names)))):
             warn(text)
         return names
 
     def pairs(self, to: str | None = None) -> list[Pair]:
-        """All ordered pairs of names, with a warning about shapes of another kind, which are left out.
+        """All ordered pairs of names. Shapes of another kind are left out, with a warning.
 
         Parameters
         ----------
         to
-            Only those that lead to this name.
+            Name of a target: return only the pairs with this target.
 
         Returns
         -------
@@ -305,13 +304,13 @@ class Collection(FitsFolder):
         """
         if to is not None:
             self._check(to)
-        names = self._names_of_one_kind()
+        names = self._names_with_warning()
         if to is None:
             return list(permutations(names, 2))
         return [(name, to) for name in names if name != to]
 
     def save_maps(self, output: str | Path, pairs: Sequence[Pair] | None = None, *, suffix: str = ".npz") -> int:
-        """Write maps; the one from A to B is ``output/A/B`` with the suffix. Maps that are as new as the fits are kept.
+        """Write maps, the one from A to B as ``output/A/B`` with the suffix. Maps that are newer than the fits are kept.
 
         Parameters
         ----------
@@ -325,13 +324,13 @@ class Collection(FitsFolder):
         Returns
         -------
         int
-            How many maps there are.
+            Number of maps, kept ones included.
 
         Raises
         ------
         MeshmatchError
-            An unknown name or format, or a name whose fit is of another kind, or the folder cannot be written, or another
-            program made it.
+            A name or the format is unknown, a shape is of another kind, or the folder cannot be written or is in use by
+            another process.
         """
         suffix = f".{suffix.removeprefix('.')}"
         check_suffix(Path(f"map{suffix}"))
@@ -340,8 +339,8 @@ class Collection(FitsFolder):
         for name in (name for pair in wanted for name in pair if name not in known):
             self._check(name)
         maps = Store.of(output)
-        with maps.alone(), hired(self.workers) as crew:
-            return map_all(self.store, maps, wanted, suffix, crew, self.progress)
+        with maps.exclusive(), open_workers(self.workers) as workers:
+            return map_all(self.store, maps, wanted, suffix, workers, self.progress)
 
     def export(
         self,
@@ -356,32 +355,32 @@ class Collection(FitsFolder):
         smooth: bool = False,
         cycle: bool = False,
     ) -> Exported:
-        """Write the template on every shape, as meshes or as a table; vertex i is the same point on all of them.
+        """Write the registered meshes (the template fitted to every shape); vertex i is the same point on all of them.
 
         Parameters
         ----------
         output
             A new folder.
         suffix
-            Of a mesh for each shape, named as it is, by default .ply; or .csv or .npz, one table of all coordinates: a row
-            for each shape, x, y and z of each vertex in turn; or arrays ``points`` (S, V, 3), ``faces`` (F, 3), ``names``,
-            ``centroid_size`` and ``mirrored`` (S,). Beside a table, metadata.csv has a row for each shape.
+            Suffix of one mesh per shape, by default .ply; or .csv or .npz for all coordinates in one file. A .csv has a row
+            per shape: x, y and z of vertex 0, then of vertex 1, ... An .npz has ``points`` (S, V, 3), ``faces`` (F, 3),
+            ``names``, ``centroid_size`` and ``mirrored`` (S,). Both come with metadata.csv, a row for each shape.
         place
-            Where they lie: where the files have the shapes ("files"), or all with the axes of the template, about its
-            center ("template"). Both are in the unit of the files; a mirror image is turned over in the second.
+            Coordinates, in the unit of the files: those of the shapes' files ("files"), or all shapes aligned with the
+            template's axes and center ("template"), where mirror images are flipped.
         poor
-            Whether poor fits are written.
+            Whether to include poor fits.
         original
             Write the shapes of the files instead, as .vtp or .vtk, with the signed distance and the displacement of each
             vertex from the mean, and the template's parts.
         values
-            A file of numbers of the template's vertices, which the originals then have too.
+            A file of values of the template's vertices to add to the originals.
         metadata
-            A table with a row for each shape, which metadata.csv then has too.
+            A table with a row for each shape, to add to metadata.csv.
         smooth
             Shapes of a folder are frames: smooth the paths of the vertices in time, along the surfaces.
         cycle
-            The same, and the last frame is followed by the first.
+            Smooth in time, as a cycle: the last frame is followed by the first.
 
         Returns
         -------
@@ -391,11 +390,11 @@ class Collection(FitsFolder):
         Raises
         ------
         MeshmatchError
-            The format or place is unknown, no fit is left, an original is not as it was, or the folder is named as a file,
-            is not empty or cannot be written.
+            The format or place is unknown, no fit is left, the file of an original has changed, or the folder is named
+            like a file, is not empty or cannot be written.
         """
         how = Export(suffix, place, original, values, metadata, smooth, cycle).into(output)
-        verdicts = {name: str(self._words(name)["verdict"]) for name in self._names_of_one_kind()}
+        verdicts = {name: str(self._metadata(name)["verdict"]) for name in self._names_with_warning()}
         left_out = tuple(name for name, verdict in verdicts.items() if verdict == "poor" and not poor)
         names = [name for name in verdicts if name not in left_out]
         if not names:
@@ -405,11 +404,11 @@ class Collection(FitsFolder):
             with self.registered(poor) as shapes:
                 mean = superimpose(shapes.points, shapes.faces)
         in_time = smooth or cycle
-        sequence = in_time or bool(self._about()["sequence"])
+        sequence = in_time or bool(self._manifest()["sequence"])
         files: dict[str, str] = {}
-        with nullcontext() if original or in_time else suppress(InputError):  # else they only say how a glb stands
-            files = files_of(self.store) if original or in_time or how.suffix == ".glb" else {}
-        names = in_sequences(names) if sequence else names
+        with nullcontext() if original or in_time else suppress(InputError):  # else only for the axes of a glb
+            files = file_table(self.store) if original or in_time or how.suffix == ".glb" else {}
+        names = sort_by_sequence(names) if sequence else names
         times = frame_times({*files, *names}) if sequence else {}
         fits = Fits(names, self.fit_of, self.places_of, files, self.template, sequence, times)
         return Exported(
@@ -426,7 +425,7 @@ class Collection(FitsFolder):
         align_by: str = WHOLE,
         leave_out: Sequence[str] = (),
     ) -> Atlas:
-        """The mean and the modes of the fitted shapes.
+        """Build an atlas (mean and modes of variation) of the fitted shapes.
 
         Parameters
         ----------
@@ -439,29 +438,29 @@ class Collection(FitsFolder):
         poor
             As in `registered`.
         align_by
-            What is superimposed: "whole" shapes, "each" connected part alone, or one part, whose number (the largest is "1")
-            or name this is: of the template, or of a mesh in the files.
+            What to superimpose: "whole" shapes; "each" connected part by itself; or one part, given by its number (the
+            largest is "1") or by its name in the template or in the files.
         leave_out
             As in `registered`.
 
         Returns
         -------
         Atlas
-            Of all fits that count.
+            Of all fits that are not left out.
         """
         with self.registered(poor, leave_out) as shapes:
             return shapes.atlas(modes=modes, scale=scale, robust=robust, align_by=align_by)
 
     @contextmanager
     def registered(self, poor: bool = False, leave_out: Sequence[str] = ()) -> Iterator[Registered]:
-        """The template on every shape, held in memory, or in a file until the block ends.
+        """The registered shapes, as a context: many of them are kept in a temporary file, which the block's end removes.
 
         Parameters
         ----------
         poor
-            Whether poor fits count.
+            Whether to include poor fits.
         leave_out
-            Names of shapes that do not count; * and ? stand for any characters.
+            Names of shapes to leave out; * and ? are wildcards.
 
         Yields
         ------
@@ -471,12 +470,12 @@ class Collection(FitsFolder):
         Raises
         ------
         InputError
-            Fewer than three shapes are left, or none is called so.
+            Fewer than three shapes are left, or a name to leave out matches no shape.
         """
-        words = {name: self._words(name) for name in self._names_of_one_kind()}
-        out = dict.fromkeys(sorted(matching(words, leave_out)), "asked")
-        out |= {name: "poor" for name, about in words.items() if about["verdict"] == "poor" and not poor}
-        names = tuple(name for name in words if name not in out)
+        metadata = {name: self._metadata(name) for name in self._names_with_warning()}
+        out = dict.fromkeys(sorted(match_names(metadata, leave_out)), "asked")
+        out |= {name: "poor" for name, about in metadata.items() if about["verdict"] == "poor" and not poor}
+        names = tuple(name for name in metadata if name not in out)
         if len(names) < 3:
             also = f" and {len(out)} that are left out" if out else ""
             raise InputError(f"{self.store.location} holds {len(names)} fits{also}", "three or more are needed")
@@ -485,16 +484,16 @@ class Collection(FitsFolder):
             fit = self.fit_of(names[number])
             return np.asarray(fit.points * fit.frame.scale)
 
-        parts, cut = partial(self._parts, names), tuple(name for name in names if words[name]["partial"])
-        with held(len(names), self.template.shape.V, read) as points:
+        parts, cut = partial(self._parts, names), tuple(name for name in names if metadata[name]["partial"])
+        with load_points(len(names), self.template.shape.V, read) as points:
             yield Registered(points, self.template.shape.faces, names, np.eye(3), out, self.template.hash, parts, cut)
 
     def _parts(self, names: Sequence[str]) -> Masks:
-        return parts_of_template(self.template, names, files_of(self.store), self.places_of)
+        return parts_of_template(self.template, names, file_table(self.store), self.places_of)
 
     def _check(self, name: str) -> None:
-        """`InputError` for a name that has no fit here, or whose fit is of another kind."""
+        """Raise `InputError` if a name has no fit in the collection, or if its shape is of another kind."""
         self.places_of(name)
-        where = self._elsewhere([name]).get(name)
+        where = self._fitted_elsewhere([name]).get(name)
         if where is not None:
             raise InputError(f"{name} is of another kind", f"its fit is in {where}: map there")

@@ -17,7 +17,7 @@ from meshmatch.api.upright import turn_of_fit
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.covariates import SIZE, Covariates, covariates
 from meshmatch.collections.motion import area_strain, smoothed
-from meshmatch.collections.registered import held, mixed_units
+from meshmatch.collections.registered import load_points, mixed_units
 from meshmatch.collections.sources import folder_of
 from meshmatch.collections.superimpose import Superimposed
 from meshmatch.errors import InputError, OptionError, warn
@@ -185,7 +185,7 @@ def export(
         elif how.suffix == ".npz":
             files.append("coords.npz")
             each = meshes()
-            with held(len(names), fits.template.shape.V, lambda number: next(each)[1].verts) as points:
+            with load_points(len(names), fits.template.shape.V, lambda number: next(each)[1].verts) as points:
                 own = {"points": points, "faces": np.asarray(fits.template.shape.faces), "names": np.array(names)}
                 if moves:
                     own |= _motions(names, points, own["faces"])
@@ -228,7 +228,7 @@ def _in_time(meshes: Iterator[tuple[str, Shape]], fits: Fits, cycle: bool) -> It
             faces.append(shape.faces)
             return shape.verts
 
-        with held(len(names), fits.template.shape.V, read) as points:
+        with load_points(len(names), fits.template.shape.V, read) as points:
             frames = smoothed(points, faces[0], [fits.times[name] for name in names], cycle, moments[folder])
             for name, verts, own_faces in zip(names, frames, faces, strict=True):
                 yield name, Shape(verts, own_faces, name)

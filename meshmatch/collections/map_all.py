@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from meshmatch.collections.setting import FITS, SUFFIX, finished_fit
+from meshmatch.collections.setting import FITS, SUFFIX, read_finished_fit
 from meshmatch.collections.stores import Store
-from meshmatch.collections.workers import Died, Workers
+from meshmatch.collections.workers import DeadWorker, Workers
 from meshmatch.errors import InputError
 from meshmatch.maps.build import map_of_placed
 from meshmatch.maps.files import save_map
@@ -67,7 +67,7 @@ def map_some(task: MapTask) -> int:
     """Write maps to one shape; how many there are. Those that are as new as the fits are kept."""
     for source in task.sources:
         if not _is_new(task, source):
-            found = map_of_placed(finished_fit(task.fits, source), finished_fit(task.fits, task.target))
+            found = map_of_placed(read_finished_fit(task.fits, source), read_finished_fit(task.fits, task.target))
             with task.output.writing(task.file(source)) as path:
                 save_map(path, found)
     return len(task.sources)
@@ -78,7 +78,7 @@ def map_all(
     output: Store,
     pairs: Sequence[Pair],
     suffix: str,
-    crew: Workers,
+    workers: Workers,
     progress: ProgressCallback | None = None,
 ) -> int:
     """Maps of pairs of fits; see `Collection.save_maps`."""
@@ -91,8 +91,8 @@ def map_all(
         for first in range(0, len(group), _SOURCES)
     ]
     done = 0
-    for _, result in crew.each(map_some, tasks):
-        if isinstance(result, Died):
+    for _, result in workers.each(map_some, tasks):
+        if isinstance(result, DeadWorker):
             raise result
         done += result
         if progress is not None:

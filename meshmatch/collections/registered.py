@@ -1,4 +1,7 @@
-"""Shapes that share their vertices, as an atlas needs them: from a folder of meshes here, from fits in `collection`."""
+"""Registered shapes (same vertices and faces), the input of an atlas, read from a folder of meshes.
+
+`Collection.registered` makes them of fits.
+"""
 
 from __future__ import annotations
 
@@ -25,22 +28,20 @@ from meshmatch.shapes.input_files import read_text, stem_of, suffix_of
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import read_by_suffix
 
-_IN_MEMORY = 256 * 2**20  # bytes; more are kept in a temporary file
-_TELLING, _UNLIKE = 8, 6.0  # shapes; deviations, by the median absolute one
-_ODD = 3.0  # sizes further apart than this are probably units
-_LINE = 200  # bytes of memory for a line
-_ONE_A_LINE = (
-    "write one name a line; of a table of specimens, --metadata TABLE --model 'shape ~ COLUMN' compares groups"
-)
+_IN_MEMORY = 256 * 2**20  # bytes; larger arrays are kept in a temporary file
+_MIN_SHAPES, _MAX_DEVIATIONS = 8, 6.0  # for outliers; deviations are estimated from the median absolute deviation
+_MAX_SIZE_RATIO = 3.0  # larger ratios are probably a mix of units
+_LINE_BYTES = 200  # memory needed per line
+_LIST_HINT = "write one name a line; of a table of specimens, --metadata TABLE --model 'shape ~ COLUMN' compares groups"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Registered(Brief):
     """S shapes with the same vertices and faces, and their names.
 
-    ``rotation`` leads into y up, z to the front, where it is known. ``left_out`` are names of shapes that do not count, and
-    why: "poor" or "asked". ``template`` is the hash of the template, if they are fits. ``parts`` gives parts by name.
-    ``partial`` are names of fits to a part of a shape.
+    ``rotation`` turns them to y up and z to the front; None if that is not known. ``left_out`` maps names of shapes that
+    were left out to the reason, "poor" or "asked". ``template`` is the hash of the template if the shapes are fits, else
+    empty. ``parts`` returns the masks of named parts. ``partial`` are names of shapes that were fitted as a part.
     """
 
     points: Float[Floats, "S V 3"]
@@ -54,13 +55,13 @@ class Registered(Brief):
 
     @property
     def cut(self) -> tuple[str, ...]:
-        """Names of cut shapes among whole ones: none, where all are cut alike."""
+        """Names of the partial shapes if there are whole ones as well; empty if all shapes are partial."""
         return self.partial if len(self.partial) < len(self.names) else ()
 
     def atlas(self, *, modes: int = 100, scale: Scale = "keep", robust: bool = False, align_by: str = WHOLE) -> Atlas:
-        """Their atlas; see `Atlas.of`. ``align_by`` is what is superimposed, as `groups_of` has it.
+        """Build the atlas of the shapes, see `Atlas.of`; ``align_by`` says what to superimpose, see `groups_of`.
 
-        Warns of cut shapes among whole ones (`MeshmatchWarning`).
+        Warns if there are partial shapes among whole ones (`MeshmatchWarning`).
         """
         if self.cut:
             warn(
@@ -79,8 +80,11 @@ class Registered(Brief):
         )
 
 
-def matching(names: Iterable[str], patterns: Sequence[str]) -> set[str]:
-    """Names that match some patterns, in which * and ? stand for any characters; `InputError` for one that matches none."""
+def match_names(names: Iterable[str], patterns: Sequence[str]) -> set[str]:
+    """Names that match any of the patterns, with wildcards * and ?; `InputError` if a pattern matches none.
+
+    A pattern may also be the name of a file: a name with its suffix.
+    """
     known, found = list(names), set[str]()
     for pattern in patterns:
         meant = fnmatch.filter(known, pattern) or fnmatch.filter(known, os.path.splitext(pattern)[0])
@@ -93,19 +97,19 @@ def matching(names: Iterable[str], patterns: Sequence[str]) -> set[str]:
 
 @contextmanager
 def registered_meshes(folder: str | Path, leave_out: Sequence[str] = ()) -> Iterator[Registered]:
-    """The meshes of a folder, by the names of their files without suffix; held in memory, or in a file until the block ends.
-    ``leave_out`` are names of some that do not count, as of `matching`.
+    """Read the meshes of a folder, named by their files without suffix, as a context; see `load_points`.
 
-    `InputError`: fewer than three meshes, two of one name, or meshes that do not share vertices and faces.
+    ``leave_out`` are patterns of names to leave out, see `match_names`. `InputError`: fewer than three meshes, two of
+    the same name, or meshes that do not share vertices and faces.
     """
     files = sorted(path for path in Path(folder).iterdir() if suffix_of(path) in PLAIN_SUFFIXES and path.is_file())
-    called = [stem_of(path) for path in files]
-    twice = next((name for name, count in Counter(called).items() if count > 1), None)
-    if twice is not None:
-        raise InputError(f"{folder} holds two meshes called {twice}", "an atlas needs different names")
-    out = dict.fromkeys(sorted(matching(called, leave_out)), "asked")
-    names = tuple(name for name in called if name not in out)
-    files = [path for path, name in zip(files, called, strict=True) if name not in out]
+    all_names = [stem_of(path) for path in files]
+    duplicate = next((name for name, count in Counter(all_names).items() if count > 1), None)
+    if duplicate is not None:
+        raise InputError(f"{folder} holds two meshes called {duplicate}", "an atlas needs different names")
+    out = dict.fromkeys(sorted(match_names(all_names, leave_out)), "asked")
+    names = tuple(name for name in all_names if name not in out)
+    files = [path for path, name in zip(files, all_names, strict=True) if name not in out]
     if len(files) < 3:
         raise InputError(f"{folder} holds {len(files)} meshes", "an atlas needs three or more, registered")
     first = load_shape(files[0])
@@ -124,13 +128,18 @@ def registered_meshes(folder: str | Path, leave_out: Sequence[str] = ()) -> Iter
             raise InputError(what, "register the shapes first: meshmatch fit")
         return shape.verts
 
-    with held(len(files), first.V, read) as points:
+    with load_points(len(files), first.V, read) as points:
         yield Registered(points, first.faces, names, None, out, parts=lambda: parts_of_file(files[0]))
 
 
 @contextmanager
-def held(count: int, vertices: int, read: Callable[[int], Float[Floats, "V 3"]]) -> Iterator[Float[Floats, "S V 3"]]:
-    """Shapes, each read once: in memory, or if they are many in a file until the block ends."""
+def load_points(
+    count: int, vertices: int, read: Callable[[int], Float[Floats, "V 3"]]
+) -> Iterator[Float[Floats, "S V 3"]]:
+    """Read shapes into one array, in memory or, above 256 MiB, in a temporary file that is removed when the block ends.
+
+    ``read`` gives the vertices of a shape by its number; it is called once for each, in order.
+    """
     size = count, vertices, 3
     with tempfile.TemporaryDirectory() as folder:
         points: Floats
@@ -144,23 +153,24 @@ def held(count: int, vertices: int, read: Callable[[int], Float[Floats, "V 3"]])
 
 
 def read_group(path: str | Path, shapes: Registered) -> list[str]:
-    """The names in a file (.txt, .csv), one a line, as the shapes have them: a name may have a suffix. Those that are left
-    out do not count. `InputError` for a name that is unknown, or a file that cannot be read.
+    """Read names of shapes from a file (.txt, .csv), one per line, with or without suffix.
+
+    Shapes that were left out are skipped. `InputError` for an unknown name, or a file that cannot be read.
     """
     found = []
     known = set(shapes.names)
 
     def read(path: Path) -> list[str]:
-        return read_text(path, _LINE).splitlines()
+        return read_text(path, _LINE_BYTES).splitlines()
 
-    for line in read_by_suffix(path, {".txt": read, ".csv": read}, "names of shapes", _ONE_A_LINE):
+    for line in read_by_suffix(path, {".txt": read, ".csv": read}, "names of shapes", _LIST_HINT):
         word = line.strip()
         if not word:
             continue
         meant = [name for name in (word, os.path.splitext(word)[0]) if name in known or name in shapes.left_out]
         if not meant:
             close = get_close_matches(word, shapes.names, n=1)
-            hint = f"did you mean {close[0]}?" if close else _ONE_A_LINE
+            hint = f"did you mean {close[0]}?" if close else _LIST_HINT
             raise InputError(f"{Path(path).name}: there is no shape called {word}", hint)
         if meant[0] in known:
             found.append(meant[0])
@@ -168,25 +178,25 @@ def read_group(path: str | Path, shapes: Registered) -> list[str]:
 
 
 def size_ratio(sizes: Sequence[float] | Floats) -> float:
-    """How many times as large the largest shape is as the smallest."""
+    """Ratio of the largest size to the smallest."""
     return float(np.max(sizes) / np.min(sizes))
 
 
 def mixed_units(names: Sequence[str], sizes: Sequence[float] | Floats) -> str:
-    """What to say where sizes of shapes are so unlike that their files may have several units; else empty."""
-    if len(sizes) == 0 or (times := size_ratio(sizes)) <= _ODD:
+    """A warning if the sizes of shapes differ so much that their files may have different units; empty if not."""
+    if len(sizes) == 0 or (ratio := size_ratio(sizes)) <= _MAX_SIZE_RATIO:
         return ""
     large, small = names[int(np.argmax(sizes))], names[int(np.argmin(sizes))]
-    words = f"{times:,.0f}" if times >= 100 else f"{times:.3g}"
+    words = f"{ratio:,.0f}" if ratio >= 100 else f"{ratio:.3g}"
     return f"{large} is {words} times as large as {small}: do the files have one unit?"
 
 
 def outlying(distances: Float[Floats, " S"]) -> Int[Ints, " N"]:
-    """Rows of shapes that are so much further from the mean than most that they are probably cut, or of another kind.
+    """Rows of shapes that are so far from the mean, compared with most, that they are probably cut or of another kind.
 
-    One collection in thirty of normal shapes has one; of fewer than eight nothing is said.
+    One in thirty collections of normal shapes has a false positive. Empty for fewer than eight shapes.
     """
-    if len(distances) < _TELLING:
+    if len(distances) < _MIN_SHAPES:
         return np.empty(0, np.int64)
     beyond = distances - np.median(distances)
-    return np.flatnonzero(beyond > _UNLIKE * 1.4826 * np.median(np.abs(beyond)) + 1e-9 * distances.max())
+    return np.flatnonzero(beyond > _MAX_DEVIATIONS * 1.4826 * np.median(np.abs(beyond)) + 1e-9 * distances.max())

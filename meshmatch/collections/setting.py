@@ -1,4 +1,4 @@
-"""What all tasks of a collection share: its shapes, the way in which they are fitted, and what becomes of each."""
+"""Data shared by the tasks of a collection: the sources, the setting (model and options), and the record of each fit."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ from meshmatch.templates.template import Template, load_template
 from meshmatch.threads import thread_limit
 
 FIRST, SECOND, ALONE, AGREEING, FITS = "first", "second", "alone", "agreeing", "fits"
-"""Folders of a collection: without a model, fits of the shape that is the first template; fits before they agree; what
-they agree on so far; and finished fits."""
+"""Subfolders of a collection: fits to the first and to the second template (without a model); fits before the agreement;
+intermediate results of the agreement; and finished fits."""
 TEMPLATE, FIRST_TEMPLATE, SECOND_TEMPLATE = "template.safetensors", "first.safetensors", "second.safetensors"
 SUFFIX = ".safetensors"
 FAILED = "failed"
-"""In place of a verdict, for a shape that could not be fitted."""
+"""Stands in place of a verdict for a shape that could not be fitted."""
 LEFT_OUT = "left out"
-"""The same for a file beside shapes whose format is that of no shape, such as a table or an image."""
+"""Stands in place of a verdict for a file among the shapes that is not a shape, such as a table or an image."""
 
 
 def digest_of(*parts: str | bytes) -> str:
-    """A digest of words or bytes, 32 hex digits."""
+    """Digest of strings or bytes, as 32 hex digits."""
     found = hashlib.blake2b(digest_size=16)
     for part in parts:
         found.update(part if isinstance(part, bytes) else f"{part}\n".encode())
@@ -50,24 +50,24 @@ def digest_of(*parts: str | bytes) -> str:
 
 @dataclass(frozen=True)
 class Source:
-    """One shape of a collection: its name there, the folder where its file lies, and the file's name in it."""
+    """A shape of a collection: its name there, the folder of its file, and the file's path in that folder."""
 
     name: str
     folder: Store
     file: str
 
     def load(self, only: Sequence[str] = (), without: Sequence[str] = ()) -> Shape:
-        """The shape, under its name in the collection, as `load_shape`; `InputError` if it cannot be read."""
+        """Read the shape, under its name in the collection, as `load_shape` does; `InputError` if it cannot be read."""
         with self.folder.reading(self.file) as path:
             return replace(load_shape(path, only=only, without=without), name=self.name)
 
     @property
     def path(self) -> str:
-        """Where the file lies."""
+        """Path or URL of the file."""
         return f"{self.folder.location}/{self.file}"
 
     def digest(self) -> str:
-        """Of the file's bytes."""
+        """Digest of the file's bytes."""
         with self.folder.reading(self.file) as path:
             try:
                 return digest_of(path.read_bytes())
@@ -77,21 +77,21 @@ class Source:
 
 @dataclass(frozen=True)
 class Record:
-    """What became of one shape: a row of ``fits.csv``."""
+    """The result for one shape: a row of ``fits.csv``."""
 
     name: str
     file: str
-    verdict: str = FAILED  # or that of the fit
+    verdict: str = FAILED  # that of the fit; or `FAILED` or `LEFT_OUT`
     trust: float = 0.0
     reasons: str = ""
     residual: float = float("nan")  # units of sqrt(area)
-    distance: float = float("nan")  # of the surfaces, on average and at most, unit of the file
-    furthest: float = float("nan")
-    inverted: float = float("nan")  # share of the template, and mean change of volume, see `Regularity`
-    volume: float = float("nan")
+    distance: float = float("nan")  # mean distance between the surfaces, unit of the file
+    furthest: float = float("nan")  # largest distance between the surfaces, unit of the file
+    inverted: float = float("nan")  # inverted share of the template, see `Regularity`
+    volume: float = float("nan")  # mean change of volume, see `Regularity`
     stretch: float = float("nan")  # of the template, see `FitFeatures`
-    likely: float = 0.0  # trust of the fit alone, however little is known of what corresponds
-    mirrored: int = 0  # 1 where it was fitted as a mirror image
+    likely: float = 0.0  # trust of the fit by itself, not capped where correspondence is uncertain
+    mirrored: int = 0  # 1 if it was fitted as a mirror image
     side: float = 0.0  # see `Fit.side`
     scale: float = 0.0  # of the fit: sqrt(area) of a whole shape, unit of the file
     up: str = ""
@@ -99,12 +99,12 @@ class Record:
     vertices: int = 0
     seconds: float = 0.0
     digest: str = ""
-    notes: str = ""  # which parts were left out, if any
-    kind: str = ""  # that it is of, if that is another one than the model's
+    notes: str = ""  # such as which parts were left out
+    kind: str = ""  # kind of the shape, if it is not the model's
 
     @classmethod
     def of(cls, words: Mapping[str, Any]) -> Record:
-        """As it was kept beside a fit; `TypeError` for other words, and values of other types."""
+        """Build from the metadata stored with a fit; `TypeError` for unknown fields and for values of other types."""
         record = cls(**words)
         for each in fields(cls):
             kind = str if each.default is MISSING else type(each.default)
@@ -114,12 +114,13 @@ class Record:
 
     @property
     def fitted(self) -> bool:
+        """Whether there is a fit."""
         return self.verdict not in (FAILED, LEFT_OUT)
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What all tasks of a collection share."""
+    """Model, template and options that all tasks of a collection share."""
 
     store: Store
     model: str  # name or folder; or `NO_MODEL`
@@ -138,7 +139,7 @@ class Setting:
     @property
     def template(self) -> Template:
         """The template, read once in each process."""
-        found = template_at(self.store, self.template_file)
+        found = read_template(self.store, self.template_file)
         if found.hash != self.template_hash:
             raise InputError(
                 f"{self.store.location}/{self.template_file} has changed",
@@ -148,29 +149,32 @@ class Setting:
 
     @property
     def learned(self) -> bool:
-        """Whether a model learned what corresponds; else fits are compared with each other."""
+        """Whether the model learned correspondences; otherwise fits are judged by comparison with each other."""
         return self.model != NO_MODEL and self.trained.card.correspondence
 
     @property
     def agrees(self) -> bool:
-        """Whether fits made so can agree: they have nodes, which a trained model moves."""
+        """Whether fits with this setting can agree: a trained model moves the nodes of the template."""
         return self.model != NO_MODEL and self.config.for_model(self.trained).moves_nodes
 
     def read(self, folder: str, name: str) -> StoredFit:
-        """A fit of the collection."""
+        """Read the fit of a shape from a subfolder of the collection."""
         with self.store.reading(f"{folder}/{name}{SUFFIX}") as path:
             return read_fit(path, self.template)
 
     def fit(self, shape: Shape, last: Fit | None = None, other_side: bool = False, whole: float | None = None) -> Fit:
-        """Fit one shape; a frame of a sequence from the last one's fit; or as a part of shapes of that sqrt(area), if it has
-        an edge. Without a model perhaps as the other side than the first template's fit took it for.
+        """Fit one shape.
+
+        ``last`` is the fit of the previous frame of a sequence, where the fit starts. ``whole`` is the sqrt(area) of a
+        whole shape: a shape with an open boundary is then fitted as a part. ``other_side``, used without a model: fit
+        with the opposite handedness to that of the first template's fit.
         """
         if self.model == NO_MODEL:
-            part, begun, mirror = validated(shape), self._begun(shape.name), self.config.mirror != "no"
+            part, start, mirror = validated(shape), self._find_start(shape.name), self.config.mirror != "no"
             whole = whole if may_show_part(part.shape, self.config) else None
             with thread_limit(1):
                 found = fit_without_model(
-                    self.template, part.shape, start=begun, mirror=mirror, other_side=other_side, whole=whole
+                    self.template, part.shape, start=start, mirror=mirror, other_side=other_side, whole=whole
                 )
             return replace(found, repaired=part)
         if whole is not None:
@@ -182,21 +186,21 @@ class Setting:
         matcher = Matcher(self.trained, self.config, 1)
         return matcher.fit(shape) if last is None else matcher.follow(shape, last)
 
-    def _begun(self, name: str) -> Fit | None:
-        """Without a model, where a mean begins: the last fit of a template before it, if that is to be believed."""
+    def _find_start(self, name: str) -> Fit | None:
+        """Start of a fit to a mean, without a model: the latest fit to an earlier template that is not poor."""
         before = {SECOND_TEMPLATE: 1, TEMPLATE: 2}.get(self.template_file, 0)
         for folder, template in reversed(((FIRST, FIRST_TEMPLATE), (SECOND, SECOND_TEMPLATE))[:before]):
             file = f"{folder}/{name}{SUFFIX}"
-            with suppress(InputError):  # one of a mean of other shapes, before some were added
+            with suppress(InputError):  # it was made with another mean, before shapes were added
                 if self.store.exists(file):
                     with self.store.reading(file) as path:
-                        found = read_fit(path, template_at(self.store, template)).fit
+                        found = read_fit(path, read_template(self.store, template)).fit
                     if found.verdict != "poor":
                         return found
         return None
 
     def choices(self) -> dict[str, Any]:
-        """How shapes are read and fitted, as JSON has it. How long poor fits are searched for may change later."""
+        """How shapes are read and fitted, as JSON values; without ``try_harder``, which may change between runs."""
         fit = asdict(self.config)
         del fit["try_harder"]
         chosen: dict[str, Any] = {"model": self.model, "only": self.only, "without": self.without}
@@ -204,15 +208,18 @@ class Setting:
         return dict(json.loads(json.dumps(chosen)))
 
     def digest(self) -> str:
-        """Of all that decides how a shape is fitted, and by what weights the fit is judged, where these are no people's."""
+        """Digest of everything that determines a fit and its verdict: template, options, and calibration.
+
+        The calibration counts where it is not the default one.
+        """
         how = "" if self.learned else "compared"
         if self.learned and (judged := calibration_of(self.trained.card.category)) != CALIBRATION:
             how = judged.date
         return digest_of(self.template_hash, json.dumps(self.choices(), sort_keys=True) + how)
 
 
-def template_at(store: Store, file: str = TEMPLATE) -> Template:
-    """A template of a collection, read once in each process, and again when it has changed."""
+def read_template(store: Store, file: str = TEMPLATE) -> Template:
+    """Read a template of a collection, once per process, and again if its file has changed."""
     return _template(store, file, store.changed(file))
 
 
@@ -222,21 +229,21 @@ def _template(store: Store, file: str, changed: int) -> Template:
         return load_template(path)
 
 
-def finished_fit(store: Store, name: str) -> PlacedFit:
-    """A finished fit; some are kept in memory. Errors as `read_fit`."""
-    return _finished(store, name, store.changed(f"{FITS}/{name}{SUFFIX}"))
+def read_finished_fit(store: Store, name: str) -> PlacedFit:
+    """Read a finished fit, with a cache of 64. Errors as `read_fit`; `InputError` if the fit is not finished."""
+    return _read_finished(store, name, store.changed(f"{FITS}/{name}{SUFFIX}"))
 
 
 @lru_cache(maxsize=64)
-def _finished(store: Store, name: str, changed: int) -> PlacedFit:
+def _read_finished(store: Store, name: str, changed: int) -> PlacedFit:
     with store.reading(f"{FITS}/{name}{SUFFIX}") as path:
-        found = read_fit(path, template_at(store)).fit
+        found = read_fit(path, read_template(store)).fit
     if not isinstance(found, PlacedFit):
         raise InputError(f"the fit of {name} is not finished", "run `meshmatch fit` to its end")
     return found
 
 
-def forget() -> None:
-    """Read templates and fits again, for remote ones may have changed."""
+def clear_caches() -> None:
+    """Clear the caches of templates and fits; changes of remote files are not noticed otherwise."""
     _template.cache_clear()
-    _finished.cache_clear()
+    _read_finished.cache_clear()

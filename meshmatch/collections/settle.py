@@ -1,4 +1,4 @@
-"""What all fits of a collection share: the model that knows its shapes, or a template that is made of them."""
+"""Settings that all fits of a collection share: the model and options, or a template built from the shapes."""
 
 from __future__ import annotations
 
@@ -28,36 +28,36 @@ from meshmatch.templates.template import Template, load_template, save_template
 
 SCHEMA = 1
 ABOUT = "collection.json"
-_READ_AHEAD = 20  # shapes that are asked for their kind before none is known
-_COMPARED = 40  # shapes among which the first template is looked for
-_AVERAGED = 200  # of which the mean is made
+_MAX_KIND_TRIES = 20  # shapes tried, in order, until one is of a known kind
+_MAX_CANDIDATES = 40  # shapes among which the first template is searched
+_MAX_AVERAGED = 200  # shapes that the mean is computed from
 
 
-def settled(wish: Setting, sources: Sequence[Source]) -> Setting:
-    """What all tasks share: a model that is named. What a folder of fits says of itself is written, or checked if it was
-    there before.
+def select_setting(requested: Setting, sources: Sequence[Source]) -> Setting:
+    """Resolve the requested setting: choose the model if it is "auto", and determine the template.
 
-    `OptionError` if it holds fits of another model, or made in another way; or as `choose_model`.
+    A new folder of fits gets its template and ``collection.json``; an existing one is checked against the setting.
+    `OptionError` if its fits were made with another model or other options. Other errors as `choose_model`.
     """
-    check_config(wish.config)
-    store, about, model = wish.store, read_about(wish.store), wish.model
+    check_config(requested.config)
+    store, about, model = requested.store, read_about(requested.store), requested.model
     if model == AUTO:
-        model = _chosen(sources, wish) if about is None else str(about["model"])
+        model = _choose_model(sources, requested) if about is None else str(about["model"])
     if model == NO_MODEL:
-        template, file = _first_template(wish, sources, about is None), FIRST_TEMPLATE
+        template, file = _first_template(requested, sources, about is None), FIRST_TEMPLATE
     else:
         trained = as_model(model)
         template, file = trained.template, TEMPLATE
         model = model if model == trained.card.name else str(Path(model).resolve())
-    setting = replace(wish, model=model, template_file=file, template_hash=template.hash)
+    setting = replace(requested, model=model, template_file=file, template_hash=template.hash)
     wanted = {"schema": SCHEMA} | setting.choices() | {"template": template.hash}
     if about is None:
         with store.writing(file) as path:
             save_template(template, path)
-        save_text(store, ABOUT, json.dumps(wanted, indent=2) + "\n")  # last: a folder without it is no collection
+        save_text(store, ABOUT, json.dumps(wanted, indent=2) + "\n")  # last: a folder without it is not a collection
     elif differs := [name for name in wanted if about[name] != wanted[name]]:
         other = f"the fits in {store.location} were made with another {_differing(differs[0], about, wanted)}"
-        hint = "choose another folder, or the options of before"
+        hint = "choose another folder, or the options used before"
         if isinstance(about["fit"], dict) and about["fit"].keys() != wanted["fit"].keys():
             other = f"the fits in {store.location} were made by another version of meshmatch, which fits otherwise"
             hint = "choose another folder, or go on with that version; maps and atlases can be made of them as they are"
@@ -66,7 +66,7 @@ def settled(wish: Setting, sources: Sequence[Source]) -> Setting:
 
 
 def _differing(name: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """The first choice that differs, by its own name where choices lie within choices, and what it was before."""
+    """Describe the first option that differs, with both values; nested options are named by the innermost key."""
     then, wanted = before[name], now[name]
     if isinstance(then, dict) and isinstance(wanted, dict):
         inner = next((key for key in wanted if then.get(key) != wanted[key]), None)
@@ -75,33 +75,38 @@ def _differing(name: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> 
     return f"{name}: {then}, not {wanted}" if isinstance(then, str | int | float) else name
 
 
-def _first_template(wish: Setting, sources: Sequence[Source], new: bool) -> Template:
-    """Without a model, the shape that is nearest to some others, as a template; the one of before, if there is one."""
+def _first_template(requested: Setting, sources: Sequence[Source], new: bool) -> Template:
+    """Make a template of the medoid of some shapes, for fits without a model; an existing collection's one is read."""
     if not new:
-        with wish.store.reading(FIRST_TEMPLATE) as path:
+        with requested.store.reading(FIRST_TEMPLATE) as path:
             return load_template(path)
-    some = np.unique(np.linspace(0, len(sources) - 1, min(len(sources), _COMPARED)).astype(int))
+    some = np.unique(np.linspace(0, len(sources) - 1, min(len(sources), _MAX_CANDIDATES)).astype(int))
     found = []
     for number in some:
         with suppress(MeshmatchError):
-            found.append(validated(sources[number].load(wish.only, wish.without)))
+            found.append(validated(sources[number].load(requested.only, requested.without)))
     if not found:
         raise InputError(f"none of {len(some)} shapes can be a template", "are they meshes?")
-    sided = wish.config.mirror != "no" and not all(is_sheet(each.shape) for each in found)  # a leaf only turns over
+    sided = requested.config.mirror != "no" and not all(
+        is_sheet(each.shape) for each in found
+    )  # a leaf only turns over
     chosen = found[medoid(found, "rigid", "area", 0, either_side=sided)]
     return template_of(chosen.shape, chosen.shape.name, ViscousConfig())
 
 
-def some_of(names: Sequence[str]) -> list[str]:
-    """Of many shapes, those that the mean is made of, evenly chosen."""
+def subsample(names: Sequence[str]) -> list[str]:
+    """Choose the shapes that the mean is computed from, evenly spaced in the list."""
     return [
-        names[number] for number in np.unique(np.linspace(0, len(names) - 1, min(len(names), _AVERAGED)).astype(int))
+        names[number]
+        for number in np.unique(np.linspace(0, len(names) - 1, min(len(names), _MAX_AVERAGED)).astype(int))
     ]
 
 
-def on_the_mean(setting: Setting, names: Sequence[str], folder: str, file: str, fine: bool = False) -> Setting:
-    """The same with the mean of the shapes that its template was fitted to, by fits of a folder, as the template, perhaps
-    with `finest` nodes; with the same one where there are none. A template that lies in the middle has less far to go.
+def rebase_on_mean(setting: Setting, names: Sequence[str], folder: str, file: str, fine: bool = False) -> Setting:
+    """Replace the template by the mean of the named shapes, which has less far to deform than any one of them.
+
+    The shapes are read from the fits in ``folder``, and the template is written to ``file``, with `finest` nodes if
+    ``fine``. Without names the template stays as it is.
     """
     before = mean = setting.template
     if names:
@@ -113,27 +118,30 @@ def on_the_mean(setting: Setting, names: Sequence[str], folder: str, file: str, 
     return replace(setting, template_file=file, template_hash=mean.hash)
 
 
-def _chosen(sources: Sequence[Source], wish: Setting) -> str:
-    """The installed model that knows the kind of the first shape which can be read and is of a known kind."""
-    trouble: MeshmatchError | None = None
-    for source in sources[:_READ_AHEAD]:
+def _choose_model(sources: Sequence[Source], requested: Setting) -> str:
+    """Name the installed model for the first shape that can be read and is of a known kind.
+
+    If there is none among the first shapes, the error of the first one is raised.
+    """
+    first_error: MeshmatchError | None = None
+    for source in sources[:_MAX_KIND_TRIES]:
         try:
-            chosen = choose_model([usable(source.load(wish.only, wish.without))], [wish.config]).model
+            chosen = choose_model([usable(source.load(requested.only, requested.without))], [requested.config]).model
         except MeshmatchError as error:
-            trouble = trouble or error
+            first_error = first_error or error
         else:
             return chosen.card.name
-    assert trouble is not None
-    raise trouble
+    assert first_error is not None
+    raise first_error
 
 
 def is_collection(folder: str | Path) -> bool:
-    """Whether a folder holds fits."""
+    """Whether a folder is a collection: it has a ``collection.json``."""
     return (Path(folder) / ABOUT).is_file()
 
 
 def read_about(store: Store) -> dict[str, Any] | None:
-    """What a folder says of its fits; None if it is no folder of fits."""
+    """Read ``collection.json``, the model and options of a folder of fits; None if the folder is not one."""
     if not store.exists(ABOUT):
         return None
     try:
@@ -147,6 +155,6 @@ def read_about(store: Store) -> dict[str, Any] | None:
 
 
 def save_text(store: Store, name: str, text: str) -> None:
-    """Write a file; it appears whole."""
+    """Write a text file atomically."""
     with store.writing(name) as path, replace_on_success(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

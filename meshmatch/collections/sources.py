@@ -1,4 +1,4 @@
-"""Which shapes a collection is made of, and what they are called in it."""
+"""Find the shapes of a collection among files, folders, patterns and URLs, and name them."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ _COMPANIONS = {
     *(".fcsv", ".tps", ".pts", ".pp", ".landmarkascii"),
     *(".txt", ".md", ".rst", ".html", ".pdf", ".svg", ".doc", ".docx", ".odt", ".rtf", ".log", ".ini", ".db"),
     *(".py", ".r", ".rdata", ".ipynb", ".sh"),
-}  # what lies beside shapes and is none
-_ABOUT = {"readme", "license", "licence", "copying", "changelog", "makefile", "authors", "notice"}
-_NAMED = 5  # of the files that are not read
-_PATTERN = "*?["
+}  # suffixes of files that are often kept with shapes but are not shapes
+_TEXT_FILES = {"readme", "license", "licence", "copying", "changelog", "makefile", "authors", "notice"}
+_MAX_NAMES = 5  # files listed in a warning
+_WILDCARDS = "*?["
 
 
 def find_sources(
     shapes: str | Path | Sequence[str | Path], output: Store | None = None
 ) -> tuple[list[Source], list[Record]]:
-    """The shapes of files, folders, patterns and URLs of folders, sorted by name; and what was left out, with the reason.
+    """Find the shapes of files, folders, patterns and URLs of folders, sorted by name; and list what was left out.
 
-    A shape of a folder is called by its path in it, without the suffix; any other by its file's name. Left out, which is
-    told, are files of unknown formats, and those that Blender reads of a folder that holds other shapes. Arrays (.npy),
-    images, tables and the like beside shapes have records too, but those of the same name as a shape; so have links to
-    folders. What lies in the folder of the fits does not count.
+    A shape of a folder is named by its path in the folder, without the suffix; any other shape by the name of its file.
+    Files of unknown formats are left out with a warning, as are files that need Blender in a folder with other shapes.
+    Images, tables, links to folders, and .npy arrays next to other shapes are left out without a warning. All of these
+    have records, except files that share the name of a shape. Files in the ``output`` folder are ignored.
 
-    `InputError` if there is nothing, or two shapes have one name.
+    `InputError` if there is no shape, or two shapes have the same name.
     """
     given = [shapes] if isinstance(shapes, str | Path) else list(shapes)
     folders = [Store.of(each) for each in given if is_url(each) or as_path(each).is_dir()]
@@ -49,7 +49,7 @@ def find_sources(
     found: list[Source] = []
     left_out: list[Record] = []
     for each in given:
-        _find(each, output, found, left_out)
+        _add_sources(each, output, found, left_out)
     found.sort(key=lambda source: source.name)
     if not found:
         raise InputError(
@@ -69,40 +69,40 @@ def find_sources(
 
 
 def frame_times(names: Iterable[str]) -> dict[str, int]:
-    """The place of each frame in the sequence of its folder, from 0."""
+    """Index of each frame in the sequence of its folder, from 0."""
     counts: Counter[str] = Counter()
     found = {}
-    for name in in_sequences(names):
+    for name in sort_by_sequence(names):
         found[name] = counts[folder := folder_of(name)]
         counts[folder] += 1
     return found
 
 
 def folder_of(name: str) -> str:
-    """The sequence that a frame belongs to."""
+    """Folder of a shape, by its name: the sequence that a frame belongs to."""
     return name.rpartition("/")[0]
 
 
-def in_sequences(names: Iterable[str]) -> list[str]:
-    """Frames of one folder after the other, in natural order; what lies in a subfolder is none of the folder's."""
-    return sorted(names, key=lambda name: (natural(folder := folder_of(name)), folder, natural(name), name))
+def sort_by_sequence(names: Iterable[str]) -> list[str]:
+    """Sort names by folder, then in natural order; a subfolder is a sequence of its own."""
+    return sorted(names, key=lambda name: (natural_key(folder := folder_of(name)), folder, natural_key(name), name))
 
 
-def natural(name: str) -> list[tuple[int, str]]:
-    """A key that sorts names as people do: frame2 before frame10."""
+def natural_key(name: str) -> list[tuple[int, str]]:
+    """Key of the natural order of names: frame2 before frame10."""
     parts = re.split(r"(\d+)", name)
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
-def _find(given: str | Path, output: Store | None, found: list[Source], left_out: list[Record]) -> None:
-    """Add the shapes of a file, a folder, a pattern or a URL, and what is left out of it."""
+def _add_sources(given: str | Path, output: Store | None, found: list[Source], left_out: list[Record]) -> None:
+    """Append the shapes of a file, folder, pattern or URL to ``found``, and records of what is skipped to ``left_out``."""
     path = None if is_url(given) else as_path(given)
     if path is None or path.is_dir():
         folder = Store.of(given)
         names = [PurePosixPath(name) for name in folder.names()]
         own = "" if output is None else f"{output.location}/"
         inside = [file for file in names if not own or not f"{folder.location}/{file}".startswith(own)]
-        _leave_out(
+        _warn_left_out(
             folder.location, "files of unknown format", filter(_is_unknown, inside), left_out, f"{folder.location}/"
         )
         shapes = [file for file in inside if suffix_of(file) in SUFFIXES]
@@ -110,32 +110,34 @@ def _find(given: str | Path, output: Store | None, found: list[Source], left_out
         taken = [file for file in plain if suffix_of(file) != ".npy"] or plain
         known = {file.with_name(stem_of(file)) for file in (*taken, *plain)}
         projects = [file for file in shapes if file.with_name(stem_of(file)) not in known]
-        _leave_out(folder.location, "files for Blender beside other shapes", projects, left_out, f"{folder.location}/")
-        left_out += _beside(inside, taken, projects, f"{folder.location}/")
+        _warn_left_out(
+            folder.location, "files for Blender beside other shapes", projects, left_out, f"{folder.location}/"
+        )
+        left_out += _skipped_records(inside, taken, projects, f"{folder.location}/")
         why = "a link to a folder, which is not followed"
         left_out += [Record(link, f"{folder.location}/{link}", LEFT_OUT, reasons=why) for link in folder.folder_links()]
         found += [Source(str(file.with_name(stem_of(file))), folder, str(file)) for file in taken]
         return
     files = [path]
-    if not path.exists() and any(mark in str(given) for mark in _PATTERN):
+    if not path.exists() and any(mark in str(given) for mark in _WILDCARDS):
         files = [Path(match) for match in glob.glob(str(path), recursive=True)]
         unknown = (file for file in files if _is_unknown(file) and file.is_file())
-        _leave_out(str(given), "files of unknown format", unknown, left_out)
+        _warn_left_out(str(given), "files of unknown format", unknown, left_out)
         matches, files = files, [file for file in files if suffix_of(file) in SUFFIXES]
-        left_out += _beside([file for file in matches if file.is_file()], files, [], "")
+        left_out += _skipped_records([file for file in matches if file.is_file()], files, [], "")
     found += [Source(stem_of(file), Store.of(file.parent), file.name) for file in files]
 
 
 def _is_unknown(file: PurePath) -> bool:
-    """Slices of a scanner often have no suffix."""
-    return suffix_of(file) not in (*SUFFIXES, *_COMPANIONS) if file.suffix else file.name.lower() not in _ABOUT
+    """Whether a file's format is unknown; a file without suffix counts, as slices of a scanner often have none."""
+    return suffix_of(file) not in (*SUFFIXES, *_COMPANIONS) if file.suffix else file.name.lower() not in _TEXT_FILES
 
 
-def _beside(
-    files: Sequence[PurePath], taken: Sequence[PurePath], told: Sequence[PurePath], folder: str
+def _skipped_records(
+    files: Sequence[PurePath], taken: Sequence[PurePath], recorded: Sequence[PurePath], folder: str
 ) -> list[Record]:
-    """A record of each file that is neither taken nor told already, nor belongs to a shape, whose name it has."""
-    known, owners = {*taken, *told}, {file.with_name(stem_of(file)) for file in taken}
+    """Records of skipped files, but for those ``recorded`` already and those that share the name of a shape."""
+    known, owners = {*taken, *recorded}, {file.with_name(stem_of(file)) for file in taken}
     found = []
     for file in files:
         words = file.name.split(".")
@@ -147,10 +149,12 @@ def _beside(
     return found
 
 
-def _leave_out(given: str, why: str, files: Iterable[PurePath], left_out: list[Record], folder: str = "") -> None:
-    """Say which files of a folder or a pattern are left out, and keep a record of each."""
+def _warn_left_out(given: str, why: str, files: Iterable[PurePath], left_out: list[Record], folder: str = "") -> None:
+    """Warn that files of a folder or a pattern are left out, and append a record of each."""
     names = [str(file) for file in files]
     if names:
-        shown = ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+        shown = ", ".join(names[:_MAX_NAMES]) + (
+            f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+        )
         warn(f"{given}: {why} are left out: {plain_text(shown)}")
         left_out += [Record(name, f"{folder}{name}", reasons=f"left out: {why}") for name in names]

@@ -1,4 +1,4 @@
-"""Where the files of a collection lie: a folder here, or any place that fsspec reaches by a URL."""
+"""Storage for the files of a collection: a local folder, or anything that fsspec reaches by a URL."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ def is_url(location: str | Path) -> bool:
 
 @dataclass(frozen=True)
 class Store:
-    """A folder, named by a path or a URL. Names in it are relative, with ``/`` between folders."""
+    """A folder, given by an absolute path or a URL. File names are relative to it, with ``/`` as the separator."""
 
     location: str
 
     @classmethod
     def of(cls, location: str | Path) -> Store:
-        """A path becomes absolute: workers may have another working directory."""
+        """Make a store; a path becomes absolute, as workers may have another working directory."""
         return cls(str(location).rstrip("/") if is_url(location) else os.path.abspath(as_path(location)))
 
     @property
     def remote(self) -> bool:
-        """Whether it is named by a URL."""
+        """Whether the location is a URL."""
         return is_url(self.location)
 
     @contextmanager
     def reading(self, name: str) -> Iterator[Path]:
-        """A file as a path on this machine; a copy, of a remote one. `InputError` if it cannot be fetched."""
+        """Yield a local path of a file; a remote file is copied first. `InputError` if it cannot be fetched."""
         if not self.remote:
             yield Path(self.location, name)
             return
@@ -56,7 +56,10 @@ class Store:
 
     @contextmanager
     def writing(self, name: str) -> Iterator[Path]:
-        """A path to write a file to, by a writer that leaves nothing half-written; `OutputError` if it cannot be sent."""
+        """Yield a local path to write a file to, and upload it if the store is remote (`OutputError` if that fails).
+
+        The file is not written atomically: that is up to the block.
+        """
         if not self.remote:
             path = Path(self.location, name)
             make_folder(path.parent)
@@ -73,10 +76,10 @@ class Store:
                 raise OutputError(f"cannot write {self.location}/{name}: {error}", "may you write there?") from error
 
     @contextmanager
-    def alone(self) -> Iterator[None]:
-        """Keep others from writing here (`OutputError` if somebody does), and remove what killed ones left half-written.
+    def exclusive(self) -> Iterator[None]:
+        """Lock the folder for writing, and remove half-written files that killed processes left.
 
-        A remote folder is not locked.
+        `OutputError` if another process holds the lock. A remote folder is not locked.
         """
         if self.remote:
             yield
@@ -89,20 +92,22 @@ class Store:
             yield
 
     def exists(self, name: str) -> bool:
-        """Whether there is such a file or folder."""
+        """Whether a file or folder of this name exists."""
         if not self.remote:
             return Path(self.location, name).exists()
         files, root = _filesystem(self.location)
         return bool(files.exists(f"{root}/{name}"))
 
     def changed(self, name: str) -> int:
-        """When a file here changed last, in nanoseconds; 0 for one that is remote or missing."""
+        """Modification time of a local file, in nanoseconds; 0 for one that is remote or missing."""
         path = Path(self.location, name)
         return 0 if self.remote or not path.is_file() else path.stat().st_mtime_ns
 
     def names(self, folder: str = "") -> list[str]:
-        """All files in a folder and below it, sorted, relative to the folder, and links that lead nowhere; those whose
-        names begin with a dot are not seen."""
+        """All files in a folder and its subfolders, sorted, relative to the folder; broken links included.
+
+        Hidden files and folders, whose names begin with a dot, are left out.
+        """
         if self.remote:
             files, root = _filesystem(self.location)
             top = f"{root}/{folder}".rstrip("/")
@@ -111,18 +116,18 @@ class Store:
             base = Path(self.location, folder)
             files = (path for path in base.rglob("*") if path.is_file() or (path.is_symlink() and not path.exists()))
             found = [path.relative_to(base).as_posix() for path in files]
-        return _seen(found)
+        return _sorted_visible(found)
 
     def folder_links(self) -> list[str]:
-        """Links to folders, which `names` does not follow, for they may lead in a circle; as `names` has files."""
+        """Links to folders, as `names` lists files; `names` does not follow them, as they may be circular."""
         if self.remote:
             return []
         base = Path(self.location)
         links = (path for path in base.rglob("*") if path.is_symlink() and path.is_dir())
-        return _seen([path.relative_to(base).as_posix() for path in links])
+        return _sorted_visible([path.relative_to(base).as_posix() for path in links])
 
     def remove(self, name: str) -> None:
-        """Remove a file, or a folder with all that is in it."""
+        """Remove a file, or a folder with everything in it."""
         if self.remote:
             files, root = _filesystem(self.location)
             if files.exists(f"{root}/{name}"):
@@ -132,12 +137,13 @@ class Store:
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
-def _seen(names: list[str]) -> list[str]:
-    """Sorted, without those that begin with a dot or lie in such a folder."""
+def _sorted_visible(names: list[str]) -> list[str]:
+    """Sort names, without hidden ones: a part of the path begins with a dot."""
     return sorted(name for name in names if not any(part.startswith(".") for part in name.split("/")))
 
 
 def _filesystem(location: str) -> tuple[Any, str]:
+    """Return the fsspec file system of a URL, and the path in it."""
     with needs("fsspec", "cluster"):
         import fsspec
     try:

@@ -1,7 +1,7 @@
-"""What workers do for a collection: fit one shape, take one step of the agreement with a few, place one shape's vertices.
+"""Tasks of a collection that workers run: fit one shape, take one agreement step for a group of fits, finish one fit.
 
-Each task reads its input from files and writes its result to one file that appears whole, so it can be done again, by
-anybody, with the same result bit for bit.
+Each task reads its input from files and writes its result to one file, atomically. It can therefore be repeated by any
+worker, with the same result bit for bit.
 """
 
 from __future__ import annotations
@@ -39,31 +39,31 @@ from meshmatch.shapes.parts import leave_out
 
 @dataclass(frozen=True)
 class FitTask:
-    """One shape to be fitted alone."""
+    """One shape to fit on its own; see `Setting.fit` for ``other_side`` and ``whole``."""
 
     setting: Setting
     source: Source
-    last: Record | None = None  # of the frame before, in a sequence
-    folder: str = ALONE
+    last: Record | None = None  # of the previous frame, in a sequence
+    folder: str = ALONE  # subfolder that the fit is written to
     other_side: bool = False
-    whole: float | None = None  # see `Setting.fit`
+    whole: float | None = None
 
 
 def fit_alone(task: FitTask) -> Record:
-    """Fit one shape, unless that was done before; a frame of a sequence from where the last one's fit ended.
+    """Fit one shape, unless its fit exists; a frame of a sequence starts from the fit of the previous frame.
 
-    A shape that cannot be fitted is a record, not an error.
+    A shape that cannot be fitted gives a record with the reason, not an error.
     """
     source, setting = task.source, task.setting
     file, began = f"{task.folder}/{source.name}{SUFFIX}", time.monotonic()
     try:
-        begins = "" if task.last is None else task.last.digest
-        begins += ("other side" if task.other_side else "") + (f"part of {task.whole}" if task.whole else "")
-        digest = digest_of(source.digest(), setting.digest(), begins)
+        variant = "" if task.last is None else task.last.digest
+        variant += ("other side" if task.other_side else "") + (f"part of {task.whole}" if task.whole else "")
+        digest = digest_of(source.digest(), setting.digest(), variant)
         harder = digest_of(digest, "try_harder")
-        known = _known(setting.store, file, (digest, harder))
+        known = _read_matching_record(setting.store, file, (digest, harder))
         if known is not None and (known.verdict != "poor" or known.digest == harder or not setting.config.try_harder):
-            return replace(known, file=source.path)  # it may lie elsewhere now
+            return replace(known, file=source.path)  # the same bytes may have moved
         last = None if task.last is None else setting.read(task.folder, task.last.name).fit
         fit = setting.fit(source.load(setting.only, setting.without), last, task.other_side, task.whole)
         assert fit.repaired is not None
@@ -74,15 +74,15 @@ def fit_alone(task: FitTask) -> Record:
         if setting.agrees:
             how = AgreeConfig.for_collection(setting.trained)
             samples = member_of(node_system(setting.trained), fit.repaired.shape, fit, setting.config, how).samples
-        likely, doubted = fit.trust, setting.model == NO_MODEL or (fit.verdict == "poor" and not setting.learned)
-        if fit.signs is not None and not doubted:
+        likely, uncertain = fit.trust, setting.model == NO_MODEL or (fit.verdict == "poor" and not setting.learned)
+        if fit.signs is not None and not uncertain:
             likely = fit.signs.p_correct(calibration_of(setting.trained.card.category))
         distance, furthest = surface_distance(fit.repaired.shape, fit.shape, fit.partial)
-        said = list(fit.repaired.notes[:1]) if fit.left_out else []
+        notes = list(fit.repaired.notes[:1]) if fit.left_out else []
         if setting.model == NO_MODEL:
-            said += fit.notes
+            notes += fit.notes
         elif fit.frame.mirrored:
-            said.append(side_words(setting.trained.card))
+            notes.append(side_words(setting.trained.card))
         record = Record(
             name=source.name,
             file=source.path,
@@ -92,7 +92,7 @@ def fit_alone(task: FitTask) -> Record:
             residual=float(fit.residual),
             distance=distance,
             furthest=furthest,
-            **regularity_words(fit.regularity),
+            **regularity_fields(fit.regularity),
             stretch=math.nan if fit.signs is None else fit.signs.stretch,
             likely=likely,
             mirrored=int(fit.frame.mirrored),
@@ -103,7 +103,7 @@ def fit_alone(task: FitTask) -> Record:
             vertices=fit.repaired.original.V,
             seconds=round(time.monotonic() - began, 3),
             digest=harder if setting.config.try_harder else digest,
-            notes="; ".join(said),
+            notes="; ".join(notes),
             kind=other,
         )
         words = {"record": asdict(record), "roughness": fit.repaired.shape.roughness}
@@ -114,8 +114,8 @@ def fit_alone(task: FitTask) -> Record:
     return record
 
 
-def _known(store: Store, file: str, digests: Sequence[str]) -> Record | None:
-    """What is known of a fit that was made before, from the same file and in one of some ways."""
+def _read_matching_record(store: Store, file: str, digests: Sequence[str]) -> Record | None:
+    """Read the record of an existing fit; None if it does not exist or has none of these digests."""
     if not store.exists(file):
         return None
     try:
@@ -128,20 +128,20 @@ def _known(store: Store, file: str, digests: Sequence[str]) -> Record | None:
 
 @dataclass(frozen=True)
 class Group:
-    """A few fits that one task takes a step with; ``agreement`` is a digest of all that agree."""
+    """The fits of one agreement task; ``agreement`` is the digest of the whole agreement."""
 
     number: int
     names: tuple[str, ...]
     agreement: str
 
     def file(self, step: int) -> str:
-        """Where their node vectors are after a step."""
+        """File of their node vectors after a step."""
         return f"{AGREEING}/{self.agreement}/{step}/{self.number}.npy"
 
 
 @dataclass(frozen=True)
 class AgreeTask:
-    """One step of the agreement with a few fits; before the first one, their stretch alone."""
+    """One step of the agreement for a group of fits; step 0 only measures their stretch."""
 
     setting: Setting
     group: Group
@@ -149,27 +149,27 @@ class AgreeTask:
 
 
 def common_file(agreement: str, step: int) -> str:
-    """Where the common stretch is that a step of an agreement pulls to."""
+    """File of the common stretch that a step of an agreement pulls towards."""
     return f"{AGREEING}/{agreement}/{step}/common.npy"
 
 
 def save_array(store: Store, name: str, array: Floats) -> None:
-    """Write one array; it appears whole."""
+    """Write one array atomically."""
     with store.writing(name) as path, replace_on_success(path) as temporary, temporary.open("wb") as file:
         np.save(file, array)
 
 
 def load_array(store: Store, name: str) -> Floats:
-    """Read one array."""
+    """Read one array, as float64."""
     with store.reading(name) as path:
         return np.asarray(read_npy(path), np.float64)
 
 
-def agree_a_little(task: AgreeTask) -> Float[Floats, "G 3 3"]:
-    """Take a step with some fits, unless that was done before; the sum of the logarithms of their stretches where the
-    next step begins.
+def agree_group(task: AgreeTask) -> Float[Floats, "G 3 3"]:
+    """Take one agreement step for a group of fits, unless its result exists.
 
-    Step 0 only gives the sum.
+    Returns the sum over the group of the logarithms of stretch at the G points, where the next step starts. Step 0 moves
+    nothing and only returns the sum.
     """
     setting, group, store = task.setting, task.group, task.setting.store
     system, how = node_system(setting.trained), AgreeConfig.for_collection(setting.trained)
@@ -183,12 +183,12 @@ def agree_a_little(task: AgreeTask) -> Float[Floats, "G 3 3"]:
         now = after(task.step)
     elif task.step > 0:
         common = load_array(store, common_file(group.agreement, task.step))
-        starts = _starts(members, before, after(max(task.step - 2, 0)))
+        starts = _extrapolate(members, before, after(max(task.step - 2, 0)))
         gradients = [system.deformation_gradient(start) for start in starts]
         steps = zip(members, starts, gradients, strict=True)
         now = np.array([agree_step(system, *each, common) for each in steps])
         save_array(store, group.file(task.step), now)
-    gradients = [system.deformation_gradient(start) for start in _starts(members, now, before)]
+    gradients = [system.deformation_gradient(start) for start in _extrapolate(members, now, before)]
     return np.asarray(np.sum([log_stretch(F) for F in gradients], axis=0))
 
 
@@ -205,32 +205,32 @@ def _member(read: StoredFit, how: AgreeConfig) -> Member:
     )
 
 
-def _starts(members: Sequence[Member], now: Floats, before: Floats) -> list[Floats]:
-    """Where a step begins: a little further on along the last one."""
+def _extrapolate(members: Sequence[Member], now: Floats, before: Floats) -> list[Floats]:
+    """Where a step starts: the current node vectors, extrapolated along the last step (momentum)."""
     paths = zip(members, now, before, strict=True)
     return [here + member.config.schedule.momentum * (here - last) for member, here, last in paths]
 
 
 @dataclass(frozen=True)
 class FinishTask:
-    """One fit to be finished: with the node vectors of the agreement, if it took part."""
+    """One fit to finish, with the node vectors of the agreement if it took part."""
 
     setting: Setting
     source: Source
-    digest: str  # of the fit alone
-    agreed_with: str  # a digest of all that took part
+    digest: str  # of the fit before the agreement
+    agreed_with: str  # digest of the agreement, and what the fit is compared with
     group: Group | None = None
     step: int = 0
     usual: Compared | None = None
 
     @property
     def file(self) -> str:
-        """Where the finished fit is."""
+        """File of the finished fit."""
         return f"{FITS}/{self.source.name}{SUFFIX}"
 
 
 def is_finished(store: Store, task: FinishTask) -> bool:
-    """Whether the fit is there that the task would make."""
+    """Whether the result of the task exists already."""
     if not store.exists(task.file):
         return False
     with store.reading(task.file) as path, suppress(InputError):
@@ -241,9 +241,9 @@ def is_finished(store: Store, task: FinishTask) -> bool:
 
 @dataclass(frozen=True)
 class Finished:
-    """What is said of a finished fit, or what went wrong."""
+    """The outcome of a `FinishTask`: verdict, reasons, trust and regularity, or the message of an error."""
 
-    trouble: str = ""
+    error: str = ""
     verdict: str = ""
     reasons: tuple[str, ...] = ()
     trust: float = 0.0
@@ -251,7 +251,7 @@ class Finished:
 
 
 def finish(task: FinishTask) -> Finished:
-    """Find the places of a shape's vertices on its fit, unless that was done before."""
+    """Place the vertices of a shape on its fit and judge it, unless the result exists."""
     try:
         if not is_finished(task.setting.store, task):
             _finish(task)
@@ -282,6 +282,6 @@ def _finish(task: FinishTask) -> None:
         write_fit(path, PlacedFit.of(fit, places), words=words)
 
 
-def regularity_words(regularity: Regularity | None) -> dict[str, Any]:
-    """As a `Record` has it; nothing where it is not known."""
+def regularity_fields(regularity: Regularity | None) -> dict[str, Any]:
+    """The fields of a `Record` that describe regularity; none if it is not known."""
     return {} if regularity is None else {name: round(value, 5) for name, value in asdict(regularity).items()}

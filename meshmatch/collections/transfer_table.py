@@ -92,7 +92,7 @@ def transfer_each(
     map's verdict and confidence.
     """
     told, tokens = [], token_of([__version__, *how])
-    with Store.of(folder).alone():
+    with Store.of(folder).exclusive():
         rows = _read(folder / TABLE)
         _write(folder / TABLE, rows.values())
         for name, file in targets.items():

@@ -1,7 +1,7 @@
-"""Who does the work of a collection: this process, several on this machine, or a Dask cluster.
+"""Executors for the tasks of a collection: this process, several local processes, or a Dask cluster.
 
-A task is a function at the top of a module, and an item that survives a pickle. It writes its result where all can read
-it and returns a few words, so it may be done twice. Results come in any order; nothing depends on it.
+A task is a module-level function together with an item that can be pickled. It writes its result to shared storage and
+returns a short summary, so it may safely run twice. Results arrive in any order, and nothing depends on the order.
 """
 
 from __future__ import annotations
@@ -25,93 +25,94 @@ from meshmatch.threads import set_threads
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_PARENT_SEEN = 1.0  # seconds between two looks
-_CONNECT = 30.0  # seconds
-_hiding = threading.Lock()
+_PARENT_POLL = 1.0  # seconds between checks that the parent process is alive
+_CONNECT_TIMEOUT = 30.0  # seconds
+_main_lock = threading.Lock()
 
 
-class Died(MeshmatchError):
-    """The process that did a task came to an end, twice."""
+class DeadWorker(MeshmatchError):
+    """The process that ran a task died, on the retry as well."""
 
 
 class Workers(Protocol):
-    """Does one task for many items."""
+    """Runs one task for many items."""
 
-    def each(self, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result | Died]]:
-        """Number of an item and the task's result for it, as they come in. What a task raises ends the work."""
+    def each(self, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result | DeadWorker]]:
+        """Yield (index of the item, result of the task) in order of completion; an exception of a task propagates."""
 
     def close(self) -> None:
-        """Leave the work."""
+        """Release the workers."""
 
 
 class CannotStart(Exception):
-    """No processes can be started here; the reason, in words."""
+    """No processes can be started here; the message gives the reason."""
 
 
 class Processes:
-    """So many processes on this machine; one is this process itself.
+    """``count`` processes on this machine; a count of 1 means this process itself.
 
-    A process that dies takes no other item's result with it. What it worked on is tried once more, alone. Where no
-    processes can be started, this one does the work, and warns.
+    The death of a process loses no other item's result. The items in flight when it died are retried once, each in a
+    process of its own. Where no processes can be started, this process does the work, with a warning.
     """
 
     def __init__(self, count: int = 1) -> None:
         self.count = count
         self._pool: _Pool | None = None
 
-    def each(self, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result | Died]]:
-        """As `Workers.each`."""
+    def each(self, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result | DeadWorker]]:
+        """Implement `Workers.each`."""
         suspects: list[int] = []
-        waiting = list(range(len(items)))[::-1]
-        while waiting and min(self.count, len(items)) > 1:
+        pending = list(range(len(items)))[::-1]
+        while pending and min(self.count, len(items)) > 1:
             in_flight: dict[Future[Result], int] = {}
             try:
                 self._pool = self._pool or _Pool(self.count, _needs_main(task, items))
-                while waiting or in_flight:
-                    while waiting and len(in_flight) < self.count:
-                        in_flight[self._pool.submit(task, items[waiting[-1]])] = waiting[-1]
-                        waiting.pop()
+                while pending or in_flight:
+                    while pending and len(in_flight) < self.count:
+                        in_flight[self._pool.submit(task, items[pending[-1]])] = pending[-1]
+                        pending.pop()
                     for done in wait(in_flight, return_when=FIRST_COMPLETED).done:
                         result = done.result()
                         yield in_flight.pop(done), result
             except BrokenProcessPool:
                 self.close()
-                if _processes_work(_needs_main(task, items)):
+                if _can_run_processes(_needs_main(task, items)):
                     suspects += in_flight.values()
                 else:
-                    waiting += in_flight.values()
-                    self._work_here("processes that were started ended at once")
+                    pending += in_flight.values()
+                    self._work_in_this_process("processes that were started ended at once")
             except CannotStart as error:
-                waiting += in_flight.values()
-                self._work_here(str(error))
+                pending += in_flight.values()
+                self._work_in_this_process(str(error))
                 self.close()
-        yield from ((number, task(items[number])) for number in reversed(waiting))
+        yield from ((number, task(items[number])) for number in reversed(pending))
         for number in sorted(suspects):
             try:
                 with closing(_Pool(1, _needs_main(task, items))) as alone:
                     result = alone.submit(task, items[number]).result()
             except (BrokenProcessPool, CannotStart):
-                yield number, Died("the process that worked on it died", "is there enough memory?")
+                yield number, DeadWorker("the process that worked on it died", "is there enough memory?")
             else:
                 yield number, result
 
-    def _work_here(self, why: str) -> None:
+    def _work_in_this_process(self, why: str) -> None:
         self.count = 1
         warn(f"this process does all the work, one shape after the other: {why}")
 
     def close(self) -> None:
-        """Let the processes finish what they are at, and end."""
+        """End the processes once they have finished their current tasks."""
         if self._pool is not None:
             self._pool.close()
             self._pool = None
 
 
 class _Pool:
-    """Processes that are spawned, for a fork would inherit locks and the thread pools of the numerical libraries.
+    """Spawned processes; forked ones would inherit locks and the thread pools of the numerical libraries.
 
-    A spawned process runs the program again that started it, up to what stands behind ``if __name__ == "__main__"``. A
-    program from standard input cannot be run again, and one without such a line should not be; so it is left alone unless
-    the work needs what it defines. Raises `CannotStart` where there can be no processes.
+    A spawned process imports the main program again, without the block under ``if __name__ == "__main__"``. A program
+    read from standard input cannot be imported again, and one without that guard should not be. The main program is
+    therefore hidden from the workers unless they need what it defines. Raises `CannotStart` where no processes can be
+    started.
     """
 
     def __init__(self, count: int, needs_main: bool) -> None:
@@ -122,21 +123,21 @@ class _Pool:
         if needs_main and not _main_can_be_imported():
             raise CannotStart("other processes cannot import the program, which is no file")
         self._needs_main = needs_main
-        with _starting():
+        with _raise_cannot_start():
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(count, context, _begin, (os.getpid(),))
+            self._pool = ProcessPoolExecutor(count, context, _init_worker, (os.getpid(),))
 
     def submit(self, task: Callable[..., Result], *items: Any) -> Future[Result]:
-        """A future of the task's result for an item. The processes are started here, whenever one is missing."""
-        with _starting(), nullcontext() if self._needs_main else _hidden_main():
+        """Return a future for the task's result; missing processes are started here."""
+        with _raise_cannot_start(), nullcontext() if self._needs_main else _hidden_main():
             return self._pool.submit(task, *items)
 
     def close(self) -> None:
         self._pool.shutdown(cancel_futures=True)
 
 
-def _processes_work(needs_main: bool) -> bool:
-    """Whether a process that is given next to nothing to do can do it."""
+def _can_run_processes(needs_main: bool) -> bool:
+    """Whether a process can be started and can run a trivial task."""
     try:
         with closing(_Pool(1, needs_main)) as pool:
             return pool.submit(os.getpid).result() > 0
@@ -145,7 +146,7 @@ def _processes_work(needs_main: bool) -> bool:
 
 
 @contextmanager
-def _starting() -> Iterator[None]:
+def _raise_cannot_start() -> Iterator[None]:
     try:
         yield
     except BrokenProcessPool:
@@ -155,7 +156,7 @@ def _starting() -> Iterator[None]:
 
 
 def _needs_main(task: Callable[[Item], Result], items: Sequence[Item]) -> bool:
-    """Whether tasks or items are of classes that the running program itself defines."""
+    """Whether the task or an item is defined in the main program, so that unpickling it needs that program."""
     return b"__main__" in pickle.dumps((task, items))
 
 
@@ -166,41 +167,41 @@ def _main_can_be_imported() -> bool:
 
 @contextmanager
 def _hidden_main() -> Iterator[None]:
-    """Inside, a process that is spawned finds no program to run again."""
+    """Context in which spawned processes find no main program to import."""
     main = vars(sys.modules["__main__"])
-    with _hiding:
-        kept: dict[str, Any] = {name: main[name] for name in ("__spec__", "__file__") if name in main}
+    with _main_lock:
+        saved: dict[str, Any] = {name: main[name] for name in ("__spec__", "__file__") if name in main}
         main.pop("__file__", None)
         main["__spec__"] = None
         try:
             yield
         finally:
-            main.update(kept)
+            main.update(saved)
 
 
-def _begin(parent: int) -> None:
-    """A worker leaves Ctrl-C to its parent, uses one thread, warns in a line, and does not outlive its parent."""
+def _init_worker(parent: int) -> None:
+    """Set up a worker: ignore Ctrl-C (the parent handles it), use one thread, warn in one line, exit with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     set_threads(1)
-    warnings.formatwarning = _in_a_line
+    warnings.formatwarning = _format_warning
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(_PARENT_SEEN)
+            time.sleep(_PARENT_POLL)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _in_a_line(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> str:
-    """A warning as the command line shows it, without the place in the code."""
+def _format_warning(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> str:
+    """Format a warning as the command line does, without its location in the code."""
     return f"warning: {message}\n"
 
 
 class Cluster:
-    """The workers of a Dask scheduler at an address such as ``tcp://127.0.0.1:8786``.
+    """The workers of the Dask scheduler at an address such as ``tcp://127.0.0.1:8786``.
 
-    `OptionError` if there is none; `MeshmatchError` if dask.distributed is not installed.
+    Raises `OptionError` if no scheduler answers there, and `MeshmatchError` if dask.distributed is not installed.
     """
 
     def __init__(self, address: str) -> None:
@@ -208,20 +209,20 @@ class Cluster:
             from distributed import Client
             from distributed.comm.addressing import resolve_address
         try:
-            resolve_address(address)  # else the client asks for a minute, and leaves a trace of it at the end
+            resolve_address(address)  # without this check, the client retries for a minute and then logs a traceback
         except ValueError as error:
-            hint = "`dask scheduler` tells it, such as tcp://127.0.0.1:8786"
+            hint = "`dask scheduler` prints it, such as tcp://127.0.0.1:8786"
             raise OptionError(f"{address} is no address of a Dask scheduler", hint) from error
         except OSError as error:
-            raise OptionError(f"there is no machine at {address}", "is the name right?") from error
+            raise OptionError(f"there is no machine at {address}", "check the name") from error
         try:
-            self._client = Client(address, timeout=_CONNECT, set_as_default=False)
+            self._client = Client(address, timeout=_CONNECT_TIMEOUT, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
             hint = "start one: dask scheduler (docs/cluster.md)"
             raise OptionError(f"no Dask scheduler answers at {address}", hint) from error
 
-    def each(self, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result | Died]]:
-        """As `Workers.each`."""
+    def each(self, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result | DeadWorker]]:
+        """Implement `Workers.each`."""
         from distributed import as_completed
         from distributed.scheduler import KilledWorker
 
@@ -232,7 +233,7 @@ class Cluster:
                 try:
                     yield number, future.result()
                 except KilledWorker:
-                    yield number, Died("the workers that worked on it died", "have they enough memory?")
+                    yield number, DeadWorker("the workers that worked on it died", "have they enough memory?")
                 except ModuleNotFoundError as error:
                     hint = "install the same meshmatch on all of them"
                     raise InputError(f"a worker of the cluster lacks {error.name}", hint) from error
@@ -241,25 +242,25 @@ class Cluster:
                 self._client.cancel(list(numbers))
 
     def close(self) -> None:
-        """Leave the scheduler."""
+        """Disconnect from the scheduler."""
         with suppress(Exception):
             self._client.close()
 
 
 @contextmanager
-def hired(who: int | str | None = None) -> Iterator[Workers]:
-    """So many processes on this machine, by default one a core; or the cluster at an address."""
-    if isinstance(who, int) and who < 1:
-        raise OptionError(f"workers must be 1 or more, not {who}", "leave it out for one a core")
-    crew: Workers = Cluster(who) if isinstance(who, str) else Processes(who or _cores())
+def open_workers(spec: int | str | None = None) -> Iterator[Workers]:
+    """Open a number of processes on this machine, by default one per core, or the Dask cluster at an address."""
+    if isinstance(spec, int) and spec < 1:
+        raise OptionError(f"workers must be 1 or more, not {spec}", "leave it out for one per core")
+    workers: Workers = Cluster(spec) if isinstance(spec, str) else Processes(spec or _cores())
     try:
-        yield crew
+        yield workers
     finally:
-        crew.close()
+        workers.close()
 
 
 def _cores() -> int:
-    """How many cores this process may use."""
+    """Number of cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on Linux

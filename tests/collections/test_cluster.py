@@ -100,7 +100,7 @@ def test_a_cluster_of_which_one_worker_is_killed(scheduler: Scheduler, tmp_path:
 
 
 def test_nobody_at_the_address(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("meshmatch.collections.workers._CONNECT", 0.5)
+    monkeypatch.setattr("meshmatch.collections.workers._CONNECT_TIMEOUT", 0.5)
     with pytest.raises(OptionError, match="no Dask scheduler answers"):
         meshmatch.Collection(tmp_path / "fits", workers="tcp://127.0.0.1:9").fit(SAMPLES / "dancer.ply", model="human")
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import meshmatch
 from meshmatch.cli import main
-from meshmatch.collections.fit_all import files_of
+from meshmatch.collections.fit_all import file_table
 from meshmatch.collections.setting import Record
 from meshmatch.collections.sources import find_sources
 from meshmatch.collections.stores import Store
@@ -543,7 +543,7 @@ def test_every_file_of_a_folder_has_a_row(tmp_path: Path, capsys: pytest.Capture
     with (fits / "fits.csv").open(newline="") as table:
         rows = {row["name"]: (row["verdict"], row["reasons"]) for row in csv.DictReader(table)}
     others = {name: rows.pop(name) for name in ("README", "more/notes.docx", "points.npy", "stack.tif")}
-    assert set(rows) == {"dancer", "climber"} == set(files_of(Store.of(fits)))
+    assert set(rows) == {"dancer", "climber"} == set(file_table(Store.of(fits)))
     assert others.pop("points.npy") == ("left out", "an array beside shapes")
     assert set(others.values()) == {("left out", "a format of no shapes")}
     assert set(meshmatch.Transfers(meshmatch.transfer_landmarks, scans / "dancer.ply", fits).files) == {"climber"}

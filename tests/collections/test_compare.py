@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from meshmatch.collections import setting
-from meshmatch.collections.compare import Compared, on_the_other_side
+from meshmatch.collections.compare import Compared, opposite_side_names
 from meshmatch.collections.setting import Record
 from meshmatch.collections.stores import Store
 from meshmatch.fitting.fit import Fit
@@ -87,7 +87,7 @@ def test_only_a_shape_with_an_edge_may_be_a_part(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(setting, "fit_without_model", fitted)
     monkeypatch.setattr(setting.Setting, "template", None)
-    monkeypatch.setattr(setting.Setting, "_begun", lambda *_: None)
+    monkeypatch.setattr(setting.Setting, "_find_start", lambda *_: None)
     how = setting.Setting(Store.of(tmp_path), NO_MODEL, FitConfig())
     for shape in (ball, Shape(ball.verts, ball.faces[ball.verts[ball.faces, 2].min(axis=1) > -0.3])):
         how.fit(shape, whole=3.0)
@@ -102,10 +102,10 @@ def test_of_few_and_of_fits_that_do_not_say_nothing_is_usual() -> None:
 def test_sides_are_taken_where_nearly_all_have_a_clear_one() -> None:
     stretches = [0.2] * 6
     clear = records(stretches, [0.3, 0.12, -0.2, 0.4, 0.25, -0.25])
-    assert on_the_other_side(clear) == {"s2", "s5"}
+    assert opposite_side_names(clear) == {"s2", "s5"}
     symmetric = records(stretches, [0.01, 0.02, -0.03, 0.01, -0.12, 0.09])
-    assert on_the_other_side(symmetric) == set()
-    assert on_the_other_side(clear[:3]) == set()
+    assert opposite_side_names(symmetric) == set()
+    assert opposite_side_names(clear[:3]) == set()
 
 
 def test_only_a_side_that_is_worse_is_in_doubt() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from meshmatch.collections.export import Export, Fits, export
 from meshmatch.collections.motion import area_strain, smoothed
-from meshmatch.collections.sources import frame_times, in_sequences
+from meshmatch.collections.sources import frame_times, sort_by_sequence
 from meshmatch.errors import MeshmatchWarning, OptionError
 from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.files import load_shape
@@ -98,8 +98,8 @@ def test_a_cycle_has_its_last_frames_even_where_they_are_missing(tmp_path: Path)
 
 def test_frames_of_a_subfolder_do_not_split_those_of_its_folder() -> None:
     names = ["a1", "z1", "m/10", "m/9", "a10", "a2"]
-    assert in_sequences(names) == ["a1", "a2", "a10", "z1", "m/9", "m/10"]
-    assert in_sequences(["f1/2", "f01/1", "f1/1", "f01/2"]) == ["f01/1", "f01/2", "f1/1", "f1/2"]
+    assert sort_by_sequence(names) == ["a1", "a2", "a10", "z1", "m/9", "m/10"]
+    assert sort_by_sequence(["f1/2", "f01/1", "f1/1", "f01/2"]) == ["f01/1", "f01/2", "f1/1", "f1/2"]
     assert list(frame_times({"x1", "x01"})) == ["x01", "x1"]
 
 

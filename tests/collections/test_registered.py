@@ -9,8 +9,8 @@ import pytest
 
 from meshmatch.collections.registered import (
     Registered,
-    held,
-    matching,
+    load_points,
+    match_names,
     mixed_units,
     read_group,
     registered_meshes,
@@ -46,7 +46,7 @@ def test_what_is_named_is_left_out(folder: Path) -> None:
         assert np.array_equal(found.points, given.points[[3, 2, 0]])
         (folder / "group.txt").write_text("b1\nb2\n")
         assert read_group(folder / "group.txt", found) == ["b1"]
-    assert matching(["cut-1", "cut-2", "b"], ["cut-*"]) == {"cut-1", "cut-2"}
+    assert match_names(["cut-1", "cut-2", "b"], ["cut-*"]) == {"cut-1", "cut-2"}
     with pytest.raises(InputError, match="no shape called b9") as caught, registered_meshes(folder, ["b9"]):
         pass
     assert caught.value.hint.startswith("did you mean b")
@@ -59,7 +59,7 @@ def test_many_are_kept_in_a_file(folder: Path, monkeypatch: pytest.MonkeyPatch) 
         file = Path(found.points.filename)
         assert np.array_equal(found.points, ellipsoids(4, splits=1).points[::-1])
     assert not file.exists()
-    with held(3, 5, lambda k: np.full((5, 3), float(k))) as points:
+    with load_points(3, 5, lambda k: np.full((5, 3), float(k))) as points:
         assert points[:, 0, 0].tolist() == [0, 1, 2]
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from meshmatch.collections.setting import Setting
-from meshmatch.collections.settle import settled
+from meshmatch.collections.settle import select_setting
 from meshmatch.collections.sources import find_sources
 from meshmatch.collections.stores import Store
 from meshmatch.fitting.fit_config import FitConfig
@@ -23,5 +23,5 @@ def test_without_a_model_the_first_template_is_made_of_the_chosen_part(tmp_path:
     save_shape(tmp_path / "in" / "a.ply", Shape(*both))
     store = Store.of(tmp_path / "fits")
     wish = Setting(store, NO_MODEL, FitConfig(), only=("1",))
-    found = settled(wish, find_sources(tmp_path / "in", store)[0])
+    found = select_setting(wish, find_sources(tmp_path / "in", store)[0])
     assert found.template.shape.V == ball.V

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from meshmatch.collections.workers import Died, Processes, hired
+from meshmatch.collections.workers import DeadWorker, Processes, open_workers
 from meshmatch.errors import MeshmatchWarning, OptionError
 
 ROOT = Path(__file__).parents[2]
@@ -38,28 +38,28 @@ def asleep(number: int) -> int:
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_every_item_is_done_once(count: int) -> None:
-    with hired(count) as crew:
+    with open_workers(count) as crew:
         assert dict(crew.each(squared, range(7))) == {number: number * number for number in range(7)}
         assert dict(crew.each(squared, [5])) == {0: 25}
         assert dict(crew.each(squared, [])) == {}
 
 
 def test_a_process_that_dies_takes_no_other_result_with_it() -> None:
-    with hired(2) as crew:
+    with open_workers(2) as crew:
         found = dict(crew.each(squared_or_dead, range(6)))
-        assert isinstance(found.pop(3), Died)
+        assert isinstance(found.pop(3), DeadWorker)
         assert found == {number: number * number for number in (0, 1, 2, 4, 5)}
         assert dict(crew.each(squared, range(3))) == {0: 0, 1: 1, 2: 4}  # and the crew is whole again
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_what_a_task_raises_ends_the_work(count: int) -> None:
-    with hired(count) as crew, pytest.raises(OptionError, match="not "):
+    with open_workers(count) as crew, pytest.raises(OptionError, match="not "):
         list(crew.each(refused, range(3)))
 
 
 def test_no_workers_are_refused() -> None:
-    with pytest.raises(OptionError, match="1 or more"), hired(0):
+    with pytest.raises(OptionError, match="1 or more"), open_workers(0):
         pass
 
 
@@ -176,13 +176,13 @@ def test_a_frozen_program_works_alone(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_processes_that_end_at_once_are_not_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "meshmatch.collections.workers._begin", os._exit
+        "meshmatch.collections.workers._init_worker", os._exit
     )  # of the parent's number: as if it could not start
     check_alone("ended at once")
 
 
 def check_alone(why: str) -> None:
-    with warnings.catch_warnings(record=True) as said, hired(2) as crew:
+    with warnings.catch_warnings(record=True) as said, open_workers(2) as crew:
         warnings.simplefilter("always")
         for _ in range(2):
             assert dict(crew.each(own_process, range(3))) == dict.fromkeys(range(3), os.getpid())
