@@ -1,4 +1,4 @@
-"""What a collection of registered shapes has in common, and how they vary: the mean and modes of variation."""
+"""Statistical shape models (atlases): the mean of registered shapes and their modes of variation."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from meshmatch.collections.atlas_arrays import load_arrays, save_arrays
 from meshmatch.collections.covariates import Columns, covariates
 from meshmatch.collections.explain import Explained, explain
 from meshmatch.collections.groups import Comparison, Statistic, compare_groups
-from meshmatch.collections.modes import components, outward
-from meshmatch.collections.superimpose import Poses, Scale, Shapes, Superimposed, blocks, superimpose
+from meshmatch.collections.modes import compute_modes, outward_signs
+from meshmatch.collections.superimpose import Poses, Scale, Shapes, Superimposed, iter_blocks, superimpose
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit, facing_out
 from meshmatch.shapes.shape import Shape
@@ -25,11 +25,11 @@ from meshmatch.shapes.shape import Shape
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Projection(Brief):
-    """A shape as the atlas sees it.
+    """A shape projected onto the modes of an atlas.
 
-    ``scores`` (M,) are in standard deviations. ``shape`` is what the modes make of it, and ``distance`` (V,) how far its
-    vertices are from there, in the frame and unit of the given points; ``residual`` is the mean of these distances over
-    the surface.
+    ``scores`` (M,) are in standard deviations. ``shape`` is the reconstruction from the scores, and ``distance`` (V,) the
+    distance of each vertex from it, in the frame and unit of the given points; ``residual`` is the mean distance over the
+    surface.
     """
 
     scores: Float[Floats, " M"]
@@ -45,34 +45,34 @@ class Atlas(Brief, Pickled):
     Attributes
     ----------
     mean
-        (V, 3) the mean shape, in the unit of the shapes; the center of its surface is the origin, its axes are the
-        shapes'.
+        (V, 3) the mean shape, in the unit of the shapes. The origin is the center of its surface; the axes are those of the
+        first shape.
     modes
-        (M, V, 3) the modes, largest variance first; orthonormal in the mean product over the surface.
+        (M, V, 3) the modes, largest variance first; orthonormal in the inner product that averages over the surface.
     deviations
         (M,) standard deviations along the modes: root mean square displacements, in the unit of the shapes.
     scores
-        (S, M) of each shape along each mode, in standard deviations.
+        (S, M) scores of each shape along each mode, in standard deviations.
     sizes
-        (S,) root mean square distance of each shape from its center (of what was superimposed, from its own centers),
-        before it was scaled, unit of its file.
+        (S,) root mean square distance of each shape from its center, before scaling, in the unit of its file. Where parts
+        were superimposed: of their vertices, each from the center of its part.
     faces
         (F, 3) triangles of all shapes.
     weights
         (V,) share of the surface around each vertex.
     names
-        Of the shapes.
+        Names of the shapes.
     total
-        Variance along all modes, also those that are not kept.
+        Variance along all modes, including those that are not kept.
     scale
-        Whether the shapes keep their sizes ("keep"), or all were scaled to one ("remove").
+        Whether the shapes keep their sizes ("keep") or are scaled to the same size ("remove").
     robust
         Whether the mean and modes resist outliers.
     template
-        Hash of the template whose fits the shapes are; empty if not known.
+        Hash of the template, if the shapes are fits; empty if not known.
     groups
-        (V,) vertices of one number from 0 were superimposed together, each group for itself, and those of -1 with group 0,
-        without a say; None where whole shapes were.
+        (V,) groups of vertices, from 0; each group was superimposed on its own. Vertices of -1 moved with group 0 but did
+        not count. None if whole shapes were superimposed.
 
     Examples
     --------
@@ -108,32 +108,32 @@ class Atlas(Brief, Pickled):
         template: str = "",
         groups: ArrayLike | None = None,
     ) -> Atlas:
-        """The atlas of S shapes with the same vertices and faces.
+        """Build the atlas of S shapes with the same vertices and faces.
 
         The shapes are aligned by rotation and translation (generalised Procrustes analysis, each vertex weighted with
-        its share of the surface). Only some shapes are in memory at a time, beside the modes and, of up to 3,000
-        shapes, an S x S matrix.
+        its share of the surface). Shapes are read in blocks; only the modes and, for up to 3,000 shapes, an S x S matrix
+        stay in memory.
 
         Parameters
         ----------
         points
-            (S, V, 3), which may be a list, also of `Shape`, or a memory-mapped array.
+            (S, V, 3): an array, which may be memory-mapped, or a list of arrays or of `Shape`.
         faces
-            (F, 3).
+            (F, 3) triangles.
         names
-            One for each shape, all different.
+            A different name for each shape.
         modes
-            Largest number of modes to keep, of S - 1.
+            Largest number of modes to keep, of at most S - 1.
         scale
-            "keep" or "remove": scale all shapes to one size.
+            "keep" the sizes of the shapes, or "remove" them: scale all shapes to the same size.
         robust
-            The mean is the spatial median, the modes are spherical principal components (Locantore et al. 1999), which
-            a few outliers hardly change.
+            Use the spatial median as the mean, and spherical principal components as the modes (Locantore et al. 1999);
+            a few outliers hardly change these.
         template
-            Hash of the template whose fits the shapes are.
+            Hash of the template, if the shapes are fits.
         groups
-            (V,) of shapes of several parts, which vertices are superimposed together: 0 for those of one part and -1 for
-            others, whose pose then shows; or 0, 1, 2, ... for each part alone, so that no pose shows. By default all.
+            (V,) how to superimpose shapes of several parts; by default as a whole. 0 for one part and -1 for the others: by
+            that part, so that the poses of the others vary. 0, 1, 2, ...: each part on its own, so that no pose varies.
 
         Returns
         -------
@@ -143,10 +143,10 @@ class Atlas(Brief, Pickled):
         Raises
         ------
         InputError
-            Fewer than three shapes, shapes that do not have the same vertices or do not differ, names that are not one
-            for each or not different, groups without surface.
+            Fewer than three shapes, shapes that differ in their vertices or are all the same, names that are missing or
+            repeated, or groups without surface.
         OptionError
-            Another ``scale``, or no modes.
+            Unknown ``scale``, or fewer than one mode.
         """
         if scale not in get_args(Scale):
             raise OptionError(f"invalid scale {scale!r}", f"choose one of {', '.join(get_args(Scale))}")
@@ -154,22 +154,22 @@ class Atlas(Brief, Pickled):
             raise OptionError(f"an atlas has one mode or more, not {modes}")
         if not hasattr(points, "shape"):
             points = [np.asarray(getattr(each, "verts", each)) for each in points]
-        called = tuple(names) if names is not None else tuple(f"shape-{k:03d}" for k in range(len(points)))
-        if len(called) != len(points) or len(set(called)) < len(called):
+        shape_names = tuple(names) if names is not None else tuple(f"shape-{k:03d}" for k in range(len(points)))
+        if len(shape_names) != len(points) or len(set(shape_names)) < len(shape_names):
             raise InputError(f"{len(points)} shapes need as many different names", "one for each, in their order")
         faces = np.array(faces, np.int64)
-        laid = superimpose(points, faces, scale, robust, groups)
-        found = components(points, laid, modes, robust)
-        mean = laid.consensus + found.center
-        sign = outward(found.modes, mean, laid.weights)
-        kept, scores = sign[:, None, None] * found.modes, sign * found.scores
-        sizes = np.concatenate([laid.poses(some).sizes for _, some in blocks(points)])
-        for array in (mean, kept, found.deviations, scores, sizes, faces, laid.weights):
+        alignment = superimpose(points, faces, scale, robust, groups)
+        found = compute_modes(points, alignment, modes, robust)
+        mean = alignment.consensus + found.center
+        sign = outward_signs(found.modes, mean, alignment.weights)
+        signed_modes, scores = sign[:, None, None] * found.modes, sign * found.scores
+        sizes = np.concatenate([alignment.poses(some).sizes for _, some in iter_blocks(points)])
+        for array in (mean, signed_modes, found.deviations, scores, sizes, faces, alignment.weights):
             frozen(array)
         return cls(
-            mean=mean, modes=kept, deviations=found.deviations, scores=scores, sizes=sizes, faces=faces,
-            weights=laid.weights, names=called, total=found.total, scale=scale, robust=robust, template=template,
-            groups=None if laid.groups is None else frozen(laid.groups),
+            mean=mean, modes=signed_modes, deviations=found.deviations, scores=scores, sizes=sizes, faces=faces,
+            weights=alignment.weights, names=shape_names, total=found.total, scale=scale, robust=robust, template=template,
+            groups=None if alignment.groups is None else frozen(alignment.groups),
         )  # fmt: skip
 
     @property
@@ -179,12 +179,12 @@ class Atlas(Brief, Pickled):
 
     @property
     def compactness(self) -> Float[Floats, " M"]:
-        """(M,) share of all variance that the first modes explain, for one mode, two, ..."""
+        """(M,) share of the total variance that the first 1, 2, ..., M modes explain."""
         return np.asarray(np.cumsum(self.variances) / self.total)
 
     @property
     def distances(self) -> Float[Floats, " S"]:
-        """(S,) root mean square distance of each shape from the mean over the surface, as far as the modes have it."""
+        """(S,) root mean square distance of each shape from the mean over the surface, within the modes."""
         return np.asarray(np.sqrt(np.square(self.scores * self.deviations).sum(axis=1)))
 
     @cached_property
@@ -194,17 +194,17 @@ class Atlas(Brief, Pickled):
 
     @cached_property
     def laid(self) -> Superimposed:
-        """How further shapes are laid over the mean."""
+        """The superimposition that aligns further shapes with the mean."""
         size = float(self.sizes.mean()) if self.scale == "remove" else None
         return Superimposed(self.mean, self.weights, size, self.groups)
 
     def offsets(self, scores: Float[Floats, "N M"]) -> Float[Floats, "N V 3"]:
-        """What scores add to the mean.
+        """Displacements of the mean by scores.
 
         Parameters
         ----------
         scores
-            (N, M) in standard deviations; of fewer than all modes, the first.
+            (N, M) in standard deviations; fewer columns than modes are those of the first modes.
 
         Returns
         -------
@@ -220,7 +220,7 @@ class Atlas(Brief, Pickled):
         Parameters
         ----------
         scores
-            (M,) in standard deviations; modes that are not given count as 0.
+            (M,) in standard deviations; missing ones are 0.
 
         Returns
         -------
@@ -238,14 +238,14 @@ class Atlas(Brief, Pickled):
         return Shape(self.mean + self.offsets(given[None])[0], self.faces)
 
     def sample(self, count: int, seed: int = 0) -> list[Shape]:
-        """Random shapes, their scores drawn from a normal distribution.
+        """Draw random shapes, with scores from a standard normal distribution.
 
         Parameters
         ----------
         count
-            How many.
+            Number of shapes.
         seed
-            The same seed gives the same shapes, whatever the count.
+            Random seed. A larger count with the same seed adds shapes to the same ones.
 
         Returns
         -------
@@ -259,33 +259,33 @@ class Atlas(Brief, Pickled):
         return [Shape(self.mean + each, self.faces, f"sample-{k:03d}") for k, each in enumerate(offsets)]
 
     def align(self, points: Float[Floats, "N V 3"]) -> tuple[Float[Floats, "N V 3"], Poses]:
-        """Lay shapes over the mean.
+        """Align shapes with the mean, by least squares.
 
         Parameters
         ----------
         points
-            (N, V, 3).
+            (N, V, 3) vertices of the shapes.
 
         Returns
         -------
         (N, V, 3), Poses
-            The shapes as they lie then, and how they were moved.
+            The aligned shapes, and the transformations that were applied.
         """
         poses = self.laid.poses(points)
         return poses.apply(points), poses
 
     def project(self, points: ArrayLike | Fit) -> Projection:
-        """A further shape, registered like the others: its scores, and what the modes cannot express.
+        """Project a further shape, registered like the others, onto the modes.
 
         Parameters
         ----------
         points
-            The template's vertices (V, 3) on the shape, or a fit.
+            The vertices (V, 3) of the registered shape, or a fit.
 
         Returns
         -------
         Projection
-            Of a fit, in the frame and unit of the shape's file.
+            Its scores, and its distance from what the modes express. For a fit, in the frame and unit of the shape's file.
 
         Raises
         ------
@@ -298,7 +298,7 @@ class Atlas(Brief, Pickled):
             if self.template:
                 points.check_template(self.template)
             frame, scale = points.frame, points.frame.scale
-            found = self.project(scale * points.points)  # as the mirror image that the template knows, if it is one
+            found = self.project(scale * points.points)  # in the template's handedness, if the shape is a mirror image
             verts = frame.undo(found.shape.verts / scale)
             return replace(found, shape=Shape(verts, facing_out(self.faces, frame)))
         given = as_numbers(points, "points", finite=True)
@@ -314,7 +314,7 @@ class Atlas(Brief, Pickled):
         return Projection(scores, Shape(back, self.faces), distance, float(self.weights @ distance))
 
     def distance_from_mean(self, name: str) -> Float[Floats, " V"]:
-        """How far each vertex of a shape of the collection is from the mean, as far as the modes express it.
+        """Distance of each vertex of one of the shapes from the mean, within the modes.
 
         Parameters
         ----------
@@ -329,12 +329,12 @@ class Atlas(Brief, Pickled):
         Raises
         ------
         InputError
-            The atlas does not have the name.
+            The atlas has no shape of this name.
         """
         return np.asarray(np.linalg.norm(self.offsets(self.scores[self.rows([name])])[0], axis=1))
 
     def rows(self, names: Sequence[str]) -> Int[Ints, " N"]:
-        """Which shapes have these names.
+        """Rows of the shapes with these names.
 
         Parameters
         ----------
@@ -349,7 +349,7 @@ class Atlas(Brief, Pickled):
         Raises
         ------
         InputError
-            The atlas does not have a name.
+            The atlas has no shape of one of the names.
         """
         known = {name: k for k, name in enumerate(self.names)}
         for name in names:
@@ -367,7 +367,7 @@ class Atlas(Brief, Pickled):
         permutations: int = 10_000,
         seed: int = 0,
     ) -> Comparison:
-        """Where two groups of shapes differ, and whether by more than chance. What the modes do not keep plays no part.
+        """Test where two groups of shapes differ (permutation tests); only variation within the modes counts.
 
         Parameters
         ----------
@@ -376,11 +376,11 @@ class Atlas(Brief, Pickled):
         second
             Names of the second group.
         kind
-            "normal": displacement along the normal of the mean; "hotelling": in any direction.
+            What to test at vertices: displacement along the mean's normal ("normal") or in any direction ("hotelling").
         permutations
-            How many relabellings the p-values come from.
+            Number of permutations of the group labels.
         seed
-            Of the relabellings.
+            Random seed of the permutations.
 
         Returns
         -------
@@ -390,9 +390,9 @@ class Atlas(Brief, Pickled):
         Raises
         ------
         InputError
-            The atlas does not have a name, or both groups have it.
+            The atlas has no shape of one of the names, or a name is in both groups.
         OptionError
-            A group of fewer than two shapes, too few shapes for the statistic, no permutations.
+            A group of fewer than two shapes, too few shapes for the statistic, or no permutations.
         """
         both = set(first) & set(second)
         if both:
@@ -415,39 +415,39 @@ class Atlas(Brief, Pickled):
         permutations: int = 10_000,
         seed: int = 0,
     ) -> Explained:
-        """How much of the variation of the shapes a linear model explains, and where: Procrustes analysis of variance.
+        """Procrustes analysis of variance: how much of the shapes' variation a linear model explains, and where.
 
-        Sums of squares are sequential: each term is given those before it. What the modes do not keep plays no part.
+        Sums of squares are sequential: each term is given those before it. Only variation within the modes counts.
 
         Parameters
         ----------
         formula
-            ``"shape ~ log(size) + sex * age"``, or ``"form ~ ..."`` of an atlas that keeps sizes. Names are columns of the
-            table; ``size`` is ``sizes`` unless there is such a column; ``factor()`` takes numbers for
-            categories; ``a * b`` is ``a + b + a:b``.
+            Such as ``"shape ~ log(size) + sex * age"``, or ``"form ~ ..."`` for an atlas that keeps sizes. Names are columns
+            of the table; ``size`` is ``sizes`` unless the table has such a column. ``factor()`` treats numbers as
+            categories; ``a * b`` means ``a + b + a:b``.
         table
-            A file (.csv, .tsv, .txt) or columns by name, such as a data frame. A column ``name``, else a file's first one,
-            names the shapes; columns without it are in the order of ``names``.
+            A file (.csv, .tsv, .txt), or columns by name, such as a data frame. The column ``name``, or else the first one
+            of a file, names the shapes; columns without names are in the order of the atlas's ``names``.
         blocks
-            A column: shapes are exchanged only where its value is the same, as for repeated measures.
+            A column: only shapes with the same value are exchanged, as for repeated measures.
         kind
-            What is tested at vertices. "normal": displacement along the normal of the mean; "hotelling": in any direction.
+            What to test at vertices: displacement along the mean's normal ("normal") or in any direction ("hotelling").
         permutations
-            How many permutations the p-values come from.
+            Number of permutations.
         seed
-            Of the permutations.
+            Random seed of the permutations.
 
         Returns
         -------
         Explained
-            The table of variances, with a map of each effect; and how shape goes with size, if the model has it.
+            The table of variances, with the effect of each term at the vertices; and the allometry if the model has size.
 
         Raises
         ------
         InputError
-            A shape has no row, a column is missing or says nothing, shapes are too few.
+            A shape has no row, a column is missing or constant, or there are too few shapes.
         OptionError
-            The formula is none, or is of shapes with sizes where the atlas has none, or the other way round.
+            The formula is invalid, or says "form" for an atlas without sizes or "shape" for one that keeps them.
         """
         return explain(
             formula,
@@ -468,12 +468,12 @@ class Atlas(Brief, Pickled):
         Parameters
         ----------
         path
-            Where to.
+            Path of the file.
 
         Raises
         ------
         OutputError
-            It cannot be written.
+            The file cannot be written.
         """
         arrays = {each.name: getattr(self, each.name) for each in fields(self)}
         save_arrays(path, {name: np.asarray(array) for name, array in arrays.items() if array is not None})
@@ -485,16 +485,16 @@ class Atlas(Brief, Pickled):
         Parameters
         ----------
         path
-            The folder that ``meshmatch atlas`` made, or its ``atlas.npz``.
+            A folder written by ``meshmatch atlas``, or its ``atlas.npz``.
 
         Returns
         -------
         Atlas
-            As it was saved.
+            The saved atlas.
 
         Raises
         ------
         InputError
-            There is none, or it is damaged or of another version.
+            The file is missing, damaged or of another version.
         """
         return cls(**load_arrays(path, [each.name for each in fields(cls)]))

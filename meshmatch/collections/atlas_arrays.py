@@ -1,4 +1,4 @@
-"""The arrays of an atlas in its file: what is damaged, or of another version, is refused."""
+"""Read and write the arrays of an atlas; damaged files and files of other versions are rejected."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, get_args
 import numpy as np
 
 from meshmatch.arrays import frozen
-from meshmatch.collections.superimpose import MOST_GROUPS, Scale
+from meshmatch.collections.superimpose import MAX_GROUPS, Scale
 from meshmatch.errors import InputError
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.input_files import read_npz
@@ -17,33 +17,33 @@ from meshmatch.shapes.shape import LARGEST
 
 FILE = "atlas.npz"
 VERSION = 1
-"""Of the arrays in ``atlas.npz``."""
-_ROUNDED = 0.01  # a sum of weights in half precision
+"""Version of the arrays in ``atlas.npz``."""
+_SUM_TOLERANCE = 0.01  # for the sum of the weights, which may be in half precision
 
 
 def save_arrays(path: str | Path, arrays: Mapping[str, Any]) -> None:
-    """Write the arrays and their version; `OutputError` where they cannot be written."""
+    """Write the arrays and the version; `OutputError` if the file cannot be written."""
     with replace_on_success(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **arrays, version=np.int64(VERSION))
 
 
 def load_arrays(path: str | Path, names: Sequence[str]) -> dict[str, Any]:
-    """The arrays of these names in a folder's file, or a file; `InputError` where there is none, or it is damaged."""
+    """Read the arrays of these names from an ``atlas.npz``, or the folder of one; `InputError` if missing or damaged."""
     file = Path(path) / FILE if Path(path).is_dir() else Path(path)
     if not file.is_file():
         raise InputError(f"there is no atlas at {path}", "give the folder that `meshmatch atlas` made")
-    return _strict(file, read_npz(file, (*names, "version")))
+    return _validated(file, read_npz(file, (*names, "version")))
 
 
-def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
-    """The arrays of a file as an `Atlas` has them; `InputError` for anything else."""
+def _validated(file: Path, given: dict[str, Any]) -> dict[str, Any]:
+    """Validate the arrays of a file and convert them to the fields of an `Atlas`; `InputError` if any is wrong."""
     version = given.pop("version", np.empty(0))
     if version.dtype.kind not in "iu" or version.shape != () or version != VERSION:
         raise InputError(f"{file} is not an atlas of version {VERSION}", "make it again with this meshmatch")
     M, V, S, F = (
         len(given[name]) if np.ndim(given.get(name, 0)) else -1 for name in ("modes", "mean", "names", "faces")
     )
-    layout: dict[str, tuple[str, tuple[int, ...]]] = {  # kinds and sizes
+    layout: dict[str, tuple[str, tuple[int, ...]]] = {  # dtype kind and shape
         **{"mean": ("f", (V, 3)), "modes": ("f", (M, V, 3)), "deviations": ("f", (M,)), "scores": ("f", (S, M))},
         **{
             "sizes": ("f", (S,)),
@@ -56,17 +56,17 @@ def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
         **({"groups": ("i", (V,))} if "groups" in given else {}),
     }
     fits = {n: n in given and (given[n].dtype.kind, given[n].shape) == about for n, about in layout.items()}
-    numbers = {n: given[n].astype(np.float64) for n in layout if fits[n] and layout[n][0] == "f"}  # any float is read
+    numbers = {n: given[n].astype(np.float64) for n in layout if fits[n] and layout[n][0] == "f"}  # of any precision
     wrong = [n for n in layout if not fits[n] or not (np.abs(numbers.get(n, 0.0)) < LARGEST).all()]
     if not wrong:
         weights, faces = numbers["weights"], given["faces"]
         right = {
             "deviations": (numbers["deviations"] > 0).all(),
             "sizes": (numbers["sizes"] > 0).all(),
-            "weights": (weights >= 0).all() and abs(weights.sum() - 1) <= _ROUNDED,
+            "weights": (weights >= 0).all() and abs(weights.sum() - 1) <= _SUM_TOLERANCE,
             "faces": F > 0 and faces.min() >= 0 and faces.max() < V,
             "scale": str(given["scale"]) in get_args(Scale),
-            "groups": "groups" not in given or _are_groups(given["groups"]),
+            "groups": "groups" not in given or _are_valid_groups(given["groups"]),
         }
         wrong = [name for name, holds in right.items() if not holds]
     if wrong:
@@ -76,8 +76,8 @@ def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
     return found | words | {"total": float(given["total"]), "robust": bool(given["robust"])}
 
 
-def _are_groups(given: np.ndarray) -> bool:
-    """Whether they count from 0, none left out and not too many, and -1."""
+def _are_valid_groups(given: np.ndarray) -> bool:
+    """Whether the group numbers are 0, 1, 2, ... without gaps and not too many, and perhaps -1."""
     found = np.unique(given)
     counted = found[found >= 0]
-    return bool(found[0] >= -1 and 0 < len(counted) <= MOST_GROUPS and counted[-1] == len(counted) - 1)
+    return bool(found[0] >= -1 and 0 < len(counted) <= MAX_GROUPS and counted[-1] == len(counted) - 1)

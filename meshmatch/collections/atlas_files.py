@@ -1,24 +1,24 @@
-"""The folder of an atlas: its arrays, tables, shapes, pictures and page.
+"""Write the folder of an atlas: arrays, tables, shapes, pictures and a page.
 
 ==================  ==============================================================================================
 atlas.npz           the arrays of `Atlas`, for `Atlas.load`
 mean.ply            the mean
-mean.vtp            the mean, its spread and what the first modes move, for ParaView and 3D Slicer
+mean.vtp            the mean, with its spread and the displacements by the first modes, for ParaView and 3D Slicer
 modes.glb           the mean; the first modes at +2 and -2 standard deviations as morph targets
-scores.csv          a line for each shape: size, distance from the mean, scores in standard deviations
+scores.csv          a row for each shape: size, distance from the mean, scores in standard deviations
 components.csv      the same scores in the unit of the files
 distances.npy       (V, S) 32-bit floats: distance of each vertex of each shape from the mean
 measures.csv        compactness, generalisation and specificity
-groups.csv          where two groups differ, a line for each vertex
+groups.csv          where two groups differ, a row for each vertex
 groups.vtp          the same on the mean
 anova.csv, effects.csv, effects.vtp, allometry.csv   a linear model, see `model_files`
-atlas.json          all that is one number, or a few
+atlas.json          all results that are single numbers or short lists
 modes.png           the mean and the first three modes at -2 and +2 standard deviations
-distances.png       distance from the mean: of all shapes, and of those that are furthest
+distances.png       distance from the mean: root mean square of all shapes, and the furthest shapes
 groups.png          where two groups differ
 histogram.png, measures.png, scree.png, components.png, allometry.png   charts, where matplotlib is installed
-symmetry.csv, asymmetry.csv, asymmetry.vtp, asymmetry.png, fluctuating.png   shapes beside their mirror images
-effect-1-sex-m-f.png   what each coefficient of a model moves, and where that is more than chance
+symmetry.csv, asymmetry.csv, asymmetry.vtp, asymmetry.png, fluctuating.png   shapes compared with their mirror images
+effect-1-sex-m-f.png   displacement by each coefficient of a model, and where it is significant
 samples/            random shapes
 page.html           a page with a slider for each mode
 ==================  ==============================================================================================
@@ -67,15 +67,18 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import write_rows
 
 MORPHS = 10
-"""Modes in modes.glb."""
+"""Largest number of modes in modes.glb."""
 _NOT_ON_PAGE = ("modes", "distances", "histogram")
-_BLOCK = 64  # shapes at a time
+_BLOCK = 64  # shapes processed at a time
 
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What was found out about an atlas beside itself; what was not asked for is None. ``groups`` are names of A and B,
-    ``members`` say which shape is in which; ``charts`` is the format of charts, ``align_by`` what was superimposed.
+    """Results of analyses of an atlas, None for those that were not requested; and options of the output.
+
+    ``groups`` are the names of the two compared groups, and ``members`` maps the names of shapes to the group of each.
+    ``samples`` random shapes are written, drawn with ``seed``. ``charts`` is the format of charts; ``align_by`` says what
+    was superimposed.
     """
 
     measures: Measures | None = None
@@ -90,7 +93,7 @@ class Findings:
     align_by: str = WHOLE
 
     def classes(self, atlas: Atlas) -> list[str]:
-        """The group of each shape in charts, "" where it has none: as it was compared, or else in the model."""
+        """The group of each shape in charts: of the comparison, else of the linear model; "" if it has none."""
         known = self.members
         if self.explained is not None and not known:
             known = dict(zip(self.explained.names, self.explained.groups, strict=False))
@@ -105,8 +108,10 @@ def write_folder(
     rotation: Float[Floats, "3 3"] | None = None,
     title: str = "atlas",
 ) -> list[str]:
-    """Write an atlas into an empty folder; the names of the files. ``rotation`` leads into y up, z to the front, and is
-    guessed if not given. `OutputError` where something cannot be written.
+    """Write an atlas into an empty folder, and return the names of the files.
+
+    ``rotation`` turns the mean to y up and z to the front; it is guessed if not given. `OutputError` if a file cannot be
+    written.
     """
     turn = facing(atlas.mean_shape) if rotation is None else rotation
     atlas.save(folder / FILE)
@@ -152,13 +157,13 @@ def write_folder(
 
 
 def _figures(folder: Path) -> list[Path]:
-    """What the page shows: charts of the shapes, and effects; the modes themselves are on it."""
+    """Pictures to show on the page: charts and effects, but not the modes, which are interactive there."""
     shown = [path for path in folder.iterdir() if path.suffix in (".png", ".svg")]
     return sorted(path for path in shown if path.stem not in _NOT_ON_PAGE)
 
 
 def record(atlas: Atlas, findings: Findings) -> dict[str, Any]:
-    """What an atlas is, and what was found out about it, for JSON."""
+    """Summary of an atlas and of the analyses, as JSON values."""
     found: dict[str, Any] = {
         "shapes": len(atlas.names),
         "vertices": len(atlas.mean),
@@ -198,7 +203,7 @@ def record(atlas: Atlas, findings: Findings) -> dict[str, Any]:
 
 
 def _write_mean(path: Path, atlas: Atlas) -> None:
-    """The mean with the spread of its vertices, and how one standard deviation of each of the first modes moves them."""
+    """Write the mean with the spread of its vertices and their displacements by one standard deviation of each mode."""
     spread = np.sqrt(np.einsum("m,mvi->v", atlas.variances, np.square(atlas.modes)))
     modes = {f"mode_{k + 1}": atlas.deviations[k] * mode for k, mode in enumerate(atlas.modes[:MORPHS])}
     write_vtp(path, atlas.mean_shape, {"spread": spread} | modes)
@@ -220,7 +225,7 @@ def _write_scores(path: Path, atlas: Atlas) -> None:
 
 
 def _write_components(path: Path, atlas: Atlas) -> None:
-    """Scores of principal components; their mean squares are the variances that the modes have over the surface."""
+    """Write scores in the unit of the files, so that their variances are those of the modes."""
     table = atlas.scores * atlas.deviations
     header = ["name", *(f"PC{k + 1}" for k in range(len(atlas.modes)))]
     write_rows(path, header, ([name, *short(row)] for name, row in zip(atlas.names, table, strict=True)))

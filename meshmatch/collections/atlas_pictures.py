@@ -1,4 +1,4 @@
-"""Pictures and charts of an atlas: its modes, its shapes, and what was found out about them."""
+"""Pictures and charts of an atlas: modes, shapes, and the results of analyses."""
 
 from __future__ import annotations
 
@@ -25,24 +25,28 @@ from meshmatch.shapes.shape import Shape
 
 ChartFormat = Literal["png", "svg", "pdf"]
 REACH = 2.0
-"""Standard deviations at which modes are shown."""
+"""Modes are shown at plus and minus this many standard deviations."""
 SHOWN, FURTHEST = 3, 3
-"""Modes and shapes in pictures."""
-_MOST_EFFECTS = 12  # pictures of a model
-_END = 260  # pixels: the longest side of pictures at the ends of axes
+"""Number of modes, and of the shapes furthest from the mean, in pictures."""
+_MAX_EFFECTS = 12  # pictures of a linear model
+_AXIS_IMAGE_SIZE = 260  # longest side of the images at the ends of axes, in pixels
 _BACK = np.diag([-1.0, 1.0, -1.0])
-_ABOVE = 0.95  # cosine: seen from straight above or below
-_AROUND = 0.1  # roots of the area: how far around the strongest effect the surface tells from where it is seen
+_STEEP = 0.95  # cosine with the up axis from which on a view counts as straight from above or below
+_NEIGHBORHOOD = 0.1  # radius around a vertex within which normals are averaged for the view, in sqrt(area)
 
 
 def furthest(atlas: Atlas) -> list[int]:
-    """Rows of the shapes that are furthest from the mean."""
+    """Rows of the shapes furthest from the mean, the furthest first."""
     rows: list[int] = np.argsort(-atlas.distances, kind="stable")[:FURTHEST].tolist()
     return rows
 
 
 def draw_modes(path: Path, atlas: Atlas, turn: Float[Floats, "3 3"]) -> None:
-    """In one scale; colors say where the surface moves in and out, of each mode by itself."""
+    """Draw the mean and the first modes at one scale.
+
+    Colors show displacement along the normal, as a share of the mode's largest displacement. ``turn`` rotates the atlas
+    to y up and z to the front, here and below.
+    """
     mean, normals = atlas.mean_shape, atlas.mean_shape.vertex_normals
     scores = np.zeros((2 * min(SHOWN, len(atlas.modes)), len(atlas.modes)))
     for row in range(len(scores)):
@@ -62,6 +66,7 @@ def draw_modes(path: Path, atlas: Atlas, turn: Float[Floats, "3 3"]) -> None:
 
 
 def draw_distances(path: Path, atlas: Atlas, turn: Float[Floats, "3 3"]) -> None:
+    """Draw distances from the mean: their root mean square over all shapes, and the shapes furthest from the mean."""
     mean = atlas.mean_shape
     spread = np.sqrt(np.einsum("m,mvi->v", atlas.variances, np.square(atlas.modes)))
     rows = furthest(atlas)
@@ -77,14 +82,14 @@ def draw_distances(path: Path, atlas: Atlas, turn: Float[Floats, "3 3"]) -> None
 
 
 def draw_effects(folder: Path, mean: Shape, found: Explained, turn: Float[Floats, "3 3"]) -> None:
-    """A picture of each coefficient of a model that was tested, up to a dozen."""
+    """Draw a picture of each tested coefficient of a linear model, at most 12."""
     shown = [
         (name, along, effect.places)
         for effect in found.table.effects
         for name, along in zip(effect.coefficients, effect.along_normal, strict=True)
         if effect.places is not None
     ]
-    for number, (name, along, places) in enumerate(shown[:_MOST_EFFECTS], 1):
+    for number, (name, along, places) in enumerate(shown[:_MAX_EFFECTS], 1):
         slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:40]
         draw_effect(folder / f"effect-{number}-{slug}.png", mean, name, along, places, turn)
 
@@ -97,19 +102,21 @@ def draw_effect(
     found: Comparison | PlaceTests,
     turn: Float[Floats, "3 3"],
 ) -> None:
-    """A displacement of the mean along its normals, all of it and where it is more than chance: from where it is largest
-    of what is more than chance, or where it is nearest to that, and from behind.
+    """Draw a displacement of the mean along its normals: everywhere, and where it is significant.
+
+    The view is towards the largest significant displacement, or the largest statistic if none is significant; a second
+    view is from behind.
     """
     most = float(np.abs(along).max()) or 1.0
     step = nice_step(most, 4)
     most = step * np.ceil(most / step)
     scale = Scale.of(along, f"{name}: displacement outwards (unit of the files)", (-most, most))
-    sure = found.p_corrected <= LEVEL
-    front = _towards(mean, int(np.argmax(sure * np.abs(along) if sure.any() else found.statistic)), turn)
+    significant = found.p_corrected <= LEVEL
+    front = _view_of(mean, int(np.argmax(significant * np.abs(along) if significant.any() else found.statistic)), turn)
     shown = {
         "displacement": np.ones(len(along), bool),
         f"false discovery rate <= {LEVEL:g}": found.p_fdr <= LEVEL,
-        f"family-wise p <= {LEVEL:g}": sure,
+        f"family-wise p <= {LEVEL:g}": significant,
     }
     panels = []
     for label, kept in shown.items():
@@ -120,15 +127,16 @@ def draw_effect(
 
 
 def draw_asymmetry(folder: Path, mean: Shape, found: Asymmetry, turn: Float[Floats, "3 3"]) -> None:
-    """Directional asymmetry as an effect, and how large fluctuating asymmetry is, from where it is largest; also where it
-    is more than errors of measurement, if these are known.
+    """Draw directional asymmetry (see `draw_effect`) and the size of fluctuating asymmetry, viewed where it is largest.
+
+    If errors of measurement are known, also where fluctuating asymmetry is significantly larger than these.
     """
     side = found.directional
     if side.places is not None:
         name = side.coefficients[0] if found.matching else "a side less the mirror image of the other"
         draw_effect(folder / "asymmetry.png", mean, name, side.along_normal[0], side.places, turn)
     scale = Scale.of(found.fluctuating, "fluctuating asymmetry, root mean square (unit of the files)")
-    front = _towards(mean, int(np.argmax(found.fluctuating)), turn)
+    front = _view_of(mean, int(np.argmax(found.fluctuating)), turn)
     shown = {"": np.ones(len(found.fluctuating), bool)}
     places = found.table.effects[-1].places
     if found.error is not None and places is not None:
@@ -141,18 +149,18 @@ def draw_asymmetry(folder: Path, mean: Shape, found: Asymmetry, turn: Float[Floa
     render_shapes(panels, folder / "fluctuating.png", Look(turn=0, tilt=0, legend=scale))
 
 
-def _towards(mean: Shape, vertex: int, turn: Float[Floats, "3 3"]) -> Float[Floats, "3 3"]:
-    """The rotation that shows a place of a surface to the viewer, with as much of the shape's up as can be."""
-    near = np.linalg.norm(mean.verts - mean.verts[vertex], axis=1) < _AROUND * np.sqrt(mean.area)
+def _view_of(mean: Shape, vertex: int, turn: Float[Floats, "3 3"]) -> Float[Floats, "3 3"]:
+    """The rotation that turns a vertex of a surface towards the viewer, with the shape's up axis as upright as possible."""
+    near = np.linalg.norm(mean.verts - mean.verts[vertex], axis=1) < _NEIGHBORHOOD * np.sqrt(mean.area)
     ahead = mean.vertex_normals[near].sum(axis=0)
     ahead = ahead / np.linalg.norm(ahead) if np.linalg.norm(ahead) > 1e-9 else turn[2]
-    right = np.cross(turn[1] if abs(turn[1] @ ahead) < _ABOVE else -turn[2], ahead)
+    right = np.cross(turn[1] if abs(turn[1] @ ahead) < _STEEP else -turn[2], ahead)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(ahead, right), ahead])
 
 
 def draw_charts(folder: Path, atlas: Atlas, measures: Measures | None, kind: ChartFormat) -> None:
-    """How far shapes are from the mean, and how the measures change with the number of modes."""
+    """Draw a histogram of distances from the mean, and the measures of the atlas by number of modes."""
     apart = atlas.distances.tolist()
     far = furthest(atlas)[0]
     marks = {apart[far]: atlas.names[far]}
@@ -176,8 +184,9 @@ def draw_scores(
     turn: Float[Floats, "3 3"],
     grouped_by: str = "",
 ) -> None:
-    """The share of the variance of each mode, and the shapes along the first two, with the hulls of groups, and what the
-    mean becomes towards the ends of both axes.
+    """Draw the share of the variance of each mode (scree plot), and the scores of the shapes along the first two modes.
+
+    The latter has hulls of groups, and images of the mean at the ends of both axes.
     """
     shares = atlas.variances / atlas.total
     draw_scree(folder / f"scree.{kind}", shares.tolist(), len(atlas.names) - 1)
@@ -192,13 +201,13 @@ def draw_scores(
         f"{axes[0]}, unit of the files",
         axes[1],
         names,
-        _ends(atlas, turn),
+        _axis_images(atlas, turn),
     )
     draw_dots(folder / f"components.{kind}", [dots], groups, hulls=True, grouped_by=grouped_by)
 
 
-def _ends(atlas: Atlas, turn: Float[Floats, "3 3"]) -> list[tuple[str, UInts8]]:
-    """Pictures of the mean with less and more of the first mode, then of the second, and their names."""
+def _axis_images(atlas: Atlas, turn: Float[Floats, "3 3"]) -> list[tuple[str, UInts8]]:
+    """Labels and images of the mean at minus and plus `REACH` deviations along the first mode, then the second."""
     mean = atlas.mean_shape
     ends = {f"PC{k + 1} {sign * REACH:+g} sd": (k, sign * REACH) for k in range(2) for sign in (-1, 1)}
     scores = np.zeros((len(ends), len(atlas.modes)))
@@ -206,11 +215,11 @@ def _ends(atlas: Atlas, turn: Float[Floats, "3 3"]) -> list[tuple[str, UInts8]]:
         row[mode] = score
     unit = float(np.sqrt(mean.area))
     panels = [Panel(Shape(mean.verts + by, mean.faces), rotation=turn, unit=unit) for by in atlas.offsets(scores)]
-    return list(zip(ends, draw_apart(panels, _END), strict=True))
+    return list(zip(ends, draw_apart(panels, _AXIS_IMAGE_SIZE), strict=True))
 
 
 def draw_allometry(folder: Path, found: Explained, about: Allometry, kind: ChartFormat) -> None:
-    """Scores that go with size, of each shape of a model, and their regression in each group."""
+    """Draw the allometry scores of each shape of a linear model against size, with a regression line for each group."""
     scores = {
         "common allometric component (CAC)": about.cac,
         "regression score (RegScore)": about.regression_scores,

@@ -1,4 +1,4 @@
-"""What is known of each shape beside its surface: a table with a row for each, and the columns of a linear model."""
+"""Covariates of shapes: read a table with a row for each shape, and build the design matrix of a linear model."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.tables import is_missing, is_number, number, read_by_suffix, read_table
 
 Columns: TypeAlias = Mapping[str, Sequence[Any]]
-"""Values of the shapes by the names of columns; with a column ``name`` in any order, else in that of the shapes."""
+"""Values of the shapes, by the name of the column; in any order if there is a column ``name``, else in the shapes' order."""
 NAMES = "name"
 SIZE = "size"
-_LARGEST = 1e30  # numbers, whose products have squares
-_SOME = 5  # names in a message
-_NONE = ("none", "null")  # missing among numbers; a category such as "no treatment" among words
+_LARGEST = 1e30  # largest number; squares of products of several must not overflow
+_MAX_NAMES = 5  # names listed in a message
+_NULLS = ("none", "null")  # missing values in a column of numbers, but a category, as in "no treatment", among words
 
 
 @dataclass(frozen=True, eq=False)
 class Covariates:
-    """Cells of a table as text, a row for each of the shapes, in their order; numbers with decimal points."""
+    """The columns of a table as text, a cell for each shape in the order of ``names``; numbers have decimal points."""
 
     names: tuple[str, ...]
     cells: dict[str, tuple[str, ...]]
 
     def column(self, name: str) -> tuple[str, ...]:
-        """The cells of a column; `InputError` where there is none of that name."""
+        """The cells of a column; `InputError` if there is no such column."""
         if name not in self.cells:
             close = get_close_matches(name, self.cells, n=1)
             known = f"there are: {some(list(self.cells))}" if len(self.cells) > 1 else "give a table that has it"
@@ -42,13 +42,13 @@ class Covariates:
         return self.cells[name]
 
     def missing(self, name: str) -> Bool[Bools, " S"]:
-        """Of which shapes a column says nothing."""
+        """Whether the value of each shape is missing in a column."""
         cells = self.column(name)
-        kept = () if _are_numbers(cells) else _NONE
+        kept = () if _are_numbers(cells) else _NULLS
         return np.array([is_missing(cell) and cell.strip().lower() not in kept for cell in cells], bool)
 
     def some(self, rows: Bool[Bools, " S"]) -> Covariates:
-        """Of these shapes alone."""
+        """Select the shapes of these rows."""
         kept = np.flatnonzero(rows).tolist()
         return Covariates(
             tuple(self.names[k] for k in kept),
@@ -58,7 +58,7 @@ class Covariates:
 
 @dataclass(frozen=True, eq=False)
 class DesignTerm:
-    """A term of a model: its columns (S, C) in the design, and what the coefficient of each is called."""
+    """A term of a linear model: its columns (S, C) of the design matrix, and the name of each coefficient."""
 
     name: str
     columns: Float[Floats, "S C"]
@@ -66,64 +66,69 @@ class DesignTerm:
 
 
 def covariates(table: str | Path | Columns | None, names: Sequence[str], sizes: Float[Floats, " S"]) -> Covariates:
-    """What a table, or a file of one, says about shapes. Their ``sizes`` are the column ``size`` if it has none.
+    """Read the covariates of shapes from a table or a file; ``sizes`` become the column ``size`` if there is none.
 
-    Rows are found by the names in the column ``name``, or else the first one: those of the shapes, or of their files.
-    `InputError` for shapes without a row, or with two, and for what is no table.
+    Rows are found by the column ``name``, else by the first column of a file: the names of the shapes or of their files.
+    `InputError` for shapes without a row or with two rows, and for files that are not tables.
     """
     if table is None:
         found: dict[str, tuple[str, ...]] = {}
     elif isinstance(table, (str, Path)):
         header, rows = read_by_suffix(
-            table, dict.fromkeys((".csv", ".tsv", ".txt"), _read), "tables", "the first row has the names of columns"
+            table,
+            dict.fromkeys((".csv", ".tsv", ".txt"), _read_table_file),
+            "tables",
+            "the first row has the names of columns",
         )
         key = next((k for k, title in enumerate(header) if title.lower() == NAMES), 0)
-        order = _matched([row[key] for row in rows], names, Path(table).name)
+        order = _match_rows([row[key] for row in rows], names, Path(table).name)
         found = {
-            title: _with_points([rows[k][column] for k in order])
+            title: _normalise_numbers([rows[k][column] for k in order])
             for column, title in enumerate(header)
             if column != key
         }
     else:
-        found = _in_order(
+        found = _reorder(
             {str(title): ["" if cell is None else str(cell) for cell in table[title]] for title in table}, names
         )
     found.setdefault(SIZE, tuple(map(repr, sizes.tolist())))
     return Covariates(tuple(names), found)
 
 
-def _read(path: Path) -> tuple[list[str], list[list[str]]]:
+def _read_table_file(path: Path) -> tuple[list[str], list[list[str]]]:
+    """Read the header and the rows of a file."""
     table = read_table(path)
     table.check_no_doubt()
     header, *rows = table.rows() or [[]]
     if len(header) < 2 or not rows:
         raise InputError("it has no rows, or one column only", "write a row for each shape, commas between the cells")
     table.check_marks(rows)
-    twice = next((title for title, count in Counter(header).items() if count > 1), None)
-    if twice is not None:
-        raise InputError(f"two columns are called {twice or 'nothing'}", "the first row has the names of columns")
+    duplicate = next((title for title, count in Counter(header).items() if count > 1), None)
+    if duplicate is not None:
+        raise InputError(f"two columns are called {duplicate or 'nothing'}", "the first row has the names of columns")
     return header, rows
 
 
-def _with_points(cells: Sequence[str]) -> tuple[str, ...]:
-    """The cells of a column; numbers with decimal commas, or minus signs of typographers, as every program reads them."""
+def _normalise_numbers(cells: Sequence[str]) -> tuple[str, ...]:
+    """Normalise the cells of a column: numbers get decimal points and ASCII minus signs."""
     if not _are_numbers(cells):
         return tuple(cells)
     return tuple(cell.replace(",", ".").replace("\N{MINUS SIGN}", "-") for cell in cells)
 
 
-def _in_order(cells: dict[str, list[str]], names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+def _reorder(cells: dict[str, list[str]], names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Bring columns into the order of the shapes, by the column ``name`` if there is one."""
     key = cells.pop(NAMES, None)
     for title, column in cells.items():
         if len(column) != len(names if key is None else key):
             hint = "add a column 'name' if there are others"
             raise InputError(f"the column {title} has {len(column)} values for {len(names)} shapes", hint)
-    order = range(len(names)) if key is None else _matched(key, names, "the table")
+    order = range(len(names)) if key is None else _match_rows(key, names, "the table")
     return {title: tuple(column[k] for k in order) for title, column in cells.items()}
 
 
-def _matched(known: Sequence[str], names: Sequence[str], what: str) -> list[int]:
-    """Which row is whose; a name in the table may be a file's, with its suffix."""
+def _match_rows(known: Sequence[str], names: Sequence[str], what: str) -> list[int]:
+    """The row of each shape; a name in the table may have the suffix of a file. ``what`` names the table in messages."""
     rows: dict[str, int] = {}
     wanted = set(names)
     for k, word in enumerate(known):
@@ -131,32 +136,32 @@ def _matched(known: Sequence[str], names: Sequence[str], what: str) -> list[int]
         if name in rows and name in wanted:
             raise InputError(f"{what} has two rows for {name}", "keep one of them")
         rows[name] = k
-    without = [name for name in names if name not in rows]
-    if without:
-        close = get_close_matches(without[0], known, n=1)
-        hint = f"is {close[0]} meant for {without[0]}?" if close else "its first column, or 'name', names the shapes"
-        raise InputError(f"{what} has no row for {some(without)}", hint)
+    unmatched = [name for name in names if name not in rows]
+    if unmatched:
+        close = get_close_matches(unmatched[0], known, n=1)
+        hint = f"is {close[0]} meant for {unmatched[0]}?" if close else "its first column, or 'name', names the shapes"
+        raise InputError(f"{what} has no row for {some(unmatched)}", hint)
     return [rows[name] for name in names]
 
 
 def some(names: Sequence[str]) -> str:
-    """The first names of a list, and how many more there are."""
-    more = f" and {len(names) - _SOME} more" if len(names) > _SOME else ""
-    return f"{', '.join(names[:_SOME])}{more}"
+    """List the first names, and the number of others."""
+    more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+    return f"{', '.join(names[:_MAX_NAMES])}{more}"
 
 
-def design(formula: Formula, known: Covariates) -> tuple[list[DesignTerm], dict[str, str]]:
-    """The terms of a model, without the mean, and what each column was taken for: words for people.
+def design_terms(formula: Formula, known: Covariates) -> tuple[list[DesignTerm], dict[str, str]]:
+    """Build the terms of a model, without the intercept, and describe how each column was interpreted.
 
-    Categories are compared with the first of them in alphabetical order. `InputError` for columns that say nothing, and
-    for models of more coefficients than shapes.
+    Categories are compared with the first one in alphabetical order. `InputError` for columns that are constant or
+    invalid, and for models with too many coefficients for the number of shapes.
     """
     coded: dict[Factor, tuple[Floats, tuple[str, ...]]] = {}
-    taken: dict[str, str] = {}
+    interpretation: dict[str, str] = {}
     for term in formula.terms:
         for factor in term:
             if factor not in coded:
-                values, titles, taken[str(factor)] = _coded(factor, known)
+                values, titles, interpretation[str(factor)] = _code_factor(factor, known)
                 coded[factor] = values, titles
     width = [int(np.prod([len(coded[factor][1]) for factor in term])) for term in formula.terms]
     if sum(width) + 1 >= len(known.names):
@@ -172,11 +177,11 @@ def design(formula: Formula, known: Covariates) -> tuple[list[DesignTerm], dict[
             columns = (columns[:, :, None] * more[:, None]).reshape(len(columns), -1)
             titles = tuple(f"{one}:{other}" for one in titles for other in others)
         terms.append(DesignTerm(term_name(term), columns, titles))
-    return terms, taken
+    return terms, interpretation
 
 
-def _coded(factor: Factor, known: Covariates) -> tuple[Floats, tuple[str, ...], str]:
-    """Columns of a factor, a name for each, and what it was taken for."""
+def _code_factor(factor: Factor, known: Covariates) -> tuple[Floats, tuple[str, ...], str]:
+    """Columns of a factor, the name of each, and a description of how the factor was interpreted."""
     cells = known.column(factor.column)
     if factor.function != "factor" and _are_numbers(cells):
         values = np.array([number(cell) for cell in cells])
@@ -199,16 +204,19 @@ def _coded(factor: Factor, known: Covariates) -> tuple[Floats, tuple[str, ...], 
     levels = sorted(set(cells))
     if len(levels) < 2:
         raise InputError(f"{factor.column} is the same for all shapes in the model", "leave it out")
-    counts = [f"{level} {cells.count(level)}" for level in levels[:_SOME]]
-    if len(levels) > _SOME:
+    counts = [f"{level} {cells.count(level)}" for level in levels[:_MAX_NAMES]]
+    if len(levels) > _MAX_NAMES:
         counts.append("...")
     columns = np.array([[cell == level for level in levels[1:]] for cell in cells], np.float64)
     titles = tuple(f"{factor.column}: {level} - {levels[0]}" for level in levels[1:])
     return columns, titles, f"{len(levels)} categories ({', '.join(counts)}), compared with {levels[0]}"
 
 
-def complete(formula: Formula, blocks: str | None, known: Covariates) -> tuple[Bool[Bools, " S"], dict[str, str]]:
-    """Which shapes have all that a model asks for, and what the others lack."""
+def complete_rows(formula: Formula, blocks: str | None, known: Covariates) -> tuple[Bool[Bools, " S"], dict[str, str]]:
+    """Whether each shape has all values that a model needs, and a missing column for each of the others.
+
+    `OptionError` if fewer than four shapes are complete.
+    """
     lacking: dict[str, str] = {}
     for column in (*formula.columns, *([blocks] if blocks else [])):
         for k in np.flatnonzero(known.missing(column)).tolist():
@@ -222,5 +230,5 @@ def complete(formula: Formula, blocks: str | None, known: Covariates) -> tuple[B
 
 
 def _are_numbers(cells: Sequence[str]) -> bool:
-    """Whether all cells that hold anything hold numbers, and some do."""
+    """Whether all cells are numbers or missing, and some are not missing."""
     return all(map(is_number, cells)) and not all(map(is_missing, cells))

@@ -1,4 +1,4 @@
-"""What the files end in that a transfer writes for several targets."""
+"""Suffixes of the files that a transfer to several targets writes."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from meshmatch.errors import OptionError
 
 @dataclass(frozen=True)
 class Ending:
-    """A suffix, or that of the target where it is one of ``own``."""
+    """The rule for the suffix of a target's output: the target's own suffix if it is in ``own``, else ``suffix``."""
 
     suffix: str
     own: tuple[str, ...] = ()
 
     def __call__(self, file: Path) -> str:
+        """The suffix for a target's file."""
         return file.suffix.lower() if file.suffix.lower() in self.own else self.suffix
 
 
 USUAL = {
     "transfer_colors": Ending(".ply", (".glb", ".vrm", ".obj", ".off")),
-    "transfer_values": Ending(".ply"),  # a shape's own file may not hold them
+    "transfer_values": Ending(".ply"),  # the format of the target may not support values
     "transfer_labels": Ending(".npy"),
     "transfer_weights": Ending(".npz"),
     "transfer_landmarks": Ending(".csv"),
@@ -31,16 +32,28 @@ USUAL = {
     "transfer_rig": Ending(".glb"),
     "transfer_shapes": Ending(".glb", (".vrm",)),
     "transfer_texture": Ending(".glb", (".obj", ".vrm")),
-    "transfer_garment": Ending(""),  # as its garment
+    "transfer_garment": Ending(""),  # that of the garment
 }
-"""By the name of the function."""
+"""Default endings, by the name of the transfer function."""
 
 
 def ending_of(
     transfer: str, given: str | None, garment: Path | None, targets: Mapping[str, Path], join: bool = False
 ) -> Ending:
-    """What the files of a transfer end in; ``join``: a garment is put into its target. `OptionError`, before any target, for
-    what it cannot write, and for a function that is not one of these if nothing is ``given``.
+    """Choose the ending of a transfer's files, and check it for all targets.
+
+    Parameters
+    ----------
+    transfer : name of the transfer function
+    given : suffix that the user chose, if any
+    garment : file of the garment, whose suffix a garment keeps
+    targets : files of the targets, by name
+    join : whether a garment is added to the file of its target
+
+    Raises
+    ------
+    OptionError
+        The transfer cannot write such files; or it is not known and no suffix is given.
     """
     found = USUAL.get(transfer)
     if given is not None:
@@ -58,6 +71,7 @@ def ending_of(
 
 
 def _check(transfer: str, name: str) -> None:
+    """Raise `OptionError` if a transfer cannot write a file of this name."""
     from meshmatch.api import blend_shapes, rig
     from meshmatch.shapes import files, tables, textured_files
     from meshmatch.transfer import label_files, landmarks, measurements, value_files, weight_files

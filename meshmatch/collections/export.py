@@ -1,4 +1,4 @@
-"""The template on every shape of a collection as files: for ParaView, 3D Slicer, R and others."""
+"""Export the registered meshes of a collection to files for ParaView, 3D Slicer, R and other programs."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ from meshmatch.templates.template import Template
 from meshmatch.transfer.value_files import Values, load_values
 
 Place = Literal["files", "template"]
-"""Where exported meshes lie: where their files have the shapes, or all with the axes of the template, about its center."""
+"""Coordinates of exported meshes: those of the shapes' files, or all aligned with the template's axes and center."""
 MESHES, TABLES = (".ply", ".vtp", ".vtk", ".obj", ".off", ".stl", ".glb"), (".csv", ".npz")
 ORIGINALS = (".vtp", ".vtk")
-_MOVING = 4_000_000  # vertices of all frames of one moving file, which are held while it is written
-_RATE = 24.0  # frames a second, as Blender has them: so that each file is a frame there
+_MAX_CLIP_VERTS = 4_000_000  # vertices of all frames of an animated file, which must fit into memory
+_FRAME_RATE = 24.0  # frames per second, Blender's default, so that each file is one frame there
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ class Exported:
     Attributes
     ----------
     files
-        Names in the folder.
+        Names of the files in the folder.
     count
-        How many shapes there are.
+        Number of shapes.
     vertices
-        How many vertices each has.
+        Number of vertices of each.
     left_out
-        Names of poor fits that were not written.
+        Names of shapes with poor fits, which were not written.
     """
 
     files: tuple[str, ...]
@@ -68,24 +68,24 @@ class Exported:
 
 @dataclass(frozen=True)
 class Export:
-    """How a collection is exported; `OptionError` for what cannot be.
+    """Options of an export; `OptionError` for invalid combinations.
 
     Attributes
     ----------
     suffix
-        Of a mesh for each shape, or of one table of all coordinates.
+        Suffix of a mesh for each shape, or of one table of all coordinates.
     place
-        Where the coordinates are.
+        Coordinates, see `Place`.
     original
-        Write the shapes themselves, with what is known of their vertices, instead of the template on each of them.
+        Write the original shapes, with values at their vertices, instead of the registered meshes.
     values
-        A file of numbers of the template's vertices that go with the shapes then.
+        A file of values of the template's vertices, to add to the original shapes.
     metadata
-        A table with a row for each shape, which metadata.csv then has too.
+        A table with a row for each shape, to add to metadata.csv.
     smooth
         Smooth the frames of sequences in time.
     cycle
-        The same, and the last frame is followed by the first.
+        Smooth in time, as a cycle: the last frame is followed by the first.
     """
 
     suffix: str = ""
@@ -114,7 +114,7 @@ class Export:
             raise OptionError("values go with the original meshes", "ask for these: original, --original")
 
     def into(self, output: str | Path) -> Export:
-        """The same; `OptionError` for a folder that is named as one of the files would be."""
+        """Return self; `OptionError` if the output folder has the suffix of a file, probably by mistake."""
         path = as_path(output)
         if (ending := path.suffix.lower()) in (*MESHES, *TABLES) and not path.is_dir():
             what = f"{path.name} is to be a folder, and is named as a file"
@@ -124,10 +124,10 @@ class Export:
 
 @dataclass(frozen=True, eq=False)
 class Fits:
-    """What is exported: names of shapes, and what gives the fit, the places and the file of each; the template of all.
+    """The fits to export: names of shapes, functions that give the fit and the places of each, their files, the template.
 
-    ``sequence``: shapes of a folder are frames; ``names`` are those of one folder after the other then, in natural order.
-    ``times`` are the places of all frames in their sequence, also of those that are not exported.
+    ``sequence``: shapes of a folder are frames, and ``names`` are sorted by folder, then in natural order. ``times`` are
+    the indices of all frames in their sequences, including those that are not exported.
     """
 
     names: Sequence[str]
@@ -140,42 +140,41 @@ class Fits:
 
 
 def mesh_of(fit: Fit, place: Place) -> Shape:
-    """The template as a fit has it, in the unit of the shape's file."""
+    """The registered mesh of a fit, in the unit of the shape's file."""
     return fit.shape if place == "files" else Shape(fit.points * fit.frame.scale, fit.faces)
 
 
 def export(
     output: str | Path, fits: Fits, how: Export, mean: Superimposed | None, progress: ProgressCallback | None = None
 ) -> list[str]:
-    """Write a mesh for each name, or one table of all coordinates, into a new folder; the names of the files.
+    """Write a mesh for each name, or one table of all coordinates, into a new folder; return the names of the files.
 
-    ``mean`` is what the originals are compared with, where there is one. `OutputError` where the folder is not empty, or
-    cannot be written.
+    Original shapes are compared with ``mean``, if given. `OutputError` if the folder is not empty or cannot be written.
     """
-    names, facts = fits.names, _Facts()
+    names, metadata = fits.names, _Metadata()
     values = None if how.values is None else load_values(how.values, fits.template.shape)
     table = None if how.metadata is None else covariates(how.metadata, names, np.full(len(names), np.nan))
 
-    turns: dict[str, Floats | None] = {}
+    rotations: dict[str, Floats | None] = {}
 
-    def stands_like(name: str) -> str:
-        return folder_of(name) if fits.sequence else name  # frames as the first of them
+    def orientation_key(name: str) -> str:
+        return folder_of(name) if fits.sequence else name  # all frames like the first one
 
-    def plain() -> Iterator[tuple[str, Shape]]:
+    def fitted_meshes() -> Iterator[tuple[str, Shape]]:
         for number, name in enumerate(names):
             fit = fits.fit_of(name)
-            facts.add(name, fit)
+            metadata.add(name, fit)
             if how.place == "files":
-                stands = Path(fits.files.get(name, "")).suffix.lower() in gltf.SUFFIXES
-                turns.setdefault(stands_like(name), None if stands else turn_of_fit(fit))
+                is_upright = Path(fits.files.get(name, "")).suffix.lower() in gltf.SUFFIXES
+                rotations.setdefault(orientation_key(name), None if is_upright else turn_of_fit(fit))
             yield name, mesh_of(fit, how.place)
             if progress is not None:
                 progress("exporting", name, (number + 1) / len(names))
 
     def meshes() -> Iterator[tuple[str, Shape]]:
-        return _in_time(plain(), fits, how.cycle) if how.smooth or how.cycle else plain()
+        return _smooth_in_time(fitted_meshes(), fits, how.cycle) if how.smooth or how.cycle else fitted_meshes()
 
-    moves = fits.sequence and how.place == "files" and not how.original
+    is_moving = fits.sequence and how.place == "files" and not how.original
 
     with folder_on_success(output) as folder:
         files = []
@@ -187,37 +186,37 @@ def export(
             each = meshes()
             with load_points(len(names), fits.template.shape.V, lambda number: next(each)[1].verts) as points:
                 own = {"points": points, "faces": np.asarray(fits.template.shape.faces), "names": np.array(names)}
-                if moves:
+                if is_moving:
                     own |= _motions(names, points, own["faces"])
-                np.savez(folder / files[0], allow_pickle=False, **own, **facts.arrays())
+                np.savez(folder / files[0], allow_pickle=False, **own, **metadata.arrays())
         else:
             first: dict[str, Shape] = {}
             for name, shape in meshes():
                 files.append(f"{name}{how.suffix}")
                 make_folder((folder / files[-1]).parent)
                 if how.original:
-                    shape = _original(fits.files.get(name), fits.places_of(name))
-                    arrays = _on_original(fits, name, shape, mean, values)
+                    shape = _read_original(fits.files.get(name), fits.places_of(name))
+                    arrays = _values_on_original(fits, name, shape, mean, values)
                     (write_vtp if how.suffix == ".vtp" else write_vtk)(folder / files[-1], shape, arrays)
-                elif moves and how.suffix in ORIGINALS:
+                elif is_moving and how.suffix in ORIGINALS:
                     began = first.setdefault(folder_of(name), shape).verts
                     (write_vtp if how.suffix == ".vtp" else write_vtk)(
                         folder / files[-1], shape, _motion(shape.verts, began, shape.faces)
                     )
                 else:
-                    save_upright(folder / files[-1], shape, turns.get(stands_like(name)))
+                    save_upright(folder / files[-1], shape, rotations.get(orientation_key(name)))
             if fits.sequence and how.suffix == ".vtp":
                 files += _write_series(folder, names)
             if fits.sequence and how.suffix == ".glb":
                 files += _write_clips(folder, fits, how.cycle)
         if how.suffix in TABLES or table is not None:
             files.append("metadata.csv")
-            facts.write(folder / files[-1], table)
+            metadata.write(folder / files[-1], table)
         return files
 
 
-def _in_time(meshes: Iterator[tuple[str, Shape]], fits: Fits, cycle: bool) -> Iterator[tuple[str, Shape]]:
-    """The frames of each sequence, smoothed in time."""
+def _smooth_in_time(meshes: Iterator[tuple[str, Shape]], fits: Fits, cycle: bool) -> Iterator[tuple[str, Shape]]:
+    """Yield the frames of each sequence, smoothed in time; ``meshes`` are read once, in order."""
     moments = Counter(map(folder_of, fits.times))
     for folder, own in groupby(fits.names, folder_of):
         names = list(own)
@@ -235,19 +234,19 @@ def _in_time(meshes: Iterator[tuple[str, Shape]], fits: Fits, cycle: bool) -> It
 
 
 def _motion(verts: Floats, first: Floats, faces: Int[Ints, "F 3"]) -> dict[str, np.ndarray]:
-    """How a frame has moved since the first one of its sequence."""
+    """Displacement and area strain of a frame since the first one of its sequence."""
     return {"displacement": verts - first, "area_strain": area_strain(verts, first, faces)}
 
 
 def _motions(names: Sequence[str], points: Floats, faces: Int[Ints, "F 3"]) -> dict[str, np.ndarray]:
-    """The same of all frames."""
+    """Displacement and area strain of all frames, stacked."""
     first = {folder_of(name): k for k, name in reversed(list(enumerate(names)))}
     found = [_motion(own, points[first[folder_of(name)]], faces) for name, own in zip(names, points, strict=True)]
     return {title: np.stack([each[title] for each in found]) for title in found[0]}
 
 
-class _Facts:
-    """What is known of each shape that was exported, for a table."""
+class _Metadata:
+    """Properties of the exported shapes, collected for metadata.csv."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
@@ -256,6 +255,7 @@ class _Facts:
         self.verdicts: list[str] = []
 
     def add(self, name: str, fit: Fit) -> None:
+        """Append a shape."""
         points = fit.points * fit.frame.scale
         self.names.append(name)
         self.sizes.append(float(np.linalg.norm(points - points.mean(axis=0))))
@@ -263,21 +263,23 @@ class _Facts:
         self.verdicts.append(fit.verdict)
 
     def arrays(self) -> dict[str, np.ndarray]:
+        """The properties that go into an .npz file."""
         return {"centroid_size": np.array(self.sizes), "mirrored": np.array(self.mirrored)}
 
     def write(self, path: Path, table: Covariates | None) -> None:
-        """A row a shape: what is known, then the cells of the user's table."""
+        """Write a row for each shape: its properties, then the cells of the user's table."""
         own = {"name": self.names, "centroid_size": self.sizes, "mirrored": [int(each) for each in self.mirrored]}
         own["verdict"] = self.verdicts
         if units := mixed_units(self.names, self.sizes):
             warn(units)
         more = {} if table is None else {title: cells for title, cells in table.cells.items() if title not in own}
-        if set(more.get(SIZE, ())) == {"nan"}:  # which a table without it has been given
+        if set(more.get(SIZE, ())) == {"nan"}:  # a placeholder that was filled in because the table has no sizes
             del more[SIZE]
         write_rows(path, [*own, *more], zip(*own.values(), *more.values(), strict=True))
 
 
-def _original(file: str | None, places: Places) -> Shape:
+def _read_original(file: str | None, places: Places) -> Shape:
+    """Read the original shape of a fit; `InputError` if its file has changed or is not known."""
     if file is None:
         raise InputError(f"fits.csv does not say which file {places.name} was", "run `meshmatch fit` again")
     shape = load_shape(file)
@@ -286,18 +288,20 @@ def _original(file: str | None, places: Places) -> Shape:
     return shape
 
 
-def _on_original(
+def _values_on_original(
     fits: Fits, name: str, shape: Shape, mean: Superimposed | None, values: Values | None
 ) -> dict[str, np.ndarray]:
-    """Numbers at the vertices of a shape's file: how far each lies from the mean, in the file's axes and unit; how thick a
-    mesh is; parts of the template; other values of it.
+    """Values at the vertices of an original shape.
+
+    These are the distance and displacement from the mean (in the axes and unit of the file), the thickness of meshes,
+    labels of the template's parts, and the user's values of the template.
     """
     fit, template = fits.fit_of(name), fits.template
     foot = fits.places_of(name).on(template.shape)
     arrays: dict[str, np.ndarray] = {}
     if mean is not None:
         own = fit.points * fit.frame.scale
-        there = mean.poses(own[None]).undo(mean.consensus[None])[0]  # the mean, laid over this shape
+        there = mean.poses(own[None]).undo(mean.consensus[None])[0]  # the mean, aligned with this shape
         moved = own - there
         outwards = np.einsum("vi,vi->v", moved, vertex_normals(there, fit.faces))
         carried = foot.values(fit.faces, np.column_stack([outwards, moved @ fit.frame.rotation]))
@@ -314,7 +318,7 @@ def _on_original(
 
 
 def _write_series(folder: Path, names: Sequence[str]) -> list[str]:
-    """ParaView's list of the frames of each folder, in their order."""
+    """Write a ParaView collection (.pvd) of the frames of each folder; return the names of the files."""
     frames: dict[str, list[str]] = {}
     for name in names:
         frames.setdefault(folder_of(name), []).append(name.rpartition("/")[2])
@@ -329,13 +333,13 @@ def _write_series(folder: Path, names: Sequence[str]) -> list[str]:
 
 
 def _write_clips(folder: Path, fits: Fits, cycle: bool) -> list[str]:
-    """The frames of each folder as one mesh that moves, at their times; of what was written."""
+    """Write the frames of each folder as one animated .glb, made of the files written before; return the names."""
     files, taken, moments = [], set(fits.names), Counter(map(folder_of, fits.times))
     for where, own in groupby(fits.names, folder_of):
         names = list(own)
         if len(names) < 2:
             continue
-        if len(names) * fits.template.shape.V > _MOVING:
+        if len(names) * fits.template.shape.V > _MAX_CLIP_VERTS:
             warn(f"{where or 'the sequence'} is too large for one moving .glb; ParaView plays the frames as .vtp")
             continue
         title = f"{where}/sequence".lstrip("/")
@@ -347,20 +351,20 @@ def _write_clips(folder: Path, fits: Fits, cycle: bool) -> list[str]:
         times = [fits.times[name] for name in names]
         if cycle:
             times.append(times[0] + moments[where])
-        seconds = (np.array(times) - times[0]) / _RATE
+        seconds = (np.array(times) - times[0]) / _FRAME_RATE
         write_morphs(folder / files[-1], replace(first, name=where or "sequence"), targets, seconds)
     return files
 
 
 def _write_table(path: Path, meshes: Iterator[tuple[str, Shape]]) -> None:
-    """A row a shape: its name, then x, y and z of each vertex in turn, as `geomorph::arrayspecs` takes them apart."""
+    """Write a row for each shape: its name, then x, y and z of vertex 0, of vertex 1, ... (for `geomorph::arrayspecs`)."""
     with path.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         for number, (name, shape) in enumerate(meshes):
             if number == 0:
                 rows.writerow(["name", *(f"{axis}{vertex}" for vertex in range(shape.V) for axis in "xyz")])
-            rows.writerow([name, *_plain(shape.verts)])
+            rows.writerow([name, *_format_coordinates(shape.verts)])
 
 
-def _plain(verts: Float[Floats, "V 3"]) -> list[str]:
+def _format_coordinates(verts: Float[Floats, "V 3"]) -> list[str]:
     return [repr(each) for each in verts.ravel().tolist()]

@@ -315,17 +315,19 @@ class _Run:
         for turn in range(max(map(len, chains))):
             numbers = [chain[turn] for chain in chains if turn < len(chain)]
             before = [self._last_fitted(chain[:turn], found) for chain in chains if turn < len(chain)]
-            places = zip(numbers, before, strict=True)
+            pairs = zip(numbers, before, strict=True)
             tasks = []
-            for number, last in places:
+            for number, last in pairs:
                 source = self.sources[number]
                 how = source.name in others, cut.get(source.name)
                 tasks.append(FitTask(self.setting, source, last, folder, *how))
-            for at, result in self._each(fit_alone, tasks, "fitting" if folder == ALONE else "choosing the template"):
-                source = self.sources[numbers[at]]
+            for index, result in self._each(
+                fit_alone, tasks, "fitting" if folder == ALONE else "choosing the template"
+            ):
+                source = self.sources[numbers[index]]
                 if isinstance(result, DeadWorker):
                     result = Record(source.name, source.path, reasons=result.message)
-                found[numbers[at]] = result
+                found[numbers[index]] = result
                 if tell is not None:
                     tell(result)
         return [found[number] for number in range(len(self.sources))]
@@ -394,8 +396,8 @@ class _Run:
     def finish(self, tasks: Mapping[int, FinishTask]) -> Iterator[tuple[int, Finished]]:
         """Place the vertices of every shape; yield (number of the shape, outcome)."""
         numbers = list(tasks)
-        for at, done in self._each(finish, list(tasks.values()), "placing vertices"):
-            yield numbers[at], Finished(done.message) if isinstance(done, DeadWorker) else done
+        for index, done in self._each(finish, list(tasks.values()), "placing vertices"):
+            yield numbers[index], Finished(done.message) if isinstance(done, DeadWorker) else done
 
 
 def _with_outcome(alone: Record, done: Finished) -> Record:

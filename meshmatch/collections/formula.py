@@ -1,7 +1,7 @@
-"""Formulas of linear models, ``shape ~ log(size) + sex * age``: read without evaluating anything.
+"""Parse formulas of linear models such as ``shape ~ log(size) + sex * age``; no code is evaluated.
 
-A term is the name of a column, ``log(name)`` or ``factor(name)``, or up to three of these joined by ``:``, their
-interaction. ``a * b`` is ``a + b + a:b``. A name that is no plain word stands in backticks or double quotes.
+A term is the name of a column, ``log(name)`` or ``factor(name)``, or an interaction of up to three of these, joined by
+``:``. ``a * b`` means ``a + b + a:b``. A name that is not a plain identifier is quoted with backticks or double quotes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from meshmatch.errors import OptionError
 
 Space = Literal["form", "shape"]
 Term: TypeAlias = "tuple[Factor, ...]"
-_LONGEST, _MOST_TERMS, _MOST_FACTORS = 1000, 50, 3
+_MAX_LENGTH, _MAX_TERMS, _MAX_FACTORS = 1000, 50, 3
 _TOKEN = re.compile(r"\s*(?:`([^`]+)`|\"([^\"]+)\"|([^\W\d][\w.]*)|(\S))")
 _FUNCTIONS = "log", "factor"
 _HINT = "such as 'shape ~ log(size) + sex * age': names of columns, log(), factor(), +, : and *"
@@ -24,7 +24,7 @@ _HINT = "such as 'shape ~ log(size) + sex * age': names of columns, log(), facto
 
 @dataclass(frozen=True)
 class Factor:
-    """A column, as it is; its natural logarithm; or its values as categories."""
+    """A column: unchanged, its natural logarithm ("log"), or its values as categories ("factor")."""
 
     column: str
     function: Literal["", "log", "factor"] = ""
@@ -35,7 +35,10 @@ class Factor:
 
 @dataclass(frozen=True)
 class Formula:
-    """What is explained, shapes without or with their sizes ("form"), by which terms: main effects before interactions."""
+    """A parsed formula: the response, "shape" (without size) or "form" (with size), and the terms.
+
+    Main effects come before interactions.
+    """
 
     space: Space
     terms: tuple[Term, ...]
@@ -45,45 +48,45 @@ class Formula:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns, each once."""
+        """Distinct names of the columns, in order."""
         return tuple(dict.fromkeys(factor.column for term in self.terms for factor in term))
 
 
 def term_name(term: Sequence[Factor]) -> str:
-    """As the term is written."""
+    """Format a term as in a formula."""
     return ":".join(map(str, term))
 
 
 def parse(text: str) -> Formula:
-    """The formula in a text; `OptionError` where it is none."""
-    if len(text) > _LONGEST:
-        raise OptionError(f"a formula of {len(text)} letters is too long", f"at most {_LONGEST}")
-    return _Reader(text).formula()
+    """Parse a formula; `OptionError` if it is invalid."""
+    if len(text) > _MAX_LENGTH:
+        raise OptionError(f"a formula of {len(text)} letters is too long", f"at most {_MAX_LENGTH}")
+    return _Parser(text).formula()
 
 
-class _Reader:
-    """Reads a formula from left to right: a sum of products of interactions of factors."""
+class _Parser:
+    """Recursive-descent parser of a formula: a sum of products of interactions of factors."""
 
     def __init__(self, text: str) -> None:
         self._text = text.strip()
         self._tokens = [(quoted or also or word, mark) for quoted, also, word, mark in _TOKEN.findall(text)]
-        self._at = 0
+        self._position = 0
 
     def formula(self) -> Formula:
         space = self._word("begins with 'shape ~' or 'form ~'")
         if space not in get_args(Space) or not self._accept("~"):
-            self._refuse("does not begin with 'shape ~' or 'form ~'")
+            self._fail("does not begin with 'shape ~' or 'form ~'")
         terms: dict[frozenset[Factor], Term] = {}
         while True:
             for term in self._product():
                 terms.setdefault(frozenset(term), term)
             if not self._accept("+"):
                 break
-        if self._at < len(self._tokens):
-            word, mark = self._tokens[self._at]
-            self._refuse(f"has {word or mark!r} where + : * or its end was expected")
-        if len(terms) > _MOST_TERMS:
-            self._refuse(f"has {len(terms)} terms, more than {_MOST_TERMS}")
+        if self._position < len(self._tokens):
+            word, mark = self._tokens[self._position]
+            self._fail(f"has {word or mark!r} where + : * or its end was expected")
+        if len(terms) > _MAX_TERMS:
+            self._fail(f"has {len(terms)} terms, more than {_MAX_TERMS}")
         for term in terms.values():
             missing = [factor for factor in term if frozenset([factor]) not in terms]
             if missing:
@@ -96,12 +99,12 @@ class _Reader:
         parts = [self._interaction()]
         while self._accept("*"):
             parts.append(self._interaction())
-            if len(parts) > _MOST_FACTORS:
-                self._refuse(f"joins more than {_MOST_FACTORS} names")
+            if len(parts) > _MAX_FACTORS:
+                self._fail(f"joins more than {_MAX_FACTORS} names")
         chosen = (some for count in range(1, len(parts) + 1) for some in combinations(parts, count))
         found = [tuple(dict.fromkeys(factor for part in some for factor in part)) for some in chosen]
-        if max(map(len, found)) > _MOST_FACTORS:
-            self._refuse(f"joins more than {_MOST_FACTORS} names")
+        if max(map(len, found)) > _MAX_FACTORS:
+            self._fail(f"joins more than {_MAX_FACTORS} names")
         return found
 
     def _interaction(self) -> Term:
@@ -115,24 +118,24 @@ class _Reader:
         if not self._accept("("):
             return Factor(name)
         if name not in _FUNCTIONS:
-            self._refuse(f"has the function {name!r}, which is none of {', '.join(_FUNCTIONS)}")
+            self._fail(f"has the function {name!r}, which is none of {', '.join(_FUNCTIONS)}")
         found = Factor(self._word(f"has nothing in {name}()"), name)  # type: ignore[arg-type]
         if not self._accept(")"):
-            self._refuse(f"has no ) behind {found.column}")
+            self._fail(f"has no ) behind {found.column}")
         return found
 
     def _word(self, problem: str) -> str:
-        word, mark = self._tokens[self._at] if self._at < len(self._tokens) else ("", "")
+        word, mark = self._tokens[self._position] if self._position < len(self._tokens) else ("", "")
         if not word:
-            self._refuse(f"{problem}, but {mark!r}" if mark else f"{problem}: it ends early")
-        self._at += 1
+            self._fail(f"{problem}, but {mark!r}" if mark else f"{problem}: it ends early")
+        self._position += 1
         return word
 
     def _accept(self, mark: str) -> bool:
-        if self._at < len(self._tokens) and self._tokens[self._at] == ("", mark):
-            self._at += 1
+        if self._position < len(self._tokens) and self._tokens[self._position] == ("", mark):
+            self._position += 1
             return True
         return False
 
-    def _refuse(self, problem: str) -> NoReturn:
+    def _fail(self, problem: str) -> NoReturn:
         raise OptionError(f"the formula '{self._text[:60]}' {problem}", _HINT)

@@ -1,4 +1,4 @@
-"""Maps of many pairs of a collection, written one by one: never more than a few of them are in memory."""
+"""Write maps of many pairs of a collection, with only a few in memory at a time."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.input_files import read_text
 
 Pair = tuple[str, str]
-"""Names of a source and of a target."""
-_SOURCES = 64  # of one task: enough to pay for the target's tree
-_LINE = 400  # bytes of memory for a pair
+"""Names of a source and a target."""
+_SOURCES = 64  # sources per task, enough to amortise the target's search tree
+_PAIR_BYTES = 400  # memory needed per pair
 
 
 @dataclass(frozen=True)
 class MapTask:
-    """Maps of some shapes to one."""
+    """Maps of several sources to one target."""
 
     fits: Store
     output: Store
@@ -34,25 +34,26 @@ class MapTask:
     suffix: str
 
     def file(self, source: str) -> str:
-        """Where a map is written."""
+        """File of the map from a source."""
         return f"{source}/{self.target}{self.suffix}"
 
 
 def load_pairs(path: str | Path) -> list[Pair]:
-    """Names of a source and a target a line, a tab, semicolon, comma or spaces between them; ``#`` begins a comment.
+    """Read pairs of names from a text file, one source and target per line.
 
-    `InputError` if the file is missing, or a line holds anything else.
+    They are separated by a tab, semicolon, comma or spaces; ``#`` starts a comment. `InputError` if the file is missing, or
+    a line is anything else.
     """
     path = as_path(path)
     found = []
     try:
-        lines = read_text(path, _LINE).splitlines()
+        lines = read_text(path, _PAIR_BYTES).splitlines()
     except ValueError as error:
         raise InputError(f"{path.name} is not text", "save it in UTF-8") from error
     for number, line in enumerate(lines, 1):
         text = line.partition("#")[0].strip()
-        mark = next((each for each in "\t;," if each in text), None)
-        words = [word.strip() for word in text.split(mark)]
+        separator = next((each for each in "\t;," if each in text), None)
+        words = [word.strip() for word in text.split(separator)]
         if text and len(words) != 2:
             hint = "each line names a source and a target; put a comma between names that contain spaces"
             raise InputError(f"{path.name}, line {number}: not two names", hint)
@@ -63,10 +64,10 @@ def load_pairs(path: str | Path) -> list[Pair]:
     return found
 
 
-def map_some(task: MapTask) -> int:
-    """Write maps to one shape; how many there are. Those that are as new as the fits are kept."""
+def write_maps(task: MapTask) -> int:
+    """Write the maps of a task, except those that are newer than the fits; return their number, kept ones included."""
     for source in task.sources:
-        if not _is_new(task, source):
+        if not _is_up_to_date(task, source):
             found = map_of_placed(read_finished_fit(task.fits, source), read_finished_fit(task.fits, task.target))
             with task.output.writing(task.file(source)) as path:
                 save_map(path, found)
@@ -81,7 +82,7 @@ def map_all(
     workers: Workers,
     progress: ProgressCallback | None = None,
 ) -> int:
-    """Maps of pairs of fits; see `Collection.save_maps`."""
+    """Write maps of pairs of fits and return their number; see `Collection.save_maps`."""
     sources: dict[str, list[str]] = defaultdict(list)
     for source, target in pairs:
         sources[target].append(source)
@@ -91,7 +92,7 @@ def map_all(
         for first in range(0, len(group), _SOURCES)
     ]
     done = 0
-    for _, result in workers.each(map_some, tasks):
+    for _, result in workers.each(write_maps, tasks):
         if isinstance(result, DeadWorker):
             raise result
         done += result
@@ -100,8 +101,8 @@ def map_all(
     return done
 
 
-def _is_new(task: MapTask, source: str) -> bool:
-    """Whether a map here was written after both fits, as far as files here tell."""
+def _is_up_to_date(task: MapTask, source: str) -> bool:
+    """Whether a map was written after both fits; False if any of the files is remote."""
     if task.fits.remote or task.output.remote:
         return False
     path = Path(task.output.location, task.file(source))

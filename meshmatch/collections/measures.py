@@ -1,8 +1,8 @@
-"""How good an atlas is: compactness, generalisation and specificity, by its number of modes.
+"""Quality of an atlas by its number of modes: compactness, generalisation and specificity.
 
 Source: Davies, Learning shape: optimal models for analysing natural variability (2002). Distances between corresponding
-points praise wrong correspondences: what is wrong in the same way in all shapes looks like the truth. Distances to
-surfaces do not know correspondences, and so are given beside them.
+points favor consistently wrong correspondences, as errors that all shapes share go unnoticed. Distances between surfaces,
+which do not depend on correspondences, are therefore given as well.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from meshmatch.arrays import Brief, Float, Floats, Int, Ints
 from meshmatch.collections.atlas import Atlas
-from meshmatch.collections.modes import inner_products, principal, rounding, weighted_sums
+from meshmatch.collections.modes import inner_products, principal_components, rounding_variance, weighted_sums
 from meshmatch.collections.superimpose import Shapes, Superimposed
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.mapped_mesh import MappedMesh
@@ -23,15 +23,15 @@ from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.shape import Shape
 
 COUNTS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
-"""Numbers of modes that are measured, as far as there are so many, and the largest that can be."""
-FOLDS = 100
-"""Of more shapes than these, several are left out at a time."""
-MOST_SHAPES = 1000
-"""Of a larger collection so many random shapes are measured, as if they were all."""
-_POINTS = 300  # of a surface whose distance to the other one is measured
-_KEPT = 100  # surfaces in memory
-_LONGER = 0.6  # of the time, for generalisation
-_NEAREST = 2  # shapes of the collection, by their points, to which a random shape's distance is measured
+"""Numbers of modes to measure, in addition to the largest possible one."""
+MAX_FOLDS = 100
+"""Largest number of folds: with more shapes than this, several are left out at a time."""
+MAX_SHAPES = 1000
+"""Largest number of shapes to measure; of a larger collection, a random sample of this size stands for all."""
+_POINTS = 300  # points per surface from which distances to another surface are measured
+_MAX_CACHED = 100  # surfaces in memory
+_GENERALISATION_TIME = 0.6  # share of the run time, for progress
+_NEAREST = 2  # shapes nearest by points to a random shape, to which its surface distance is measured
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -41,15 +41,15 @@ class Measures(Brief):
     Attributes
     ----------
     counts : (K,) numbers of modes
-    compactness : (K,) share of the variance that so many modes explain
-    generalisation : (K,) distance of a shape that the modes do not know from what they make of it, between points
+    compactness : (K,) share of the variance that these modes explain
+    generalisation : (K,) distance of a left-out shape from its reconstruction by the modes, between corresponding points
     generalisation_error : (K,) its standard error, over the shapes
-    generalisation_surface : (K,) the same between surfaces, both ways
-    specificity : (K,) distance of a random shape from the nearest shape of the collection, between points
+    generalisation_surface : (K,) the same distance between surfaces, the mean of both directions
+    specificity : (K,) distance of a random shape from the nearest shape of the collection, between corresponding points
     specificity_error : (K,) its standard error, over the random shapes
-    specificity_surface : (K,) the same between surfaces, both ways
-    samples, seed : how many random shapes, and with which random numbers
-    left_out : how many shapes are left out at a time: 1 but for large collections
+    specificity_surface : (K,) the same distance between surfaces, the mean of both directions
+    samples, seed : number of random shapes, and their random seed
+    left_out : number of shapes left out at a time: 1 except for large collections
     """
 
     counts: Int[Ints, " K"]
@@ -74,37 +74,37 @@ def measure_atlas(
     seed: int = 0,
     progress: ProgressCallback | None = None,
 ) -> Measures:
-    """Measure an atlas on the shapes that it was made of: compactness, generalisation and specificity.
+    """Measure compactness, generalisation and specificity of an atlas, on the shapes that it was built from.
 
-    Of more than 1,000 shapes so many are measured. They are left out one at a time, or of more than 100 in 100 parts;
-    the mean and the modes are made of the others, and the shape is laid over that mean. Between surfaces a random shape
-    is compared with the two nearest by points.
+    Of more than 1,000 shapes, a random 1,000 are measured. Each is left out in turn, or one of 100 folds if there are more
+    than 100 shapes; the mean and the modes are computed from the others, and the shape is aligned with that mean. The
+    surface of a random shape is compared with those of the two shapes that are nearest by points.
 
     Parameters
     ----------
     atlas
         The atlas.
     points
-        (S, V, 3) the shapes that it was made of.
+        (S, V, 3) vertices of the shapes that it was built from.
     surfaces
-        The shapes themselves, each in the frame of its points, to compare with these rather than with the registered
-        template.
+        The original shapes, each in the frame of its points, to measure surface distances to; by default the registered
+        shapes.
     samples
-        Random shapes with normal scores.
+        Number of random shapes, whose scores are drawn from a normal distribution.
     seed
-        Of the random shapes.
+        Random seed.
     progress
         As in `match`.
 
     Returns
     -------
     Measures
-        For each number of modes.
+        The measures for each number of modes.
 
     Raises
     ------
     InputError
-        The shapes are not those of the atlas, or fewer than four: a model of what is left needs three.
+        The shapes are not those of the atlas, or fewer than four.
     OptionError
         Fewer than two random shapes.
 
@@ -119,32 +119,32 @@ def measure_atlas(
         raise InputError(f"the atlas is of {len(atlas.names)} shapes, not of {S}", "give those that it was made of")
     if samples < 2:
         raise OptionError(f"specificity needs two random shapes or more, not {samples}", "50 are usual")
-    if S > MOST_SHAPES:
-        some = np.sort(np.random.default_rng(seed).permutation(S)[:MOST_SHAPES]).tolist()
+    if S > MAX_SHAPES:
+        some = np.sort(np.random.default_rng(seed).permutation(S)[:MAX_SHAPES]).tolist()
         atlas = replace(atlas, names=tuple(atlas.names[k] for k in some), scores=atlas.scores[some])
         points = [points[k] for k in some]
         surfaces = None if surfaces is None else [surfaces[k] for k in some]
-        S = MOST_SHAPES
+        S = MAX_SHAPES
     if S < 4:
         raise InputError(f"the measures of an atlas need four shapes or more, not {S}")
-    folds = np.array_split(np.random.default_rng(seed).permutation(S), min(S, FOLDS))
+    folds = np.array_split(np.random.default_rng(seed).permutation(S), min(S, MAX_FOLDS))
     most = min(len(atlas.modes), S - 1 - len(folds[0]))
     counts = np.array(sorted({*(count for count in COUNTS if count <= most), min(most, COUNTS[-1])}), np.int64)
     collection = _Collection(atlas, points, surfaces, seed)
 
-    def told(done: float) -> None:
+    def report(done: float) -> None:
         if progress is not None:
             progress("measures", "atlas", done)
 
     general = np.empty((2, S, len(counts)))
     for number, out in enumerate(folds):
         general[:, out] = collection.generalisation(out, counts)
-        told(_LONGER * (number + 1) / len(folds))
+        report(_GENERALISATION_TIME * (number + 1) / len(folds))
     special = np.empty((2, samples, len(counts)))
     draws = np.random.default_rng(seed).standard_normal((samples, len(atlas.modes)))
     for number, draw in enumerate(draws):
         special[:, number] = collection.specificity(draw, counts)
-        told(_LONGER + (1 - _LONGER) * (number + 1) / samples)
+        report(_GENERALISATION_TIME + (1 - _GENERALISATION_TIME) * (number + 1) / samples)
     means = [found.mean(axis=0) for found in (*general, *special)]
     errors = [found.std(axis=0, ddof=1) / np.sqrt(len(found)) for found in (general[0], special[0])]
     return Measures(
@@ -154,8 +154,8 @@ def measure_atlas(
 
 
 @dataclass(frozen=True, eq=False)
-class _Real:
-    """A shape's surface, some points on it, and the share of the surface around each."""
+class _Surface:
+    """The surface of an aligned shape, some of its vertices, and the share of the surface around each."""
 
     surface: MappedMesh
     points: Float[Floats, "N 3"]
@@ -163,71 +163,87 @@ class _Real:
 
 
 class _Collection:
-    """An atlas, with the shapes that it was made of."""
+    """An atlas with the shapes that it was built from, and their inner products."""
 
     def __init__(self, atlas: Atlas, points: Shapes, surfaces: Sequence[Shape] | None, seed: int) -> None:
         self._atlas, self._shapes, self._surfaces = atlas, points, surfaces
         self._products = inner_products(points, atlas.laid)
         rows = np.random.default_rng(seed).permutation(len(atlas.mean))[:_POINTS]
-        self._known = lru_cache(maxsize=_KEPT)(lambda row: self._real(row, atlas.laid))
-        self._rows, self._share = rows, atlas.weights[rows] / atlas.weights[rows].sum()
+        self._cached_surface = lru_cache(maxsize=_MAX_CACHED)(lambda row: self._surface_of(row, atlas.laid))
+        self._sample_rows, self._sample_weights = rows, atlas.weights[rows] / atlas.weights[rows].sum()
 
     def generalisation(self, out: Int[Ints, " B"], counts: Int[Ints, " K"]) -> Float[Floats, "2 B K"]:
-        """How far shapes are from what a model of all others makes of them, between points and between surfaces."""
+        """Distances of left-out shapes from their reconstructions, between points (row 0) and surfaces (row 1).
+
+        ``out`` are the rows of the shapes to leave out; the model is built from all others.
+        """
         atlas, S = self._atlas, len(self._shapes)
-        kept = np.setdiff1d(np.arange(S), out)
-        found = principal(self._products[np.ix_(kept, kept)], int(counts[-1]), atlas.robust, rounding(atlas.laid))
+        remaining = np.setdiff1d(np.arange(S), out)
+        found = principal_components(
+            self._products[np.ix_(remaining, remaining)], int(counts[-1]), atlas.robust, rounding_variance(atlas.laid)
+        )
         shares = np.zeros((1 + len(found.modes), S))
-        shares[:, kept] = np.concatenate([found.center[None], found.modes])
+        shares[:, remaining] = np.concatenate([found.center[None], found.modes])
         sums = weighted_sums(self._shapes, atlas.laid, shares)
-        laid = replace(atlas.laid, consensus=atlas.mean + sums[0])
-        apart = np.empty((2, len(out), len(counts)))
+        alignment = replace(atlas.laid, consensus=atlas.mean + sums[0])
+        distances = np.empty((2, len(out), len(counts)))
         for number, row in enumerate(out.tolist()):
-            known, real = self._laid(row, laid), self._real(row, laid)
-            scores = np.einsum("mvi,v,vi->m", sums[1:], atlas.weights, known - laid.consensus, optimize=True)
+            known, real = self._aligned(row, alignment), self._surface_of(row, alignment)
+            scores = np.einsum("mvi,v,vi->m", sums[1:], atlas.weights, known - alignment.consensus, optimize=True)
             for column, count in enumerate(counts.tolist()):
-                made = laid.consensus + np.tensordot(scores[:count], sums[1 : 1 + count], 1)
-                apart[:, number, column] = self._apart(made, known), self._between_surfaces(made, real)
-        return apart
+                reconstruction = alignment.consensus + np.tensordot(scores[:count], sums[1 : 1 + count], 1)
+                distances[:, number, column] = (
+                    self._point_distance(reconstruction, known),
+                    self._surface_distance(reconstruction, real),
+                )
+        return distances
 
     def specificity(self, draw: Float[Floats, " M"], counts: Int[Ints, " K"]) -> Float[Floats, "2 K"]:
-        """How far the shapes of random scores are from the nearest shape, between points and between surfaces."""
+        """Distances of a random shape from the nearest shape, between points (row 0) and surfaces (row 1).
+
+        ``draw`` are its scores, of which the first 1, 2, ... are used.
+        """
         atlas = self._atlas
         own = atlas.scores * atlas.deviations
-        apart = np.empty((2, len(counts)))
+        distances = np.empty((2, len(counts)))
         for column, count in enumerate(counts.tolist()):
-            made = atlas.mean + atlas.offsets(draw[None, :count])[0]
-            # Squared distances over the surface: along these modes, and across.
+            reconstruction = atlas.mean + atlas.offsets(draw[None, :count])[0]
+            # Squared distances over the surface: within the span of these modes, and orthogonal to it.
             along = np.square(own[:, :count] - draw[:count] * atlas.deviations[:count]).sum(axis=1)
             squared = along + np.diag(self._products) - np.square(own[:, :count]).sum(axis=1)
             near = np.argsort(squared)[: 2 * _NEAREST].tolist()
-            own_points = [self._apart(made, self._laid(row, atlas.laid)) for row in near]
-            apart[0, column] = min(own_points)
+            own_points = [self._point_distance(reconstruction, self._aligned(row, atlas.laid)) for row in near]
+            distances[0, column] = min(own_points)
             best = [near[k] for k in np.argsort(own_points)[:_NEAREST]]
-            apart[1, column] = min(self._between_surfaces(made, self._known(row)) for row in best)
-        return apart
+            distances[1, column] = min(
+                self._surface_distance(reconstruction, self._cached_surface(row)) for row in best
+            )
+        return distances
 
-    def _laid(self, row: int, laid: Superimposed) -> Floats:
-        """The points of a shape laid over the others."""
-        return np.asarray(laid.align(np.asarray(self._shapes[row], np.float64)[None])[0])
+    def _aligned(self, row: int, alignment: Superimposed) -> Floats:
+        """The aligned vertices of a shape."""
+        return np.asarray(alignment.align(np.asarray(self._shapes[row], np.float64)[None])[0])
 
-    def _real(self, row: int, laid: Superimposed) -> _Real:
-        """The surface of a shape laid over the others."""
+    def _surface_of(self, row: int, alignment: Superimposed) -> _Surface:
+        """The aligned surface of a shape: of the original one if there are originals."""
         if self._surfaces is None:
-            known = self._laid(row, laid)
-            return _Real(MappedMesh.of(Shape(known, self._atlas.faces)), known[self._rows], self._share)
-        poses = laid.poses(np.asarray(self._shapes[row], np.float64)[None])
+            known = self._aligned(row, alignment)
+            return _Surface(
+                MappedMesh.of(Shape(known, self._atlas.faces)), known[self._sample_rows], self._sample_weights
+            )
+        poses = alignment.poses(np.asarray(self._shapes[row], np.float64)[None])
         own = self._surfaces[row]
         shape = Shape(poses.apply(own.verts[None])[0], own.faces)
         rows = np.linspace(0, shape.V - 1, min(shape.V, _POINTS)).astype(np.int64)
         share = shape.vertex_areas[rows] / shape.vertex_areas[rows].sum()
-        return _Real(MappedMesh.of(shape), shape.verts[rows], share)
+        return _Surface(MappedMesh.of(shape), shape.verts[rows], share)
 
-    def _apart(self, made: Floats, known: Floats) -> float:
-        return float(self._atlas.weights @ np.linalg.norm(made - known, axis=1))
+    def _point_distance(self, reconstruction: Floats, known: Floats) -> float:
+        """Mean distance between corresponding points, over the surface."""
+        return float(self._atlas.weights @ np.linalg.norm(reconstruction - known, axis=1))
 
-    def _between_surfaces(self, made: Floats, real: _Real) -> float:
-        """Mean distance of some points of each from the other's surface, the mean of both ways."""
-        there = real.surface.query(made[self._rows]).distance @ self._share
-        back = MappedMesh.of(Shape(made, self._atlas.faces)).query(real.points).distance @ real.share
+    def _surface_distance(self, reconstruction: Floats, real: _Surface) -> float:
+        """Mean distance of points of each surface from the other, averaged over both directions."""
+        there = real.surface.query(reconstruction[self._sample_rows]).distance @ self._sample_weights
+        back = MappedMesh.of(Shape(reconstruction, self._atlas.faces)).query(real.points).distance @ real.share
         return float(there + back) / 2

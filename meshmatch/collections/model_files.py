@@ -1,13 +1,13 @@
-"""What the folder of an atlas holds of a linear model, and of asymmetry.
+"""Write the results of linear models and of asymmetry into the folder of an atlas.
 
 =============  ===================================================================================================
-anova.csv      a line for each term, what is left, and all: df, SS, MS, R2, F, Z, p, and p anywhere
-effects.csv    a line for each vertex: displacement by each coefficient; F and p-values of each term
+anova.csv      a row for each term, the residuals and the total: df, SS, MS, R2, F, Z, p, and p anywhere
+effects.csv    a row for each vertex: displacement by each coefficient; F and p-values of each term
 effects.vtp    the same on the mean, for ParaView and 3D Slicer
-allometry.csv  a line for each shape: size, scores that go with it, group
-asymmetry.csv  a line for each individual: how far its sides differ, and without what all have in common
+allometry.csv  a row for each shape: size, allometry scores, group
+asymmetry.csv  a row for each individual: difference between its sides, and the same less the mean difference
 asymmetry.vtp  directional and fluctuating asymmetry on the mean, and errors of measurement
-symmetry.csv   individuals, sides, fluctuating asymmetry, and errors of measurement, as in anova.csv
+symmetry.csv   effects of individuals and sides, fluctuating asymmetry and errors of measurement, as in anova.csv
 =============  ===================================================================================================
 """
 
@@ -28,12 +28,12 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import write_rows
 
 LEVEL = 0.05
-"""At which a difference is shown as one."""
+"""Significance level."""
 _HEADER = "term", "df", "SS", "MS", "R2", "F", "Z", "p", "p_anywhere"
 
 
 def write_model(folder: Path, mean: Shape, found: Explained) -> None:
-    """Write the tables of a model into a folder."""
+    """Write the tables and maps of a linear model into a folder."""
     write_rows(folder / "anova.csv", _HEADER, _lines(model_record(found)))
     arrays = _arrays(found.table.effects)
     write_vtp(folder / "effects.vtp", mean, arrays)
@@ -47,7 +47,7 @@ def write_model(folder: Path, mean: Shape, found: Explained) -> None:
 
 
 def write_asymmetry(folder: Path, mean: Shape, found: Asymmetry) -> None:
-    """Write the tables of asymmetry into a folder."""
+    """Write the tables and the map of asymmetry into a folder."""
     write_rows(folder / "symmetry.csv", _HEADER, _lines(asymmetry_record(found)))
     rows = zip(found.names, short(found.total_of), short(found.fluctuating_of), strict=True)
     write_rows(folder / "asymmetry.csv", ["name", "asymmetry", "fluctuating"], rows)
@@ -56,7 +56,7 @@ def write_asymmetry(folder: Path, mean: Shape, found: Asymmetry) -> None:
 
 
 def _arrays(effects: Sequence[Effect]) -> dict[str, np.ndarray]:
-    """Values of vertices, by names that a terminal may show."""
+    """Values of the vertices by name; control characters in names are replaced."""
     arrays: dict[str, np.ndarray] = {}
     for effect in effects:
         for name, change, along in zip(effect.coefficients, effect.change, effect.along_normal, strict=True):
@@ -78,7 +78,7 @@ def _write_allometry(path: Path, found: Explained, about: Allometry) -> None:
 
 
 def model_record(found: Explained) -> dict[str, Any]:
-    """A model and its table, for JSON; what was not tested is None."""
+    """A linear model and its table, as JSON values; None for what was not tested."""
     return {
         "formula": found.formula,
         "shapes": len(found.names),
@@ -91,7 +91,7 @@ def model_record(found: Explained) -> dict[str, Any]:
 
 
 def asymmetry_record(found: Asymmetry) -> dict[str, Any]:
-    """Asymmetry and its table, for JSON."""
+    """Asymmetry and its table, as JSON values."""
     told = {
         "matching": found.matching,
         "of_mean": short(found.of_mean),
@@ -131,7 +131,7 @@ def _lines(record: dict[str, Any]) -> list[list[Any]]:
 
 
 def anova_rows(record: dict[str, Any]) -> list[list[str]]:
-    """The table of a model as text, with the number of vertices where a term is found."""
+    """The table of a model as text, with the number of vertices at which each term is significant."""
     titles = [*_HEADER[:-1], "p anywhere", f"vertices p <= {LEVEL:g}", f"FDR <= {LEVEL:g}"]
     numbers = [[cell if isinstance(cell, str) else f"{cell:.4g}" for cell in line] for line in _lines(record)]
     counts = [[str(term.get(name, "")) for name in ("vertices_corrected", "vertices_fdr")] for term in record["terms"]]
@@ -139,7 +139,7 @@ def anova_rows(record: dict[str, Any]) -> list[list[str]]:
 
 
 def short(values: Any) -> Any:
-    """Numbers of six digits, as JSON has them."""
+    """Round floats to six significant digits and convert arrays to lists, for JSON."""
     if isinstance(values, np.ndarray):
         return [short(value) for value in values.tolist()]
     return float(f"{values:.6g}") if isinstance(values, float) else values

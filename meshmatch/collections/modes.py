@@ -1,10 +1,10 @@
-"""Modes of variation of shapes that lie over one another.
+"""Principal components (modes of variation) of superimposed shapes.
 
-Of some thousands, from their inner products alone; of more, by a random sketch, for which the shapes are read a few times
-and a matrix of all inner products, which grows with their square, is never made.
+For up to 3,000 shapes they are computed from the S x S matrix of inner products; for more, by a randomised SVD, which
+reads all shapes several times but does not need that matrix.
 
 Sources: Cootes et al., Active shape models, CVIU 61 (1995). With outliers: spherical principal components, Locantore et
-al., Robust principal component analysis for functional data, Test 8 (1999). The sketch: Halko et al., Finding structure
+al., Robust principal component analysis for functional data, Test 8 (1999). Randomised SVD: Halko et al., Finding structure
 with randomness, SIAM Review 53 (2011), algorithm 4.4.
 """
 
@@ -16,22 +16,22 @@ from typing import TypeVar
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.collections.superimpose import Shapes, Superimposed, blocks
+from meshmatch.collections.superimpose import Shapes, Superimposed, iter_blocks
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import squared_lengths
 
-_SMALLEST = 1e-12  # of the largest variance: less is rounding
-_ROUNDING = 1e-24  # of the squared size: a smaller variance is rounding
-_MAD = 1.482602218505602  # of a normal distribution, its deviation by its median absolute deviation
-_ROUNDS = 500
+_MIN_SHARE = 1e-12  # variances below this share of the largest are rounding
+_ROUNDING = 1e-24  # variances below this share of the squared size are rounding
+_MAD_TO_SD = 1.482602218505602  # standard deviation over median absolute deviation, of a normal distribution
+_MAX_ROUNDS = 500
 Found = TypeVar("Found", "Components", "Principal")
-_SKETCHED = 3000  # shapes; of more the modes are found by a sketch
-_SPARE, _PASSES = 20, 4  # directions beside those that are asked for, and how often all shapes are read
+_MAX_EXACT = 3000  # shapes; for more, the modes are computed by randomised SVD
+_OVERSAMPLING, _PASSES = 20, 4  # directions in addition to the requested ones; subspace iterations
 
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """Center and modes of S shapes, see `Atlas` for their arrays; the center is an offset from the consensus."""
+    """Center and modes of S shapes, as in `Atlas`; the center is an offset from the consensus."""
 
     center: Float[Floats, "V 3"]
     modes: Float[Floats, "M V 3"]
@@ -40,67 +40,72 @@ class Components:
     total: float
 
 
-def components(shapes: Shapes, laid: Superimposed, most: int, robust: bool = False) -> Components:
-    """Center and modes of aligned shapes; `InputError` where they are all the same."""
-    if len(shapes) > _SKETCHED:
-        return _sketched(shapes, laid, most, robust)
-    products = inner_products(shapes, laid)
-    found = _some(principal(products, most, robust, rounding(laid)), robust)
-    sums = weighted_sums(shapes, laid, np.concatenate([found.center[None], found.modes]))
-    moved = products - found.center @ products
-    scores = moved @ found.modes.T / found.deviations
+def compute_modes(shapes: Shapes, alignment: Superimposed, most: int, robust: bool = False) -> Components:
+    """Compute the center and at most ``most`` modes of shapes; `InputError` if they are all the same."""
+    if len(shapes) > _MAX_EXACT:
+        return _compute_by_sketch(shapes, alignment, most, robust)
+    products = inner_products(shapes, alignment)
+    found = _checked(principal_components(products, most, robust, rounding_variance(alignment)), robust)
+    sums = weighted_sums(shapes, alignment, np.concatenate([found.center[None], found.modes]))
+    centered = products - found.center @ products
+    scores = centered @ found.modes.T / found.deviations
     return Components(sums[0], sums[1:], found.deviations, scores, found.total)
 
 
-def rounding(laid: Superimposed) -> float:
-    """Variance below which shapes differ by rounding alone."""
-    return _ROUNDING * float(laid.weights @ squared_lengths(laid.consensus))
+def rounding_variance(alignment: Superimposed) -> float:
+    """Variance below which shapes differ only by rounding."""
+    return _ROUNDING * float(alignment.weights @ squared_lengths(alignment.consensus))
 
 
-def _some(found: Found, robust: bool) -> Found:
-    """What was found, if there are modes (`InputError`)."""
+def _checked(found: Found, robust: bool) -> Found:
+    """Return the components if there are any, else raise `InputError`."""
     if not len(found.deviations):
         what = "most of the shapes do not differ" if robust else "the shapes do not differ"
         raise InputError(what, "leave out --robust" if robust else "an atlas is made of different shapes")
     return found
 
 
-def _sketched(shapes: Shapes, laid: Superimposed, most: int, robust: bool) -> Components:
-    """The consensus is the center here: it is the mean, or the spatial median, up to rounding."""
-    S, N, least = len(shapes), laid.consensus.size, rounding(laid)
+def _compute_by_sketch(shapes: Shapes, alignment: Superimposed, most: int, robust: bool) -> Components:
+    """Compute modes by randomised SVD.
+
+    The consensus serves as the center: up to rounding it is the mean, or the spatial median if ``robust``.
+    """
+    S, N, least = len(shapes), alignment.consensus.size, rounding_variance(alignment)
     shrink = np.ones(S)
     power = 0.0
-    for rows, points in blocks(shapes):
-        squared = squared_lengths(_weighted(points, laid))
+    for rows, points in iter_blocks(shapes):
+        squared = squared_lengths(_weighted(points, alignment))
         power += float(squared.sum())
         if robust:
             shrink[rows] = np.where(squared > least, 1 / np.sqrt(np.maximum(squared, least)), 0)
-    width = min(most + _SPARE, N, S)
+    width = min(most + _OVERSAMPLING, N, S)
     sides = np.random.default_rng(0).standard_normal((N, width))
     for _ in range(_PASSES):
         image = np.zeros((N, width))
-        for rows, points in blocks(shapes):
-            part = shrink[rows, None] * _weighted(points, laid)
+        for rows, points in iter_blocks(shapes):
+            part = shrink[rows, None] * _weighted(points, alignment)
             image += part.T @ (part @ sides)
         sides = np.linalg.qr(image)[0]
-    raw = np.concatenate([_weighted(points, laid) @ sides for _, points in blocks(shapes)])
+    raw = np.concatenate([_weighted(points, alignment) @ sides for _, points in iter_blocks(shapes)])
     _, sizes, turn = np.linalg.svd(shrink[:, None] * raw, full_matrices=False)
-    turn = turn[np.square(sizes) > _SMALLEST * np.square(sizes[0])]
+    turn = turn[np.square(sizes) > _MIN_SHARE * np.square(sizes[0])]
     raw = raw @ turn.T
     deviations, order = _ordered(raw, robust, least)
     total = float(np.square(deviations).sum()) if robust else power / (S - 1)
     order = order[:most]
-    modes = (sides @ turn[order].T).T.reshape(len(order), *laid.consensus.shape) / np.sqrt(laid.weights)[:, None]
+    modes = (sides @ turn[order].T).T.reshape(len(order), *alignment.consensus.shape) / np.sqrt(alignment.weights)[
+        :, None
+    ]
     scores = raw[:, order] / deviations[order]
-    return _some(Components(np.zeros_like(laid.consensus), modes, deviations[order], scores, total), robust)
+    return _checked(Components(np.zeros_like(alignment.consensus), modes, deviations[order], scores, total), robust)
 
 
 @dataclass(frozen=True, eq=False)
 class Principal:
-    """Center and modes as sums of S shapes, each less the consensus: ``center`` (S,) and ``modes`` (M, S) are the shares.
+    """Center and modes as linear combinations of S shapes, each less the consensus.
 
-    ``deviations`` (M,) are those of the scores along the modes, in the unit of the shapes, the largest first; ``total`` is
-    the variance along all modes, also those that were not asked for.
+    ``center`` (S,) and ``modes`` (M, S) are the coefficients. ``deviations`` (M,) are the standard deviations along the
+    modes, in the unit of the shapes, the largest first; ``total`` is the variance along all modes, kept or not.
     """
 
     center: Float[Floats, " S"]
@@ -109,52 +114,55 @@ class Principal:
     total: float
 
 
-def inner_products(shapes: Shapes, laid: Superimposed) -> Float[Floats, "S S"]:
-    """Of aligned shapes, each less the consensus: mean products over the surface, in squared units of the shapes."""
+def inner_products(shapes: Shapes, alignment: Superimposed) -> Float[Floats, "S S"]:
+    """Inner products of aligned shapes, each less the consensus: means over the surface, in squared units of the shapes."""
     count = len(shapes)
     found = np.empty((count, count))
-    for rows, points in blocks(shapes):
-        own = _weighted(points, laid)
-        for columns, others in blocks(shapes):
+    for rows, points in iter_blocks(shapes):
+        own = _weighted(points, alignment)
+        for columns, others in iter_blocks(shapes):
             if columns.start < rows.start:
                 continue
-            found[rows, columns] = own @ (own if columns == rows else _weighted(others, laid)).T
+            found[rows, columns] = own @ (own if columns == rows else _weighted(others, alignment)).T
             found[columns, rows] = found[rows, columns].T
     return found
 
 
-def _weighted(points: Float[Floats, "B V 3"], laid: Superimposed) -> Float[Floats, "B N"]:
-    offset = (laid.align(points) - laid.consensus) * np.sqrt(laid.weights)[:, None]
+def _weighted(points: Float[Floats, "B V 3"], alignment: Superimposed) -> Float[Floats, "B N"]:
+    """Offsets of shapes from the consensus, times the square roots of the weights, with N = 3 V."""
+    offset = (alignment.align(points) - alignment.consensus) * np.sqrt(alignment.weights)[:, None]
     return offset.reshape(len(points), -1)
 
 
-def weighted_sums(shapes: Shapes, laid: Superimposed, shares: Float[Floats, "M S"]) -> Float[Floats, "M V 3"]:
-    """Sums of aligned shapes, each less the consensus."""
-    total = np.zeros((len(shares), *laid.consensus.shape))
-    for rows, points in blocks(shapes):
-        total += np.tensordot(shares[:, rows], laid.align(points) - laid.consensus, 1)
+def weighted_sums(shapes: Shapes, alignment: Superimposed, shares: Float[Floats, "M S"]) -> Float[Floats, "M V 3"]:
+    """Linear combinations of aligned shapes, each less the consensus."""
+    total = np.zeros((len(shares), *alignment.consensus.shape))
+    for rows, points in iter_blocks(shapes):
+        total += np.tensordot(shares[:, rows], alignment.align(points) - alignment.consensus, 1)
     return total
 
 
-def principal(products: Float[Floats, "S S"], most: int, robust: bool = False, least: float = 0.0) -> Principal:
-    """The modes of shapes with these inner products: at most ``most``, those along which they vary the most, none with a
-    variance of ``least`` or less.
+def principal_components(
+    products: Float[Floats, "S S"], most: int, robust: bool = False, least: float = 0.0
+) -> Principal:
+    """Compute at most ``most`` modes from inner products of shapes, those of the largest variance.
 
-    ``robust``: the center is the spatial median, the modes are those of the directions in which the shapes lie from there
-    (every shape counts the same, however far away), and deviations are median absolute ones, as of a normal
-    distribution. Modes along which most shapes do not differ at all are then left out.
+    Modes with a variance of ``least`` or less are dropped. ``robust``: the center is the spatial median, and the modes are
+    spherical principal components: those of the directions from the center, so that distant shapes count no more than
+    others. Standard deviations are then estimated from median absolute deviations, and modes along which most shapes
+    do not differ are dropped.
     """
     S = len(products)
     center = _spatial_median(products) if robust else np.full(S, 1 / S)
-    moved = products - center @ products
-    moved = moved - (moved @ center)[:, None]  # products of shapes less their center
-    apart = np.sqrt(np.maximum(np.diag(moved), 0))
-    near = apart > 1e-9 * apart.max()
-    shrink = np.where(near, 1 / np.where(near, apart, 1), 0) if robust else np.ones(S)
-    sizes, sides = np.linalg.eigh(shrink[:, None] * moved * shrink)
-    kept = np.flatnonzero(sizes > _SMALLEST * sizes[-1])[::-1]
+    centered = products - center @ products
+    centered = centered - (centered @ center)[:, None]  # products of shapes less their center
+    distances = np.sqrt(np.maximum(np.diag(centered), 0))
+    near = distances > 1e-9 * distances.max()
+    shrink = np.where(near, 1 / np.where(near, distances, 1), 0) if robust else np.ones(S)
+    sizes, sides = np.linalg.eigh(shrink[:, None] * centered * shrink)
+    kept = np.flatnonzero(sizes > _MIN_SHARE * sizes[-1])[::-1]
     shares = (sides[:, kept] * shrink[:, None] / np.sqrt(sizes[kept])).T
-    scores = moved @ shares.T
+    scores = centered @ shares.T
     deviations, order = _ordered(scores, robust, least)
     total = float(np.square(deviations).sum())
     order = order[:most]
@@ -163,23 +171,23 @@ def principal(products: Float[Floats, "S S"], most: int, robust: bool = False, l
 
 
 def _ordered(scores: Float[Floats, "S M"], robust: bool, least: float) -> tuple[Float[Floats, " M"], Int[Ints, " K"]]:
-    """Deviations of scores along modes, and which modes there are, the largest first."""
+    """Standard deviations of scores along all modes, and the modes to keep, largest first."""
     if robust:
-        deviations = _MAD * np.median(np.abs(scores - np.median(scores, axis=0)), axis=0)
+        deviations = _MAD_TO_SD * np.median(np.abs(scores - np.median(scores, axis=0)), axis=0)
     else:
         deviations = np.sqrt(np.sum(np.square(scores), axis=0) / (len(scores) - 1))
     order = np.argsort(-deviations, kind="stable")
     variances = np.square(deviations[order])
-    order = order[variances > max(least, _SMALLEST * variances.max(initial=0.0))]
+    order = order[variances > max(least, _MIN_SHARE * variances.max(initial=0.0))]
     return deviations, order
 
 
 def _spatial_median(products: Float[Floats, "S S"]) -> Float[Floats, " S"]:
-    """Shares of the point with the least sum of distances to the shapes (Weiszfeld 1937)."""
+    """Coefficients of the shapes in their spatial median, the point with the least sum of distances (Weiszfeld 1937)."""
     S = len(products)
     center = np.full(S, 1 / S)
     scale = np.sqrt(np.maximum(np.diag(products).max(), 1e-300))
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         squared = np.diag(products) - 2 * products @ center + center @ products @ center
         trust = 1 / np.maximum(np.sqrt(np.maximum(squared, 0)), 1e-9 * scale)
         new = trust / trust.sum()
@@ -190,10 +198,10 @@ def _spatial_median(products: Float[Floats, "S S"]) -> Float[Floats, " S"]:
     return center
 
 
-def outward(
+def outward_signs(
     modes: Float[Floats, "M V 3"], mean: Float[Floats, "V 3"], weights: Float[Floats, " V"]
 ) -> Float[Floats, " M"]:
-    """Signs (M,) with which the modes make the mean larger; where they leave its size, with the largest entry positive."""
+    """Signs (M,) that make each mode enlarge the mean, or its largest entry positive if it does not change the size."""
     growth = np.einsum("mvi,v,vi->m", modes, weights, mean, optimize=True)
     flat = modes.reshape(len(modes), -1)
     largest = flat[np.arange(len(flat)), np.abs(flat).argmax(axis=1)]

@@ -1,4 +1,4 @@
-"""The parts of shapes that share their vertices, such as the bones of a joint: by name or number."""
+"""Find parts of registered shapes, such as the bones of a joint, by name or number."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Int, Ints
-from meshmatch.collections.superimpose import MOST_GROUPS
+from meshmatch.collections.superimpose import MAX_GROUPS
 from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.places import Places
@@ -18,21 +18,21 @@ from meshmatch.shapes.parts import Parts
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 
-_NEARLY_ALL = 0.9  # of the vertices of a connected part
+_MIN_MAJORITY = 0.9  # share of a connected part's votes above which the whole part gets the name
 WHOLE, EACH = "whole", "each"
-"""Words for what is superimposed: the whole shape, or each of its connected parts alone."""
+"""Values of ``align_by``: superimpose whole shapes, or each connected part on its own."""
 Masks = Mapping[str, Bool[Bools, " V"]]
-"""Which vertices the parts of a name have."""
+"""Vertex masks of parts, by name."""
 
 
-class _Owned(Mapping[str, "Bool[Bools, ' V']"]):
-    """Masks of names, one at a time, for there may be thousands of both: of each vertex the number of its name is kept."""
+class _LabelMasks(Mapping[str, "Bool[Bools, ' V']"]):
+    """Masks computed on access from the label of each vertex, as there may be thousands of names and vertices."""
 
-    def __init__(self, names: Sequence[str], owner: Int[Ints, " V"]) -> None:
-        self.owner, self._numbers = owner, {name: k for k, name in enumerate(names)}
+    def __init__(self, names: Sequence[str], labels: Int[Ints, " V"]) -> None:
+        self.labels, self._numbers = labels, {name: k for k, name in enumerate(names)}
 
     def __getitem__(self, name: str) -> Bool[Bools, " V"]:
-        return np.asarray(self.owner == self._numbers[name])
+        return np.asarray(self.labels == self._numbers[name])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._numbers)
@@ -42,11 +42,12 @@ class _Owned(Mapping[str, "Bool[Bools, ' V']"]):
 
 
 def groups_of(shape: Shape, by: str, named: Callable[[], Masks]) -> Int[Ints, " V"] | None:
-    """Which vertices of shapes with this mesh are superimposed together, as `superimpose` has it.
+    """Groups of vertices for `superimpose`; None for whole shapes.
 
-    ``by`` is "whole", "each", the number of a connected part, the largest first, or a name among those that ``named`` gives.
+    ``by`` is "whole", "each", the number of a connected part (1 is the largest), or a name in the masks that ``named``
+    returns.
 
-    `OptionError`: there is no such part, or only one or too many where each is asked for.
+    `OptionError`: there is no such part; or, with "each", only one part or too many.
     """
     if by == WHOLE:
         return None
@@ -54,9 +55,9 @@ def groups_of(shape: Shape, by: str, named: Callable[[], Masks]) -> Int[Ints, " 
     if by == EACH:
         if len(parts) < 2:
             raise OptionError("these shapes have one part, and it is superimposed alone", "leave out --align-by")
-        if len(parts) > MOST_GROUPS:
+        if len(parts) > MAX_GROUPS:
             what = f"these shapes have {len(parts):,} connected parts, too many to superimpose each alone"
-            raise OptionError(what, f"{MOST_GROUPS} can be; merge vertices at one place, or leave out --align-by")
+            raise OptionError(what, f"{MAX_GROUPS} can be; merge vertices at one place, or leave out --align-by")
         return parts.number - 1
     if by.isascii() and by.isdecimal():
         if not 1 <= int(by[:9]) <= len(parts):
@@ -75,38 +76,40 @@ def groups_of(shape: Shape, by: str, named: Callable[[], Masks]) -> Int[Ints, " 
     return np.where(masks[by], 0, -1)
 
 
-def parts_of_file(path: str | Path) -> _Owned:
-    """The meshes of a file by name; none for formats without names."""
+def parts_of_file(path: str | Path) -> _LabelMasks:
+    """Masks of the meshes of a file, by name; empty for formats without names."""
     meshes = mesh_list(path)
     numbers = {name: k for k, name in enumerate(dict.fromkeys(name for name, _ in meshes))}
     each = np.array([(numbers[name], count) for name, count in meshes], np.int64).reshape(-1, 2)
-    return _Owned(list(numbers), np.repeat(*each.T))
+    return _LabelMasks(list(numbers), np.repeat(*each.T))
 
 
 def parts_of_template(
     template: Template, names: Sequence[str], file_of: Mapping[str, str], places_of: Callable[[str], Places]
 ) -> Masks:
-    """The parts of a template by the names that it has itself; or else by the meshes of the first shape whose file has
-    names: each connected part by the one to which nearly all vertices there belong; where there is none, each vertex by the
-    nearest.
+    """Masks of a template's parts by name: its own labels, or else the meshes of the first shape whose file names them.
+
+    In the latter case, a connected part of the template gets the name of the mesh to which at least 90 % of the vertices
+    placed on it belong. If no mesh has so many, each vertex of the part gets the name at the nearest placed vertex. Empty
+    if there are no names.
     """
     if len(template.label_names) > 1:
-        return _Owned(template.label_names, template.labels)
+        return _LabelMasks(template.label_names, template.labels)
     number = Parts.of(template.shape).number
     for name in names:
         file = file_of.get(name)
         try:
-            if file is None or len((named := parts_of_file(file)).owner) == 0:
+            if file is None or len((named := parts_of_file(file)).labels) == 0:
                 continue
-            if len(named.owner) != len((places := places_of(name)).resting):
+            if len(named.labels) != len((places := places_of(name)).resting):
                 continue
-        except InputError:  # it has been moved since
+        except InputError:  # the file has moved since it was fitted
             continue
         part, count = number[places.on(template.shape).vertex], int(number.max()) + 1
-        votes = np.bincount(named.owner * count + part, minlength=len(named) * count).reshape(len(named), count)
-        owner = votes.argmax(axis=0)[number]
-        mixed = (votes.max(axis=0) < _NEARLY_ALL * votes.sum(axis=0))[number]
+        votes = np.bincount(named.labels * count + part, minlength=len(named) * count).reshape(len(named), count)
+        labels = votes.argmax(axis=0)[number]
+        mixed = (votes.max(axis=0) < _MIN_MAJORITY * votes.sum(axis=0))[number]
         if mixed.any():
-            owner[mixed] = named.owner[cKDTree(places.resting).query(template.shape.verts[mixed])[1]]
-        return _Owned(list(named), owner)
+            labels[mixed] = named.labels[cKDTree(places.resting).query(template.shape.verts[mixed])[1]]
+        return _LabelMasks(list(named), labels)
     return {}

@@ -1,8 +1,9 @@
-"""Tests by permutation, at every vertex and of them all at once.
+"""Permutation tests at every vertex, with corrections for multiple comparisons.
 
-Sources: residuals of a reduced model are permuted: Freedman and Lane, J. Business Econ. Stat. 1 (1983), Collyer et al.,
-Heredity 115 (2015); the largest statistic of each permutation: Westfall and Young, Resampling-based multiple testing
-(1993), Nichols and Holmes, Human Brain Mapping 15 (2002); false discovery: Benjamini and Hochberg, JRSS B 57 (1995).
+Sources: permutation of residuals of a reduced model: Freedman and Lane, J. Business Econ. Stat. 1 (1983), Collyer et al.,
+Heredity 115 (2015); family-wise errors by the largest statistic of each permutation: Westfall and Young,
+Resampling-based multiple testing (1993), Nichols and Holmes, Human Brain Mapping 15 (2002); false discovery rate:
+Benjamini and Hochberg, JRSS B 57 (1995).
 """
 
 from __future__ import annotations
@@ -17,18 +18,24 @@ import numpy as np
 from meshmatch.arrays import Float, Floats, Int, Ints, Ints32
 from meshmatch.errors import OptionError
 
-_CHUNK = 2_000_000  # numbers at a time
-_LARGEST = 200_000_000  # numbers of all permutations
-HAIR = 1e-9
-"""Statistics of one labelling that rounding tells apart."""
-_FLAT = 1e-12  # of the largest scatter at a vertex: directions of less have none
+_CHUNK = 2_000_000  # array elements processed at a time
+_MAX_ELEMENTS = 200_000_000  # permutations times shapes
+TIE_TOLERANCE = 1e-9
+"""Relative difference of statistics up to which they count as equal: it may be rounding."""
+_MIN_SCATTER = 1e-12  # as a share of the largest scatter at a vertex; directions with less count as flat
 
 
 @dataclass(frozen=True, eq=False)
 class PlaceTests:
-    """The ``statistic`` (N,) at each place; the share of the labellings where it is as large there, ``p``, and anywhere,
-    ``p_corrected``; ``p_fdr`` by which of the places found a share is found by chance; and the ``largest`` statistic of each
-    labelling (P,), the given one first.
+    """Results of a permutation test at N places, with P labellings (permutations, the given one first).
+
+    Attributes
+    ----------
+    statistic : (N,) the statistic of the given labelling
+    p : (N,) p-values: share of the labellings whose statistic is as large at the place
+    p_corrected : (N,) p-values corrected for family-wise error: share whose largest statistic anywhere is as large
+    p_fdr : (N,) p-values adjusted for the false discovery rate (Benjamini and Hochberg)
+    largest : (P,) the largest statistic of each labelling
     """
 
     statistic: Float[Floats, " N"]
@@ -39,23 +46,24 @@ class PlaceTests:
 
 
 def orders(groups: Int[Ints, " S"], most: int, seed: int) -> tuple[Int[Ints32, "P S"], bool]:
-    """Orders of S shapes that leave each in its group, the given one first; and whether these are all there are.
+    """Permutations of S shapes within groups, the identity first; and whether these are all there are.
 
-    All of them where there are at most ``most``, else that many random ones and the given one; `OptionError` for too many.
+    All permutations if there are at most ``most``, else ``most`` random ones and the identity. `OptionError` if these need
+    too much memory.
     """
     count = 1
     for size in np.bincount(groups).tolist():
         count *= factorial(size) if size < 20 and count <= most else most + 1
     place = np.argsort(groups, kind="stable")
-    if count <= most and count * len(groups) <= _LARGEST:
+    if count <= most and count * len(groups) <= _MAX_ELEMENTS:
         members = np.split(place, np.flatnonzero(np.diff(groups[place])) + 1)
         found = np.empty((count, len(groups)), np.int32)
         for row, each in enumerate(product(*(permutations(some.tolist()) for some in members))):
             found[row, place] = [k for some in each for k in some]
         return found, True
     random = np.random.default_rng(seed)
-    if most * len(groups) > _LARGEST:
-        hint = f"at most {_LARGEST // len(groups):,}"
+    if most * len(groups) > _MAX_ELEMENTS:
+        hint = f"at most {_MAX_ELEMENTS // len(groups):,}"
         raise OptionError(f"{most:,} permutations of {len(groups)} shapes are too many", hint)
     found = np.empty((most + 1, len(groups)), np.int32)
     found[0] = np.arange(len(groups))
@@ -67,33 +75,37 @@ def orders(groups: Int[Ints, " S"], most: int, seed: int) -> tuple[Int[Ints32, "
 
 
 def permuted(basis: Float[Floats, "S R"], order: Int[Ints32, "P S"]) -> Iterator[Float[Floats, "B R S"]]:
-    """A basis in each order of the shapes, some at a time; as the orders are all, or random, so are their inverses."""
+    """Yield a basis with its rows in each of the orders, in blocks.
+
+    Indexing applies the inverse permutations, which are equally all of them or random.
+    """
     step = max(1, _CHUNK // max(1, basis.size))
     for low in range(0, len(order), step):
         yield basis[order[low : low + step]].transpose(0, 2, 1)
 
 
 def whitened(values: Float[Floats, "S N D"]) -> Float[Floats, "S N D"]:
-    """Values of mean 0 with their scatter at each place removed, so that all directions count the same."""
+    """Whiten values of mean 0 at each place, so that their scatter is the same in all directions (1, or 0 if flat)."""
     size, axes = np.linalg.eigh(np.einsum("sni,snj->nij", values, values))
-    known = size > _FLAT * np.maximum(size[:, -1:], 1e-300)  # in a direction in which nothing moves, nothing differs
+    known = size > _MIN_SCATTER * np.maximum(size[:, -1:], 1e-300)  # a flat direction shows no differences
     factors = np.where(known, 1 / np.sqrt(np.where(known, size, 1)), 0)
     return np.asarray((values.transpose(1, 0, 2) @ (axes * factors[:, None])).transpose(1, 0, 2))
 
 
-def tested(
+def run_tests(
     values: Float[Floats, "S N D"],
     bases: Iterable[Float[Floats, "B R S"]],
     statistic: Callable[[Float[Floats, "B R N"], Float[Floats, " N"]], Float[Floats, "B N"]],
 ) -> PlaceTests:
-    """Test values of S shapes at N places, such as their displacements, for something that labels of shapes say.
+    """Test the values of S shapes at N places, such as displacements, against labels of the shapes.
 
-    ``bases`` are R orthonormal directions for each labelling, the given one first, some labellings at a time. The
-    ``statistic`` is made of the squares along the directions (B, R, N), and of all squares (N,), summed over D.
+    ``bases`` yields R orthonormal directions for each labelling, in blocks of B, the given labelling first. ``statistic``
+    computes the statistic (B, N) from squared projections on the directions (B, R, N) and total squares (N,), both summed
+    over D.
     """
     S, N, D = values.shape
     own = np.empty(N)
-    as_large = np.zeros(N)
+    n_as_large = np.zeros(N)
     largest: list[Floats] = []
     total = np.square(values).sum(axis=(0, 2))
     for rows in bases:
@@ -106,12 +118,12 @@ def tested(
             found = statistic(np.square(along.reshape(B, R, -1, D)).sum(axis=3), total[part])
             if not largest:
                 own[part] = found[0]
-            as_large[part] += (found >= own[part] * (1 - HAIR)).sum(axis=0)
+            n_as_large[part] += (found >= own[part] * (1 - TIE_TOLERANCE)).sum(axis=0)
             np.maximum(most, found.max(axis=1), out=most)
         largest.append(most)
-    every = np.concatenate(largest)
-    above = len(every) - np.searchsorted(np.sort(every), own * (1 - HAIR), side="left")
-    p = as_large / len(every)
+    all_largest = np.concatenate(largest)
+    above = len(all_largest) - np.searchsorted(np.sort(all_largest), own * (1 - TIE_TOLERANCE), side="left")
+    p = n_as_large / len(all_largest)
     from scipy.stats import false_discovery_control
 
-    return PlaceTests(own, p, above / len(every), np.asarray(false_discovery_control(p)), every)
+    return PlaceTests(own, p, above / len(all_largest), np.asarray(false_discovery_control(p)), all_largest)

@@ -1,4 +1,4 @@
-"""One transfer to many targets: files, a folder of shapes, or a folder of fits; what is finished is kept."""
+"""Transfers to many targets: files, a folder of shapes, or a folder of fits. Finished outputs are kept."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from meshmatch.collections.endings import ending_of
 from meshmatch.collections.setting import FAILED, LEFT_OUT
 from meshmatch.collections.sources import find_sources
 from meshmatch.collections.stores import Store
-from meshmatch.collections.transfer_table import TransferRecord, transfer_each, words_of
+from meshmatch.collections.transfer_table import TransferRecord, transfer_each, with_hint
 from meshmatch.errors import InputError, MeshmatchError, warn
 from meshmatch.outputs import as_path
 from meshmatch.shapes.files import ShapeLike
@@ -29,7 +29,7 @@ _FITS = "fits.csv"
 
 
 class HasMaps(Protocol):
-    """What every transfer gives back."""
+    """The interface that the results of all transfers share."""
 
     @property
     def maps(self) -> MapPair: ...
@@ -42,8 +42,10 @@ R = TypeVar("R", bound=HasMaps)
 
 @dataclass(frozen=True)
 class Targets:
-    """Files by name, without other inputs; the fits that their maps are looked up in, if the source is among these; and
-    what the source is called among the targets.
+    """The targets of a transfer.
+
+    ``files`` are the targets by name, without the source and other inputs. ``fits`` is the folder of fits in which maps
+    are looked up, None unless it has a fit of the source. ``source`` is the name of the source among the targets.
     """
 
     files: dict[str, Path]
@@ -54,35 +56,36 @@ class Targets:
     def find(
         cls, given: Sequence[str | Path], source: ShapeLike, other: object = None, output: Path | None = None
     ) -> Targets:
-        """The shapes of files, folders and patterns, or those of one folder of fits; not the source, what lies in the
-        output folder, or another input. `InputError` if there is none.
+        """Find targets in files, folders and patterns, or in one folder of fits.
+
+        The source, the input ``other`` and files in the ``output`` folder are excluded. `InputError` if none is left.
         """
-        fits, held, meant = Path(given[0], _FITS), False, meant_source(source)
+        fits, has_source, meant = Path(given[0], _FITS), False, meant_source(source)
         if len(given) == 1 and fits.is_file():
             with fits.open(encoding="utf-8", newline="") as file:
                 rows = [row for row in csv.DictReader(file) if row.get("verdict") not in (FAILED, LEFT_OUT)]
-            found = {_inner(str(row.get("name")), fits): Path(str(row.get("file"))) for row in rows}
-            held = Collection(fits.parent).holds(meant)
+            found = {_safe_name(str(row.get("name")), fits): Path(str(row.get("file"))) for row in rows}
+            has_source = Collection(fits.parent).holds(meant)
         else:
             sources, _ = find_sources([str(each) for each in given], None if output is None else Store.of(output))
             found = {each.name: Path(each.path) for each in sources}
-        taken = [os.path.realpath(each) for each in (meant, other) if isinstance(each, str | Path)]
-        inputs = {name: file for name, file in found.items() if os.path.realpath(file) in taken}
+        input_paths = [os.path.realpath(each) for each in (meant, other) if isinstance(each, str | Path)]
+        inputs = {name: file for name, file in found.items() if os.path.realpath(file) in input_paths}
         if is_body(source):
-            called = ""  # it is no specimen among others
+            source_name = ""  # the bundled body is not one of the shapes
         elif isinstance(source, str | Path):
-            own = [name for name, file in inputs.items() if os.path.realpath(file) == taken[0]]
-            called = own[0] if own else stem_of(Path(source))
+            own = [name for name, file in inputs.items() if os.path.realpath(file) == input_paths[0]]
+            source_name = own[0] if own else stem_of(Path(source))
         else:
-            called = source.name if isinstance(source, Shape) else ""
+            source_name = source.name if isinstance(source, Shape) else ""
         left = {name: file for name, file in found.items() if name not in inputs}
         if not left:
             raise InputError(f"there is no target in {given[0]}", "name files or folders of shapes")
-        return cls(left, fits.parent if held else None, called)
+        return cls(left, fits.parent if has_source else None, source_name)
 
 
-def _inner(name: str, table: Path) -> str:
-    """A name of a table; `InputError` if a file named so could lie outside of the folder it is meant for."""
+def _safe_name(name: str, table: Path) -> str:
+    """Validate a name read from a table; `InputError` if an output of this name could be outside the output folder."""
     path = Path(name)
     if not path.parts or path.anchor or ".." in path.parts or "\0" in name:
         raise InputError(f"{table}: {name!r} is no name of a shape", "correct that row, or fit the shapes again")
@@ -90,27 +93,27 @@ def _inner(name: str, table: Path) -> str:
 
 
 class Transfers(Generic[R]):
-    """One transfer to many targets, as ``meshmatch transfer-...`` does it with several.
+    """A transfer to many targets, like ``meshmatch transfer-...`` with several.
 
-    Iterating makes a result for each target when its turn comes, and keeps none of them. `save` writes them all.
-    A target that fails stops no other: it is left out, with a warning.
+    Iteration computes the result for one target at a time, and keeps none of them. `save` writes all results to files.
+    A target that fails is left out with a warning and does not stop the others.
 
     Parameters
     ----------
     transfer
-        The function that transfers to one, such as `transfer_rig`.
+        The function that transfers to one target, such as `transfer_rig`.
     source
-        Its ``source``.
+        The ``source`` of the function.
     targets
-        Files, patterns such as ``scans/*.ply``, or a folder of shapes; or a folder of fits, or its `Collection`: the shapes
-        in it, whose maps are looked up if the source is one of them. The source is no target.
+        Files, patterns such as ``scans/*.ply``, or a folder of shapes; or a folder of fits or its `Collection`, for the
+        shapes in it, with maps that are looked up if the source is one of them. The source itself is not a target.
     choices
-        What else the function takes, by name, for all targets.
+        Other keyword arguments of the function, for all targets.
 
     Raises
     ------
     InputError
-        There are no targets, or two of one name.
+        There are no targets, or two have the same name.
 
     Examples
     --------
@@ -133,91 +136,92 @@ class Transfers(Generic[R]):
         self.targets = [targets] if isinstance(targets, str | Path) else list(targets)
         if not self.targets:
             raise InputError("there are no targets", "name files or folders of shapes")
-        self._found()
+        self._find_targets()
 
     def __repr__(self) -> str:
-        return f"Transfers({_called(self.transfer)}, {len(self.files)} targets)"
+        return f"Transfers({_function_name(self.transfer)}, {len(self.files)} targets)"
 
     @property
     def files(self) -> dict[str, Path]:
-        """The targets by name: the path in their folder without the suffix, or the file's name."""
-        return self._found().files
+        """The targets by name: their path in the folder or the name of the file, without the suffix."""
+        return self._find_targets().files
 
     def __len__(self) -> int:
         return len(self.files)
 
     def __iter__(self) -> Iterator[tuple[str, R]]:
-        """Names and results, each made when its turn comes."""
-        found = self._found()
+        """Yield (name, result) for each target; results are computed one at a time."""
+        found = self._find_targets()
         for name, file in found.files.items():
             try:
-                result = self._to(file, found)
+                result = self._transfer_to(file, found)
             except MeshmatchError as error:
-                warn(f"{name}: {words_of(error)}")
+                warn(f"{name}: {with_hint(error)}")
             else:
                 yield name, result
 
     def save(
         self, folder: str | Path, suffix: str | None = None, tell: Callable[[TransferRecord], None] | None = None
     ) -> list[TransferRecord]:
-        """Write a file for each target, called by its name, and ``transfers.csv`` with a row for each.
+        """Write a file for each target, with the target's name, and ``transfers.csv`` with a row for each.
 
-        What is there, made of the same files and choices, is kept, so that a run that was stopped goes on. What cannot be
-        compared, such as a function for ``match``, counts as another choice each time.
+        Outputs made from the same files and options are kept, so that an interrupted run can be continued. Options that
+        cannot be compared, such as a function for ``match``, count as changed each time.
 
         Parameters
         ----------
         folder
-            Where to; it is made if it is missing.
+            Output folder; it is created if missing.
         suffix
-            Of each file; by default what the command would write.
+            Suffix of the files; by default that of the command line.
         tell
-            Called with the record of each target, as they come in.
+            Called with the record of each target as soon as it is done.
 
         Returns
         -------
         list of TransferRecord
-            What became of each target, also of those that failed.
+            The result for each target, failed ones included.
 
         Raises
         ------
         OptionError
-            The suffix is not one that the transfer writes.
+            The transfer cannot write files of this suffix.
         InputError
-            There are no targets any more, or two of one name.
+            There are no targets any more, or two have the same name.
         OutputError
-            The folder cannot be written, or holds another table of that name.
+            The folder cannot be written, or has another kind of file named ``transfers.csv``.
         """
-        folder, word = as_path(folder), _called(self.transfer)
+        folder, word = as_path(folder), _function_name(self.transfer)
         changes = None if self.transfer.__module__.startswith("meshmatch.") else self.transfer
-        found = self._found(folder)
+        found = self._find_targets(folder)
         garment = self.choices.get("garment")
         worn = Path(garment) if isinstance(garment, str | Path) else None
         ending = ending_of(word, suffix, worn, found.files)
 
         def made(name: str, file: Path, output: Path) -> tuple[str, float | None]:
-            result = self._to(file, found)
+            result = self._transfer_to(file, found)
             result.save(output)
             forward = result.maps.forward
             confidence = float(np.mean(forward.confidence))
             return forward.verdict, None if np.isnan(confidence) else confidence
 
-        def told(record: TransferRecord) -> None:
+        def report(record: TransferRecord) -> None:
             if record.error:
                 warn(f"{record.name}: {record.error}")
             if tell is not None:
                 tell(record)
 
         how = word, changes, self.source, self.choices, found.fits
-        return transfer_each(found.files, folder, ending, how, made, told)
+        return transfer_each(found.files, folder, ending, how, made, report)
 
-    def _found(self, output: Path | None = None) -> Targets:
+    def _find_targets(self, output: Path | None = None) -> Targets:
         return Targets.find(self.targets, self.source, self.choices.get("garment"), output)
 
-    def _to(self, file: Path, found: Targets) -> R:
+    def _transfer_to(self, file: Path, found: Targets) -> R:
         maps = {} if found.fits is None else {"match": Collection(found.fits).maps_between}
         return self.transfer(source=self.source, target=file, **maps | self.choices)
 
 
-def _called(transfer: Callable[..., object]) -> str:
+def _function_name(transfer: Callable[..., object]) -> str:
+    """Name of a transfer function."""
     return str(getattr(transfer, "__name__", type(transfer).__name__))

@@ -361,7 +361,7 @@ def test_a_sketch_of_many_shapes_is_enough(monkeypatch: pytest.MonkeyPatch, robu
     given = ellipsoids(60, splits=1)
     points = moved(given.points + 0.005 * np.random.default_rng(1).standard_normal(given.points.shape))
     plain = Atlas.of(points, given.faces, modes=3, robust=robust)
-    monkeypatch.setattr("meshmatch.collections.modes._SKETCHED", 20)
+    monkeypatch.setattr("meshmatch.collections.modes._MAX_EXACT", 20)
     monkeypatch.setattr("meshmatch.collections.superimpose._BLOCK", 7 * points[0].size)
     sketch = Atlas.of(points, given.faces, modes=3, robust=robust)
     assert np.allclose(sketch.mean, plain.mean, atol=1e-5)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch.collections.covariates import Covariates, complete, covariates, design
+from meshmatch.collections.covariates import Covariates, complete_rows, covariates, design_terms
 from meshmatch.collections.formula import parse
 from meshmatch.errors import InputError, OptionError
 from tests.growth import grows_with_size
@@ -74,15 +74,15 @@ def test_rows_are_found_by_name(tmp_path: Path) -> None:
     assert known.cells["sex"] == ("m", "none", "f", "m", "f", "f", "m")
     assert [float(cell) for cell in known.column("size")] == SIZES.tolist()
     model = parse("shape ~ log(size) + age + sex + factor(site) + site")
-    rows_kept, lacking = complete(model, None, known)
+    rows_kept, lacking = complete_rows(model, None, known)
     assert lacking == {"e": "age"}
-    terms, taken = design(parse("shape ~ log(size) + age + sex"), known.some(rows_kept))
+    terms, taken = design_terms(parse("shape ~ log(size) + age + sex"), known.some(rows_kept))
     assert [term.coefficients for term in terms] == [("log(size)",), ("age",), ("sex: m - f", "sex: none - f")]
     assert terms[0].columns[:, 0] == pytest.approx(np.log(SIZES[rows_kept]))
     assert terms[1].columns[:, 0].tolist() == [1.5, 2.5, 3.5, 4.5, 6.5, 7.5]
     assert terms[2].columns[:3].tolist() == [[1, 0], [0, 1], [0, 0]]
     assert taken["sex"] == "3 categories (f 2, m 3, none 1), compared with f"
-    (term,), taken = design(parse("form ~ factor(site)"), known)
+    (term,), taken = design_terms(parse("form ~ factor(site)"), known)
     assert term.columns[:, 0].tolist() == [0, 1, 1, 0, 0, 1, 0]
 
 
@@ -92,7 +92,7 @@ def test_columns_of_python(tmp_path: Path) -> None:
     assert known.cells["size"] == ("1",) * 7
     turned = covariates({"name": NAMES[::-1], "age": range(7)}, NAMES, SIZES)
     assert turned.cells["age"] == tuple("6543210")
-    crossed = design(parse("form ~ age*sex"), covariates({"age": range(7), "sex": "xxyyxyx"}, NAMES, SIZES))[0]
+    crossed = design_terms(parse("form ~ age*sex"), covariates({"age": range(7), "sex": "xxyyxyx"}, NAMES, SIZES))[0]
     assert crossed[2].coefficients == ("age:sex: y - x",)
     assert crossed[2].columns[:, 0].tolist() == [0, 0, 2, 3, 0, 5, 0]
 
@@ -121,7 +121,7 @@ def test_what_a_table_cannot_say(tmp_path: Path, rows: list[str], formula: str, 
     with pytest.raises((InputError, OptionError), match=words):
         known = covariates(write(tmp_path / "t.csv", *rows), NAMES, SIZES)
         model = parse(f"form ~ {formula}")
-        design(model, known.some(complete(model, None, known)[0]))
+        design_terms(model, known.some(complete_rows(model, None, known)[0]))
 
 
 def test_columns_of_another_length_are_refused() -> None:

@@ -130,7 +130,7 @@ def test_large_collections_are_measured_in_parts(monkeypatch: pytest.MonkeyPatch
     points, faces = rough_ellipsoids(10)
     atlas = Atlas.of(points, faces)
     seen: list[float] = []
-    monkeypatch.setattr("meshmatch.collections.measures.FOLDS", 5)
+    monkeypatch.setattr("meshmatch.collections.measures.MAX_FOLDS", 5)
     parts = measure_atlas(atlas, points, samples=2, progress=lambda stage, name, share: seen.append(share))
     monkeypatch.undo()
     whole = measure_atlas(atlas, points, samples=2)
@@ -144,7 +144,7 @@ def test_large_collections_are_measured_in_parts(monkeypatch: pytest.MonkeyPatch
 def test_some_of_very_many_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     points, faces = rough_ellipsoids(12)
     atlas = Atlas.of(points, faces)
-    monkeypatch.setattr("meshmatch.collections.measures.MOST_SHAPES", 6)
+    monkeypatch.setattr("meshmatch.collections.measures.MAX_SHAPES", 6)
     found = measure_atlas(atlas, points, samples=2)
     assert found.counts[-1] == 4
     assert np.isfinite(found.generalisation).all()

@@ -180,7 +180,7 @@ def test_a_long_sequence_and_a_single_frame_do_not_move(tmp_path: Path, monkeypa
         *(f"{name}.glb" for name in names),
         "a/sequence-.glb",
     ]
-    monkeypatch.setattr("meshmatch.collections.export._MOVING", 2 * BALL.V - 1)
+    monkeypatch.setattr("meshmatch.collections.export._MAX_CLIP_VERTS", 2 * BALL.V - 1)
     with pytest.warns(MeshmatchWarning, match="a is too large"):
         assert len(export(tmp_path / "long", fits, Export(".glb"), None)) == 3
 

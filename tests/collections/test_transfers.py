@@ -10,7 +10,7 @@ import pytest
 import meshmatch
 from meshmatch import Collection, MeshmatchWarning, Transfers
 from meshmatch.api.results import MapPair, Transferred
-from meshmatch.collections.transfer_table import TransferRecord, token_of
+from meshmatch.collections.transfer_table import TransferRecord, fingerprint
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.shapes.files import load_shape, save_shape
@@ -212,15 +212,15 @@ def test_what_cannot_be_is_told_first(files: Path, targets: Any, suffix: str | N
 
 def test_tokens_tell_choices_apart(sphere: Shape) -> None:
     def twice(value: object) -> bool:
-        return token_of(value) == token_of(value)
+        return fingerprint(value) == fingerprint(value)
 
     fast, near = FitConfig(), FitConfig(seed=1)
-    assert token_of(fast) != token_of(near) and twice(fast)
-    assert token_of(meshmatch.Matcher("human", fast)) != token_of(meshmatch.Matcher("human", near))
+    assert fingerprint(fast) != fingerprint(near) and twice(fast)
+    assert fingerprint(meshmatch.Matcher("human", fast)) != fingerprint(meshmatch.Matcher("human", near))
     assert twice(meshmatch.Matcher("human")) and twice(meshmatch.Matcher())
     first, second = (weights_of(np.eye(642)[:, [0, 1 + number]] + 0.1, sphere) for number in (0, 1))
-    assert twice(first) and token_of(first) != token_of(second)
-    assert token_of([1, "1"]) != token_of(["1", 1]) and token_of({"a": 1}) != token_of({"a": 2})
-    assert token_of("x" * 5000) != token_of("\0")
+    assert twice(first) and fingerprint(first) != fingerprint(second)
+    assert fingerprint([1, "1"]) != fingerprint(["1", 1]) and fingerprint({"a": 1}) != fingerprint({"a": 2})
+    assert fingerprint("x" * 5000) != fingerprint("\0")
     assert not twice(lambda: None) and not twice(object())
     assert twice(Collection("fits").maps_between)
