@@ -55,12 +55,16 @@ def _validated(file: Path, given: dict[str, Any]) -> dict[str, Any]:
         **{"scale": ("U", ()), "robust": ("b", ()), "template": ("U", ())},
         **({"groups": ("i", (V,))} if "groups" in given else {}),
     }
-    fits = {n: n in given and (given[n].dtype.kind, given[n].shape) == about for n, about in layout.items()}
-    numbers = {n: given[n].astype(np.float64) for n in layout if fits[n] and layout[n][0] == "f"}  # of any precision
-    wrong = [n for n in layout if not fits[n] or not (np.abs(numbers.get(n, 0.0)) < LARGEST).all()]
-    if not wrong:
+    matches_layout = {
+        n: n in given and (given[n].dtype.kind, given[n].shape) == expected for n, expected in layout.items()
+    }
+    numbers = {
+        n: given[n].astype(np.float64) for n in layout if matches_layout[n] and layout[n][0] == "f"
+    }  # of any precision
+    invalid = [n for n in layout if not matches_layout[n] or not (np.abs(numbers.get(n, 0.0)) < LARGEST).all()]
+    if not invalid:
         weights, faces = numbers["weights"], given["faces"]
-        right = {
+        checks = {
             "deviations": (numbers["deviations"] > 0).all(),
             "sizes": (numbers["sizes"] > 0).all(),
             "weights": (weights >= 0).all() and abs(weights.sum() - 1) <= _SUM_TOLERANCE,
@@ -68,9 +72,9 @@ def _validated(file: Path, given: dict[str, Any]) -> dict[str, Any]:
             "scale": str(given["scale"]) in get_args(Scale),
             "groups": "groups" not in given or _are_valid_groups(given["groups"]),
         }
-        wrong = [name for name, holds in right.items() if not holds]
-    if wrong:
-        raise InputError(f"{file} is damaged: {', '.join(wrong)}", "make it again")
+        invalid = [name for name, holds in checks.items() if not holds]
+    if invalid:
+        raise InputError(f"{file} is damaged: {', '.join(invalid)}", "make it again")
     found: dict[str, Any] = {name: frozen(array) for name, array in (given | numbers).items()}
     words = {"names": tuple(map(str, given["names"])), "scale": str(given["scale"]), "template": str(given["template"])}
     return found | words | {"total": float(given["total"]), "robust": bool(given["robust"])}

@@ -55,7 +55,14 @@ from meshmatch.collections.atlas_pictures import (
 from meshmatch.collections.explain import Explained
 from meshmatch.collections.groups import Comparison
 from meshmatch.collections.measures import Measures
-from meshmatch.collections.model_files import LEVEL, asymmetry_record, model_record, short, write_asymmetry, write_model
+from meshmatch.collections.model_files import (
+    LEVEL,
+    asymmetry_record,
+    model_record,
+    rounded,
+    write_asymmetry,
+    write_model,
+)
 from meshmatch.collections.named_parts import WHOLE
 from meshmatch.collections.registered import outlying
 from meshmatch.render.facing import facing
@@ -171,23 +178,23 @@ def record(atlas: Atlas, findings: Findings) -> dict[str, Any]:
         "scale": atlas.scale,
         "align_by": findings.align_by,
         "robust": atlas.robust,
-        "deviations": short(atlas.deviations),
-        "compactness": short(atlas.compactness),
+        "deviations": rounded(atlas.deviations),
+        "compactness": rounded(atlas.compactness),
         "outliers": [atlas.names[k] for k in outlying(atlas.distances)],
-        "furthest": {atlas.names[k]: short(atlas.distances[k]) for k in furthest(atlas)},
+        "furthest": {atlas.names[k]: rounded(atlas.distances[k]) for k in furthest(atlas)},
         "samples": findings.samples,
         "seed": findings.seed,
     }
     if findings.measures is not None:
-        found["measures"] = {each.name: short(getattr(findings.measures, each.name)) for each in fields(Measures)}
+        found["measures"] = {each.name: rounded(getattr(findings.measures, each.name)) for each in fields(Measures)}
     if findings.comparison is not None:
         about = findings.comparison
         found["groups"] = {
             "names": list(findings.groups),
             "counts": list(about.counts),
             "statistic": about.kind,
-            "p_overall": short(about.p_overall),
-            "p_anywhere": short(float(about.p_corrected.min())),
+            "p_overall": rounded(about.p_overall),
+            "p_anywhere": rounded(float(about.p_corrected.min())),
             "vertices_corrected": int((about.p_corrected <= LEVEL).sum()),
             "vertices_fdr": int((about.p_fdr <= LEVEL).sum()),
             "level": LEVEL,
@@ -221,14 +228,14 @@ def _write_morphs(path: Path, atlas: Atlas) -> None:
 def _write_scores(path: Path, atlas: Atlas) -> None:
     header = ["name", "size", "distance", *(f"mode_{k + 1}" for k in range(len(atlas.modes)))]
     table = np.column_stack([atlas.sizes, atlas.distances, atlas.scores])
-    write_rows(path, header, ([name, *short(row)] for name, row in zip(atlas.names, table, strict=True)))
+    write_rows(path, header, ([name, *rounded(row)] for name, row in zip(atlas.names, table, strict=True)))
 
 
 def _write_components(path: Path, atlas: Atlas) -> None:
     """Write scores in the unit of the files, so that their variances are those of the modes."""
     table = atlas.scores * atlas.deviations
     header = ["name", *(f"PC{k + 1}" for k in range(len(atlas.modes)))]
-    write_rows(path, header, ([name, *short(row)] for name, row in zip(atlas.names, table, strict=True)))
+    write_rows(path, header, ([name, *rounded(row)] for name, row in zip(atlas.names, table, strict=True)))
 
 
 def _write_distances(path: Path, atlas: Atlas) -> None:
@@ -242,7 +249,7 @@ def _write_distances(path: Path, atlas: Atlas) -> None:
 
 def _write_measures(path: Path, measures: Measures) -> None:
     names = [each.name for each in fields(Measures) if isinstance(getattr(measures, each.name), np.ndarray)]
-    columns = [short(getattr(measures, name)) for name in names]
+    columns = [rounded(getattr(measures, name)) for name in names]
     write_rows(path, ["modes", *names[1:]], zip(*columns, strict=True))
 
 
@@ -251,5 +258,5 @@ def _write_comparison(folder: Path, mean: Shape, found: Comparison) -> None:
     arrays = {"difference": found.difference} | {name: getattr(found, name) for name in names}
     write_vtp(folder / "groups.vtp", mean, arrays)
     table = np.column_stack(list(arrays.values()))
-    rows = ([k, *short(row)] for k, row in enumerate(table))
+    rows = ([k, *rounded(row)] for k, row in enumerate(table))
     write_rows(folder / "groups.csv", ["vertex", "dx", "dy", "dz", *names], rows)

@@ -47,7 +47,7 @@ class Covariates:
         kept = () if _are_numbers(cells) else _NULLS
         return np.array([is_missing(cell) and cell.strip().lower() not in kept for cell in cells], bool)
 
-    def some(self, rows: Bool[Bools, " S"]) -> Covariates:
+    def select(self, rows: Bool[Bools, " S"]) -> Covariates:
         """Select the shapes of these rows."""
         kept = np.flatnonzero(rows).tolist()
         return Covariates(

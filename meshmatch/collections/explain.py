@@ -98,7 +98,7 @@ def explain(
         other = "form" if scale == "keep" else "shape"
         raise OptionError(f"the atlas {kept}, and the formula is of {model.space}", f"write {other} ~ ...")
     rows, left_out = complete_rows(model, blocks, known)
-    used = known.some(rows)
+    used = known.select(rows)
     terms, interpretation = design_terms(model, used)
     centered = points[rows] - points[rows].mean(axis=0)
     groups = None if blocks is None else np.unique(used.column(blocks), return_inverse=True)[1]

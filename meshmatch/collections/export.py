@@ -16,7 +16,7 @@ import numpy as np
 from meshmatch.api.upright import turn_of_fit
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.covariates import SIZE, Covariates, covariates
-from meshmatch.collections.motion import area_strain, smoothed
+from meshmatch.collections.motion import area_strain, smooth_frames
 from meshmatch.collections.registered import load_points, mixed_units
 from meshmatch.collections.sources import folder_of
 from meshmatch.collections.superimpose import Superimposed
@@ -228,7 +228,7 @@ def _smooth_in_time(meshes: Iterator[tuple[str, Shape]], fits: Fits, cycle: bool
             return shape.verts
 
         with load_points(len(names), fits.template.shape.V, read) as points:
-            frames = smoothed(points, faces[0], [fits.times[name] for name in names], cycle, moments[folder])
+            frames = smooth_frames(points, faces[0], [fits.times[name] for name in names], cycle, moments[folder])
             for name, verts, own_faces in zip(names, frames, faces, strict=True):
                 yield name, Shape(verts, own_faces, name)
 

@@ -45,7 +45,7 @@ from meshmatch.collections.tasks import (
     regularity_fields,
     save_array,
 )
-from meshmatch.collections.workers import DeadWorker, Item, Result, Workers
+from meshmatch.collections.workers import DeadWorkerError, Item, Result, Workers
 from meshmatch.errors import InputError, warn
 from meshmatch.fitting.solve.agreement import AgreeConfig, held_mean, log_stretch, stretch_of
 from meshmatch.fitting.usual import FAIR
@@ -290,11 +290,11 @@ class _Run:
     workers: Workers
     report: ProgressCallback
 
-    def _each(
+    def _map(
         self, task: Callable[[Item], Result], items: Sequence[Item], stage: str
-    ) -> Iterator[tuple[int, Result | DeadWorker]]:
+    ) -> Iterator[tuple[int, Result | DeadWorkerError]]:
         self.report(stage, self.setting.store.location, 0.0)
-        for done, (number, result) in enumerate(self.workers.each(task, items)):
+        for done, (number, result) in enumerate(self.workers.map_unordered(task, items)):
             self.report(stage, self.setting.store.location, (done + 1) / len(items))
             yield number, result
 
@@ -321,11 +321,9 @@ class _Run:
                 source = self.sources[number]
                 how = source.name in others, cut.get(source.name)
                 tasks.append(FitTask(self.setting, source, last, folder, *how))
-            for index, result in self._each(
-                fit_alone, tasks, "fitting" if folder == ALONE else "choosing the template"
-            ):
+            for index, result in self._map(fit_alone, tasks, "fitting" if folder == ALONE else "choosing the template"):
                 source = self.sources[numbers[index]]
-                if isinstance(result, DeadWorker):
+                if isinstance(result, DeadWorkerError):
                     result = Record(source.name, source.path, reasons=result.message)
                 found[numbers[index]] = result
                 if tell is not None:
@@ -379,8 +377,8 @@ class _Run:
             total, next_one = None, 0
             waiting: dict[int, Floats] = {}
             tasks = [AgreeTask(self.setting, group, step) for group in groups]
-            for number, result in self._each(agree_group, tasks, f"agreeing, step {step} of {steps}"):
-                if isinstance(result, DeadWorker):
+            for number, result in self._map(agree_group, tasks, f"agreeing, step {step} of {steps}"):
+                if isinstance(result, DeadWorkerError):
                     raise result
                 waiting[number] = result
                 while next_one in waiting:
@@ -396,8 +394,8 @@ class _Run:
     def finish(self, tasks: Mapping[int, FinishTask]) -> Iterator[tuple[int, Finished]]:
         """Place the vertices of every shape; yield (number of the shape, outcome)."""
         numbers = list(tasks)
-        for index, done in self._each(finish, list(tasks.values()), "placing vertices"):
-            yield numbers[index], Finished(done.message) if isinstance(done, DeadWorker) else done
+        for index, done in self._map(finish, list(tasks.values()), "placing vertices"):
+            yield numbers[index], Finished(done.message) if isinstance(done, DeadWorkerError) else done
 
 
 def _with_outcome(alone: Record, done: Finished) -> Record:

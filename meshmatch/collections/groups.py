@@ -109,12 +109,12 @@ def compare_groups(
     )  # fmt: skip
 
 
-def _labellings(in_second: Bool[Bools, " S"], most: int, seed: int) -> tuple[Bool[Bools, "P S"], bool]:
+def _labellings(in_second: Bool[Bools, " S"], max_count: int, seed: int) -> tuple[Bool[Bools, "P S"], bool]:
     """Labellings of the shapes, True for the second group, the given one first; and whether these are all there are."""
     S, second = len(in_second), int(in_second.sum())
-    if comb(S, second) <= most:
+    if comb(S, second) <= max_count:
         rows = [np.isin(np.arange(S), chosen) for chosen in combinations(range(S), second)]
         others = [row for row in rows if not np.array_equal(row, in_second)]
         return np.stack([in_second, *others]), True
     random = np.random.default_rng(seed)
-    return np.stack([in_second, *(random.permutation(in_second) for _ in range(most))]), False
+    return np.stack([in_second, *(random.permutation(in_second) for _ in range(max_count))]), False

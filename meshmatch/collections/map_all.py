@@ -9,7 +9,7 @@ from pathlib import Path
 
 from meshmatch.collections.setting import FITS, SUFFIX, read_finished_fit
 from meshmatch.collections.stores import Store
-from meshmatch.collections.workers import DeadWorker, Workers
+from meshmatch.collections.workers import DeadWorkerError, Workers
 from meshmatch.errors import InputError
 from meshmatch.maps.build import map_of_placed
 from meshmatch.maps.files import save_map
@@ -92,8 +92,8 @@ def map_all(
         for first in range(0, len(group), _SOURCES)
     ]
     done = 0
-    for _, result in workers.each(write_maps, tasks):
-        if isinstance(result, DeadWorker):
+    for _, result in workers.map_unordered(write_maps, tasks):
+        if isinstance(result, DeadWorkerError):
             raise result
         done += result
         if progress is not None:

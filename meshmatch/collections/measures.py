@@ -128,9 +128,11 @@ def measure_atlas(
     if S < 4:
         raise InputError(f"the measures of an atlas need four shapes or more, not {S}")
     folds = np.array_split(np.random.default_rng(seed).permutation(S), min(S, MAX_FOLDS))
-    most = min(len(atlas.modes), S - 1 - len(folds[0]))
-    counts = np.array(sorted({*(count for count in COUNTS if count <= most), min(most, COUNTS[-1])}), np.int64)
-    collection = _Collection(atlas, points, surfaces, seed)
+    max_modes = min(len(atlas.modes), S - 1 - len(folds[0]))
+    counts = np.array(
+        sorted({*(count for count in COUNTS if count <= max_modes), min(max_modes, COUNTS[-1])}), np.int64
+    )
+    collection = _AtlasWithShapes(atlas, points, surfaces, seed)
 
     def report(done: float) -> None:
         if progress is not None:
@@ -162,7 +164,7 @@ class _Surface:
     share: Float[Floats, " N"]
 
 
-class _Collection:
+class _AtlasWithShapes:
     """An atlas with the shapes that it was built from, and their inner products."""
 
     def __init__(self, atlas: Atlas, points: Shapes, surfaces: Sequence[Shape] | None, seed: int) -> None:

@@ -34,28 +34,28 @@ _HEADER = "term", "df", "SS", "MS", "R2", "F", "Z", "p", "p_anywhere"
 
 def write_model(folder: Path, mean: Shape, found: Explained) -> None:
     """Write the tables and maps of a linear model into a folder."""
-    write_rows(folder / "anova.csv", _HEADER, _lines(model_record(found)))
-    arrays = _arrays(found.table.effects)
+    write_rows(folder / "anova.csv", _HEADER, _table_rows(model_record(found)))
+    arrays = _vertex_arrays(found.table.effects)
     write_vtp(folder / "effects.vtp", mean, arrays)
     header = ["vertex"]
     for name, array in arrays.items():
         header += [name] if array.ndim == 1 else [f"{name}, {axis}" for axis in "xyz"]
     table = np.column_stack(list(arrays.values()))
-    write_rows(folder / "effects.csv", header, ([k, *short(row)] for k, row in enumerate(table)))
+    write_rows(folder / "effects.csv", header, ([k, *rounded(row)] for k, row in enumerate(table)))
     if found.allometry is not None:
         _write_allometry(folder / "allometry.csv", found, found.allometry)
 
 
 def write_asymmetry(folder: Path, mean: Shape, found: Asymmetry) -> None:
     """Write the tables and the map of asymmetry into a folder."""
-    write_rows(folder / "symmetry.csv", _HEADER, _lines(asymmetry_record(found)))
-    rows = zip(found.names, short(found.total_of), short(found.fluctuating_of), strict=True)
+    write_rows(folder / "symmetry.csv", _HEADER, _table_rows(asymmetry_record(found)))
+    rows = zip(found.names, rounded(found.total_of), rounded(found.fluctuating_of), strict=True)
     write_rows(folder / "asymmetry.csv", ["name", "asymmetry", "fluctuating"], rows)
-    arrays = _arrays(found.table.effects[1:]) | {"fluctuating": found.fluctuating}
+    arrays = _vertex_arrays(found.table.effects[1:]) | {"fluctuating": found.fluctuating}
     write_vtp(folder / "asymmetry.vtp", mean, arrays | ({} if found.error is None else {"error": found.error}))
 
 
-def _arrays(effects: Sequence[Effect]) -> dict[str, np.ndarray]:
+def _vertex_arrays(effects: Sequence[Effect]) -> dict[str, np.ndarray]:
     """Values of the vertices by name; control characters in names are replaced."""
     arrays: dict[str, np.ndarray] = {}
     for effect in effects:
@@ -74,7 +74,7 @@ def _write_allometry(path: Path, found: Explained, about: Allometry) -> None:
     groups = found.groups or ("",) * len(found.names)
     rows = zip(found.names, np.column_stack(scores), groups, strict=True)
     header = ["name", about.label, "CAC", "RegScore", "predicted_PC1", "residual_PC1", "group"]
-    write_rows(path, header, ([name, *short(row), group] for name, row, group in rows))
+    write_rows(path, header, ([name, *rounded(row), group] for name, row, group in rows))
 
 
 def model_record(found: Explained) -> dict[str, Any]:
@@ -94,9 +94,9 @@ def asymmetry_record(found: Asymmetry) -> dict[str, Any]:
     """Asymmetry and its table, as JSON values."""
     told = {
         "matching": found.matching,
-        "of_mean": short(found.of_mean),
-        "of_shapes": dict(zip(found.names, short(found.total_of), strict=True)),
-        "fluctuating_of_shapes": dict(zip(found.names, short(found.fluctuating_of), strict=True)),
+        "of_mean": rounded(found.of_mean),
+        "of_shapes": dict(zip(found.names, rounded(found.total_of), strict=True)),
+        "fluctuating_of_shapes": dict(zip(found.names, rounded(found.fluctuating_of), strict=True)),
     }
     return told | _table_record(found.table, "fluctuating" if found.error is None else "error")
 
@@ -110,14 +110,14 @@ def _table_record(about: Variances, left: str = "residuals") -> dict[str, Any]:
         "seed": about.seed,
         "level": LEVEL,
         "terms": [_effect_record(effect) for effect in about.effects],
-        "residuals": {"term": left, "df": about.residual_df} | {name: short(value) for name, value in rest.items()},
-        "total": {"term": "total", "df": about.total_df, "SS": short(about.total_ss)},
+        "residuals": {"term": left, "df": about.residual_df} | {name: rounded(value) for name, value in rest.items()},
+        "total": {"term": "total", "df": about.total_df, "SS": rounded(about.total_ss)},
     }
 
 
 def _effect_record(effect: Effect) -> dict[str, Any]:
     numbers = effect.ss, effect.ms, effect.r2, effect.f, effect.z, effect.p, effect.p_anywhere
-    told = [None if np.isnan(number) else short(number) for number in numbers]
+    told = [None if np.isnan(number) else rounded(number) for number in numbers]
     found: dict[str, Any] = dict(zip(_HEADER, (effect.name, effect.df, *told), strict=True))
     if effect.places is not None:
         found["vertices_corrected"] = int((effect.places.p_corrected <= LEVEL).sum())
@@ -125,7 +125,7 @@ def _effect_record(effect: Effect) -> dict[str, Any]:
     return found
 
 
-def _lines(record: dict[str, Any]) -> list[list[Any]]:
+def _table_rows(record: dict[str, Any]) -> list[list[Any]]:
     rows = [*record["terms"], record["residuals"], record["total"]]
     return [["" if row.get(name) is None else row[name] for name in _HEADER] for row in rows]
 
@@ -133,13 +133,13 @@ def _lines(record: dict[str, Any]) -> list[list[Any]]:
 def anova_rows(record: dict[str, Any]) -> list[list[str]]:
     """The table of a model as text, with the number of vertices at which each term is significant."""
     titles = [*_HEADER[:-1], "p anywhere", f"vertices p <= {LEVEL:g}", f"FDR <= {LEVEL:g}"]
-    numbers = [[cell if isinstance(cell, str) else f"{cell:.4g}" for cell in line] for line in _lines(record)]
+    numbers = [[cell if isinstance(cell, str) else f"{cell:.4g}" for cell in line] for line in _table_rows(record)]
     counts = [[str(term.get(name, "")) for name in ("vertices_corrected", "vertices_fdr")] for term in record["terms"]]
     return [titles, *(line + count for line, count in zip(numbers, [*counts, ["", ""], ["", ""]], strict=True))]
 
 
-def short(values: Any) -> Any:
+def rounded(values: Any) -> Any:
     """Round floats to six significant digits and convert arrays to lists, for JSON."""
     if isinstance(values, np.ndarray):
-        return [short(value) for value in values.tolist()]
+        return [rounded(value) for value in values.tolist()]
     return float(f"{values:.6g}") if isinstance(values, float) else values

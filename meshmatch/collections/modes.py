@@ -40,12 +40,12 @@ class Components:
     total: float
 
 
-def compute_modes(shapes: Shapes, alignment: Superimposed, most: int, robust: bool = False) -> Components:
-    """Compute the center and at most ``most`` modes of shapes; `InputError` if they are all the same."""
+def compute_modes(shapes: Shapes, alignment: Superimposed, max_modes: int, robust: bool = False) -> Components:
+    """Compute the center and at most ``max_modes`` modes of shapes; `InputError` if they are all the same."""
     if len(shapes) > _MAX_EXACT:
-        return _compute_by_sketch(shapes, alignment, most, robust)
+        return _compute_by_sketch(shapes, alignment, max_modes, robust)
     products = inner_products(shapes, alignment)
-    found = _checked(principal_components(products, most, robust, rounding_variance(alignment)), robust)
+    found = _require_modes(principal_components(products, max_modes, robust, rounding_variance(alignment)), robust)
     sums = weighted_sums(shapes, alignment, np.concatenate([found.center[None], found.modes]))
     centered = products - found.center @ products
     scores = centered @ found.modes.T / found.deviations
@@ -57,7 +57,7 @@ def rounding_variance(alignment: Superimposed) -> float:
     return _ROUNDING * float(alignment.weights @ squared_lengths(alignment.consensus))
 
 
-def _checked(found: Found, robust: bool) -> Found:
+def _require_modes(found: Found, robust: bool) -> Found:
     """Return the components if there are any, else raise `InputError`."""
     if not len(found.deviations):
         what = "most of the shapes do not differ" if robust else "the shapes do not differ"
@@ -65,39 +65,41 @@ def _checked(found: Found, robust: bool) -> Found:
     return found
 
 
-def _compute_by_sketch(shapes: Shapes, alignment: Superimposed, most: int, robust: bool) -> Components:
+def _compute_by_sketch(shapes: Shapes, alignment: Superimposed, max_modes: int, robust: bool) -> Components:
     """Compute modes by randomised SVD.
 
     The consensus serves as the center: up to rounding it is the mean, or the spatial median if ``robust``.
     """
-    S, N, least = len(shapes), alignment.consensus.size, rounding_variance(alignment)
+    S, N, min_variance = len(shapes), alignment.consensus.size, rounding_variance(alignment)
     shrink = np.ones(S)
     power = 0.0
     for rows, points in iter_blocks(shapes):
-        squared = squared_lengths(_weighted(points, alignment))
+        squared = squared_lengths(_weighted_offsets(points, alignment))
         power += float(squared.sum())
         if robust:
-            shrink[rows] = np.where(squared > least, 1 / np.sqrt(np.maximum(squared, least)), 0)
-    width = min(most + _OVERSAMPLING, N, S)
+            shrink[rows] = np.where(squared > min_variance, 1 / np.sqrt(np.maximum(squared, min_variance)), 0)
+    width = min(max_modes + _OVERSAMPLING, N, S)
     sides = np.random.default_rng(0).standard_normal((N, width))
     for _ in range(_PASSES):
         image = np.zeros((N, width))
         for rows, points in iter_blocks(shapes):
-            part = shrink[rows, None] * _weighted(points, alignment)
+            part = shrink[rows, None] * _weighted_offsets(points, alignment)
             image += part.T @ (part @ sides)
         sides = np.linalg.qr(image)[0]
-    raw = np.concatenate([_weighted(points, alignment) @ sides for _, points in iter_blocks(shapes)])
+    raw = np.concatenate([_weighted_offsets(points, alignment) @ sides for _, points in iter_blocks(shapes)])
     _, sizes, turn = np.linalg.svd(shrink[:, None] * raw, full_matrices=False)
     turn = turn[np.square(sizes) > _MIN_SHARE * np.square(sizes[0])]
     raw = raw @ turn.T
-    deviations, order = _ordered(raw, robust, least)
+    deviations, order = _order_modes(raw, robust, min_variance)
     total = float(np.square(deviations).sum()) if robust else power / (S - 1)
-    order = order[:most]
+    order = order[:max_modes]
     modes = (sides @ turn[order].T).T.reshape(len(order), *alignment.consensus.shape) / np.sqrt(alignment.weights)[
         :, None
     ]
     scores = raw[:, order] / deviations[order]
-    return _checked(Components(np.zeros_like(alignment.consensus), modes, deviations[order], scores, total), robust)
+    return _require_modes(
+        Components(np.zeros_like(alignment.consensus), modes, deviations[order], scores, total), robust
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,16 +121,16 @@ def inner_products(shapes: Shapes, alignment: Superimposed) -> Float[Floats, "S 
     count = len(shapes)
     found = np.empty((count, count))
     for rows, points in iter_blocks(shapes):
-        own = _weighted(points, alignment)
+        own = _weighted_offsets(points, alignment)
         for columns, others in iter_blocks(shapes):
             if columns.start < rows.start:
                 continue
-            found[rows, columns] = own @ (own if columns == rows else _weighted(others, alignment)).T
+            found[rows, columns] = own @ (own if columns == rows else _weighted_offsets(others, alignment)).T
             found[columns, rows] = found[rows, columns].T
     return found
 
 
-def _weighted(points: Float[Floats, "B V 3"], alignment: Superimposed) -> Float[Floats, "B N"]:
+def _weighted_offsets(points: Float[Floats, "B V 3"], alignment: Superimposed) -> Float[Floats, "B N"]:
     """Offsets of shapes from the consensus, times the square roots of the weights, with N = 3 V."""
     offset = (alignment.align(points) - alignment.consensus) * np.sqrt(alignment.weights)[:, None]
     return offset.reshape(len(points), -1)
@@ -143,14 +145,14 @@ def weighted_sums(shapes: Shapes, alignment: Superimposed, shares: Float[Floats,
 
 
 def principal_components(
-    products: Float[Floats, "S S"], most: int, robust: bool = False, least: float = 0.0
+    products: Float[Floats, "S S"], max_modes: int, robust: bool = False, min_variance: float = 0.0
 ) -> Principal:
-    """Compute at most ``most`` modes from inner products of shapes, those of the largest variance.
+    """Compute at most ``max_modes`` modes from inner products of shapes, those of the largest variance.
 
-    Modes with a variance of ``least`` or less are dropped. ``robust``: the center is the spatial median, and the modes are
-    spherical principal components: those of the directions from the center, so that distant shapes count no more than
-    others. Standard deviations are then estimated from median absolute deviations, and modes along which most shapes
-    do not differ are dropped.
+    Modes with a variance of ``min_variance`` or less are dropped. ``robust``: the center is the spatial median, and the
+    modes are spherical principal components: those of the directions from the center, so that distant shapes count no
+    more than others. Standard deviations are then estimated from median absolute deviations, and modes along which most
+    shapes do not differ are dropped.
     """
     S = len(products)
     center = _spatial_median(products) if robust else np.full(S, 1 / S)
@@ -163,14 +165,16 @@ def principal_components(
     kept = np.flatnonzero(sizes > _MIN_SHARE * sizes[-1])[::-1]
     shares = (sides[:, kept] * shrink[:, None] / np.sqrt(sizes[kept])).T
     scores = centered @ shares.T
-    deviations, order = _ordered(scores, robust, least)
+    deviations, order = _order_modes(scores, robust, min_variance)
     total = float(np.square(deviations).sum())
-    order = order[:most]
+    order = order[:max_modes]
     shares = shares[order] - shares[order].sum(axis=1)[:, None] * center
     return Principal(center, shares, deviations[order], total)
 
 
-def _ordered(scores: Float[Floats, "S M"], robust: bool, least: float) -> tuple[Float[Floats, " M"], Int[Ints, " K"]]:
+def _order_modes(
+    scores: Float[Floats, "S M"], robust: bool, min_variance: float
+) -> tuple[Float[Floats, " M"], Int[Ints, " K"]]:
     """Standard deviations of scores along all modes, and the modes to keep, largest first."""
     if robust:
         deviations = _MAD_TO_SD * np.median(np.abs(scores - np.median(scores, axis=0)), axis=0)
@@ -178,7 +182,7 @@ def _ordered(scores: Float[Floats, "S M"], robust: bool, least: float) -> tuple[
         deviations = np.sqrt(np.sum(np.square(scores), axis=0) / (len(scores) - 1))
     order = np.argsort(-deviations, kind="stable")
     variances = np.square(deviations[order])
-    order = order[variances > max(least, _MIN_SHARE * variances.max(initial=0.0))]
+    order = order[variances > max(min_variance, _MIN_SHARE * variances.max(initial=0.0))]
     return deviations, order
 
 

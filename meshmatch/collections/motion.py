@@ -26,7 +26,7 @@ _MIN_ENERGY = 1e-12  # components with a smaller share of the energy are roundin
 _SAMPLED = 1500  # vertices used to choose the weights
 
 
-def smoothed(
+def smooth_frames(
     points: Float[Floats, "T V 3"], faces: Int[Ints, "F 3"], times: Sequence[int], cycle: bool = False, moments: int = 0
 ) -> Iterator[Float[Floats, "V 3"]]:
     """Yield the frames of a sequence with the paths of their vertices smoothed along their surfaces.

@@ -45,31 +45,31 @@ class PlaceTests:
     largest: Float[Floats, " P"]
 
 
-def orders(groups: Int[Ints, " S"], most: int, seed: int) -> tuple[Int[Ints32, "P S"], bool]:
+def orders(groups: Int[Ints, " S"], max_count: int, seed: int) -> tuple[Int[Ints32, "P S"], bool]:
     """Permutations of S shapes within groups, the identity first; and whether these are all there are.
 
-    All permutations if there are at most ``most``, else ``most`` random ones and the identity. `OptionError` if these need
-    too much memory.
+    All permutations if there are at most ``max_count``, else ``max_count`` random ones and the identity. `OptionError` if
+    these need too much memory.
     """
     count = 1
     for size in np.bincount(groups).tolist():
-        count *= factorial(size) if size < 20 and count <= most else most + 1
+        count *= factorial(size) if size < 20 and count <= max_count else max_count + 1
     place = np.argsort(groups, kind="stable")
-    if count <= most and count * len(groups) <= _MAX_ELEMENTS:
+    if count <= max_count and count * len(groups) <= _MAX_ELEMENTS:
         members = np.split(place, np.flatnonzero(np.diff(groups[place])) + 1)
         found = np.empty((count, len(groups)), np.int32)
         for row, each in enumerate(product(*(permutations(some.tolist()) for some in members))):
             found[row, place] = [k for some in each for k in some]
         return found, True
     random = np.random.default_rng(seed)
-    if most * len(groups) > _MAX_ELEMENTS:
+    if max_count * len(groups) > _MAX_ELEMENTS:
         hint = f"at most {_MAX_ELEMENTS // len(groups):,}"
-        raise OptionError(f"{most:,} permutations of {len(groups)} shapes are too many", hint)
-    found = np.empty((most + 1, len(groups)), np.int32)
+        raise OptionError(f"{max_count:,} permutations of {len(groups)} shapes are too many", hint)
+    found = np.empty((max_count + 1, len(groups)), np.int32)
     found[0] = np.arange(len(groups))
     step = max(1, _CHUNK // len(groups))
-    for low in range(1, most + 1, step):
-        keys = groups + random.random((min(step, most + 1 - low), len(groups)))
+    for low in range(1, max_count + 1, step):
+        keys = groups + random.random((min(step, max_count + 1 - low), len(groups)))
         found[low : low + step, place] = np.argsort(keys, axis=1)
     return found, False
 
@@ -110,7 +110,7 @@ def run_tests(
     total = np.square(values).sum(axis=(0, 2))
     for rows in bases:
         B, R, _ = rows.shape
-        most = np.zeros(B)
+        block_largest = np.zeros(B)
         step = max(1, _CHUNK // (B * R * D))
         for low in range(0, N, step):
             part = slice(low, low + step)
@@ -119,8 +119,8 @@ def run_tests(
             if not largest:
                 own[part] = found[0]
             n_as_large[part] += (found >= own[part] * (1 - TIE_TOLERANCE)).sum(axis=0)
-            np.maximum(most, found.max(axis=1), out=most)
-        largest.append(most)
+            np.maximum(block_largest, found.max(axis=1), out=block_largest)
+        largest.append(block_largest)
     all_largest = np.concatenate(largest)
     above = len(all_largest) - np.searchsorted(np.sort(all_largest), own * (1 - TIE_TOLERANCE), side="left")
     p = n_as_large / len(all_largest)

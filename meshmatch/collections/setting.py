@@ -220,22 +220,22 @@ class Setting:
 
 def read_template(store: Store, file: str = TEMPLATE) -> Template:
     """Read a template of a collection, once per process, and again if its file has changed."""
-    return _template(store, file, store.changed(file))
+    return _template(store, file, store.mtime_ns(file))
 
 
 @lru_cache(maxsize=4)
-def _template(store: Store, file: str, changed: int) -> Template:
+def _template(store: Store, file: str, mtime_ns: int) -> Template:
     with store.reading(file) as path:
         return load_template(path)
 
 
 def read_finished_fit(store: Store, name: str) -> PlacedFit:
     """Read a finished fit, with a cache of 64. Errors as `read_fit`; `InputError` if the fit is not finished."""
-    return _read_finished(store, name, store.changed(f"{FITS}/{name}{SUFFIX}"))
+    return _read_finished(store, name, store.mtime_ns(f"{FITS}/{name}{SUFFIX}"))
 
 
 @lru_cache(maxsize=64)
-def _read_finished(store: Store, name: str, changed: int) -> PlacedFit:
+def _read_finished(store: Store, name: str, mtime_ns: int) -> PlacedFit:
     with store.reading(f"{FITS}/{name}{SUFFIX}") as path:
         found = read_fit(path, read_template(store)).fit
     if not isinstance(found, PlacedFit):

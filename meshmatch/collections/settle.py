@@ -56,7 +56,7 @@ def select_setting(requested: Setting, sources: Sequence[Source]) -> Setting:
             save_template(template, path)
         save_text(store, ABOUT, json.dumps(wanted, indent=2) + "\n")  # last: a folder without it is not a collection
     elif differs := [name for name in wanted if about[name] != wanted[name]]:
-        other = f"the fits in {store.location} were made with another {_differing(differs[0], about, wanted)}"
+        other = f"the fits in {store.location} were made with another {_describe_difference(differs[0], about, wanted)}"
         hint = "choose another folder, or the options used before"
         if isinstance(about["fit"], dict) and about["fit"].keys() != wanted["fit"].keys():
             other = f"the fits in {store.location} were made by another version of meshmatch, which fits otherwise"
@@ -65,13 +65,13 @@ def select_setting(requested: Setting, sources: Sequence[Source]) -> Setting:
     return setting
 
 
-def _differing(name: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+def _describe_difference(name: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Describe the first option that differs, with both values; nested options are named by the innermost key."""
     then, wanted = before[name], now[name]
     if isinstance(then, dict) and isinstance(wanted, dict):
         inner = next((key for key in wanted if then.get(key) != wanted[key]), None)
         if inner is not None and inner in then:
-            return _differing(inner, then, wanted)
+            return _describe_difference(inner, then, wanted)
     return f"{name}: {then}, not {wanted}" if isinstance(then, str | int | float) else name
 
 

@@ -58,13 +58,13 @@ def find_sources(
     counts = Counter(source.name for source in found)
     for source in found:
         if counts[source.name] > 1:
-            alike = [each for each in found if each.name == source.name]
-            apart = len({each.folder.location for each in alike}) > 1
-            hint = "give the folder that both folders are in, or rename one" if apart else "rename one"
-            both = " and ".join(each.path for each in alike)
-            if len({os.path.realpath(each.path) for each in alike}) == 1:
-                raise InputError(f"{alike[0].path} is named {len(alike)} times", "name each file once")
-            raise InputError(f"two shapes are called {source.name}: {both}", hint)
+            same_name = [each for each in found if each.name == source.name]
+            in_different_folders = len({each.folder.location for each in same_name}) > 1
+            hint = "give the folder that both folders are in, or rename one" if in_different_folders else "rename one"
+            paths = " and ".join(each.path for each in same_name)
+            if len({os.path.realpath(each.path) for each in same_name}) == 1:
+                raise InputError(f"{same_name[0].path} is named {len(same_name)} times", "name each file once")
+            raise InputError(f"two shapes are called {source.name}: {paths}", hint)
     return found, left_out
 
 
@@ -100,23 +100,25 @@ def _add_sources(given: str | Path, output: Store | None, found: list[Source], l
     if path is None or path.is_dir():
         folder = Store.of(given)
         names = [PurePosixPath(name) for name in folder.names()]
-        own = "" if output is None else f"{output.location}/"
-        inside = [file for file in names if not own or not f"{folder.location}/{file}".startswith(own)]
+        output_prefix = "" if output is None else f"{output.location}/"
+        candidates = [
+            file for file in names if not output_prefix or not f"{folder.location}/{file}".startswith(output_prefix)
+        ]
         _warn_left_out(
-            folder.location, "files of unknown format", filter(_is_unknown, inside), left_out, f"{folder.location}/"
+            folder.location, "files of unknown format", filter(_is_unknown, candidates), left_out, f"{folder.location}/"
         )
-        shapes = [file for file in inside if suffix_of(file) in SUFFIXES]
-        plain = [file for file in shapes if suffix_of(file) not in blender.SUFFIXES] or shapes
-        taken = [file for file in plain if suffix_of(file) != ".npy"] or plain
-        known = {file.with_name(stem_of(file)) for file in (*taken, *plain)}
+        shapes = [file for file in candidates if suffix_of(file) in SUFFIXES]
+        preferred = [file for file in shapes if suffix_of(file) not in blender.SUFFIXES] or shapes
+        selected = [file for file in preferred if suffix_of(file) != ".npy"] or preferred
+        known = {file.with_name(stem_of(file)) for file in (*selected, *preferred)}
         projects = [file for file in shapes if file.with_name(stem_of(file)) not in known]
         _warn_left_out(
             folder.location, "files for Blender beside other shapes", projects, left_out, f"{folder.location}/"
         )
-        left_out += _skipped_records(inside, taken, projects, f"{folder.location}/")
+        left_out += _skipped_records(candidates, selected, projects, f"{folder.location}/")
         why = "a link to a folder, which is not followed"
         left_out += [Record(link, f"{folder.location}/{link}", LEFT_OUT, reasons=why) for link in folder.folder_links()]
-        found += [Source(str(file.with_name(stem_of(file))), folder, str(file)) for file in taken]
+        found += [Source(str(file.with_name(stem_of(file))), folder, str(file)) for file in selected]
         return
     files = [path]
     if not path.exists() and any(mark in str(given) for mark in _WILDCARDS):
@@ -134,10 +136,10 @@ def _is_unknown(file: PurePath) -> bool:
 
 
 def _skipped_records(
-    files: Sequence[PurePath], taken: Sequence[PurePath], recorded: Sequence[PurePath], folder: str
+    files: Sequence[PurePath], selected: Sequence[PurePath], recorded: Sequence[PurePath], folder: str
 ) -> list[Record]:
     """Records of skipped files, but for those ``recorded`` already and those that share the name of a shape."""
-    known, owners = {*taken, *recorded}, {file.with_name(stem_of(file)) for file in taken}
+    known, owners = {*selected, *recorded}, {file.with_name(stem_of(file)) for file in selected}
     found = []
     for file in files:
         words = file.name.split(".")

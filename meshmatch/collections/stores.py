@@ -98,7 +98,7 @@ class Store:
         files, root = _filesystem(self.location)
         return bool(files.exists(f"{root}/{name}"))
 
-    def changed(self, name: str) -> int:
+    def mtime_ns(self, name: str) -> int:
         """Modification time of a local file, in nanoseconds; 0 for one that is remote or missing."""
         path = Path(self.location, name)
         return 0 if self.remote or not path.is_file() else path.stat().st_mtime_ns

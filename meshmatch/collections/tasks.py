@@ -173,7 +173,7 @@ def agree_group(task: AgreeTask) -> Float[Floats, "G 3 3"]:
     """
     setting, group, store = task.setting, task.group, task.setting.store
     system, how = node_system(setting.trained), AgreeConfig.for_collection(setting.trained)
-    members = [_member(setting.read(ALONE, name), how) for name in group.names]
+    members = [_build_member(setting.read(ALONE, name), how) for name in group.names]
 
     def after(step: int) -> Floats:
         return load_array(store, group.file(step)) if step > 0 else np.array([member.vectors for member in members])
@@ -192,7 +192,7 @@ def agree_group(task: AgreeTask) -> Float[Floats, "G 3 3"]:
     return np.asarray(np.sum([log_stretch(F) for F in gradients], axis=0))
 
 
-def _member(read: StoredFit, how: AgreeConfig) -> Member:
+def _build_member(read: StoredFit, how: AgreeConfig) -> Member:
     roughness = read.words.get("roughness")
     if read.samples is None or type(roughness) is not float:
         raise InputError("a fit that should agree has no samples", "remove the folder of fits, and make it again")
@@ -254,7 +254,7 @@ def finish(task: FinishTask) -> Finished:
     """Place the vertices of a shape on its fit and judge it, unless the result exists."""
     try:
         if not is_finished(task.setting.store, task):
-            _finish(task)
+            _write_finished_fit(task)
         with task.setting.store.reading(task.file) as path:
             about = load_words(path)[0]
             reasons = tuple(str(sentence) for _, sentence in about["reasons"])
@@ -263,7 +263,7 @@ def finish(task: FinishTask) -> Finished:
         return Finished(error.message)
 
 
-def _finish(task: FinishTask) -> None:
+def _write_finished_fit(task: FinishTask) -> None:
     setting, name = task.setting, task.source.name
     alone = setting.read(ALONE, name)
     part = validated(leave_out(task.source.load(setting.only, setting.without), alone.fit.left_out))

@@ -30,14 +30,16 @@ _CONNECT_TIMEOUT = 30.0  # seconds
 _main_lock = threading.Lock()
 
 
-class DeadWorker(MeshmatchError):
+class DeadWorkerError(MeshmatchError):
     """The process that ran a task died, on the retry as well."""
 
 
 class Workers(Protocol):
     """Runs one task for many items."""
 
-    def each(self, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result | DeadWorker]]:
+    def map_unordered(
+        self, task: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result | DeadWorkerError]]:
         """Yield (index of the item, result of the task) in order of completion; an exception of a task propagates."""
 
     def close(self) -> None:
@@ -59,8 +61,10 @@ class Processes:
         self.count = count
         self._pool: _Pool | None = None
 
-    def each(self, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result | DeadWorker]]:
-        """Implement `Workers.each`."""
+    def map_unordered(
+        self, task: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result | DeadWorkerError]]:
+        """Implement `Workers.map_unordered`."""
         suspects: list[int] = []
         pending = list(range(len(items)))[::-1]
         while pending and min(self.count, len(items)) > 1:
@@ -91,7 +95,7 @@ class Processes:
                 with closing(_Pool(1, _needs_main(task, items))) as alone:
                     result = alone.submit(task, items[number]).result()
             except (BrokenProcessPool, CannotStart):
-                yield number, DeadWorker("the process that worked on it died", "is there enough memory?")
+                yield number, DeadWorkerError("the process that worked on it died", "is there enough memory?")
             else:
                 yield number, result
 
@@ -221,8 +225,10 @@ class Cluster:
             hint = "start one: dask scheduler (docs/cluster.md)"
             raise OptionError(f"no Dask scheduler answers at {address}", hint) from error
 
-    def each(self, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result | DeadWorker]]:
-        """Implement `Workers.each`."""
+    def map_unordered(
+        self, task: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result | DeadWorkerError]]:
+        """Implement `Workers.map_unordered`."""
         from distributed import as_completed
         from distributed.scheduler import KilledWorker
 
@@ -233,7 +239,7 @@ class Cluster:
                 try:
                     yield number, future.result()
                 except KilledWorker:
-                    yield number, DeadWorker("the workers that worked on it died", "have they enough memory?")
+                    yield number, DeadWorkerError("the workers that worked on it died", "have they enough memory?")
                 except ModuleNotFoundError as error:
                     hint = "install the same meshmatch on all of them"
                     raise InputError(f"a worker of the cluster lacks {error.name}", hint) from error

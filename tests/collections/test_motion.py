@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from meshmatch.collections.export import Export, Fits, export
-from meshmatch.collections.motion import area_strain, smoothed
+from meshmatch.collections.motion import area_strain, smooth_frames
 from meshmatch.collections.sources import frame_times, sort_by_sequence
 from meshmatch.errors import MeshmatchWarning, OptionError
 from meshmatch.geometry.frames import Frame
@@ -39,7 +39,7 @@ def rough(paths: np.ndarray) -> float:
 @pytest.mark.parametrize("cycle", [False, True])
 def test_paths_are_as_smooth_as_the_true_ones_and_nearer_to_them(cycle: bool) -> None:
     true, points = pulsing(), pulsing(0.05)
-    found = np.array(list(smoothed(points, BALL.faces, range(FRAMES), cycle)))
+    found = np.array(list(smooth_frames(points, BALL.faces, range(FRAMES), cycle)))
     before, after = (np.linalg.norm(some - true, axis=2).mean() for some in (points, found))
     assert after < 0.7 * before
     assert rough(points) > 1.8 * rough(true) and rough(found) < 1.3 * rough(true)
@@ -52,7 +52,7 @@ def test_a_first_frame_is_smoothed_as_well() -> None:
     """It has neighbours on one side alone, and a component of its own if it slid further than they."""
     true, points = pulsing(), pulsing(0.05)
     points[0] = pulsing(0.15)[0]
-    found = np.array(list(smoothed(points, BALL.faces, range(FRAMES))))
+    found = np.array(list(smooth_frames(points, BALL.faces, range(FRAMES))))
     before, after = (np.linalg.norm((some - true)[0], axis=1).mean() for some in (points, found))
     assert after < 0.6 * before
 
@@ -63,21 +63,21 @@ def test_a_short_motion_is_no_noise() -> None:
     rng = np.random.default_rng(4)
     slid = BALL.verts + 0.05 * rng.standard_normal((FRAMES, *BALL.verts.shape))
     points, true = slid / np.linalg.norm(slid, axis=2, keepdims=True) + aside, BALL.verts + aside
-    found = np.array(list(smoothed(points, BALL.faces, range(FRAMES))))
+    found = np.array(list(smooth_frames(points, BALL.faces, range(FRAMES))))
     before, after = (np.linalg.norm(some - true, axis=2).mean() for some in (points, found))
     assert after < 0.6 * before and rough(found) < 1.3 * rough(true)
 
 
 def test_what_is_smooth_stays_as_it_is() -> None:
     true = pulsing()
-    assert np.abs(np.array(list(smoothed(true, BALL.faces, range(FRAMES), True))) - true).max() < 0.02
+    assert np.abs(np.array(list(smooth_frames(true, BALL.faces, range(FRAMES), True))) - true).max() < 0.02
 
 
 def test_a_missing_frame_is_a_gap_in_time() -> None:
     true, points = pulsing(), pulsing(0.05)
     kept = [k for k in range(FRAMES) if k not in (5, 6)]
-    found = np.array(list(smoothed(points[kept], BALL.faces, kept, True)))
-    as_if_none = np.array(list(smoothed(points[kept], BALL.faces, range(len(kept)), True)))
+    found = np.array(list(smooth_frames(points[kept], BALL.faces, kept, True)))
+    as_if_none = np.array(list(smooth_frames(points[kept], BALL.faces, range(len(kept)), True)))
     off = [np.linalg.norm(some - true[kept], axis=2)[3:7].mean() for some in (found, as_if_none)]
     assert off[0] < off[1]
 
@@ -88,8 +88,8 @@ def test_a_cycle_has_its_last_frames_even_where_they_are_missing(tmp_path: Path)
     part = fits_of(points[:13], names[:13])
     export(tmp_path / "cycle", replace(part, times=frame_times(names)), Export(".npz", cycle=True), None)
     found = np.load(tmp_path / "cycle" / "coords.npz")["points"]
-    known = np.array(list(smoothed(points[:13], BALL.faces, range(13), True, FRAMES)))
-    shorter = np.array(list(smoothed(points[:13], BALL.faces, range(13), True)))
+    known = np.array(list(smooth_frames(points[:13], BALL.faces, range(13), True, FRAMES)))
+    shorter = np.array(list(smooth_frames(points[:13], BALL.faces, range(13), True)))
     assert np.allclose(found, known)
     ends = [0, 12]
     off = [np.linalg.norm(some[ends] - pulsing()[ends], axis=2).mean() for some in (found, shorter)]
@@ -106,7 +106,7 @@ def test_frames_of_a_subfolder_do_not_split_those_of_its_folder() -> None:
 @pytest.mark.parametrize("times", [range(1), range(4), [*range(7), 5000]])
 def test_too_few_or_too_many_are_refused(times: list[int]) -> None:
     with pytest.raises(OptionError, match="cannot be smoothed"):
-        next(smoothed(pulsing()[: len(times)], BALL.faces, times))
+        next(smooth_frames(pulsing()[: len(times)], BALL.faces, times))
 
 
 def test_strain_is_how_much_the_surface_grew() -> None:

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from meshmatch.collections.workers import DeadWorker, Processes, open_workers
+from meshmatch.collections.workers import DeadWorkerError, Processes, open_workers
 from meshmatch.errors import MeshmatchWarning, OptionError
 
 ROOT = Path(__file__).parents[2]
@@ -39,23 +39,23 @@ def asleep(number: int) -> int:
 @pytest.mark.parametrize("count", [1, 2])
 def test_every_item_is_done_once(count: int) -> None:
     with open_workers(count) as crew:
-        assert dict(crew.each(squared, range(7))) == {number: number * number for number in range(7)}
-        assert dict(crew.each(squared, [5])) == {0: 25}
-        assert dict(crew.each(squared, [])) == {}
+        assert dict(crew.map_unordered(squared, range(7))) == {number: number * number for number in range(7)}
+        assert dict(crew.map_unordered(squared, [5])) == {0: 25}
+        assert dict(crew.map_unordered(squared, [])) == {}
 
 
 def test_a_process_that_dies_takes_no_other_result_with_it() -> None:
     with open_workers(2) as crew:
-        found = dict(crew.each(squared_or_dead, range(6)))
-        assert isinstance(found.pop(3), DeadWorker)
+        found = dict(crew.map_unordered(squared_or_dead, range(6)))
+        assert isinstance(found.pop(3), DeadWorkerError)
         assert found == {number: number * number for number in (0, 1, 2, 4, 5)}
-        assert dict(crew.each(squared, range(3))) == {0: 0, 1: 1, 2: 4}  # and the crew is whole again
+        assert dict(crew.map_unordered(squared, range(3))) == {0: 0, 1: 1, 2: 4}  # and the crew is whole again
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_what_a_task_raises_ends_the_work(count: int) -> None:
     with open_workers(count) as crew, pytest.raises(OptionError, match="not "):
-        list(crew.each(refused, range(3)))
+        list(crew.map_unordered(refused, range(3)))
 
 
 def test_no_workers_are_refused() -> None:
@@ -71,7 +71,7 @@ def test_workers_do_not_outlive_a_parent_that_is_killed(tmp_path: Path) -> None:
         "from tests.collections.test_workers import asleep\n"
         "if __name__ == '__main__':\n"
         "    crew = Processes(2)\n"
-        "    list(crew.each(asleep, [1, 2]))\n"
+        "    list(crew.map_unordered(asleep, [1, 2]))\n"
     )
     child = subprocess.Popen([sys.executable, str(program)], env=os.environ | {"PYTHONPATH": str(ROOT)})
     try:
@@ -96,7 +96,7 @@ def children(pid: int) -> list[int]:
 
 
 def test_one_process_is_this_one() -> None:
-    assert dict(Processes(1).each(own_process, [0, 0])) == {0: os.getpid(), 1: os.getpid()}
+    assert dict(Processes(1).map_unordered(own_process, [0, 0])) == {0: os.getpid(), 1: os.getpid()}
 
 
 def own_process(_: int) -> int:
@@ -113,7 +113,7 @@ import os
 from meshmatch.collections.workers import Processes
 from tests.collections.test_workers import pid_after_a_while
 print("once")
-found = dict(Processes(2).each(pid_after_a_while, range(4)))
+found = dict(Processes(2).map_unordered(pid_after_a_while, range(4)))
 print(len(found), os.getpid() in found.values())
 """
 
@@ -140,7 +140,7 @@ class Own:
     name: str
 warnings.simplefilter("always")
 if __name__ == "__main__":
-    print(sorted(Processes(2).each(name_of, [Own("a"), Own("b")])))
+    print(sorted(Processes(2).map_unordered(name_of, [Own("a"), Own("b")])))
 """
 
 
@@ -185,14 +185,18 @@ def check_alone(why: str) -> None:
     with warnings.catch_warnings(record=True) as said, open_workers(2) as crew:
         warnings.simplefilter("always")
         for _ in range(2):
-            assert dict(crew.each(own_process, range(3))) == dict.fromkeys(range(3), os.getpid())
+            assert dict(crew.map_unordered(own_process, range(3))) == dict.fromkeys(range(3), os.getpid())
     assert [each.category for each in said] == [MeshmatchWarning] and why in str(said[0].message)
 
 
 def in_a_daemon(count: int) -> tuple[dict[int, object], list[str], int]:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        return dict(Processes(count).each(own_process, range(3))), [str(each.message) for each in said], os.getpid()
+        return (
+            dict(Processes(count).map_unordered(own_process, range(3))),
+            [str(each.message) for each in said],
+            os.getpid(),
+        )
 
 
 def test_a_daemonic_process_works_alone() -> None:
