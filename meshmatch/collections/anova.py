@@ -205,7 +205,7 @@ def _basis(terms: Sequence[DesignTerm], groups: Int[Ints, " S"]) -> _Basis:
         sides, sizes, _ = np.linalg.svd(columns, full_matrices=False)
         new = sides[:, sizes > _MIN_INDEPENDENT]
         if not new.shape[1]:
-            raise InputError(f"{term.name} says nothing that the terms before it do not", "leave it out")
+            raise InputError(f"{term.name} adds nothing to the terms before it", "leave it out")
         found = np.concatenate([found, new], axis=1)
         number += [k] * new.shape[1]
     counts = np.bincount(groups)

@@ -123,7 +123,7 @@ def measure_asymmetry(
     elif individuals is not None:
         given = _pair_sides(atlas, labels, sides, _cells(known, sides))
     else:
-        raise OptionError("sides are of individuals", "say which column names these")
+        raise OptionError("sides are of individuals", "give the column that names individuals")
     names, owner, pairs = given.names, given.owner, given.points
     if len(names) < 3:
         raise InputError(f"{len(names)} individuals are too few", "three or more are needed")
@@ -192,7 +192,7 @@ def _pair_with_images(atlas: Atlas, labels: Sequence[str], seed: int) -> _Pairs:
     if of_mean > _MAX_ASYMMETRY * np.sqrt(mean.area):
         raise InputError(
             f"the mean is no mirror image of itself: they are {of_mean:.3g} apart on average",
-            "left and right ones of a pair are compared by columns that say which is whose (sides, individuals)",
+            "to compare left shapes with right ones, give the columns that name sides and individuals",
         )
     reference = Superimposed((mean.verts + image) / 2, weights, None)
     names, owner, order = _number_individuals(labels)

@@ -496,4 +496,4 @@ class Collection(FitsFolder):
         self.places_of(name)
         where = self._fitted_elsewhere([name]).get(name)
         if where is not None:
-            raise InputError(f"{name} is of another kind", f"its fit is in {where}: map there")
+            raise InputError(f"{name} is of another kind", f"its fit is in {where}: map it there")

@@ -111,13 +111,13 @@ class Export:
             what = "frames are smoothed as registered meshes, where their files have them"
             raise OptionError(what, "leave out the originals and the place")
         if self.values is not None and not self.original:
-            raise OptionError("values go with the original meshes", "ask for these: original, --original")
+            raise OptionError("values go with the original meshes", "add --original (`original`)")
 
     def into(self, output: str | Path) -> Export:
         """Return self; `OptionError` if the output folder has the suffix of a file, probably by mistake."""
         path = as_path(output)
         if (ending := path.suffix.lower()) in (*MESHES, *TABLES) and not path.is_dir():
-            what = f"{path.name} is to be a folder, and is named as a file"
+            what = f"{path.name} must be a folder, but is named like a file"
             raise OptionError(what, f"name the folder {path.stem}, and the files --format {ending}")
         return self
 
@@ -340,7 +340,7 @@ def _write_clips(folder: Path, fits: Fits, cycle: bool) -> list[str]:
         if len(names) < 2:
             continue
         if len(names) * fits.template.shape.V > _MAX_CLIP_VERTS:
-            warn(f"{where or 'the sequence'} is too large for one moving .glb; ParaView plays the frames as .vtp")
+            warn(f"{where or 'the sequence'} is too large for one animated .glb; ParaView plays the frames as .vtp")
             continue
         title = f"{where}/sequence".lstrip("/")
         while title in taken:

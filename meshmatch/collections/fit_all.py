@@ -278,7 +278,7 @@ def _remove_stale_fits(store: Store, records: Sequence[Record]) -> None:
         store.remove(f"{FITS}/{name}{SUFFIX}")
     if gone := [name for name in others if name not in fitted]:
         why = "no longer in it, for their files are gone or have other names"
-        warn(f"{store.location}: {why}: {_list_names(gone)}; shapes that are given again join it again")
+        warn(f"{store.location}: {why}: {_list_names(gone)}; give them again to fit them again")
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,9 @@ _IN_MEMORY = 256 * 2**20  # bytes; larger arrays are kept in a temporary file
 _MIN_SHAPES, _MAX_DEVIATIONS = 8, 6.0  # for outliers; deviations are estimated from the median absolute deviation
 _MAX_SIZE_RATIO = 3.0  # larger ratios are probably a mix of units
 _LINE_BYTES = 200  # memory needed per line
-_LIST_HINT = "write one name a line; of a table of specimens, --metadata TABLE --model 'shape ~ COLUMN' compares groups"
+_LIST_HINT = (
+    "write one name per line; for a table of specimens, --metadata TABLE --model 'shape ~ COLUMN' compares groups"
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -65,7 +67,7 @@ class Registered(Brief):
         """
         if self.cut:
             warn(
-                f"{some(self.cut)}: cut, among whole shapes, what is missing was guessed: see --leave-out (`leave_out`)"
+                f"{some(self.cut)}: cut, among whole shapes: what is missing was guessed, see --leave-out (`leave_out`)"
             )
         groups = groups_of(Shape(self.points[0], self.faces), align_by, self.parts)
         return Atlas.of(
@@ -121,9 +123,7 @@ def registered_meshes(folder: str | Path, leave_out: Sequence[str] = ()) -> Iter
         if shape.V != first.V or not np.array_equal(shape.faces, first.faces):
             what = f"{files[number].name} does not have the vertices and faces of {files[0].name}"
             if shape.V == first.V and np.array_equal(np.sort(shape.faces, axis=1), np.sort(first.faces, axis=1)):
-                hint = (
-                    "faces look the other way, as of a mirror image: meshmatch export --place template turns those over"
-                )
+                hint = "faces are reversed, as in a mirror image: meshmatch export --place template flips them back"
                 raise InputError(what, hint)
             raise InputError(what, "register the shapes first: meshmatch fit")
         return shape.verts

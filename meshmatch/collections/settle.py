@@ -59,8 +59,8 @@ def select_setting(requested: Setting, sources: Sequence[Source]) -> Setting:
         other = f"the fits in {store.location} were made with another {_describe_difference(differs[0], about, wanted)}"
         hint = "choose another folder, or the options used before"
         if isinstance(about["fit"], dict) and about["fit"].keys() != wanted["fit"].keys():
-            other = f"the fits in {store.location} were made by another version of meshmatch, which fits otherwise"
-            hint = "choose another folder, or go on with that version; maps and atlases can be made of them as they are"
+            other = f"the fits in {store.location} were made by another version of meshmatch, which fits differently"
+            hint = "choose another folder, or keep using that version; maps and atlases of these fits still work"
         raise OptionError(other, hint)
     return setting
 

@@ -53,7 +53,7 @@ def find_sources(
     found.sort(key=lambda source: source.name)
     if not found:
         raise InputError(
-            f"there are no shapes in {given[0] if given else 'nothing'}", f"read are {', '.join(SUFFIXES)}"
+            f"there are no shapes in {given[0] if given else 'nothing'}", f"supported formats are {', '.join(SUFFIXES)}"
         )
     counts = Counter(source.name for source in found)
     for source in found:
@@ -112,9 +112,7 @@ def _add_sources(given: str | Path, output: Store | None, found: list[Source], l
         selected = [file for file in preferred if suffix_of(file) != ".npy"] or preferred
         known = {file.with_name(stem_of(file)) for file in (*selected, *preferred)}
         projects = [file for file in shapes if file.with_name(stem_of(file)) not in known]
-        _warn_left_out(
-            folder.location, "files for Blender beside other shapes", projects, left_out, f"{folder.location}/"
-        )
+        _warn_left_out(folder.location, "Blender files next to other shapes", projects, left_out, f"{folder.location}/")
         left_out += _skipped_records(candidates, selected, projects, f"{folder.location}/")
         why = "a link to a folder, which is not followed"
         left_out += [Record(link, f"{folder.location}/{link}", LEFT_OUT, reasons=why) for link in folder.folder_links()]
@@ -146,7 +144,7 @@ def _skipped_records(
         belongs = any(file.with_name(".".join(words[:count])) in owners for count in range(1, len(words)))
         if file not in known and not belongs and not _is_unknown(file):
             is_array = suffix_of(file) == ".npy"
-            why = "an array beside shapes" if is_array else "a format of no shapes"
+            why = "an array next to shapes" if is_array else "not a format of shapes"
             found.append(Record(str(file), f"{folder}{file}", LEFT_OUT, reasons=why))
     return found
 

@@ -51,7 +51,7 @@ class Store:
             try:
                 files.get_file(f"{root}/{name}", str(local))
             except OSError as error:
-                raise InputError(f"cannot read {self.location}/{name}: {error}", "is the address right?") from error
+                raise InputError(f"cannot read {self.location}/{name}: {error}", "check the address") from error
             yield local
 
     @contextmanager
@@ -73,7 +73,7 @@ class Store:
                 files.makedirs(f"{root}/{PurePosixPath(name).parent}", exist_ok=True)
                 files.put_file(str(local), f"{root}/{name}")
             except OSError as error:
-                raise OutputError(f"cannot write {self.location}/{name}: {error}", "may you write there?") from error
+                raise OutputError(f"cannot write {self.location}/{name}: {error}", "check the permissions") from error
 
     @contextmanager
     def exclusive(self) -> Iterator[None]:

@@ -84,7 +84,7 @@ class Processes:
                     suspects += in_flight.values()
                 else:
                     pending += in_flight.values()
-                    self._work_in_this_process("processes that were started ended at once")
+                    self._work_in_this_process("the started processes ended at once")
             except CannotStart as error:
                 pending += in_flight.values()
                 self._work_in_this_process(str(error))
@@ -125,7 +125,7 @@ class _Pool:
         if getattr(sys, "frozen", False) or not sys.executable:
             raise CannotStart("a frozen program has no Python to start others with")
         if needs_main and not _main_can_be_imported():
-            raise CannotStart("other processes cannot import the program, which is no file")
+            raise CannotStart("other processes cannot import the program, which is not a file")
         self._needs_main = needs_main
         with _raise_cannot_start():
             context = multiprocessing.get_context("spawn")
@@ -239,7 +239,7 @@ class Cluster:
                 try:
                     yield number, future.result()
                 except KilledWorker:
-                    yield number, DeadWorkerError("the workers that worked on it died", "have they enough memory?")
+                    yield number, DeadWorkerError("the workers that worked on it died", "do they have enough memory?")
                 except ModuleNotFoundError as error:
                     hint = "install the same meshmatch on all of them"
                     raise InputError(f"a worker of the cluster lacks {error.name}", hint) from error

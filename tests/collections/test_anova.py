@@ -250,7 +250,7 @@ def test_what_cannot_be_explained() -> None:
     atlas = Atlas.of(given.points, given.faces)
     ages = {"age": [1, 2, 3, 4, 5, 6], "twice": [2, 4, 6, 8, 10, 12], "id": list("abcdef"), "x": list("aabbaa")}
     refused: dict[str, tuple[type[Exception], str]] = {
-        "form ~ age + twice": (InputError, "twice says nothing that the terms before it do not"),
+        "form ~ age + twice": (InputError, "twice adds nothing to the terms before it"),
         "form ~ id": (InputError, "too few"),
         "form ~ age*x + log(age) + log(twice)": (InputError, "too few"),
         "shape ~ age": (OptionError, "keeps the shapes' sizes"),

@@ -544,8 +544,8 @@ def test_every_file_of_a_folder_has_a_row(tmp_path: Path, capsys: pytest.Capture
         rows = {row["name"]: (row["verdict"], row["reasons"]) for row in csv.DictReader(table)}
     others = {name: rows.pop(name) for name in ("README", "more/notes.docx", "points.npy", "stack.tif")}
     assert set(rows) == {"dancer", "climber"} == set(file_table(Store.of(fits)))
-    assert others.pop("points.npy") == ("left out", "an array beside shapes")
-    assert set(others.values()) == {("left out", "a format of no shapes")}
+    assert others.pop("points.npy") == ("left out", "an array next to shapes")
+    assert set(others.values()) == {("left out", "not a format of shapes")}
     assert set(meshmatch.Transfers(meshmatch.transfer_landmarks, scans / "dancer.ply", fits).files) == {"climber"}
     for number in range(3):
         (scans / f"{number}.png").write_bytes(b"no shape")

@@ -286,7 +286,7 @@ def test_works_of_an_artist_beside_shapes_of_a_folder_are_left_alone(tmp_path: P
     assert ([source.file for source in found], left_out) == (["a.fbx", "b.fbx"], [])
     for name in ("c.ply", "c.blend", "c.npy"):
         (tmp_path / name).write_bytes(b"x")
-    with pytest.warns(MeshmatchWarning, match=r"files for Blender beside other shapes are left out: a\.fbx, b\.fbx$"):
+    with pytest.warns(MeshmatchWarning, match=r"Blender files next to other shapes are left out: a\.fbx, b\.fbx$"):
         found, left_out = find_sources(tmp_path, fits)
     assert [source.file for source in found] == ["c.ply"]
     assert [record.name for record in left_out] == ["a.fbx", "b.fbx"]
