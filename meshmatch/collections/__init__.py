@@ -1,1 +1,1 @@
-"""Many shapes at once: what is learned from all of them."""
+"""Collections of many shapes of one kind: fits, maps between any two, atlases and statistics."""

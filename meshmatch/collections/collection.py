@@ -133,12 +133,12 @@ class Collection(FitsFolder):
         with self.store.exclusive(), open_workers(self.workers) as workers:
             setting = select_setting(requested, sources := self._with_earlier(given))
             if model == AUTO:
-                made = fit_all_kinds(setting, requested, sources, workers, agree, self.progress, tell)
+                fitted = fit_all_kinds(setting, requested, sources, workers, agree, self.progress, tell)
             else:
-                made = fit_all(setting, sources, workers, agree, self.progress, tell)
-            made = with_left_out(made, self.store, left_out)
+                fitted = fit_all(setting, sources, workers, agree, self.progress, tell)
+            fitted = with_left_out(fitted, self.store, left_out)
         clear_caches()
-        return made
+        return fitted
 
     @property
     def names(self) -> list[str]:

@@ -110,18 +110,18 @@ def fit_all(
 ) -> Fitted:
     """Fit all shapes of a collection; see `Collection.fit`. `InputError` if none can be fitted."""
     report = progress or (lambda stage, name, share: None)
-    others: set[str] = set()
+    opposite: set[str] = set()
     cut: dict[str, float] = {}
     if setting.model == NO_MODEL:
         first = _Run(setting, sources, workers, report).fit_alone(None, FIRST)
-        cut, others = _maybe_partial(first), opposite_side_names(first)
+        cut, opposite = _maybe_partial(first), opposite_side_names(first)
         usual = Compared.of(first)
         setting = _refine_mean_template(
             _Run(setting, sources, workers, report),
-            subsample([each.name for each in first if _is_credible(each, usual) and each.name not in others]),
+            subsample([each.name for each in first if _is_credible(each, usual) and each.name not in opposite]),
         )
     run = _Run(setting, sources, workers, report)
-    records = run.fit_alone(tell if setting.learned else None, others=others, cut=cut)
+    records = run.fit_alone(tell if setting.learned else None, opposite=opposite, cut=cut)
     if not (setting.learned or setting.model == NO_MODEL) and (cut := _maybe_partial(records)):
         records = run.fit_alone(None, cut=cut)
     fitted = [number for number, record in enumerate(records) if record.fitted]
@@ -134,7 +134,7 @@ def fit_all(
     how = AgreeConfig.for_collection(setting.trained) if setting.agrees else None
     agreement = digest_of(
         *parts, str(how), *([str(usual)] if usual else [])
-    )  # if anything in it changes, the fits agree again
+    )  # fits agree again if any of this changes, including the reprs of configurations
     groups = run.groups(agreeing, agreement) if agree and setting.agrees and len(agreeing) > 1 else []
     tasks = run.finish_tasks({number: records[number] for number in fitted}, groups, usual)
     if groups and not all(is_finished(setting.store, task) for task in tasks.values()):
@@ -187,12 +187,12 @@ def fit_all_kinds(
 
     ``requested`` is the setting as the user gave it, before a model was chosen.
     """
-    made = fit_all(setting, sources, workers, agree, progress, _skip_other_kinds(tell))
-    return _fit_other_kinds(made, requested, sources, workers, agree, progress, tell)
+    result = fit_all(setting, sources, workers, agree, progress, _skip_other_kinds(tell))
+    return _fit_other_kinds(result, requested, sources, workers, agree, progress, tell)
 
 
 def _fit_other_kinds(
-    made: Fitted,
+    result: Fitted,
     requested: Setting,
     sources: Sequence[Source],
     workers: Workers,
@@ -205,18 +205,18 @@ def _fit_other_kinds(
     Their records then name that folder. ``tell`` gets the record of the second fit, or of the first one where the
     second failed.
     """
-    others: dict[str, list[int]] = defaultdict(list)
-    for number, record in enumerate(made.records):
+    numbers_by_kind: dict[str, list[int]] = defaultdict(list)
+    for number, record in enumerate(result.records):
         if record.kind:
-            others[record.kind].append(number)
-    records, elsewhere = list(made.records), {}
-    for kind, numbers in others.items():
+            numbers_by_kind[record.kind].append(number)
+    records, elsewhere = list(result.records), {}
+    for kind, numbers in numbers_by_kind.items():
         store, own = Store.of(f"{requested.store.location}/{kind}"), [sources[number] for number in numbers]
         try:
             with store.exclusive():
                 setting = select_setting(replace(requested, store=store), own)
                 found = fit_all(setting, own, workers, agree, progress, tell)
-        except InputError:  # the kind's model rejects them, or none of them can be fitted: keep the first fits
+        except InputError:  # no model can be chosen, or none can be fitted: keep the first fits
             if tell is not None:
                 for number in numbers:
                     tell(records[number])
@@ -226,9 +226,9 @@ def _fit_other_kinds(
             records[number] = replace(record, kind=kind, notes=f"{where}; {record.notes}".removesuffix("; "))
             if record.fitted:
                 elsewhere[record.name] = store.location
-    if others:
+    if numbers_by_kind:
         _write_table(requested.store, records)
-    return replace(made, records=tuple(records), elsewhere=elsewhere)
+    return replace(result, records=tuple(records), elsewhere=elsewhere)
 
 
 def _skip_other_kinds(tell: Callable[[Record], None] | None) -> Callable[[Record], None] | None:
@@ -236,13 +236,13 @@ def _skip_other_kinds(tell: Callable[[Record], None] | None) -> Callable[[Record
     return None if tell is None else lambda record: None if record.kind else tell(record)
 
 
-def with_left_out(made: Fitted, store: Store, left_out: Sequence[Record]) -> Fitted:
+def with_left_out(result: Fitted, store: Store, left_out: Sequence[Record]) -> Fitted:
     """Add the records of files that were left out, and rewrite the table with them."""
     if not left_out:
-        return made
-    made = replace(made, records=(*made.records, *left_out))
-    _write_table(store, made.records)
-    return made
+        return result
+    result = replace(result, records=(*result.records, *left_out))
+    _write_table(store, result.records)
+    return result
 
 
 def file_table(store: Store) -> dict[str, str]:
@@ -273,10 +273,10 @@ def _remove_stale_fits(store: Store, records: Sequence[Record]) -> None:
     """Remove finished fits of shapes that failed this time or left the collection, with a warning about the latter."""
     fitted = {record.name: record.fitted for record in records}
     names = [file.removesuffix(SUFFIX) for file in store.names(FITS)]
-    others = [name for name in names if not fitted.get(name)]
-    for name in others:
+    stale = [name for name in names if not fitted.get(name)]
+    for name in stale:
         store.remove(f"{FITS}/{name}{SUFFIX}")
-    if gone := [name for name in others if name not in fitted]:
+    if gone := [name for name in stale if name not in fitted]:
         why = "no longer in it, for their files are gone or have other names"
         warn(f"{store.location}: {why}: {_list_names(gone)}; give them again to fit them again")
 
@@ -302,24 +302,24 @@ class _Run:
         self,
         tell: Callable[[Record], None] | None,
         folder: str = ALONE,
-        others: Set[str] = frozenset(),
+        opposite: Set[str] = frozenset(),
         cut: Mapping[str, float] = MappingProxyType({}),
     ) -> list[Record]:
         """Fit every shape on its own. Frames of a sequence are fitted one after another, several sequences in parallel.
 
-        ``others`` names shapes to fit with the opposite handedness to that found before. ``cut`` maps names of shapes
+        ``opposite`` names shapes to fit with the opposite handedness to that found before. ``cut`` maps names of shapes
         that may be partial to the sqrt(area) of a whole shape. Returns the records in the order of the sources.
         """
         found: dict[int, Record] = {}
         chains = self._chains()
-        for turn in range(max(map(len, chains))):
-            numbers = [chain[turn] for chain in chains if turn < len(chain)]
-            before = [self._last_fitted(chain[:turn], found) for chain in chains if turn < len(chain)]
+        for position in range(max(map(len, chains))):
+            numbers = [chain[position] for chain in chains if position < len(chain)]
+            before = [self._last_fitted(chain[:position], found) for chain in chains if position < len(chain)]
             pairs = zip(numbers, before, strict=True)
             tasks = []
             for number, last in pairs:
                 source = self.sources[number]
-                how = source.name in others, cut.get(source.name)
+                how = source.name in opposite, cut.get(source.name)
                 tasks.append(FitTask(self.setting, source, last, folder, *how))
             for index, result in self._map(fit_alone, tasks, "fitting" if folder == ALONE else "choosing the template"):
                 source = self.sources[numbers[index]]

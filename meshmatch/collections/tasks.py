@@ -193,6 +193,7 @@ def agree_group(task: AgreeTask) -> Float[Floats, "G 3 3"]:
 
 
 def _build_member(read: StoredFit, how: AgreeConfig) -> Member:
+    """The part of a stored fit that the agreement needs; `InputError` if the fit was stored without samples."""
     roughness = read.words.get("roughness")
     if read.samples is None or type(roughness) is not float:
         raise InputError("a fit that should agree has no samples", "remove the folder of fits, and make it again")
@@ -264,6 +265,7 @@ def finish(task: FinishTask) -> Finished:
 
 
 def _write_finished_fit(task: FinishTask) -> None:
+    """Judge a fit by comparison, apply the result of the agreement, and store it with the places of its vertices."""
     setting, name = task.setting, task.source.name
     alone = setting.read(ALONE, name)
     part = validated(leave_out(task.source.load(setting.only, setting.without), alone.fit.left_out))

@@ -198,7 +198,7 @@ class Transfers(Generic[R]):
         worn = Path(garment) if isinstance(garment, str | Path) else None
         ending = ending_of(word, suffix, worn, found.files)
 
-        def made(name: str, file: Path, output: Path) -> tuple[str, float | None]:
+        def transfer_one(name: str, file: Path, output: Path) -> tuple[str, float | None]:
             result = self._transfer_to(file, found)
             result.save(output)
             forward = result.maps.forward
@@ -212,7 +212,7 @@ class Transfers(Generic[R]):
                 tell(record)
 
         how = word, changes, self.source, self.choices, found.fits
-        return transfer_each(found.files, folder, ending, how, made, report)
+        return transfer_each(found.files, folder, ending, how, transfer_one, report)
 
     def _find_targets(self, output: Path | None = None) -> Targets:
         return Targets.find(self.targets, self.source, self.choices.get("garment"), output)
