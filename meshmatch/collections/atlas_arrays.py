@@ -60,7 +60,7 @@ def _validated(file: Path, given: dict[str, Any]) -> dict[str, Any]:
     }
     numbers = {
         n: given[n].astype(np.float64) for n in layout if matches_layout[n] and layout[n][0] == "f"
-    }  # of any precision
+    }  # floats of any precision
     invalid = [n for n in layout if not matches_layout[n] or not (np.abs(numbers.get(n, 0.0)) < LARGEST).all()]
     if not invalid:
         weights, faces = numbers["weights"], given["faces"]

@@ -32,7 +32,7 @@ USUAL = {
     "transfer_rig": Ending(".glb"),
     "transfer_shapes": Ending(".glb", (".vrm",)),
     "transfer_texture": Ending(".glb", (".obj", ".vrm")),
-    "transfer_garment": Ending(""),  # that of the garment
+    "transfer_garment": Ending(""),  # the garment's own suffix
 }
 """Default endings, by the name of the transfer function."""
 

@@ -73,7 +73,7 @@ class _Parser:
         self._position = 0
 
     def formula(self) -> Formula:
-        space = self._word("begins with 'shape ~' or 'form ~'")
+        space = self._word("must begin with 'shape ~' or 'form ~'")
         if space not in get_args(Space) or not self._accept("~"):
             self._fail("does not begin with 'shape ~' or 'form ~'")
         terms: dict[frozenset[Factor], Term] = {}
@@ -114,28 +114,31 @@ class _Parser:
         return tuple(dict.fromkeys(factors))
 
     def _factor(self) -> Factor:
-        name = self._word("has no name")
+        name = self._word("needs a name")
         if not self._accept("("):
             return Factor(name)
         if name not in _FUNCTIONS:
-            self._fail(f"has the function {name!r}, which is none of {', '.join(_FUNCTIONS)}")
-        found = Factor(self._word(f"has nothing in {name}()"), name)  # type: ignore[arg-type]
+            self._fail(f"has the function {name!r}, which is not one of {', '.join(_FUNCTIONS)}")
+        found = Factor(self._word(f"needs a name in {name}()"), name)  # type: ignore[arg-type]
         if not self._accept(")"):
             self._fail(f"has no ) behind {found.column}")
         return found
 
     def _word(self, problem: str) -> str:
+        """Consume a name; ``problem`` continues the message if there is none."""
         word, mark = self._tokens[self._position] if self._position < len(self._tokens) else ("", "")
         if not word:
-            self._fail(f"{problem}, but {mark!r}" if mark else f"{problem}: it ends early")
+            self._fail(f"{problem}, not {mark!r}" if mark else f"{problem}: it ends early")
         self._position += 1
         return word
 
     def _accept(self, mark: str) -> bool:
+        """Consume a punctuation mark if it comes next."""
         if self._position < len(self._tokens) and self._tokens[self._position] == ("", mark):
             self._position += 1
             return True
         return False
 
     def _fail(self, problem: str) -> NoReturn:
+        """Raise `OptionError`."""
         raise OptionError(f"the formula '{self._text[:60]}' {problem}", _HINT)

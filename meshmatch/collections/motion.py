@@ -21,7 +21,7 @@ from meshmatch.maps.footpoints import Surface
 
 MIN_FRAMES, MAX_FRAMES = 5, 2000
 """Smallest and largest number of frames of a sequence that can be smoothed."""
-_WEIGHTS = 10.0 ** np.arange(-4, 7.1, 0.25)  # of second differences: from almost no smoothing to uniform motion
+_WEIGHTS = 10.0 ** np.arange(-4, 7.1, 0.25)  # weights of the penalty, from almost no smoothing to uniform motion
 _MIN_ENERGY = 1e-12  # components with a smaller share of the energy are rounding
 _SAMPLED = 1500  # vertices used to choose the weights
 

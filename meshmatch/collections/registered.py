@@ -29,7 +29,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import read_by_suffix
 
 _IN_MEMORY = 256 * 2**20  # bytes; larger arrays are kept in a temporary file
-_MIN_SHAPES, _MAX_DEVIATIONS = 8, 6.0  # for outliers; deviations are estimated from the median absolute deviation
+_MIN_SHAPES, _MAX_DEVIATIONS = 8, 6.0  # criteria of outliers; deviations are estimated robustly (MAD)
 _MAX_SIZE_RATIO = 3.0  # larger ratios are probably a mix of units
 _LINE_BYTES = 200  # memory needed per line
 _LIST_HINT = (

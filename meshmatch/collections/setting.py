@@ -81,7 +81,7 @@ class Record:
 
     name: str
     file: str
-    verdict: str = FAILED  # that of the fit; or `FAILED` or `LEFT_OUT`
+    verdict: str = FAILED  # the fit's verdict, or `FAILED` or `LEFT_OUT`
     trust: float = 0.0
     reasons: str = ""
     residual: float = float("nan")  # units of sqrt(area)
@@ -89,11 +89,11 @@ class Record:
     furthest: float = float("nan")  # largest distance between the surfaces, unit of the file
     inverted: float = float("nan")  # inverted share of the template, see `Regularity`
     volume: float = float("nan")  # mean change of volume, see `Regularity`
-    stretch: float = float("nan")  # of the template, see `FitFeatures`
+    stretch: float = float("nan")  # stretch of the template, see `FitFeatures`
     likely: float = 0.0  # trust of the fit by itself, not capped where correspondence is uncertain
     mirrored: int = 0  # 1 if it was fitted as a mirror image
     side: float = 0.0  # see `Fit.side`
-    scale: float = 0.0  # of the fit: sqrt(area) of a whole shape, unit of the file
+    scale: float = 0.0  # sqrt(area) of a whole shape according to the fit, unit of the file
     up: str = ""
     front: str = ""
     vertices: int = 0
@@ -125,7 +125,7 @@ class Setting:
     store: Store
     model: str  # name or folder; or `NO_MODEL`
     config: FitConfig
-    only: tuple[str, ...] = ()  # of a glb or gltf file, see `load_shape`
+    only: tuple[str, ...] = ()  # meshes of a glb or gltf file to read, see `load_shape`
     without: tuple[str, ...] = ()
     sequence: bool = False  # shapes of a folder are frames, in the natural order of their names
     template_file: str = TEMPLATE

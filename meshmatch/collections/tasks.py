@@ -43,7 +43,7 @@ class FitTask:
 
     setting: Setting
     source: Source
-    last: Record | None = None  # of the previous frame, in a sequence
+    last: Record | None = None  # the previous frame, in a sequence
     folder: str = ALONE  # subfolder that the fit is written to
     other_side: bool = False
     whole: float | None = None
@@ -218,7 +218,7 @@ class FinishTask:
 
     setting: Setting
     source: Source
-    digest: str  # of the fit before the agreement
+    digest: str  # digest of the fit before the agreement
     agreed_with: str  # digest of the agreement, and what the fit is compared with
     group: Group | None = None
     step: int = 0

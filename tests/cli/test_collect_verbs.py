@@ -257,8 +257,8 @@ def test_what_cannot_be_exported(fits: Path, run: Run, tmp_path: Path, monkeypat
     (out / "mine.txt").write_text("kept")
     answer = run("export", fits, "-o", out)
     assert answer.status == 1 and (out / "mine.txt").read_text() == "kept" and len(list(out.iterdir())) == 1
-    words = Collection._words
-    monkeypatch.setattr(Collection, "_words", lambda self, name: words(self, name) | {"verdict": "poor"})
+    words = Collection._metadata
+    monkeypatch.setattr(Collection, "_metadata", lambda self, name: words(self, name) | {"verdict": "poor"})
     assert "are poor" in run("export", fits, "-o", tmp_path / "none").err
     assert run("export", fits, "-o", tmp_path / "all", "--poor").status == 0
 

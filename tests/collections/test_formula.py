@@ -45,7 +45,7 @@ def test_formulas_are_read(text: str, meant: str) -> None:
         ("shape ~ a +", "ends early"),
         ("shape ~ a - b", "'-' where"),
         ("shape ~ a b", "'b' where"),
-        ("shape ~ 1", "but '1'"),
+        ("shape ~ 1", "not '1'"),
         ("shape ~ exp(a)", "function 'exp'"),
         ("shape ~ log(a", "no \\) behind a"),
         ("shape ~ log(log(a))", "no \\) behind log"),
@@ -76,7 +76,7 @@ def test_rows_are_found_by_name(tmp_path: Path) -> None:
     model = parse("shape ~ log(size) + age + sex + factor(site) + site")
     rows_kept, lacking = complete_rows(model, None, known)
     assert lacking == {"e": "age"}
-    terms, taken = design_terms(parse("shape ~ log(size) + age + sex"), known.some(rows_kept))
+    terms, taken = design_terms(parse("shape ~ log(size) + age + sex"), known.select(rows_kept))
     assert [term.coefficients for term in terms] == [("log(size)",), ("age",), ("sex: m - f", "sex: none - f")]
     assert terms[0].columns[:, 0] == pytest.approx(np.log(SIZES[rows_kept]))
     assert terms[1].columns[:, 0].tolist() == [1.5, 2.5, 3.5, 4.5, 6.5, 7.5]
@@ -121,7 +121,7 @@ def test_what_a_table_cannot_say(tmp_path: Path, rows: list[str], formula: str, 
     with pytest.raises((InputError, OptionError), match=words):
         known = covariates(write(tmp_path / "t.csv", *rows), NAMES, SIZES)
         model = parse(f"form ~ {formula}")
-        design_terms(model, known.some(complete_rows(model, None, known)[0]))
+        design_terms(model, known.select(complete_rows(model, None, known)[0]))
 
 
 def test_columns_of_another_length_are_refused() -> None:
