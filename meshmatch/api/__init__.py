@@ -1,1 +1,1 @@
-"""The composer: each verb of the command line is one typed call here, and `import meshmatch` offers them all."""
+"""The Python interface: one typed function for each command, exported by `import meshmatch`."""

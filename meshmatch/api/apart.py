@@ -1,7 +1,8 @@
-"""What of a file is fitted where the whole is of no known kind, or fits poorly: its parts are tried apart.
+"""Select the parts of a file to fit when the whole file is of no known kind, or fits poorly.
 
-A body may stand on a pedestal or a floor, carry a box, or share its file with a chair. Readings by models tell which parts
-are a shape that they know; the others are left out, as `load_shape` leaves out those that a user names, and are said.
+A body may stand on a pedestal or a floor, carry a box, or share its file with a chair. The residuals of the models'
+predictions show which parts are a shape of a known kind. The other parts are left out, as with ``load_shape(without=...)``,
+and a note lists them.
 """
 
 from __future__ import annotations
@@ -28,22 +29,31 @@ from meshmatch.shapes.repair import NOT_TRUSTED, Repaired
 from meshmatch.shapes.shape import Shape
 
 Loader = Callable[[], TrainedModel]
-_AS_WELL = 0.003  # what also reads so much worse (units of sqrt(area)) keeps what touches it, such as clothes
-_AS_LARGE = 0.5  # share of the area of what reads best from which on another shape of the kind may be meant instead
-_MOST_FITS = 2  # of parts that read strangely, in a long search
-# Residual up to which a fit of them is likely to be found; stylised characters on pedestals had 0.051, others, whose fits
+# A larger set of parts, such as a body with its clothes, is preferred while its residual exceeds the best one by at n_fits
+# this (units of sqrt(area)).
+_RESIDUAL_MARGIN = 0.003
+_MIN_RIVAL_AREA = 0.5  # area of another shape that may be meant instead, as a share of the area of the best one
+_MAX_FITS = 2  # sets of parts with an inconclusive residual that are fitted, in a long search
+# Residual up to which a fit of them is likely to succeed; stylised characters on pedestals had 0.051, others, whose fits
 # were poor, 0.058. Set by hand.
-_PROMISING = 0.054
-_TOLD = 6  # numbers of parts in a line
+_MAX_PROMISING = 0.054
+_MAX_LISTED = 6  # part numbers in a message
 
 
 @dataclass(frozen=True, eq=False)
-class Alone:
-    """Some parts of a shape that are a shape by themselves.
+class KnownParts:
+    """Parts of a file that are a shape of a known kind by themselves.
 
-    ``clean`` is what is left, with the way back to all vertices of the file; ``readings`` are by the models that were asked,
-    infinite for others, ``row`` is the model that reads it best, and ``fit`` the one by it, with refined nodes, that had to
-    tell, if any.
+    Attributes
+    ----------
+    clean
+        The repaired parts, with the correspondence to all vertices of the file.
+    readings
+        (M,) `category_residual` by each model; infinite for models that were not evaluated.
+    row
+        Index of the model with the lowest residual.
+    fit
+        The fit by that model, with refined nodes, if one was needed to decide.
     """
 
     clean: Repaired
@@ -52,23 +62,41 @@ class Alone:
     fit: Fit | None = None
 
     def usable_fit(self, config: FitConfig) -> Fit | None:
-        """The fit, if it is one that the config asks for."""
+        """Return the fit if the config asks for refined nodes, as it has."""
         return self.fit if config.refine == "nodes" else None
 
 
-def find_alone(
+def find_known_parts(
     models: Sequence[Loader],
     whole: Shape,
     config: FitConfig,
     order: Iterable[Sequence[int]] | None = None,
     progress: ProgressCallback | None = None,
-) -> Alone | None:
-    """The parts of a shape that are a shape which one of the models knows; None where there are none, or where its user
-    chose parts or says that it is a part itself. ``order`` says which models (rows) are asked together, until one knows
-    some parts; by default all. Of parts that read strangely, the most promising are fitted to find out; others only
-    where the config says to try harder.
+) -> KnownParts | None:
+    """Find the parts of a file that are a shape of a kind that one of the models knows.
 
-    `InputError` where different parts are such shapes, and nothing tells which one is meant.
+    Parameters
+    ----------
+    models
+        Loaders of the M models.
+    whole
+        The shape as it was loaded.
+    config
+        How it is fitted. With ``try_harder``, more sets of parts with inconclusive residuals are fitted to decide.
+    order
+        Groups of rows of ``models``, evaluated one after the other until a model knows some parts; by default all at once.
+    progress
+        As in `match`.
+
+    Returns
+    -------
+    KnownParts or None
+        None if there are no such parts, if the user chose parts (the shape has weights), or if ``config.partial`` is "yes".
+
+    Raises
+    ------
+    InputError
+        Several shapes of one kind fit about equally well.
     """
     if whole.weights is not None or config.partial == "yes":
         return None
@@ -90,56 +118,59 @@ def find_alone(
             break
     value = found.min(axis=0)
 
-    def trusted(k: int) -> Fit | None:
-        """The fit of a set that reads strangely, if it shows that this is such a shape."""
+    def confirming_fit(k: int) -> Fit | None:
+        """Fit a set with an inconclusive residual; return the fit if it confirms the kind."""
         model = models[int(found[:, k].argmin())]()
         of_kind, fit = classify(model, clean[k].shape, value[k], config, progress)
         return fit if of_kind and fit is not None and fit.trust >= BELONGS and not fit.partial else None
 
     known = [k for k in range(len(sets)) if value[k] <= FAMILIAR]
     if known:
-        chosen, fit = _fullest(parts, sets, value, known), None
+        chosen, fit = _largest_good_set(parts, sets, value, known), None
     else:
-        most, least_known = (_MOST_FITS, STRANGE) if config.try_harder else (1, _PROMISING)
-        for chosen in [int(k) for k in value.argsort(kind="stable")[:most] if value[k] <= least_known]:
-            if (fit := trusted(chosen)) is not None:
+        n_fits, max_value = (_MAX_FITS, STRANGE) if config.try_harder else (1, _MAX_PROMISING)
+        for chosen in [int(k) for k in value.argsort(kind="stable")[:n_fits] if value[k] <= max_value]:
+            if (fit := confirming_fit(chosen)) is not None:
                 break
         else:
             return None
-    copied = clean[chosen].copied  # the same figure again, at another place of the scene: either is meant
+    copied = clean[chosen].copied  # copies of one figure elsewhere in the scene are no rivals: either may be fitted
     copies = [k for k in range(len(sets)) if copied is not None and copied[np.isin(parts.number, list(sets[k]))].all()]
     others = _rivals(parts, sets, chosen, [k for k in known if k not in copies])
-    if not others:  # another one may be in a pose that reads strangely
-        promising = [k for k in range(len(sets)) if FAMILIAR < value[k] <= _PROMISING and k not in copies]
-        others = [k for k in _rivals(parts, sets, chosen, promising, beside=True)[:1] if trusted(k) is not None]
+    if not others:  # another figure may be in a pose with an inconclusive residual
+        promising = [k for k in range(len(sets)) if FAMILIAR < value[k] <= _MAX_PROMISING and k not in copies]
+        others = [k for k in _rivals(parts, sets, chosen, promising, separate=True)[:1] if confirming_fit(k) is not None]
     if others:
         _refuse_to_choose(whole, parts, [sets[k] for k in (chosen, *others)])
     left_out = parts.others(sets[chosen])
     notes = [note for note in clean[chosen].notes if not note.endswith(NOT_TRUSTED)]
-    rest = replace(clean[chosen], notes=(left_out_words(parts, left_out), *notes), left_out=left_out)
-    return Alone(rest, found[:, chosen], int(found[:, chosen].argmin()), fit)
+    rest = replace(clean[chosen], notes=(left_out_note(parts, left_out), *notes), left_out=left_out)
+    return KnownParts(rest, found[:, chosen], int(found[:, chosen].argmin()), fit)
 
 
-def fit_of_parts(
+def fit_known_parts(
     model: TrainedModel, clean: Repaired, config: FitConfig, progress: ProgressCallback | None
 ) -> tuple[Fit, Repaired] | None:
-    """A fit of some parts of a shape whose fit as a whole is poor, and these parts; None where that is poor too."""
-    alone = find_alone([lambda: model], clean.original, config, progress=progress)
+    """Fit parts of a shape whose fit as a whole is poor.
+
+    Return the fit and the parts, or None if no parts are of the model's kind or their fit is poor too.
+    """
+    alone = find_known_parts([lambda: model], clean.original, config, progress=progress)
     if alone is None:
         return None
     fit = alone.usable_fit(config) or Fitter(model, config, progress).fit(alone.clean.shape)
     return None if fit.verdict == "poor" else (fit, alone.clean)
 
 
-def may_be_parts(clean: Repaired, config: FitConfig) -> bool:
-    """Whether a long search would try a mesh, or what it is made of, as parts of something."""
+def may_contain_known_parts(clean: Repaired, config: FitConfig) -> bool:
+    """Whether a longer search could fit a mesh as partial, or parts of it on their own."""
     if clean.shape.is_cloud:
         return False
     return len(Parts.of(clean.original, bases=True)) > 1 or may_show_part(clean.shape, config)
 
 
-def left_out_words(parts: Parts, numbers: Sequence[int]) -> str:
-    """What is said of parts that were left out."""
+def left_out_note(parts: Parts, numbers: Sequence[int]) -> str:
+    """Describe the parts that were left out, and how to choose others."""
     those = f"{len(numbers)} of {len(parts)} parts"
     if min(numbers) > len(parts) - parts.bases:
         those = "the flat base that it is fused with" if parts.bases == 1 else f"{parts.bases} flat bases"
@@ -148,35 +179,40 @@ def left_out_words(parts: Parts, numbers: Sequence[int]) -> str:
 
 
 def _listed(numbers: Sequence[int]) -> str:
-    more = f" and {len(numbers) - _TOLD} more" if len(numbers) > _TOLD else ""
-    return f"{'part' if len(numbers) == 1 else 'parts'} {', '.join(map(str, numbers[:_TOLD]))}{more}"
+    more = f" and {len(numbers) - _MAX_LISTED} more" if len(numbers) > _MAX_LISTED else ""
+    return f"{'part' if len(numbers) == 1 else 'parts'} {', '.join(map(str, numbers[:_MAX_LISTED]))}{more}"
 
 
-def _fullest(parts: Parts, sets: Sequence[frozenset[int]], value: Floats, known: Sequence[int]) -> int:
-    """The set that reads best, or one around it that reads as well: a body in its clothes rather than without."""
+def _largest_good_set(parts: Parts, sets: Sequence[frozenset[int]], value: Floats, known: Sequence[int]) -> int:
+    """Index of the set with the lowest residual, or of the largest superset with about the same residual.
+
+    A body with its clothes is preferred to the body alone.
+    """
     best = min(known, key=lambda k: value[k])
-    as_well = max(SURE, value[best] + _AS_WELL)
-    return max((k for k in known if sets[k] >= sets[best] and value[k] <= as_well), key=lambda k: parts.share(sets[k]))
+    max_residual = max(SURE, value[best] + _RESIDUAL_MARGIN)
+    return max((k for k in known if sets[k] >= sets[best] and value[k] <= max_residual), key=lambda k: parts.share(sets[k]))
 
 
 def _rivals(
-    parts: Parts, sets: Sequence[frozenset[int]], best: int, among: Sequence[int], beside: bool = False
+    parts: Parts, sets: Sequence[frozenset[int]], best: int, among: Sequence[int], separate: bool = False
 ) -> list[int]:
-    """Which sets may be meant instead of the best one, the largest first: those that are large enough and ``beside`` it; by
-    default also those around it that are in no such set together with it, as clothes would be.
+    """Indices of the sets that may be meant instead of the best one, the largest first.
+
+    These are large enough and lie apart from it. Unless ``separate``, a set that surrounds the best one also counts, if no
+    set contains both, as one would if it were its clothes.
     """
-    least = _AS_LARGE * parts.share(sets[best])
+    min_share = _MIN_RIVAL_AREA * parts.share(sets[best])
 
-    def another(one: frozenset[int]) -> bool:
-        as_clothes = beside or one & sets[best] or any(sets[k] >= one | sets[best] for k in among)
-        return apart(parts, one, sets[best]) or not as_clothes
+    def is_another(one: frozenset[int]) -> bool:
+        may_be_clothes = separate or one & sets[best] or any(sets[k] >= one | sets[best] for k in among)
+        return apart(parts, one, sets[best]) or not may_be_clothes
 
-    rivals = [k for k in among if k != best and parts.share(sets[k]) >= least and another(sets[k])]
+    rivals = [k for k in among if k != best and parts.share(sets[k]) >= min_share and is_another(sets[k])]
     return sorted(rivals, key=lambda k: -parts.share(sets[k]))
 
 
 def _refuse_to_choose(whole: Shape, parts: Parts, rivals: Sequence[frozenset[int]]) -> NoReturn:
-    """Two people in one file (`InputError`)."""
+    """Raise `InputError`: several shapes of one kind, such as two people in one file."""
     firsts = sorted({min(each) for each in rivals})
     shares = " and ".join(f"part {n} ({100 * parts.shares[n - 1]:.0f} % of the area)" for n in firsts[:3])
     problem = f"{whole.name or 'the shape'} holds several shapes of one kind: {shares} fit about equally well"

@@ -1,4 +1,4 @@
-"""Blendshapes from one shape to another."""
+"""Transfer of blendshapes (morph targets) between shapes."""
 
 from __future__ import annotations
 
@@ -32,32 +32,34 @@ from meshmatch.threads import thread_limit
 from meshmatch.transfer.blend_shapes import carry_moves
 
 check_suffix = partial(tables.check_suffix, suffixes=(".glb", ".vrm", ".npz"), what="blendshapes")
-_PLAIN = re.compile(r"[^\w .+-]")
-_LONGEST = 100  # letters of a file's name
+_UNSAFE = re.compile(r"[^\w .+-]")  # characters that are replaced in the names of files
+_MAX_NAME_LENGTH = 100  # characters of a file's name
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BlendShapesResult(Brief):
-    """The blendshapes of the source on the target.
+    """The blendshapes of the source on the target: the result of `transfer_shapes`.
 
     Attributes
     ----------
     shapes
-        ``names`` (K,), ``moves`` (K, V_target, 3) in the frame and unit of the target, ``weights`` and ``clips``.
+        The transferred blendshapes: ``names`` (K,), ``moves`` (K, V_target, 3) in the frame and unit of the target,
+        ``weights`` and ``clips``.
     given
-        Those of the source.
+        The blendshapes of the source.
     still
-        Names of shapes that move vertices of the source, and none of the target.
+        Names of blendshapes that move vertices of the source but none of the target.
     target
         The target.
     maps
-        The maps that were followed.
+        The maps that were used.
     seconds
-        Time beside the match.
+        Wall time, excluding the match.
     stands_along_y
-        Whether the source comes from a glTF file: the target then stands upright in a glb.
+        Whether the source was read from a glTF file, so that y is its up axis; a target of unknown orientation is then
+        turned upright like it in a .glb.
     original
-        The target's file, if it came from one.
+        The target's file, if it was read from one.
 
     Examples
     --------
@@ -81,20 +83,20 @@ class BlendShapesResult(Brief):
         return carried_html("Blendshapes", self.maps.forward, None, {"shapes": ", ".join(self.shapes.names)})
 
     def save(self, path: str | Path) -> None:
-        """Write the target with its shapes.
+        """Write the target with its blendshapes.
 
         Parameters
         ----------
         path
-            A .glb: the target as it came, with morph targets and the clips that animate them; of another file than glTF
-            with its texture or its one color. An .npz: ``names`` (K,) and
-            ``moves`` (K, V, 3). Or a new folder, which gets an .obj for each shape: the target's own text with other
-            positions, if it came as .obj.
+            A .glb (or a .vrm, if the target is one): the target's scene with morph targets and the clips that animate them;
+            a target from another format than glTF keeps its texture or single color. An .npz: ``names`` (K,) and
+            ``moves`` (K, V, 3). Or a new folder, with an .obj for each blendshape: the text of the target's .obj with
+            other positions, if it was read from one.
 
         Raises
         ------
         OptionError
-            The suffix is another one.
+            The suffix is not supported.
         OutputError
             A file cannot be written, or the folder is not empty.
         """
@@ -109,9 +111,9 @@ class BlendShapesResult(Brief):
             self._write_meshes(self._plans(folder))
 
     def _plans(self, folder: Path) -> list[MovedFile]:
-        """The files of a folder of meshes: an .obj for each shape, and what an .obj takes along, once."""
-        plain = (_PLAIN.sub("_", name)[:_LONGEST].strip(". ") or "shape" for name in self.shapes.names)
-        files = [folder / f"{stem}.obj" for stem in numbered_apart(plain, "-", str.lower)]
+        """Plan the files of a folder of meshes: an .obj for each blendshape, and their common materials and images."""
+        safe_names = (_UNSAFE.sub("_", name)[:_MAX_NAME_LENGTH].strip(". ") or "shape" for name in self.shapes.names)
+        files = [folder / f"{stem}.obj" for stem in numbered_apart(safe_names, "-", str.lower)]
         return MovedFile.planned_all(files, self.original)
 
     def _write_meshes(self, plans: Sequence[MovedFile]) -> None:
@@ -123,12 +125,12 @@ class BlendShapesResult(Brief):
 
 
 def write_shapes(result: BlendShapesResult, output: Path, place: Path) -> None:
-    """Write an output that is one file where it waits to get its name. What it does not hold is told."""
+    """Write the result for ``output``, a single file, to the temporary path ``place``; warn of what is lost."""
     if check_shapes_output(output) == ".npz":
         save_blend_shapes(place, result.shapes)
         return
     target, original = result.target, result.original
-    path, data, in_gltf = as_scene(original or target, target)  # as it came
+    path, data, in_gltf = as_scene(original or target, target)
     turn = np.eye(3) if in_gltf else turn_upright(result.maps, result.stands_along_y)
     adding = partial(with_morphs, shape=target, added=result.shapes, turn=turn)
     glb, lost = with_look(gltf.understood(path, data, "scene makes", adding), original, target)
@@ -137,9 +139,10 @@ def write_shapes(result: BlendShapesResult, output: Path, place: Path) -> None:
 
 
 def check_shapes_output(path: Path) -> str:
-    """The suffix of an output, "" for a folder, such as v1.0. Ask before long work.
+    """Return the suffix of an output, or "" for a folder (a numeric suffix, as in "v1.0", is part of its name).
 
-    `OptionError` for a suffix that holds no blendshapes, `OutputError` for a folder that cannot be made or is not empty.
+    Check an output before the transfer: `OptionError` if the format does not support blendshapes, `OutputError` if the
+    folder cannot be made or is not empty.
     """
     if path.suffix and not path.suffix[1:].isdecimal():
         return check_suffix(path)
@@ -154,29 +157,29 @@ def transfer_shapes(
     *,
     shapes: BlendShapes | str | Path | Sequence[str | Path] | None = None,
 ) -> BlendShapesResult:
-    """Blendshapes (morph targets) of the source on the target: expressions of a face, corrections of a pose.
+    """Transfer blendshapes (morph targets) from the source to the target: facial expressions, pose corrections.
 
     Parameters
     ----------
     source
-        As in `find_maps`: a mesh at rest.
+        A mesh in its rest pose, given as in `find_maps`.
     target
-        As in `find_maps`: a mesh.
+        A mesh, given as in `find_maps`.
     match
         As in `find_maps`.
     shapes
-        The blendshapes, if they are not in the source's own file: a glTF scene, an .npz, or meshes with the source's own
-        vertices, as a list of files or a folder.
+        The blendshapes, if they are not in the source's file: a glTF scene, an .npz, or meshes with the vertices of the
+        source, as a list of files or a folder.
 
     Returns
     -------
     BlendShapesResult
-        Its ``save("face.glb")`` writes the target with them.
+        Its ``save("face.glb")`` writes the target with the blendshapes.
 
     Raises
     ------
     MeshmatchError
-        There are no blendshapes, or those of another mesh; one of the two is a point cloud; or as for `find_maps`.
+        There are no blendshapes, or they are of another mesh; a shape is a point cloud; or as for `find_maps`.
 
     Examples
     --------
@@ -198,8 +201,8 @@ def transfer_shapes(
     began = time.monotonic()
     with thread_limit(1):
         moves = carry_moves(given.moves, maps.forward, maps.backward, a, b)
-    stopped = [bool(old.any()) and not new.any() for old, new in zip(given.moves, moves, strict=True)]
-    still = tuple(name for name, gone in zip(given.names, stopped, strict=True) if gone)
+    is_still = [bool(old.any()) and not new.any() for old, new in zip(given.moves, moves, strict=True)]
+    still = tuple(name for name, flag in zip(given.names, is_still, strict=True) if flag)
     original = Path(target) if isinstance(target, str | Path) else None
     seconds = time.monotonic() - began
     return BlendShapesResult(replace(given, moves=moves), given, still, b, maps, seconds, in_gltf, original)

@@ -1,4 +1,4 @@
-"""Skeletons of meshes that have moved: that of the body that a garment sits on, or their own, carried along."""
+"""Skeletons for moved meshes: the skeleton of the body under a garment, or the mesh's own skeleton moved with it."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from meshmatch.transfer.retarget_clips import standing_clips
 from meshmatch.transfer.weight_files import SkinWeights, load_weights
 
 INFLUENCES = 4
-"""Joints that may move a vertex: what all programs read."""
+"""Maximum number of joints per vertex, which all programs support."""
 
 
 def has_skin(file: Path | None) -> bool:
-    """Whether joints of a file move a mesh of it."""
+    """Whether a glTF file contains a skinned mesh."""
     if file is None or file.suffix.lower() not in gltf.SUFFIXES:
         return False
 
@@ -39,10 +39,12 @@ def has_skin(file: Path | None) -> bool:
     return gltf.understood(file, read_bytes(file), "scene makes", found)
 
 
-def bound_to(maps: MapPair, file: Path | None, garment: Shape, original: Path | None) -> Binding | None:
-    """How the skeleton of the target's file moves a garment that was on the source: by the weights of its ``original`` file,
-    if the joints of these have their namesakes in the target, or else as the skin that is below it on the source. None
-    where the target has no skeleton; one that cannot be followed is told.
+def bind_garment(maps: MapPair, file: Path | None, garment: Shape, original: Path | None) -> Binding | None:
+    """Bind a garment, in its place on the source, to the skeleton of the target's ``file``.
+
+    The garment keeps the skin weights of its ``original`` file if all joints they use exist in the target by name.
+    Otherwise it takes the transferred weights of the source's surface nearest to it. Return None if the target has no
+    skeleton, or if one of the skeletons cannot be read, with a warning.
     """
     if file is None or not has_skin(file):
         return None
@@ -52,7 +54,7 @@ def bound_to(maps: MapPair, file: Path | None, garment: Shape, original: Path | 
     except InputError as error:
         warn(f"{garment.name} does not move with {file.name}: {error.message}")
         return None
-    found = None if own is None else _renamed(own, skin.names)
+    found = None if own is None else _reorder_joints(own, skin.names)
     if found is None:
         near = MappedMesh.of(maps.source).query(garment.verts, known_normals(garment), maps.threads)
         below = VertexMap.between(garment, maps.source, near.vertex, face=near.face, barycentric=near.barycentric)
@@ -61,21 +63,21 @@ def bound_to(maps: MapPair, file: Path | None, garment: Shape, original: Path | 
     return Binding(rig, rig.worlds(), *joint_table(largest_weights(found, INFLUENCES)))
 
 
-def _renamed(weights: SkinWeights, names: tuple[str, ...]) -> csr_array | None:
-    """Weights of the joints with these names; None where one that moves something has none."""
-    place = {name: k for k, name in enumerate(names)}
-    column = np.array([place.get(name, -1) for name in weights.names])[weights.matrix.indices]
+def _reorder_joints(weights: SkinWeights, names: tuple[str, ...]) -> csr_array | None:
+    """Skin weights with columns in the order of ``names``; None if a joint that moves a vertex is not among them."""
+    index = {name: k for k, name in enumerate(names)}
+    column = np.array([index.get(name, -1) for name in weights.names])[weights.matrix.indices]
     if (column < 0).any():
         return None
     matrix = weights.matrix
     return csr_array((matrix.data, column, matrix.indptr), (matrix.shape[0], len(names)))
 
 
-def carried_along(original: Path | None, now: Shape, stands: bool) -> Binding | None:
-    """The skeleton of a mesh's own file, each joint where the skin around it has gone, with its clips; None where there is
-    none, or where an extension knows its nodes, as that of a vrm does.
+def move_skeleton(original: Path | None, now: Shape, is_upright: bool) -> Binding | None:
+    """Move the skeleton of a mesh's ``original`` file, with its clips, to the mesh as it is ``now``.
 
-    ``stands`` says that the mesh stands along y where it is ``now``; else the skeleton turns it.
+    Each joint follows the skin around it. Return None if the file has no skeleton, or is a VRM, whose extension refers to
+    its nodes. If y is not the up axis of the moved mesh (``is_upright``), the binding turns it upright.
     """
     if original is None or not has_skin(original):
         return None
@@ -86,7 +88,7 @@ def carried_along(original: Path | None, now: Shape, stands: bool) -> Binding | 
     before = load_shape(original)
     rig, weights = read_rig(original, data), load_weights(original, before)
     share = np.where(before.valid, before.vertex_areas / max(before.area, 1e-300) * before.V + 1e-3, 0.0)
-    turn = np.eye(3) if stands else upright(before, now.verts, share)
+    turn = np.eye(3) if is_upright else upright(before, now.verts, share)
     places = now.verts @ turn.T
     carried = carry(rig, weights.matrix, before, places, share, float(places[now.valid, UP].min()))
     standing = replace(carried.bind, clips=standing_clips(carried.bind, carried.source_pose))

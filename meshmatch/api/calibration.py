@@ -1,4 +1,4 @@
-"""What is usual of a model's fits, found by fitting shapes of its kind, and kept on its card."""
+"""Calibration of a model's verdicts: reference values from fits of shapes of its kind, stored on the model card."""
 
 from __future__ import annotations
 
@@ -20,54 +20,55 @@ from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import SUFFIXES, ShapeLike
 from meshmatch.shapes.input_files import suffix_of
 
-COUNT = 12
-"""Shapes that are fitted, where nobody says how many."""
-SEARCHED = 400
-"""Steps of the search for a code, of a pointwise model, where a fit takes 2,000 and five minutes. Of a femur they brought
-residual and stretch from 0.0197 and 0.071 to 0.0185 and 0.057, all steps to 0.0195 and 0.042."""
-_NORMALISED = "normalised"  # of a prepared folder
+DEFAULT_COUNT = 12
+"""Default number of shapes to fit."""
+SEARCH_STEPS = 400
+"""Steps of the latent code search for a pointwise model; a normal fit takes 2,000 steps and five minutes. For a femur, 400
+steps changed residual and stretch from 0.0197 and 0.071 to 0.0185 and 0.057; 2,000 steps changed them to 0.0195 and 0.042."""
+_NORMALISED = "normalised"  # subfolder of a prepared folder
 
 
 def calibrate(
     model: str | Path,
     shapes: str | Path | Sequence[ShapeLike],
     *,
-    count: int = COUNT,
+    count: int = DEFAULT_COUNT,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> ModelCard:
-    """Fit sound shapes of its kind with a model that was trained without correspondence, and keep on its card what is usual:
-    how much its template stretches, and how far it stays from the shapes.
+    """Calibrate the verdicts of a model that was trained without correspondence.
 
-    Fits by the model are then judged beside that: their trust is a probability, and they may be good. ``meshmatch train
-    --shapes`` does it at its end.
+    Fit sound shapes of the model's kind, and store on its card the median stretch of the template and the median residual.
+    Later fits are judged relative to these values: their trust becomes a probability, and their verdict can be "good".
+    ``meshmatch train --shapes`` does this at the end of the training.
 
     Parameters
     ----------
     model
-        Folder of the model, or its name.
+        Folder or name of the model.
     shapes
-        Most of them whole and of its kind: a folder that `prepare` made, or any other, or shapes as in `match`.
+        A folder that `prepare` wrote, any other folder of shapes, or shapes as in `match`. Most should be complete and of
+        the model's kind.
     count
-        How many of them are fitted, evenly chosen; 5 or more.
+        How many of the shapes to fit, evenly spaced in their order; at least 5.
     threads
-        How many are fitted at once; 2 by default.
+        How many shapes are fitted at once; 2 by default.
     progress
         As in `match`.
 
     Returns
     -------
     ModelCard
-        As it is now; its ``metrics["usual"]`` are medians.
+        The new card, with the medians in ``metrics["usual"]``.
 
     Raises
     ------
     ModelError
-        There is no such model, it is damaged, or it learned correspondence, whose fits need no comparison.
+        There is no such model, it is damaged, or it learned correspondence, and its fits need no calibration.
     InputError
         Fewer than five shapes can be fitted.
     OptionError
-        ``count`` is less.
+        ``count`` is below five.
     OutputError
         The card cannot be written.
 
@@ -82,15 +83,15 @@ def calibrate(
         raise ModelError(f"{card.name} learned correspondence: its fits are judged without others", "leave it as it is")
     if count < FEWEST:
         raise OptionError(f"{count} shapes are too few to say what is usual", f"take {FEWEST} or more")
-    given = shapes_in(as_path(shapes)) if isinstance(shapes, str | Path) else list(shapes)
+    given = list_shapes(as_path(shapes)) if isinstance(shapes, str | Path) else list(shapes)
     if len(given) < FEWEST:
-        raise _too_few(len(given))
+        raise _too_few_error(len(given))
     some = [given[k] for k in np.unique(np.linspace(0, len(given) - 1, min(count, len(given))).round().astype(int))]
-    config = FitConfig(latent=LatentRefineConfig(steps=SEARCHED))
+    config = FitConfig(latent=LatentRefineConfig(steps=SEARCH_STEPS))
     matcher = Matcher(folder, config, threads=threads, progress=progress)
     fits = [fit for fit in matcher.fit_all(some, errors="return") if isinstance(fit, Fit) and fit.signs is not None]
     if len(fits) < FEWEST:
-        raise _too_few(len(fits))
+        raise _too_few_error(len(fits))
     usual = {"fits": len(fits), "residual": float(np.median([fit.residual for fit in fits]))}
     usual["stretch"] = float(np.median([fit.signs.stretch for fit in fits if fit.signs is not None]))
     card = replace(card, metrics=card.metrics | {USUAL: {name: round(value, 5) for name, value in usual.items()}})
@@ -98,12 +99,12 @@ def calibrate(
     return card
 
 
-def _too_few(count: int) -> InputError:
+def _too_few_error(count: int) -> InputError:
     return InputError(f"{count} shapes that can be fitted are too few to say what is usual", f"give {FEWEST} or more")
 
 
-def shapes_in(folder: Path) -> list[Path]:
-    """The shapes of a folder; of one that `prepare` made, as it left them."""
+def list_shapes(folder: Path) -> list[Path]:
+    """List the shapes of a folder; for a prepared folder, its normalised shapes. `InputError` if there are none."""
     inside = folder / _NORMALISED if (folder / _NORMALISED).is_dir() else folder
     files = [file for file in sorted(inside.glob("*")) if file.is_file() and suffix_of(file) in SUFFIXES]
     if not files:

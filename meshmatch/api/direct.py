@@ -1,4 +1,4 @@
-"""Matching of two shapes without a model, as `match` gives it back."""
+"""Direct matching of two shapes without a model, with the result type of `match`."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from meshmatch.fitting.direct import DirectMatch
     from meshmatch.fitting.one_way import DirectConfig, KnownPairs
 
-_UNKNOWN = "no installed model knows these shapes: they were matched directly"
-_BETTER = "the model {} fits these shapes less well than they fit each other: they were matched directly"
-_UNUSED = "up, front and partial have no meaning without a model, and were not used"
+_NOTE_UNKNOWN = "no installed model knows these shapes: they were matched directly"
+_NOTE_BETTER = "the model {} fits these shapes less well than they fit each other: they were matched directly"
+_NOTE_UNUSED = "up, front and partial have no meaning without a model, and were not used"
 
 
 def match_without_model(
@@ -35,10 +35,12 @@ def match_without_model(
     unknown: bool = False,
     guess: MatchResult | None = None,
 ) -> MatchResult:
-    """The map of two repaired shapes, of which one is the template of both; ``unknown`` says that no model knew them. What a
-    model found, and does not call good, is a ``guess``, and given back where nothing better is found.
+    """Match two repaired shapes directly: one of them serves as the template of both.
 
-    `InputError` where a shape cannot be matched: large parts far apart, or a cloud that is no surface.
+    With ``unknown``, the notes say that no model knows the shapes. ``guess`` is the result of a model whose verdict is not
+    good: it is used as an initial correspondence, and returned if the direct match is not clearly better.
+
+    `InputError` if a shape cannot be matched: it has large parts far apart, or is a cloud that is no surface.
     """
     from meshmatch.fitting.alike import match_alike
     from meshmatch.fitting.direct import CLEARLY
@@ -49,7 +51,7 @@ def match_without_model(
     known = None if pairs is None else (source.original.verts[pairs[0]], target.original.verts[pairs[1]])
     by_model = None if guess is None else (guess.source_fit.points_in_file, guess.target_fit.points_in_file)
     direct = DirectConfig(seed=configs[0].seed)
-    found = _matched(source, target, configs[0], direct, threads, progress, known, by_model)
+    found = _match_pair(source, target, configs[0], direct, threads, progress, known, by_model)
     if known is None and guess is None:
         with thread_limit(1), worker_slot(threading.Semaphore(threads)):
             found = match_alike(source.shape, target.shape, found, configs[0], progress)
@@ -68,7 +70,7 @@ def match_without_model(
         if fit.partial:
             notes = (*notes, f"{one.shape.name}: taken for a part of {other.shape.name}")
     if guess is not None:
-        notes = (_BETTER.format(guess.source_fit.model), *notes)
+        notes = (_NOTE_BETTER.format(guess.source_fit.model), *notes)
     seconds = time.monotonic() - began
     return MatchResult(mapped, fits[0], fits[1], seconds, notes, (fits[0], fits[1]), threads, opposite)
 
@@ -76,19 +78,22 @@ def match_without_model(
 def fit_to_first(
     clean: Sequence[Repaired], configs: Sequence[FitConfig], threads: int, progress: ProgressCallback | None
 ) -> tuple[list[Fit], DirectMatch]:
-    """Fits of two or more repaired shapes, whose template is the first of them, and how it was matched to the second; errors
-    as `match_without_model`."""
+    """Fit the first of two or more repaired shapes, as the template, to all others.
+
+    Return the fits of all shapes, the first included, and the match of the first to the second. Errors as in
+    `match_without_model`.
+    """
     from meshmatch.fitting.one_way import DirectConfig
 
     first, *others = clean
     direct = DirectConfig(seed=configs[0].seed, from_source=True)
-    found = [_matched(first, each, configs[0], direct, threads, progress) for each in others]
+    found = [_match_pair(first, each, configs[0], direct, threads, progress) for each in others]
     fits = [replace(found[0].source, repaired=first)]
     fits += [replace(each.target, repaired=own) for each, own in zip(found, others, strict=True)]
     return fits, found[0]
 
 
-def _matched(
+def _match_pair(
     source: Repaired,
     target: Repaired,
     config: FitConfig,
@@ -108,15 +113,15 @@ def _matched(
 
 
 def direct_notes(clean: Sequence[Repaired], configs: Sequence[FitConfig], unknown: bool) -> tuple[str, ...]:
-    """What is to be said of shapes that were matched directly; ``unknown`` says that no model knew them."""
-    notes = [_UNKNOWN] if unknown else []
+    """Notes on shapes that were matched directly; with ``unknown``, because no model knows them."""
+    notes = [_NOTE_UNKNOWN] if unknown else []
     if any(each.up or each.front or each.partial == "yes" for each in configs):
-        notes.append(_UNUSED)
+        notes.append(_NOTE_UNUSED)
     notes += [f"{each.shape.name}: {note}" for each in clean for note in each.notes]
     return tuple(dict.fromkeys(notes))
 
 
-def both_whole(clean: Sequence[Repaired], fits: Sequence[Fit]) -> bool:
-    """Whether both are meshes of one whole shape, of which nothing was left out: these can be matched directly as well."""
-    alone = all(not (each.shape.is_cloud or each.far_parts or each.left_out) for each in clean)
-    return alone and not any(fit.partial for fit in fits)
+def are_whole_meshes(clean: Sequence[Repaired], fits: Sequence[Fit]) -> bool:
+    """Whether all shapes are complete meshes with no parts left out, so that they can also be matched directly."""
+    are_complete = all(not (each.shape.is_cloud or each.far_parts or each.left_out) for each in clean)
+    return are_complete and not any(fit.partial for fit in fits)

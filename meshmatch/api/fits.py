@@ -1,4 +1,4 @@
-"""Fits as files of their own."""
+"""Save and load single fits."""
 
 from __future__ import annotations
 
@@ -19,21 +19,24 @@ _SUFFIX = ".safetensors"
 
 
 def save_fit(path: str | Path, fit: Fit) -> None:
-    """Write a fit with its shape, whole or not at all, as folders of fits have them. Its model is named, not contained.
+    """Write a fit and its shape to a file, in the format that a `Collection` uses.
+
+    The file contains the model's name, not the model. It is written completely or not at all.
 
     Parameters
     ----------
     path
         A file with the suffix .safetensors.
     fit
-        Of a model.
+        A fit by a model.
 
     Raises
     ------
     OptionError
-        Another suffix, or a fit that was made without a model: it is of the other shape, which the file would not hold.
+        The suffix is not .safetensors, or the fit was made without a model: its template is the other shape, which the
+        file would not contain.
     InputError
-        It is no fit, or does not know its shape.
+        ``fit`` is not a `Fit`, or does not contain its shape.
     OutputError
         The file cannot be written.
 
@@ -52,26 +55,27 @@ def save_fit(path: str | Path, fit: Fit) -> None:
 
 
 def load_fit(path: str | Path, model: str | Path | TrainedModel | None = None) -> Fit:
-    """Read a fit, for `Matcher` to map or follow as if it had just been made.
+    """Read a fit from a file. `Matcher.map` and `Matcher.follow` accept it like a new one.
 
     Parameters
     ----------
     path
-        What `save_fit` wrote; or a file in ``fits`` of a `Collection`, whose fit does not know its shape.
+        A file that `save_fit` wrote; or a file in the folder ``fits`` of a `Collection`, whose fit does not contain its
+        shape.
     model
-        The model of the fit, by default the installed one that the file names.
+        The model of the fit; by default the installed model with the name in the file.
 
     Returns
     -------
     Fit
-        Its ``seconds`` are 0, and it has no ``signs``.
+        The fit, with ``seconds`` 0 and without ``signs``.
 
     Raises
     ------
     InputError
         The file is missing or damaged, or its fit is of another template.
     ModelError
-        The file's model is not installed.
+        The model is not installed.
 
     Examples
     --------

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from meshmatch.api.bound import bound_to, carried_along
+from meshmatch.api.bound import bind_garment, move_skeleton
 from meshmatch.api.results import MapPair, MovedMesh
 from meshmatch.api.transfer import MapLike, find_maps
 from meshmatch.api.upright import turn_upright
@@ -144,7 +144,7 @@ def transfer_garment(garment: ShapeLike, source: ShapeLike, target: ShapeLike, m
     with thread_limit(1):
         found = carry_garment(cloth, maps.forward, maps.source, maps.target, maps.threads)
         shape = replace(cloth, verts=found.verts)
-        binding = bound_to(maps, body, cloth, original) or carried_along(original, shape, target.upright)
+        binding = bind_garment(maps, body, cloth, original) or move_skeleton(original, shape, target.upright)
         turn = None if target.upright else turn_upright(maps, source.upright)
     seconds = time.monotonic() - began
     return GarmentResult(

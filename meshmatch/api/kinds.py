@@ -11,7 +11,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from meshmatch.api.apart import find_alone
+from meshmatch.api.apart import find_known_parts
 from meshmatch.api.inputs import UnknownKindsError, as_model, refuse_far_parts
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, ModelError, OptionError
@@ -166,7 +166,7 @@ def choose_model(
         config = configs[number]
         Progress(progress, shapes[number].name).stage("looking at its parts")(0.0)
         loaders, whole = [model.load for model in models], clean[number].original
-        if (alone := find_alone(loaders, whole, config, _order(models), progress)) is not None:
+        if (alone := find_known_parts(loaders, whole, config, _order(models), progress)) is not None:
             card = models[alone.row].card
             clean[number], readings[:, number] = alone.clean, alone.readings
             found[number] = Classification(card.category, card, alone.fit)

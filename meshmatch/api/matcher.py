@@ -13,7 +13,7 @@ from typing import Any, Literal, overload
 
 import numpy as np
 
-from meshmatch.api.direct import both_whole, match_without_model
+from meshmatch.api.direct import are_whole_meshes, match_without_model
 from meshmatch.api.inputs import (
     LandmarkPairs,
     UnknownKindsError,
@@ -346,7 +346,7 @@ class Matcher:
                 found = judged_by_pairs(found, clean[1].original, pairs, agreed[1].frame.scale)
         notes = tuple(dict.fromkeys((*(words for kind in kinds for words in kind), *fits[0].notes, *fits[1].notes)))
         result = MatchResult(found, *agreed, time.monotonic() - began, notes, before, self.threads, opposite)
-        if self._auto and landmarks is None and found.verdict != "good" and both_whole(clean, agreed):
+        if self._auto and landmarks is None and found.verdict != "good" and are_whole_meshes(clean, agreed):
             with suppress(InputError):  # one that cannot be matched directly has the model's map
                 result = match_without_model(clean, configs, None, self.threads, self.progress, guess=result)
         return replace(result, seconds=time.monotonic() - began)
@@ -372,9 +372,9 @@ class Matcher:
     def _near(self, clean: Repaired, config: FitConfig) -> tuple[Repaired, _Begun]:
         """A shape; of one with parts far apart those that the model knows, with a fit if that took one, or `InputError`."""
         if clean.far_parts:
-            from meshmatch.api.apart import find_alone
+            from meshmatch.api.apart import find_known_parts
 
-            alone = find_alone([lambda: self.model], clean.original, config, progress=self.progress)
+            alone = find_known_parts([lambda: self.model], clean.original, config, progress=self.progress)
             if alone is not None:
                 return alone.clean, _Begun(alone.usable_fit(config), True)
         refuse_far_parts(clean)
@@ -386,9 +386,9 @@ class Matcher:
         """The fit of a shape, or where that is poor the better one of some of its parts; and what it is a fit of."""
         if whole.verdict != "poor":
             return whole, clean
-        from meshmatch.api.apart import fit_of_parts
+        from meshmatch.api.apart import fit_known_parts
 
-        return fit_of_parts(self.model, clean, config, progress) or (whole, clean)
+        return fit_known_parts(self.model, clean, config, progress) or (whole, clean)
 
     def _fit_each(self, shapes: Sequence[ShapeLike], configs: Sequence[FitConfig]) -> list[Fit | MeshmatchError]:
         """What becomes of each shape: a fit or an error."""
@@ -453,13 +453,13 @@ class Matcher:
 
     def _finished(self, fit: Fit, clean: Repaired, config: FitConfig) -> Fit:
         """The fit with its shape, and with what its user should know."""
-        from meshmatch.api.apart import may_be_parts
+        from meshmatch.api.apart import may_contain_known_parts
 
         whose = f"{clean.shape.name}: " if clean.shape.name else ""
         notes = [f"{whose}{note}" for note in clean.notes]
         if config.for_model(self.model).refine != config.refine:
             notes.append(f"model {self.model.card.name} is pointwise and has no nodes: its code was refined instead")
-        if fit.verdict == "poor" and not config.try_harder and may_be_parts(clean, config):
+        if fit.verdict == "poor" and not config.try_harder and may_contain_known_parts(clean, config):
             notes.append(f"{whose}--try-harder (in Python FitConfig(try_harder=True)) searches for longer")
         return replace(fit, repaired=clean, left_out=clean.left_out, notes=(*notes, *fit.notes))
 

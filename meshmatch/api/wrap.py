@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from meshmatch.api import matching
-from meshmatch.api.bound import carried_along
+from meshmatch.api.bound import move_skeleton
 from meshmatch.api.inputs import LandmarkPairs
 from meshmatch.api.results import MatchResult, MovedMesh
 from meshmatch.api.upright import turn_of_moved
@@ -146,7 +146,7 @@ def wrap(
     with thread_limit(1):
         wrapped = wrap_onto(turned_outwards(mesh), near.verts, turned_outwards(surface), kept, found.threads)
     shape = replace(mesh, verts=wrapped.verts)
-    binding = carried_along(original, shape, surface.upright)
+    binding = move_skeleton(original, shape, surface.upright)
     turn = turn_of_moved(mesh, shape.verts, surface, found.target_fit)
     seconds = time.monotonic() - began
     return WrapResult(

@@ -167,7 +167,7 @@ def _register_onto(
     """Deform the mesh of one shape onto another."""
     import numpy as np
 
-    from meshmatch.api.bound import carried_along
+    from meshmatch.api.bound import move_skeleton
     from meshmatch.api.matching import match as match_shapes
     from meshmatch.api.upright import turn_of_moved
     from meshmatch.geometry.triangles import shortest_turns
@@ -193,7 +193,7 @@ def _register_onto(
         moved = result.deformed_source()
         turn = turn_of_moved(a, moved.verts, b, result.target_fit)
         before, after = shape_normals(a, (moved.verts - a.verts)[None].astype(np.float32))
-        binding = carried_along(shape, moved, b.upright)
+        binding = move_skeleton(shape, moved, b.upright)
         plan.write(temporary, moved, shortest_turns(before, after), binding, turn)
     if picture is not None:
         from meshmatch.render.compose import compose_fit

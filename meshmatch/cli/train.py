@@ -244,7 +244,7 @@ def _forecast(
     console: Console, progress: ProgressCallback, steps: int, how: TrainOptions, then: "Recipe | None"
 ) -> ProgressCallback:
     """The same progress, which tells after the first steps about how long the training takes, and what comes then."""
-    from meshmatch.api.calibration import COUNT, SEARCHED, shapes_in
+    from meshmatch.api.calibration import DEFAULT_COUNT, SEARCH_STEPS, list_shapes
     from meshmatch.fields.shape_functions import has_nodes
 
     began: tuple[float, float] | None = None
@@ -263,10 +263,10 @@ def _forecast(
             left = each * steps * (1 - share) / 60
             words = [_about(left if how.minutes is None else min(left, how.minutes), "of training")]
             if then is not None and how.shapes is not None:
-                fits = min(COUNT, len(shapes_in(how.shapes)))
+                fits = min(DEFAULT_COUNT, len(list_shapes(how.shapes)))
                 what = f"to fit {fits} of the shapes, which tells how far fits are to be trusted"
                 pointwise = not has_nodes(then.network.field)
-                words.append(_about(each * fits * SEARCHED * _CODE_STEP / 60 if pointwise else 0, what))
+                words.append(_about(each * fits * SEARCH_STEPS * _CODE_STEP / 60 if pointwise else 0, what))
             console.say(", then ".join(words))
             told = True
 

@@ -44,7 +44,7 @@ def wrap(
     """
     import numpy as np
 
-    from meshmatch.api.bound import carried_along
+    from meshmatch.api.bound import move_skeleton
     from meshmatch.outputs import replace_all_on_success
     from meshmatch.shapes.files import check_mesh_suffix
     from meshmatch.shapes.moved_files import MovedFile
@@ -69,7 +69,7 @@ def wrap(
             )  # fmt: skip
         found = result.match.map
         words.refuse_poor(run.strict, found.verdict, found.reasons, "the map")
-        binding = carried_along(base, result.shape, b.upright)
+        binding = move_skeleton(base, result.shape, b.upright)
         plan.write(temporary, result.shape, result.turns, binding, result.turn)
     words.tell_match(console, result.match, names)
     words.tell_verdict(console, found.verdict, found.reasons, "the map")

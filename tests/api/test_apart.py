@@ -11,7 +11,7 @@ import pytest
 
 import meshmatch
 from meshmatch.api import apart, matcher
-from meshmatch.api.apart import find_alone
+from meshmatch.api.apart import find_known_parts
 from meshmatch.api.inputs import as_model, usable
 from meshmatch.api.matcher import Matcher
 from meshmatch.errors import InputError
@@ -67,7 +67,7 @@ Reads = Callable[[dict[int, float]], list[int]]
 def test_the_parts_that_are_known_are_kept_and_the_others_said(reads: Reads) -> None:
     asked = reads({BODY.V: 3.7})
     scene = together("scan.ply", BODY, floor(BODY), pack(BODY))
-    alone = find_alone(loaders(), scene, CONFIG)
+    alone = find_known_parts(loaders(), scene, CONFIG)
     assert alone is not None and alone.fit is None and alone.readings == pytest.approx([0.037])
     body = int(Parts.of(scene).number[0])
     assert alone.clean.left_out == tuple({1, 2, 3} - {body})
@@ -82,7 +82,7 @@ def test_a_base_that_a_body_is_fused_with_is_left_out(reads: Reads) -> None:
     scene = fused_with_floor(BODY)
     rest = usable(leave_out(scene, [2])).shape.V
     reads({rest: 3.7})
-    alone = find_alone(loaders(), scene, CONFIG)
+    alone = find_known_parts(loaders(), scene, CONFIG)
     assert alone is not None and alone.clean.left_out == (2,)
     words = "left out the flat base that it is fused with, 8"
     assert alone.clean.notes[0].startswith(words) and "part 2 (--only" in alone.clean.notes[0]
@@ -94,7 +94,7 @@ def test_clothes_stay_where_they_read_as_well(reads: Reads) -> None:
     kept = usable(dressed).shape.V  # without the eyes, which repair drops
     for with_coat, expected in ((4.0, kept), (4.6, BODY.V)):
         reads({BODY.V: 3.7, kept: with_coat})
-        alone = find_alone(loaders(), scene, CONFIG)
+        alone = find_known_parts(loaders(), scene, CONFIG)
         assert alone is not None and alone.clean.shape.V == expected
         assert len(alone.clean.left_out) == (1 if expected == kept else 2)
 
@@ -103,7 +103,7 @@ def test_two_bodies_are_for_the_user_to_choose_from(reads: Reads) -> None:
     reads({BODY.V: 3.7})
     scene = together("two.ply", BODY, second(BODY))
     with pytest.raises(InputError, match=r"two\.ply holds several shapes of one kind: part 1 .* and part 2 ") as caught:
-        find_alone(loaders(), scene, CONFIG)
+        find_known_parts(loaders(), scene, CONFIG)
     assert "--only 1 or --only 2" in caught.value.hint
 
 
@@ -113,7 +113,7 @@ def test_of_copies_in_a_scene_any_is_meant(reads: Reads, monkeypatch: pytest.Mon
     monkeypatch.setattr(apart, "classify", lambda *_: (True, made))
     for reading in (3.7, 5.0):  # the last is of a body that reads strangely, whose fit tells
         reads({BODY.V: reading})
-        alone = find_alone(loaders(), replace(scene, meshes=(("a", BODY.V), ("b", BODY.V))), CONFIG)
+        alone = find_known_parts(loaders(), replace(scene, meshes=(("a", BODY.V), ("b", BODY.V))), CONFIG)
         assert alone is not None and alone.clean.shape.V == BODY.V
         assert alone.clean.copied is not None and alone.clean.copied.sum() == BODY.V
 
@@ -125,11 +125,11 @@ def test_two_bodies_that_run_into_each_other_are_not_one_in_clothes(reads: Reads
     parts = Parts.of(scene)
     assert not parts_apart(parts, frozenset([1]), frozenset([2]))
     with pytest.raises(InputError, match="several shapes of one kind"):
-        find_alone(loaders(), scene, CONFIG)
+        find_known_parts(loaders(), scene, CONFIG)
     # a body and its clothes read as a body, both alone and together
     on_floor = together("scan.ply", BODY, other, floor(BODY))
     reads({BODY.V: 3.7, 2 * BODY.V: 3.9})
-    alone = find_alone(loaders(), on_floor, CONFIG)
+    alone = find_known_parts(loaders(), on_floor, CONFIG)
     assert alone is not None and alone.clean.shape.V == 2 * BODY.V
 
 
@@ -141,11 +141,11 @@ def test_a_body_that_reads_strangely_may_be_meant_too(reads: Reads, monkeypatch:
         made = SimpleNamespace(verdict="fair", trust=trust, partial=False)
         monkeypatch.setattr(apart, "classify", lambda *_, made=made: (True, made))
         if trust < 0.7:
-            alone = find_alone(loaders(), scene, CONFIG)
+            alone = find_known_parts(loaders(), scene, CONFIG)
             assert alone is not None and alone.fit is None and len(alone.clean.left_out) == 1
         else:
             with pytest.raises(InputError, match="several shapes of one kind"):
-                find_alone(loaders(), scene, CONFIG)
+                find_known_parts(loaders(), scene, CONFIG)
 
 
 def test_what_its_user_chose_and_what_has_no_parts_is_left_alone(reads: Reads) -> None:
@@ -154,15 +154,15 @@ def test_what_its_user_chose_and_what_has_no_parts_is_left_alone(reads: Reads) -
     chosen = Shape(scene.verts, scene.faces, weights=np.ones(scene.V))
     cloud = Shape(scene.verts, np.empty((0, 3), np.int64))
     for shape in (chosen, cloud, BODY):
-        assert find_alone(loaders(), shape, CONFIG) is None
-    assert find_alone(loaders(), scene, FitConfig(partial="yes")) is None
+        assert find_known_parts(loaders(), shape, CONFIG) is None
+    assert find_known_parts(loaders(), scene, FitConfig(partial="yes")) is None
     assert asked == []
 
 
 def test_nothing_is_made_of_what_nobody_knows(reads: Reads, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = reads({})
     scene = together("room.ply", chair(beside(BODY)), floor(BODY))
-    assert find_alone(loaders(2), scene, CONFIG, [[0], [1]]) is None
+    assert find_known_parts(loaders(2), scene, CONFIG, [[0], [1]]) is None
     assert 0 < len(asked) <= 12  # both models were asked
     # what reads strangely needs a fit that can be trusted
     table = chair(beside(BODY))
@@ -171,15 +171,15 @@ def test_nothing_is_made_of_what_nobody_knows(reads: Reads, monkeypatch: pytest.
         made = SimpleNamespace(verdict=fit[0], trust=fit[1], partial=fit[2])
         monkeypatch.setattr(apart, "classify", lambda *_, made=made: (made.verdict != "poor", made))
         scene = together("room.ply", table, floor(BODY))
-        alone = find_alone(loaders(), scene, FitConfig(try_harder=True))
+        alone = find_known_parts(loaders(), scene, FitConfig(try_harder=True))
         assert (alone is not None) is found
-        assert find_alone(loaders(), scene, CONFIG) is None  # such a fit takes long
+        assert find_known_parts(loaders(), scene, CONFIG) is None  # such a fit takes long
 
 
 def test_a_model_that_knows_some_parts_spares_the_others(reads: Reads) -> None:
     asked = reads({BODY.V: 3.7})
     scene = together("scan.ply", BODY, floor(BODY))
-    alone = find_alone(loaders(2), scene, CONFIG, [[0], [1]])
+    alone = find_known_parts(loaders(2), scene, CONFIG, [[0], [1]])
     assert alone is not None and alone.row == 0 and np.isinf(alone.readings[1])
     assert len(asked) == len(set(asked))
 

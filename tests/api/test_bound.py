@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import meshmatch
-from meshmatch.api.bound import carried_along
+from meshmatch.api.bound import move_skeleton
 from meshmatch.errors import InputError, MeshmatchWarning, OptionError
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.gltf import Document
@@ -128,7 +128,7 @@ def test_its_own_joints_go_where_the_skin_goes(body: Path) -> None:
     bent = longer * played(body, "bend", 1.0)
     lying = bent @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     now = Shape(lying, tube().faces, "body.glb")
-    binding = carried_along(body, now, stands=False)
+    binding = move_skeleton(body, now, stands=False)
     out = body.with_name("out.glb")
     save_moved(out, body, now, np.tile(np.eye(3), (V, 1, 1)), binding)
     assert np.allclose(played(out), bent, atol=1e-4)
@@ -160,7 +160,7 @@ def test_a_vrm_keeps_its_joints(body: Path) -> None:
     path.write_bytes(body.read_bytes())
     write_tube(path.with_suffix(".glb"), extensionsUsed=["VRMC_vrm"], extensions={"VRMC_vrm": {}})
     path.write_bytes(path.with_suffix(".glb").read_bytes())
-    assert carried_along(path, tube(), stands=True) is None
+    assert move_skeleton(path, tube(), stands=True) is None
 
 
 def test_a_body_whose_skeleton_cannot_be_followed_is_told(body: Path) -> None:
