@@ -1,4 +1,4 @@
-"""`Matcher` and `interpolate` for implicit models: a fit is a code, and a map goes through the template of distances."""
+"""`Matcher` for implicit models: a fit is a latent code, and maps go through the implicit template."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from meshmatch.threads import thread_limit
 
 
 class ImplicitMatcher:
-    """One implicit model for many shapes, with the methods of `meshmatch.Matcher` that it can answer."""
+    """Match shapes with one implicit model; has the methods of `meshmatch.Matcher` that apply to such models."""
 
     def __init__(
         self,
@@ -42,7 +42,7 @@ class ImplicitMatcher:
         configs = configs_for(self.config if config is None else config, len(shapes))
         for each in configs:
             refuse_changed(each, ("seed",))
-        with thread_limit(1):  # tensors are small
+        with thread_limit(1):  # the tensors are small
             return [
                 fit_implicit(self.model, shape, seed=each.seed, progress=self.progress)
                 for shape, each in zip(shapes, configs, strict=True)
@@ -68,8 +68,8 @@ class ImplicitMatcher:
 
 
 def refuse_changed(options: object, allowed: Sequence[str]) -> None:
-    """`OptionError` if a choice that an implicit model cannot obey is not as by default."""
-    usual = type(options)()
+    """Raise `OptionError` if an option that does not apply to implicit models differs from its default."""
+    defaults = type(options)()
     for each in fields(options):  # type: ignore[arg-type]
-        if each.name not in allowed and getattr(options, each.name) != getattr(usual, each.name):
+        if each.name not in allowed and getattr(options, each.name) != getattr(defaults, each.name):
             raise OptionError(f"{each.name} does not go with an implicit model", "leave it out")

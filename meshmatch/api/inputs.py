@@ -1,4 +1,4 @@
-"""What users hand in: models and shapes, checked."""
+"""Check the inputs of public functions: models, shapes, configs and landmarks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MINIMUM_FACES = 50
 MINIMUM_POINTS = 100
 
 THREADS = 2
-"""Unless said otherwise: the two shapes of a match are fitted beside each other, each on one thread."""
+"""Default number of threads: the two shapes of a match are fitted in parallel, each on one thread."""
 
 
 class UnknownKindsError(InputError):
@@ -37,8 +37,10 @@ class UnknownKindsError(InputError):
 
 
 def as_model(model: TrainedModel | str | Path) -> TrainedModel:
-    """A model, loaded once if it is given by its name or folder (and again if its files have changed since).
-    `ModelError` where there is none of this name, its files are damaged, or it is something else.
+    """Return a model, loading it if it is given by name or folder.
+
+    Loaded models are cached until their files change. `ModelError` if there is no such model, its files are damaged, or
+    the argument has another type.
     """
     if not isinstance(model, str | Path):
         from meshmatch.models.trained import TrainedModel
@@ -53,8 +55,9 @@ def as_model(model: TrainedModel | str | Path) -> TrainedModel:
 
 
 def validated(shape: Shape) -> Repaired:
-    """Repair a shape and refuse what cannot be fitted (`InputError`): too few faces or points, no extent, or large parts
-    far apart.
+    """Repair a shape, and raise `InputError` if it cannot be fitted.
+
+    It then has too few faces or points, no surface area, or large parts far apart.
     """
     clean = usable(shape)
     refuse_far_parts(clean)
@@ -62,15 +65,15 @@ def validated(shape: Shape) -> Repaired:
 
 
 def refuse_far_parts(clean: Repaired) -> None:
-    """Refuse a shape with large parts far apart (`InputError`)."""
+    """Raise `InputError` for a shape with large parts far apart."""
     if clean.far_parts:
-        many = f"{clean.shape.name or 'the shape'} contains {clean.far_parts + 1} large parts far apart"
-        choose = "save each object in a file of its own, or choose parts with --only (see `meshmatch info`)"
-        raise InputError(many, choose)
+        problem = f"{clean.shape.name or 'the shape'} contains {clean.far_parts + 1} large parts far apart"
+        hint = "save each object in a file of its own, or choose parts with --only (see `meshmatch info`)"
+        raise InputError(problem, hint)
 
 
 def usable(shape: Shape) -> Repaired:
-    """As `validated`, for shapes whose parts may be tried apart: large parts may be far apart."""
+    """As `validated`, but allow large parts far apart, for callers that can select parts."""
     clean = repair(shape)
     fixed = clean.shape
     name = shape.name or "the shape"
@@ -89,7 +92,7 @@ def usable(shape: Shape) -> Repaired:
 
 
 def checked_threads(threads: int | None) -> int:
-    """The number of threads that is meant (`OptionError` if it is below 1 or not an integer)."""
+    """Return the number of threads, `THREADS` for None; `OptionError` if it is below 1 or not an integer."""
     if threads is None:
         return THREADS
     if not isinstance(threads, Integral) or threads < 1:
@@ -98,20 +101,20 @@ def checked_threads(threads: int | None) -> int:
 
 
 def check_seed(seed: object) -> None:
-    """Refuse what no random numbers can begin with (`OptionError`)."""
+    """Raise `OptionError` unless a seed is a non-negative integer."""
     if not isinstance(seed, Integral) or seed < 0:
         raise OptionError(f"a seed is a whole number of 0 or more, not {seed!r}")
 
 
 def check_config(config: object) -> None:
-    """Refuse what is no `FitConfig` (`OptionError`)."""
+    """Raise `OptionError` unless a config is a `FitConfig`."""
     if not isinstance(config, FitConfig):
         hint = 'such as meshmatch.FitConfig(up="y")'
         raise OptionError(f"a config is a FitConfig, not {type(config).__name__}", hint)
 
 
 def configs_for(config: FitConfig | Sequence[FitConfig], count: int) -> list[FitConfig]:
-    """One configuration for each of ``count`` shapes (`OptionError` for another number of them)."""
+    """Return one config for each of ``count`` shapes; `OptionError` if their numbers differ."""
     configs = list(config) if isinstance(config, Sequence) else [config] * count
     if len(configs) != count:
         raise OptionError(f"{count} shapes need one FitConfig, or {count} of them, not {len(configs)}")
@@ -123,9 +126,9 @@ def configs_for(config: FitConfig | Sequence[FitConfig], count: int) -> list[Fit
 def landmark_vertices(
     clean: Sequence[Repaired], landmarks: Sequence[ArrayLike], configs: Sequence[FitConfig] = ()
 ) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
-    """Known pairs as arrays of vertices.
+    """Return landmark pairs as two arrays of vertices.
 
-    `OptionError` where a shape has no such vertex, or where ``configs`` do not refine nodes, which landmarks pull.
+    `OptionError` if a shape has no such vertex, or if a config does not refine nodes, which landmarks require.
     """
     for each in configs:
         if not each.moves_nodes:

@@ -1,4 +1,4 @@
-"""`match` and `register`: two shapes in, a map out; one shape in, a fit out; by a model of either kind."""
+"""`match` maps one shape to another; `register` fits a model's template to one shape. Models may be implicit ones."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def matcher_for(
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> Matcher | ImplicitMatcher:
-    """What fits and maps shapes by a model of either kind."""
+    """Make a matcher for a model of either kind: a `Matcher`, or an `ImplicitMatcher` for an implicit model."""
     if isinstance(model, str | Path):
         implicit = implicit_folder(model) is not None
     else:
@@ -52,27 +52,28 @@ def match(
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> MatchResult:
-    """Match two shapes: ``map.index[i]`` of the result is the vertex of the target matched to vertex i of the source.
+    """Match two shapes: map every vertex of the source to a vertex of the target.
 
-    Where a whole file cannot be fitted, such as a body on a floor, its parts are tried one by one; ``notes`` of the
-    result say which were left out.
+    In the result, ``map.index[i]`` is the vertex of the target matched to vertex i of the source. If a file cannot be
+    fitted as a whole, such as a body on a floor, its parts are tried on their own; ``notes`` of the result say which parts
+    were left out.
 
     Parameters
     ----------
     source
-        A mesh or point cloud, in any unit, orientation and resolution: a path, a `Shape`, an
-        (N, 3) array, a pair (vertices, faces), or a mesh of another library.
+        The shape to map from: a mesh or point cloud in any unit, orientation and resolution. A path, a `Shape`, an
+        (N, 3) array of points, a pair (vertices, faces), or a mesh of another library.
     target
-        The same, for the shape it is matched to.
+        The shape to map to, in any of the same forms.
     model
-        Name in the registry, model folder, or what `load_model` or `load_implicit` returned; "auto" chooses the installed
-        model for this kind of shape, and where none knows either shape they are matched directly, as with "none". An
-        implicit model reads ``.npz`` samples too, and obeys the seed of a config alone.
+        Name in the registry, model folder, or what `load_model` or `load_implicit` returned. "auto" chooses the installed
+        model for this kind of shape; if no model knows either shape, they are matched directly, as with "none". An
+        implicit model also reads ``.npz`` samples, and uses only the seed of a config.
     config
-        How shapes are fitted; a pair holds one for the source and one for the target, which may differ in their axes.
+        How shapes are fitted: one for both shapes, or one for each, for example with different axes.
     landmarks
-        Known pairs: source vertices (N,), target vertices (N,). They pull both fits; the map names the pairs it misses,
-        and is then not good. Only with ``refine="nodes"``.
+        Known correspondences: source vertices (N,) and target vertices (N,). They guide both fits. If the map misses any
+        of them, its ``reasons`` say so and its verdict is not "good". Requires ``refine="nodes"``.
     threads
         How many shapes are fitted at once; 2 by default.
     progress
@@ -86,7 +87,7 @@ def match(
     Raises
     ------
     MeshmatchError
-        A shape cannot be read or fitted, the model is unknown, or choices contradict each other.
+        A shape cannot be read or fitted, the model is unknown, or options contradict each other.
 
     Examples
     --------
@@ -118,15 +119,15 @@ def register(
     config
         How the shape is fitted.
     threads
-        Threads of the numerical libraries; more than one may change the last bits.
+        Threads of the numerical libraries; more than one may change the last bits of the result.
     progress
         As in `match`.
 
     Returns
     -------
     Fit
-        Its ``points_in_file`` (V, 3) are the template's vertices on the shape, in the frame and unit of the file. By an
-        implicit model an `ImplicitFit`, whose ``shape`` is its template on the shape.
+        Its ``points_in_file`` (V, 3) are the vertices of the deformed template, in the frame and unit of the file. For an
+        implicit model, an `ImplicitFit`, whose ``shape`` is the deformed template.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What matching and transfers give back, the maps in both directions that transfers follow, and how good a map is."""
+"""Result types of matching and transfers, and functions that evaluate maps and fits."""
 
 from __future__ import annotations
 
@@ -43,20 +43,20 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MovedMesh(Brief):
-    """A mesh whose vertices have moved: what `transfer_garment` and `wrap` give back.
+    """A mesh with moved vertices: the base of the results of `transfer_garment` and `wrap`.
 
     Attributes
     ----------
     shape
-        Vertices and faces in their order, where they are now.
+        The mesh with its new positions; vertices and faces in their original order.
     turns
-        (V, 3, 3) how each vertex was turned.
+        (V, 3, 3) rotation of the surface at each vertex.
     original
-        The mesh's file, if it came from one.
+        The mesh's file, if it was read from one.
     binding
-        The skeleton that moves it in a .glb, if there is one.
+        The skeleton that moves the mesh in a .glb, if there is one.
     turn
-        (3, 3) the rotation after which it stands along y, as a .glb does; None where it stands so, or that is not known.
+        (3, 3) rotation that makes y the up axis, as .glb requires; None if it is already, or the up axis is unknown.
     """
 
     shape: Shape
@@ -66,14 +66,16 @@ class MovedMesh(Brief):
     turn: Float[Floats, "3 3"] | None = field(default=None, kw_only=True)
 
     def save(self, path: str | Path) -> None:
-        """Write the mesh; an .obj from an .obj keeps all of its text but the positions and the directions of normals, and
-        its materials and images are copied beside it. A .glb from a .glb, .gltf or .vrm keeps everything but positions and
-        what turns with them. In a .glb a node turns the mesh upright.
+        """Write the mesh, with everything else of its file that the format supports.
+
+        An .obj written from an .obj keeps all text but the positions and normals; its materials and images are copied next
+        to it. A .glb written from a .glb, .gltf or .vrm keeps everything but the positions and what rotates with them. In
+        a .glb, a node turns the mesh upright if needed.
 
         Parameters
         ----------
         path
-            Where to; its suffix chooses the format, see `save_shape`. What it cannot hold is told.
+            The output file; its suffix selects the format, see `save_shape`. A warning lists what the format cannot hold.
 
         Raises
         ------
@@ -87,27 +89,27 @@ class MovedMesh(Brief):
 
 @dataclass(frozen=True, eq=False)
 class MatchResult:
-    """What `match` found.
+    """The result of `match`: a map, and the fits it was made from.
 
     Attributes
     ----------
     map
         From source to target: ``map.index[i]`` is the vertex of the target matched to vertex i of the source.
     source_fit
-        The template fitted to the source, after both fits agreed on how it stretches.
+        The template fitted to the source, after both fits were refined jointly so that the template stretches alike.
     target_fit
         The same for the target.
     seconds
         Wall time.
     notes
-        What was changed in the shapes before fitting, and which choices were replaced.
+        Repairs of the shapes before fitting, parts that were left out, and options that were replaced.
     before_agreement
-        Both fits before they agreed: where agreement moved them much, the map is not to be trusted.
+        Both fits before the joint refinement. Where it moved them far, the confidence of the map is low.
     threads
-        How many were allowed.
+        Number of threads for further computations, such as `backward`.
     opposite
-        The map from target to source where it was found together with `map`: of two whole meshes of up to 60,000 vertices
-        that match well.
+        The map from target to source, if it was computed together with `map`: for two complete meshes of up to 60,000
+        vertices that match well.
 
     Examples
     --------
@@ -138,17 +140,19 @@ class MatchResult:
 
     @property
     def rotations(self) -> tuple[Floats | None, Floats | None]:
-        """(3, 3) of source and target: from their files into the orientation of the template, for pictures; an implicit
-        model knows none that is upright, and fits without a model lie on each other, which arms may turn around.
+        """Rotations (3, 3) of source and target, from their files to the orientation of the template, for pictures.
+
+        (None, None) for implicit models, whose template has no known up axis, and for fits without a model, whose common
+        frame says nothing about what is upright.
         """
         known = isinstance(self.source_fit, Fit) and self.source_fit.model != NO_MODEL
         return (self.source_fit.frame.turn, self.target_fit.frame.turn) if known else (None, None)
 
     def backward(self) -> VertexMap:
-        """The map from target to source: it pulls values from the source to the target.
+        """Return the map from target to source, which transfers use to pull values from the source.
 
-        Of two whole meshes of up to 60,000 vertices that match well it is the inverse of `map`, whichever of them is the
-        source: what goes there and back comes to where it was. Otherwise it is made from the same fits.
+        For two complete meshes of up to 60,000 vertices that match well, it is the inverse of `map`, and exchanging source
+        and target gives the same two maps. Otherwise it is computed separately from the same fits.
 
         Returns
         -------
@@ -162,9 +166,9 @@ class MatchResult:
             return maps_of_fits((self.target_fit, self.source_fit), (target, source), self.threads)[0]
 
     def deformed_source(self) -> Shape:
-        """The source's own mesh, deformed onto the target.
+        """Return the mesh of the source, deformed onto the target.
 
-        Its vertices follow the fitted template and keep their offsets from it, so that details are carried along.
+        Its vertices follow the fitted template and keep their offsets from it, so that details are preserved.
 
         Returns
         -------
@@ -174,7 +178,7 @@ class MatchResult:
         Raises
         ------
         OptionError
-            The model is an implicit one, which has no template that could carry a mesh.
+            The match was made with an implicit model, which cannot deform a mesh.
         """
         from meshmatch.maps.deformed import deformed
 
@@ -192,17 +196,17 @@ class MapPair(Brief):
     Attributes
     ----------
     source
-        The shape that values come from.
+        The shape that attributes are transferred from.
     target
-        The shape that they go to.
+        The shape that they are transferred to.
     forward
         The map from source to target.
     match
-        The match that the map is of, if there was one: it knows the way back.
+        The match that produced the map, if any; it also provides the map back.
     threads
-        How many are allowed.
+        Number of threads for further computations, such as `backward`.
     opposite
-        The map from target to source, if it is known already.
+        The map from target to source, if it is already known.
 
     Examples
     --------
@@ -224,12 +228,12 @@ class MapPair(Brief):
 
     @property
     def rotations(self) -> tuple[Floats | None, Floats | None]:
-        """Those of the match, or nothing."""
+        """Rotations of the match, see `MatchResult.rotations`; (None, None) without a match."""
         return (None, None) if self.match is None else self.match.rotations
 
     @cached_property
     def backward(self) -> VertexMap:
-        """The map from target to source: the opposite one, or that of the match, or else the inverse of ``forward``."""
+        """The map from target to source: ``opposite``, or the match's, or else the inverse of ``forward``."""
         if self.opposite is not None:
             return self.opposite
         if self.match is not None:
@@ -241,9 +245,11 @@ class MapPair(Brief):
 def maps_of_fits(
     fits: tuple[Fit | ImplicitFit, Fit | ImplicitFit], before: tuple[Fit | ImplicitFit, Fit | ImplicitFit], threads: int
 ) -> tuple[VertexMap, VertexMap | None]:
-    """The map from the shape of the first fit to that of the second; of two whole meshes that match well, and are not
-    too large, with its inverse: the same two maps, whichever comes first. `OptionError` where the fits are of different
-    templates, or do not know their shapes.
+    """Compute the map from the shape of the first fit to the shape of the second.
+
+    For two complete meshes that match well and are not too large, also return the inverse map; exchanging the fits then
+    exchanges the two maps. For other shapes the second result is None. ``before`` are the fits before their joint
+    refinement. `OptionError` if the fits are of different templates, or do not contain their shapes.
     """
     first, second = fits
     if not isinstance(first, Fit) and not isinstance(second, Fit):
@@ -271,7 +277,7 @@ def _partial(fit: Fit | ImplicitFit) -> bool:
 
 
 def shape_of(fit: Fit) -> Repaired:
-    """The repaired shape that a fit is of."""
+    """The repaired shape of a fit; `OptionError` if the fit does not contain it."""
     if fit.repaired is None:
         hint = "make it with meshmatch.register or Matcher.fit, or read it with meshmatch.load_fit"
         raise OptionError("this fit does not know its shape", hint)
@@ -280,16 +286,16 @@ def shape_of(fit: Fit) -> Repaired:
 
 @dataclass(frozen=True)
 class ConfidenceRule:
-    """What to do where the map is not to be trusted; by default values are kept.
+    """What to do with transferred values of low confidence; by default they are kept.
 
     Attributes
     ----------
     minimum
-        Confidence (0..1) below which a value is not trusted.
+        Confidence (0..1) below which a value counts as low.
     fill
-        Replace values by those of their neighbours.
+        Replace low values by those of their neighbours.
     blank
-        Replace them by a number, one number for each column, a color (sRGB, 0..1), or a label.
+        Replace low values by this number, numbers (one per column), color (sRGB, 0..1) or label.
 
     Raises
     ------
@@ -316,20 +322,20 @@ class ConfidenceRule:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Transferred(Brief, Generic[T]):
-    """What arrived on the target.
+    """Attributes transferred to the target.
 
     Attributes
     ----------
     data
-        An array, `Labels`, `SkinWeights` or `Landmarks`.
+        The transferred attributes: an array, `Labels`, `SkinWeights`, `Landmarks` or `Measurements`.
     confidence
-        (N,) float64 of each vertex, face or landmark, from 0 (a guess) to 1 (certain).
+        (N,) float64 confidence of each vertex, face, landmark or measurement, from 0 (a guess) to 1 (certain).
     low
-        How many values were not trusted, and what became of them.
+        The number of values of low confidence, and how they were handled.
     maps
-        The maps that were followed.
+        The maps that were used.
     writer
-        What `save` lets write the file: called with the path of a temporary one and with its own.
+        Writes the file for `save`; called with a temporary path and the final path.
 
     Examples
     --------
@@ -345,19 +351,19 @@ class Transferred(Brief, Generic[T]):
     writer: Callable[[Path, Path], None] = field(repr=False)
 
     def save(self, path: str | Path) -> None:
-        """Write what arrived, in the format that the suffix names.
+        """Write the transferred data, in the format of the suffix.
 
         Parameters
         ----------
         path
-            Colors: .ply, .glb, .obj or .off (the target with them), .npy or .csv. Values: .npy or .csv; .ply, .vtp or .vtk
-            (the target with them). Labels: .npy, .csv, .txt, .json, or .ply (the target with them). Skin weights: .npz or
-            .json. Landmarks: .csv, .json, .pp, .fcsv, .mrk.json or .tps.
+            The output file. Mesh formats contain the target with the data. Colors: .ply, .glb, .obj or .off; .npy or .csv.
+            Values: .ply, .vtp or .vtk; .npy or .csv. Labels: .ply; .npy, .csv, .txt or .json. Skin weights: .npz or .json.
+            Landmarks: .csv, .json, .pp, .fcsv, .mrk.json or .tps. Measurements: .csv or .json.
 
         Raises
         ------
         OptionError
-            The suffix is another one.
+            The suffix is not supported.
         OutputError
             The file cannot be written.
         """
@@ -383,41 +389,41 @@ def evaluate(
     seed: int = 0,
     progress: ProgressCallback | None = None,
 ) -> Evaluation:
-    """Measure a map: its coverage, distortion and Dirichlet energy, and its errors where the truth is known.
+    """Evaluate a map: coverage, distortion, Dirichlet energy and folds, and errors if the ground truth is known.
 
-    Errors are geodesic distances on the target, divided by the square root of its area; they are told in the unit of its
-    file, or for a person in centimetres, with the target scaled to 1.9 square metres of skin.
+    Errors are geodesic distances on the target, divided by the square root of its area. They are reported in the unit of
+    its file, or for a person in centimetres, with the target scaled to 1.9 square metres of skin.
 
     Parameters
     ----------
     found
-        A match, a map, or the map's file.
+        A match, a map, or the path of a map.
     source
         As in `match`.
     target
         As in `match`.
     truth
-        The true target vertex of every source vertex (V_source,), -1 where it has none; or N vertices of the source and
-        those of the target, ((N,), (N,)), or an array of such pairs (N, 2).
+        The true target vertex of every source vertex (V_source,), -1 if it has none; or corresponding vertices of source
+        and target, as two arrays ((N,), (N,)) or as an array of pairs (N, 2).
     backward
-        A map from target to source, or its file, for ``bijectivity``; for instance ``result.backward()`` of a match.
+        A map from target to source, or its path, to measure ``bijectivity``; for instance ``result.backward()`` of a match.
     unit
-        What errors are told in: "cm" (a person's), "file" (the unit of the target's file), "x100" (hundredths of
+        Unit of errors: "cm" (target scaled to a person), "file" (the unit of the target's file), "x100" (hundredths of
         sqrt(area)), or "auto": "cm" if the model ``human`` recognises the target, else "file".
     seed
-        Of the random pairs of points between which distortion is measured.
+        Random seed for the pairs of points between which distortion is measured.
     progress
         As in `match`.
 
     Returns
     -------
     Evaluation
-        The measurements; errors are None without the truth.
+        The measurements; ``errors`` is None without the ground truth.
 
     Raises
     ------
     MeshmatchError
-        The map or the truth belongs to other shapes, or is something else; or there is no such unit.
+        The map or the ground truth belongs to other shapes or has an invalid type, or the unit is unknown.
 
     Examples
     --------
@@ -440,20 +446,20 @@ def evaluate(
     check_seed(seed)
     rng = np.random.default_rng(seed)
     with thread_limit(1):
-        # Whether the target is a person takes a moment to find out: not where there are no errors to tell.
-        told = error_unit("cm" if truth is None and str(unit) == "auto" else unit, target)
+        # Finding out whether the target is a person takes a moment, and is not needed without errors to report.
+        resolved = error_unit("cm" if truth is None and str(unit) == "auto" else unit, target)
         return evaluate_map(
-            vertex_map, source, target, *known, backward=backward, unit=told, rng=rng, progress=progress
+            vertex_map, source, target, *known, backward=backward, unit=resolved, rng=rng, progress=progress
         )
 
 
 def measure_distance(
     shape: ShapeLike, fitted: ShapeLike, *, one_way: bool = False, unit: UnitName = "auto"
 ) -> SurfaceDistance:
-    """How far the surfaces of a shape and of what was fitted to it lie apart.
+    """Measure the distance between the surfaces of a shape and of a mesh that was fitted to it.
 
-    From every vertex of each to the nearest place of the other that faces the same way, each for the area around it; of a
-    cloud only from there.
+    Distances are measured from every vertex of either shape to the nearest point of the other whose normal points the same
+    way, weighted by the area around the vertex. If the shape is a point cloud, they are measured from its points alone.
 
     Parameters
     ----------
@@ -463,19 +469,19 @@ def measure_distance(
         A mesh in the same frame and unit, such as ``fit.shape`` of `register`, `MatchResult.deformed_source` or
         ``shape`` of a `WrapResult`.
     one_way
-        Only from the shape, for it is a part (``fit.partial``).
+        Measure only from the shape to the mesh, for a partial shape (``fit.partial``).
     unit
-        As in `evaluate`, of the shape.
+        As in `evaluate`, for the shape.
 
     Returns
     -------
     SurfaceDistance
-        Mean and largest distance; printed, they say it in words.
+        Mean and largest distance; ``str`` gives a readable sentence.
 
     Raises
     ------
     MeshmatchError
-        A shape cannot be read or has no surface, or there is no such unit.
+        A shape cannot be read or has no surface area, or the unit is unknown.
 
     Examples
     --------
@@ -490,7 +496,7 @@ def measure_distance(
             if not each.vertex_areas.sum() > 0:
                 hint = "are all its points the same, or on a line?"
                 raise InputError(f"{each.name or what} has no surface area", hint)
-        told = error_unit(unit, there)
-        times = 1.0 if told.name == "file" else told.factor / float(np.sqrt(here.area))
-        mean, most = surface_distance(there, here, one_way)
-        return SurfaceDistance(times * mean, times * most, told)
+        resolved = error_unit(unit, there)
+        factor = 1.0 if resolved.name == "file" else resolved.factor / float(np.sqrt(here.area))
+        mean, largest = surface_distance(there, here, one_way)
+        return SurfaceDistance(factor * mean, factor * largest, resolved)
