@@ -139,7 +139,9 @@ def find_known_parts(
     others = _rivals(parts, sets, chosen, [k for k in known if k not in copies])
     if not others:  # another figure may be in a pose with an inconclusive residual
         promising = [k for k in range(len(sets)) if FAMILIAR < value[k] <= _MAX_PROMISING and k not in copies]
-        others = [k for k in _rivals(parts, sets, chosen, promising, separate=True)[:1] if confirming_fit(k) is not None]
+        others = [
+            k for k in _rivals(parts, sets, chosen, promising, separate=True)[:1] if confirming_fit(k) is not None
+        ]
     if others:
         _refuse_to_choose(whole, parts, [sets[k] for k in (chosen, *others)])
     left_out = parts.others(sets[chosen])
@@ -190,7 +192,9 @@ def _largest_good_set(parts: Parts, sets: Sequence[frozenset[int]], value: Float
     """
     best = min(known, key=lambda k: value[k])
     max_residual = max(SURE, value[best] + _RESIDUAL_MARGIN)
-    return max((k for k in known if sets[k] >= sets[best] and value[k] <= max_residual), key=lambda k: parts.share(sets[k]))
+    return max(
+        (k for k in known if sets[k] >= sets[best] and value[k] <= max_residual), key=lambda k: parts.share(sets[k])
+    )
 
 
 def _rivals(

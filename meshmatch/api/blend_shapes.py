@@ -78,9 +78,9 @@ class BlendShapesResult(Brief):
     original: Path | None = None
 
     def _repr_html_(self) -> str:
-        from meshmatch.api.notebook import carried_html
+        from meshmatch.api.notebook import transfer_html
 
-        return carried_html("Blendshapes", self.maps.forward, None, {"shapes": ", ".join(self.shapes.names)})
+        return transfer_html("Blendshapes", self.maps.forward, None, {"shapes": ", ".join(self.shapes.names)})
 
     def save(self, path: str | Path) -> None:
         """Write the target with its blendshapes.

@@ -1,4 +1,4 @@
-"""Clothes, hair and other things that sit on a shape, from one shape to another."""
+"""Transfer of clothes, hair and other worn meshes between shapes."""
 
 from __future__ import annotations
 
@@ -21,36 +21,36 @@ from meshmatch.transfer.garment import carry_garment
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GarmentResult(MovedMesh):
-    """A garment on another body.
+    """A garment on the target: the result of `transfer_garment`.
 
     Attributes
     ----------
     shape
-        The garment's vertices and faces in their order, in the frame and unit of the target.
+        The garment in the frame and unit of the target; vertices and faces in their original order.
     turns
-        (V, 3, 3) how each vertex was turned.
+        (V, 3, 3) rotation of the garment at each vertex.
     pushed
-        (N,) vertices that would have sunk deeper below the target's skin than below the source's, and were pushed out.
+        (N,) vertices that were pushed out, since they would lie deeper below the target's skin than below the source's.
     sunk
-        (M,) vertices that are below the target's skin all the same, and are above the source's.
+        (M,) vertices that lie above the source's skin, but still below the target's.
     below
-        Share (0..1) of its vertices below the source's skin.
+        Share (0..1) of the garment's vertices below the source's skin.
     far
-        Share (0..1) of its vertices further from the source's skin than 5 % of sqrt(area).
+        Share (0..1) of the garment's vertices farther from the source's skin than 5 % of sqrt(area).
     sits
-        Whether these say that it sits on the source; another person's clothes, or another pose's, do not.
+        Whether ``below`` and ``far`` are low enough for a garment of the source, in the source's pose.
     maps
-        The maps that were followed.
+        The maps that were used.
     seconds
-        Time beside the match.
+        Wall time, excluding the match.
     original
-        The garment's file, if it came from one.
+        The garment's file, if it was read from one.
     binding
-        The skeleton that moves the garment in a .glb: the target's, or else its own, carried along.
+        The skeleton that moves the garment in a .glb: the target's, or else the garment's own, moved with it.
     turn
-        (3, 3) the rotation after which it stands along y, as a .glb does; None where it stands so, or that is not known.
+        (3, 3) rotation that makes y the up axis, as .glb requires; None if it is already, or the up axis is unknown.
     body
-        The target's file, if it came from one.
+        The target's file, if it was read from one.
 
     Examples
     --------
@@ -68,15 +68,15 @@ class GarmentResult(MovedMesh):
     body: Path | None = None
 
     def save(self, path: str | Path, join: bool = False) -> None:
-        """Write the garment, as `MovedMesh.save`; or the target with the garment in it.
+        """Write the garment, as `MovedMesh.save` does, or the target together with the garment.
 
         Parameters
         ----------
         path
-            Where to.
+            The output file; its suffix selects the format.
         join
-            Put the garment into the target's file, a .glb, .gltf or .vrm, and write both as one .glb; a skeleton of the
-            target moves both.
+            Add the garment to the scene of the target, a .glb, .gltf or .vrm, and write both as one .glb (or .vrm); the
+            target's skeleton moves both.
 
         Raises
         ------
@@ -91,37 +91,37 @@ class GarmentResult(MovedMesh):
         save_moved(path, self.original, self.shape, self.turns, self.binding, self.turn, into)
 
     def _repr_html_(self) -> str:
-        from meshmatch.api.notebook import carried_html
+        from meshmatch.api.notebook import transfer_html
         from meshmatch.render.compose import compose_worn
 
         sunk = f"{len(self.pushed)} pushed out, {len(self.sunk)} below the skin"
         draw = partial(compose_worn, [self.maps.target], [self.shape])
-        return carried_html("Garment", self.maps.forward, draw, {"vertices of the garment": sunk})
+        return transfer_html("Garment", self.maps.forward, draw, {"vertices of the garment": sunk})
 
 
 def transfer_garment(garment: ShapeLike, source: ShapeLike, target: ShapeLike, match: MapLike = None) -> GarmentResult:
-    """A mesh that sits on the source (clothes, hair, a hat, shoes), as it sits on the target.
+    """Transfer a mesh that is worn by the source (clothes, hair, a hat, shoes) to the target.
 
-    Each vertex of the garment follows the nearest vertices of the source through the map, with its offset from them,
-    turned and scaled as the body is there. It is pushed out where it would sink below the target's skin; what is below
-    the source's skin stays as deep.
+    Each vertex of the garment follows the nearest vertices of the source through the map and keeps its offset from them,
+    rotated and scaled as the body is there. Vertices that would sink below the target's skin are pushed out; vertices below
+    the source's skin stay equally deep.
 
     Parameters
     ----------
     garment
-        The mesh to carry, in the frame and unit of the source.
+        The mesh to transfer, in the frame and unit of the source.
     source
-        The body that it sits on: a mesh.
+        The mesh that wears the garment.
     target
-        The body that it will sit on; if its file has a skeleton, that moves the garment too. Out of a point cloud nothing
-        is pushed.
+        The body that will wear it. If its file has a skeleton, the skeleton also moves the garment. If it is a point cloud,
+        no vertices are pushed out.
     match
         As in `find_maps`.
 
     Returns
     -------
     GarmentResult
-        Its ``save("worn.obj")`` writes the garment.
+        The garment on the target; ``save("worn.obj")`` writes it.
 
     Raises
     ------

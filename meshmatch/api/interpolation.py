@@ -1,4 +1,4 @@
-"""A sequence of shapes between two or more."""
+"""Interpolation: a sequence of shapes between two or more shapes."""
 
 from __future__ import annotations
 
@@ -43,35 +43,38 @@ if TYPE_CHECKING:
 
 Mesh = Literal["source", "template"]
 Place = Literal["auto", "files", "source"]
-EARLIEST, LATEST = -1.0, 2.0  # times between which a sequence may run
-FORMATS = ("ply", "obj", "off", "glb")  # of the files in a folder
-_HAIR = 1e-9
-_ALIKE = 1.5  # sizes of files in one unit differ by less
+EARLIEST, LATEST = -1.0, 2.0  # range of times
+FORMATS = ("ply", "obj", "off", "glb")  # formats of the files in a folder
+_TIME_TOLERANCE = 1e-9
+_MAX_SIZE_RATIO = 1.5  # of shapes whose files are assumed to have the same unit
 
 
 @dataclass(frozen=True)
 class InterpolationOptions:
-    """What a sequence of shapes shows.
+    """Options of `interpolate`.
 
     Attributes
     ----------
     start
-        Time of the first shape, from -1 to 2; beyond 0 and 1 the motion is extrapolated.
+        Time of the first frame, from -1 to 2; before 0 and after 1 the motion is extrapolated.
     stop
-        Time of the last shape.
+        Time of the last frame, after ``start`` and at most 2.
     mesh
-        Whose mesh moves: the first shape's own ("source") or the model's ("template").
+        The mesh that moves: the mesh of the first shape ("source") or the model's template ("template").
     way
-        What is blended: the rotation and stretch of the "field" everywhere, or the network's "codes".
+        What is blended: the local rotation and stretch of the deformation ("field"), or the network's latent codes
+        ("codes").
     place
-        Where the shapes lie, see `Interpolation`; "auto" is "files" where their sizes differ by less than a half.
+        Placement of the shapes, see `Interpolation`; "auto" is "files" if the sizes of the shapes differ by a factor of
+        less than 1.5 and none is a mirror image, else "source".
     resolution
-        Of an implicit model's surfaces: cells along each side of the cube, an even number from 8 to 512.
+        For implicit models: grid cells along each side of the cube from which surfaces are extracted, an even number from
+        8 to 512.
 
     Raises
     ------
     OptionError
-        A choice is unknown, or a time out of range.
+        An option has an unknown value, or a time is out of range.
 
     Examples
     --------
@@ -102,8 +105,10 @@ class InterpolationOptions:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Step(Brief):
-    """A shape of a sequence, at 0 the source, at 1 the target; ``rotation`` (3, 3) leads to the axes of the template. An
-    implicit model knows neither that nor a deviation.
+    """A frame of a sequence.
+
+    ``time`` is 0 at the source and 1 at the target. ``rotation`` (3, 3) leads from the axes of the frame to those of the
+    template. For an implicit model, ``rotation`` and ``deviation`` are None.
     """
 
     time: float
@@ -113,7 +118,7 @@ class Step(Brief):
 
     @property
     def record(self) -> dict[str, float]:
-        """Time and deviations, or the number of vertices where shapes share none, for JSON."""
+        """Time and deviations for JSON; for an implicit model, time and the number of vertices."""
         if self.deviation is None:
             return {"time": round(self.time, 9), "vertices": self.shape.V}
         return {"time": round(self.time, 9)} | {key: round(value, 6) for key, value in asdict(self.deviation).items()}
@@ -121,26 +126,28 @@ class Step(Brief):
 
 @dataclass(frozen=True, eq=False)
 class Interpolation:
-    """A sequence of shapes with the same vertices and faces; by an implicit model, each has its own.
+    """The result of `interpolate`: a sequence of shapes with common vertices and faces.
+
+    With an implicit model, each shape has its own vertices and faces.
 
     Attributes
     ----------
     steps
-        Time, shape and deviation of each frame.
+        The frames, each with ``time``, ``shape`` and ``deviation``.
     fits
-        Fits of the first shape, of those on the way, and of the last.
+        The fits of the given shapes, in order.
     times
-        When each of these shapes is met.
+        The time at which the sequence passes each of these shapes.
     place
-        From where the first file has the shape to where the last has it ("files"), or all in the frame and unit of the
-        first ("source").
+        "files": positions move from those of the first file to those of the last; "source": all shapes are in the frame and
+        unit of the first file.
     to_target
-        Mean distance of the moved vertices at time 1 to the last shape's surface, in units of sqrt(area); None by an
+        Mean distance of the moved vertices at time 1 to the surface of the last shape, in units of sqrt(area); None for an
         implicit model.
     seconds
         Wall time.
     notes
-        What repair did.
+        Repairs of the shapes and other notes on their fits.
 
     Examples
     --------
@@ -172,20 +179,20 @@ def interpolate(
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> Interpolation:
-    """The shapes between two shapes: from the first at time 0 to the last at time 1.
+    """Blend shapes into each other: a sequence from the first shape at time 0 to the last at time 1.
 
     Parameters
     ----------
     shapes
-        At least two, each as in `match`; those in between are passed at even times.
+        At least two shapes, each as in `match`; those in between are passed at evenly spaced times.
     frames
-        How many shapes to make, at least 2, at even times.
+        Number of shapes to make, at least 2, at evenly spaced times.
     options
         Times, mesh, method and placement of the sequence.
     model
         As in `match`.
     config
-        As in `match`; a sequence has one for each shape.
+        How shapes are fitted: one for all shapes, or one for each.
     threads
         As in `match`.
     progress
@@ -194,12 +201,12 @@ def interpolate(
     Returns
     -------
     Interpolation
-        Its ``steps`` have a time and a shape each; all shapes share vertices and faces.
+        The sequence: each of its ``steps`` has a ``time`` and a ``shape``.
 
     Raises
     ------
     MeshmatchError
-        A shape cannot be read or fitted, the model is unknown, or choices contradict each other.
+        A shape cannot be read or fitted, the model is unknown, or options contradict each other.
 
     Examples
     --------
@@ -217,20 +224,22 @@ def interpolate(
         if count < 2:
             raise OptionError(f"a sequence needs at least {what}, not {count}", "give two or more")
     if not isinstance(matcher, Matcher):
-        return _surfaces(matcher, shapes, frames, options, config)
+        return _interpolate_implicit(matcher, shapes, frames, options, config)
     configs = configs_for(config or matcher.config, len(loaded))
     try:
         if model == NO_MODEL:
-            registered = _registered_directly(matcher, loaded, configs, options, unknown=False)
+            registered = _register_directly(matcher, loaded, configs, options, unknown=False)
         else:
-            registered = _registered(matcher, loaded, configs)
+            registered = _register_with_model(matcher, loaded, configs)
     except UnknownKindsError:
-        registered = _registered_directly(matcher, loaded, configs, options, unknown=True)
+        registered = _register_directly(matcher, loaded, configs, options, unknown=True)
     fits = registered.fits
     with thread_limit(1):
         repaired = [shape_of(fit).shape for fit in fits]
         blend = Blend(registered.mover, fits, None, repaired, options.way)
-        steps, place, distance = _steps(blend, fits, np.linspace(options.start, options.stop, frames), options, matcher)
+        steps, place, distance = _make_steps(
+            blend, fits, np.linspace(options.start, options.stop, frames), options, matcher
+        )
     return Interpolation(
         steps, tuple(fits), tuple(blend.times.tolist()), place, distance, time.monotonic() - began, registered.notes
     )
@@ -238,15 +247,15 @@ def interpolate(
 
 @dataclass(frozen=True, eq=False)
 class _Registered:
-    """Fits of one template, what moves it, and what is to be said of the shapes."""
+    """Fits of one template, the model or node system that deforms it, and notes on the shapes."""
 
     fits: list[Fit]
     mover: TrainedModel | NodeSystem
     notes: tuple[str, ...]
 
 
-def _registered(matcher: Matcher, shapes: Sequence[Shape], configs: Sequence[FitConfig]) -> _Registered:
-    """By a model. `UnknownKindsError` where the shapes should choose it, and none knows them."""
+def _register_with_model(matcher: Matcher, shapes: Sequence[Shape], configs: Sequence[FitConfig]) -> _Registered:
+    """Fit the shapes with the matcher's model; `UnknownKindsError` if it is to be chosen and none knows the shapes."""
     fits = matcher.fit_all(shapes, configs)
     notes = tuple(dict.fromkeys(note for fit in fits for note in fit.notes))
     with thread_limit(1):
@@ -254,14 +263,14 @@ def _registered(matcher: Matcher, shapes: Sequence[Shape], configs: Sequence[Fit
         return _Registered(agreed_fits(matcher.model, repaired, fits, configs[0]), matcher.model, notes)
 
 
-def _registered_directly(
+def _register_directly(
     matcher: Matcher,
     shapes: Sequence[Shape],
     configs: Sequence[FitConfig],
     options: InterpolationOptions,
     unknown: bool,
 ) -> _Registered:
-    """The first shape is the template of all; `OptionError` for a choice that needs a model."""
+    """Fit the first shape, as the template, to all others; `OptionError` for options that need a model."""
     if options.mesh == "template":
         raise OptionError("without a model there is no template", "leave out the mesh: that of the first shape moves")
     if options.way == "codes":
@@ -271,14 +280,14 @@ def _registered_directly(
     return _Registered(fits, found.system, direct_notes(clean, configs, unknown))
 
 
-def _surfaces(
+def _interpolate_implicit(
     matcher: ImplicitMatcher,
     shapes: Sequence[ShapeLike],
     frames: int,
     options: InterpolationOptions,
     config: FitConfig | Sequence[FitConfig] | None,
 ) -> Interpolation:
-    """By the codes of an implicit model: each shape has a surface of its own."""
+    """Blend the latent codes of an implicit model and extract the surface of each frame."""
     from meshmatch.api.implicit import refuse_changed
     from meshmatch.implicit.model import check_resolution
 
@@ -300,53 +309,77 @@ def _surfaces(
     return Interpolation(tuple(steps), tuple(fits), (0.0, 1.0), "files", None, time.monotonic() - began, notes)
 
 
-def _steps(
+def _make_steps(
     blend: Blend, fits: Sequence[Fit], moments: Floats, options: InterpolationOptions, matcher: Matcher
 ) -> tuple[tuple[Step, ...], Place, float]:
-    """The shapes, where they lie, and how far the mesh is from the target at time 1."""
+    """Make the frames; also return their placement, and the mean distance of the mesh at time 1 from the target."""
     binding = None
     if options.mesh == "source":
         binding = SurfaceBinding(shape_of(fits[0]), fits[0], blend.turns(fits[0].vectors), matcher.threads)
     place, mirrored = options.place, any(fit.frame.mirrored for fit in fits)
-    if place == "auto":  # files of different units have no place in common
+    if place == "auto":  # positions in files of different units are not comparable
         sizes = [fit.frame.scale for fit in fits]
-        place = "files" if max(sizes) < _ALIKE * min(sizes) and not mirrored else "source"
+        place = "files" if max(sizes) < _MAX_SIZE_RATIO * min(sizes) and not mirrored else "source"
     elif place == "files" and mirrored:
         hint = "leave out the place: the sequence then stays with the source, and ends as the target's mirror image"
         raise OptionError("one of the shapes fits as a mirror image, so no motion leads from file to file", hint)
 
-    def seen(moment: float) -> tuple[np.ndarray, np.ndarray]:
-        """Node vectors and carried vertices, core frame."""
+    def blended(moment: float) -> tuple[np.ndarray, np.ndarray]:
+        """Node vectors and moved vertices at a time, in the core frame."""
         vectors = blend.vectors(moment)
         points = blend.points(vectors)
         return vectors, points if binding is None else binding.at(points, blend.turns(vectors))
 
     def step(number: int, moment: float) -> Step:
-        vectors, verts = seen(moment)
+        vectors, verts = blended(moment)
         frame = blend.frame(moment) if place == "files" else fits[0].frame
         name = f"{number:03d}"
         placed = frame.undo(verts)
-        if binding is not None and moment == blend.times[0]:  # rounding aside it is where it was
+        if binding is not None and moment == blend.times[0]:  # exactly the source, without rounding errors
             placed = shape_of(fits[0]).original.verts
         shape = Shape(placed, fits[0].shape.faces, name) if binding is None else binding.shape(placed, name)
         if matcher.progress is not None:
             matcher.progress("frames", "sequence", (number + 1) / len(moments))
         return Step(moment, shape, blend.deviation(moment, vectors), frame.turn)
 
-    for met in blend.times:  # which rounding may have missed by a hair
-        moments[np.abs(moments - met) < _HAIR] = met
+    for key_time in blend.times:  # snap frames to the times of given shapes
+        moments[np.abs(moments - key_time) < _TIME_TOLERANCE] = key_time
     steps = tuple(step(number, moment) for number, moment in enumerate(moments.tolist()))
-    target, last = shape_of(fits[-1]).shape, seen(1.0)[1]
+    target, last = shape_of(fits[-1]).shape, blended(1.0)[1]
     own, normals = in_core_frame(target, fits[-1])
     found = Surface(own, target.faces, np.zeros_like(normals)).query(last, np.zeros_like(last))
     return steps, place, float(found.distance.mean())
 
 
 def save_folder(path: str | Path, result: Interpolation, kind: str = "ply", original: Path | None = None) -> list[str]:
-    """Write each shape of a sequence into a new folder, ``frame-000.ply`` ..., and a list of them, ``frames.json``; the
-    names of the files in order. ``original`` is the file whose mesh moves, which they are like but for positions. A glb
-    stands along y as the first shape does. `OptionError` for another format; `OutputError` where the folder is not empty,
-    or cannot be written.
+    """Write each shape of a sequence into a new folder.
+
+    The folder gets ``frame-000.ply``, ... and ``frames.json``, which lists them with times and deviations. If ``original``
+    is the file of the mesh that moves, the frames keep everything in it but the positions. In a glb, a node turns the shapes
+    upright as the first shape stands.
+
+    Parameters
+    ----------
+    path
+        The new folder.
+    result
+        The sequence.
+    kind
+        Format of the files, one of `FORMATS`.
+    original
+        The file of the mesh that moves.
+
+    Returns
+    -------
+    list of str
+        The names of the files, in order.
+
+    Raises
+    ------
+    OptionError
+        The format is unknown.
+    OutputError
+        The folder is not empty, or cannot be written.
     """
     if kind not in FORMATS:
         raise OptionError(f"shapes of a sequence are not written as {kind}", f"choose {', '.join(FORMATS)}")

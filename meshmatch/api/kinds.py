@@ -1,4 +1,4 @@
-"""Which of the installed models fits what users hand in: the shapes decide."""
+"""Choose among the installed models by the kinds of the given shapes."""
 
 from __future__ import annotations
 
@@ -33,18 +33,19 @@ from meshmatch.threads import parallel_map
 UnitName = Literal["auto", "cm", "file", "x100"]
 
 _PEOPLE = "human"
-_NEXT, _TOGETHER = ("quadruped",), 2  # asked after people, before the others; how many models at a time
-# Trust from which on a shape that its model hardly knows may be of the other shapes' kind; set by hand: a character with a
-# large head and short limbs has 0.48; planes, hearts, bones and dinosaurs have 0.13 at most.
-_PERHAPS = 0.25
-_MOST_READ = 40  # files of a folder whose kind is found out
-_NAME_IT = "name the model (--model NAME, in Python model=NAME) if that is wrong"
-_LEAVE_OUT = "exclude what does not belong to it with --without (`meshmatch info` lists parts), or try --try-harder"
+# Categories that are evaluated after people and before the others; how many models are evaluated at a time.
+_SECOND_CATEGORIES, _GROUP_SIZE = ("quadruped",), 2
+# Trust above which a shape with an uncertain kind may be of the other shapes' kind; set by hand: a character with a large
+# head and short limbs has 0.48; planes, hearts, bones and dinosaurs have 0.13 at most.
+_MIN_PLAUSIBLE_TRUST = 0.25
+_MAX_CLASSIFIED = 40  # files of a folder that are classified
+_HINT_MODEL = "name the model (--model NAME, in Python model=NAME) if that is wrong"
+_HINT_WITHOUT = "exclude what does not belong to it with --without (`meshmatch info` lists parts), or try --try-harder"
 
 
 @dataclass(frozen=True)
 class Installed:
-    """A model that shapes may be of, loaded when it is first asked."""
+    """A candidate model, loaded when it is first evaluated."""
 
     card: ModelCard
     load: Callable[[], TrainedModel]
@@ -56,39 +57,43 @@ class Installed:
 
 
 def installed_models() -> list[Installed]:
-    """The models of the registry whose cards can be read; `ModelError` if there are none."""
+    """The explicit models of the registry with readable cards; `ModelError` if there are none."""
     found = [
         Installed(entry.card, partial(as_model, entry.folder), entry.built_in)
         for entry in list_models()
         if isinstance(entry.card, ModelCard)
     ]
     if not found:
-        raise _no_model()
+        raise _no_model_error()
     return found
 
 
-def _no_model() -> ModelError:
+def _no_model_error() -> ModelError:
     return ModelError("no model is installed", "see `meshmatch models list`")
 
 
 def category_residuals(
     models: Sequence[Installed], shapes: Sequence[Shape], configs: Sequence[FitConfig], sure: float = SURE
 ) -> Float[Floats, "M S"]:
-    """`category_residual` of repaired shapes by models; infinite where a model cannot see a shape, or was not asked.
+    """Compute `category_residual` of repaired shapes by models, evaluating as few pairs as needed.
 
-    One shape decides first, if possible a whole one, or that with the shortest boundary. The model of people, and the
-    user's own, are asked about it, and the others where none of these is ``sure``: two at a time, animals first, until one
-    is. Models of its kind are then asked about the other shapes, and the rest where they do not know them: but not about a
-    part of something whose kind is known.
+    1. One shape comes first: a complete mesh if possible, else the mesh with the shortest boundary.
+    2. The model of people and the user's own models are evaluated on it. Unless one of them has a residual of at most
+       ``sure``, the other models follow, two at a time and animals first, until one has.
+    3. The models of the category found are evaluated on the other shapes.
+    4. All other models are evaluated on the shapes that those models do not know, except partial shapes if the category is
+       known.
+
+    The residual is infinite for pairs that are not evaluated, and where a model cannot be evaluated on a shape.
     """
     readings = Readings([model.load for model in models], shapes, configs)
     found = readings.found
     parts = [_is_part(shape, config) for shape, config in zip(shapes, configs, strict=True)]
-    lacking = [
+    boundary = [
         np.inf if shape.is_cloud else part * boundary_length(shape) / np.sqrt(shape.area)
         for shape, part in zip(shapes, parts, strict=True)
     ]
-    first, *others = np.argsort(lacking, kind="stable").tolist()
+    first, *others = np.argsort(boundary, kind="stable").tolist()
     for rows in _order(models):
         readings.ask(rows, [first])
         if found[:, first].min() <= sure:
@@ -103,21 +108,31 @@ def category_residuals(
 
 
 def _order(models: Sequence[Installed]) -> list[list[int]]:
-    """Which models (rows) are asked together, one group after the other."""
+    """Group the models (rows) by the order in which they are evaluated."""
     likely = [row for row, model in enumerate(models) if model.card.category == _PEOPLE or not model.built_in]
-    rest = sorted(set(range(len(models))) - set(likely), key=lambda row: models[row].card.category not in _NEXT)
-    return [likely, *(rest[first : first + _TOGETHER] for first in range(0, len(rest), _TOGETHER))]
+    rest = sorted(
+        set(range(len(models))) - set(likely), key=lambda row: models[row].card.category not in _SECOND_CATEGORIES
+    )
+    return [likely, *(rest[first : first + _GROUP_SIZE] for first in range(0, len(rest), _GROUP_SIZE))]
 
 
 def _is_part(shape: Shape, config: FitConfig) -> bool:
-    """Whether its user says that a shape is a part, and it may be one."""
+    """Whether the user says that a shape is partial, and its surface is consistent with that."""
     return config.partial == "yes" and may_show_part(shape, replace(config, partial="auto"))
 
 
 @dataclass(frozen=True, eq=False)
 class Classification:
-    """What is known of one shape: its kind, None where that cannot be told; the card of the model that reads it best; and
-    the fit by it, with refined nodes, that had to tell, if any.
+    """The kind of one shape.
+
+    Attributes
+    ----------
+    kind
+        The category, None if it is uncertain.
+    card
+        The card of the model with the lowest residual.
+    fit
+        The fit by that model, with refined nodes, if one was needed to decide.
     """
 
     kind: str | None
@@ -127,15 +142,27 @@ class Classification:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The model that knows all of some shapes. For each shape what is fitted of it: all, or some parts; a few words; a fit
-    by the model that telling its kind took, if any; and whether its parts were tried apart.
+    """The model for several shapes.
+
+    Attributes
+    ----------
+    model
+        The chosen model.
+    clean
+        What is fitted of each shape: all of it, or some parts.
+    notes
+        One note on the kind of each shape.
+    fits
+        The fit of each shape by the model, if one was needed to find its kind.
+    parts_tried
+        Whether the parts of each shape were parts_tried on their own.
     """
 
     model: TrainedModel
     clean: list[Repaired]
-    words: list[str]
+    notes: list[str]
     fits: list[Fit | None]
-    tried: list[bool]
+    parts_tried: list[bool]
 
 
 def choose_model(
@@ -144,12 +171,14 @@ def choose_model(
     settled: TrainedModel | None = None,
     progress: ProgressCallback | None = None,
 ) -> Choice:
-    """The installed model that knows the kind of all the shapes; or ``settled``, if it does.
+    """Choose the installed model that knows the kind of all shapes; ``settled``, if given, is the model chosen before.
 
-    A cloud, or a shape that may be a part of something, is of the other shapes' kind where its own cannot be told; so is a
-    mesh that hardly looks like that kind, but more so than like any other, as are several such meshes together. Of a
-    mesh of no kind, or of parts far apart, those parts are chosen that are of a kind (`meshmatch.api.apart`).
-    `InputError` if two shapes are of different kinds, or one of none; `ModelError` if no model is installed.
+    A point cloud, or a shape that may be partial, takes the kind of the other shapes if its own is uncertain. So does a mesh
+    that resembles that kind weakly, if it resembles no other kind more; several such meshes take the kind they all resemble.
+    If a mesh is of no known kind, or has large parts far apart, parts of it that are of a known kind are selected
+    (`meshmatch.api.apart`).
+
+    `InputError` if the shapes are of different kinds, or one of no known kind; `ModelError` if no model is installed.
     """
     models = installed_models()
     if settled is not None and settled.card not in [model.card for model in models]:
@@ -158,11 +187,11 @@ def choose_model(
     Progress(progress, shapes[0].name).stage("looking for its kind")(0.0)
     readings = category_residuals(models, shapes, configs)
     if np.isinf(readings).all():
-        raise _no_model()
-    found = _classified(models, readings, shapes, configs, progress)
+        raise _no_model_error()
+    found = _classify_all(models, readings, shapes, configs, progress)
     clean = list(clean)
-    tried = [known.kind is None or each.far_parts > 0 for known, each in zip(found, clean, strict=True)]
-    for number in np.flatnonzero(tried).tolist():
+    parts_tried = [known.kind is None or each.far_parts > 0 for known, each in zip(found, clean, strict=True)]
+    for number in np.flatnonzero(parts_tried).tolist():
         config = configs[number]
         Progress(progress, shapes[number].name).stage("looking at its parts")(0.0)
         loaders, whole = [model.load for model in models], clean[number].original
@@ -178,32 +207,32 @@ def choose_model(
         if kind is not None and kind not in names and names:
             ((other, name),) = names.items()
             problem = f"two kinds of shapes: {name}: {other}; {shape.name}: {kind}"
-            raise InputError(problem, f"match shapes of one kind; {_NAME_IT}")
+            raise InputError(problem, f"match shapes of one kind; {_HINT_MODEL}")
         if kind is not None:
             names.setdefault(kind, shape.name)
     common = next(iter(names), models[int(readings.sum(1).argmin())].card.category)
     rows = [row for row, model in enumerate(models) if model.card.category == common]
     chosen = settled or models[min(rows, key=lambda row: readings[row].sum())].load()
-    by = "" if chosen.card.name == common else f" (model {chosen.card.name})"
-    words = [
-        f"{shape.name or 'the shape'}: {each.kind}{by}"
+    suffix = "" if chosen.card.name == common else f" (model {chosen.card.name})"
+    notes = [
+        f"{shape.name or 'the shape'}: {each.kind}{suffix}"
         if each.kind
-        else f"{shape.name} {_unsure(shape, each, common + by)}"
+        else f"{shape.name} {_uncertain_note(shape, each, common + suffix)}"
         for shape, each in zip(shapes, found, strict=True)
     ]
     usable = [
         each.fit if each.card == chosen.card and config.refine == "nodes" else None
         for each, config in zip(found, configs, strict=True)
     ]
-    return Choice(chosen, clean, words, usable, tried)
+    return Choice(chosen, clean, notes, usable, parts_tried)
 
 
-def _unsure(shape: Shape, found: Classification, taken: str) -> str:
+def _uncertain_note(shape: Shape, found: Classification, assumed: str) -> str:
     why = "may be a part, or a rough cloud" if shape.is_cloud else "may be a part, or several objects"
-    if not shape.is_cloud and found.fit is not None and _perhaps(found, {found.card.category}):
+    if not shape.is_cloud and found.fit is not None and _may_be_of_kind(found, {found.card.category}):
         why = f"hardly looks like it (trust {found.fit.trust:.2f})"
-    hint = _NAME_IT if shape.is_cloud else f"{_NAME_IT}; {_LEAVE_OUT}"
-    return f"{why}: treated as {taken}; {hint}"
+    hint = _HINT_MODEL if shape.is_cloud else f"{_HINT_MODEL}; {_HINT_WITHOUT}"
+    return f"{why}: treated as {assumed}; {hint}"
 
 
 def classify_shapes(
@@ -213,33 +242,33 @@ def classify_shapes(
     configs: Sequence[FitConfig],
     progress: ProgressCallback | None = None,
 ) -> list[Classification]:
-    """What the readings, and fits of those that read strangely, tell of each shape (`meshmatch.fitting.classify`).
+    """Classify shapes by their residuals, and by fits where these are inconclusive (`meshmatch.fitting.classify`).
 
-    `InputError` for a complete mesh that is not of the kind that reads it best.
+    `InputError` for a complete mesh that is not of the kind whose model has the lowest residual.
     """
-    found = _classified(models, readings, shapes, configs, progress)
+    found = _classify_all(models, readings, shapes, configs, progress)
     _refuse_unknown(models, readings, found, shapes, configs)
     return found
 
 
-def _classified(
+def _classify_all(
     models: Sequence[Installed],
     readings: Float[Floats, "M S"],
     shapes: Sequence[Shape],
     configs: Sequence[FitConfig],
     progress: ProgressCallback | None,
 ) -> list[Classification]:
-    def tell(shape: Shape, config: FitConfig, column: Float[Floats, " M"]) -> Classification:
+    def classify_one(shape: Shape, config: FitConfig, column: Float[Floats, " M"]) -> Classification:
         best = models[row := int(column.argmin())]
         kind = best.card.category
         if np.isinf(column[row]):
             return Classification(None, best.card)
-        if _is_part(shape, config):  # whose fit would tell nothing that the reading does not
+        if _is_part(shape, config):  # its fit would say no more than the residual
             return Classification(kind if column[row] <= KNOWN else None, best.card)
         known, fit = classify(best.load(), shape, column[row], config, progress)
         return Classification(kind if known else None, best.card, fit)
 
-    return parallel_map(tell, shapes, configs, readings.T)
+    return parallel_map(classify_one, shapes, configs, readings.T)
 
 
 def _refuse_unknown(
@@ -254,27 +283,27 @@ def _refuse_unknown(
         kinds = {each.card.category for each in found}
     for shape, config, each, nearest in zip(shapes, configs, found, readings.min(0), strict=True):
         unknown = each.kind is None and not shape.is_cloud and not may_show_part(shape, config)
-        if unknown and not _perhaps(each, kinds):
+        if unknown and not _may_be_of_kind(each, kinds):
             names = ", ".join(sorted({model.card.category for model in models}))
             problem = f"{shape.name} does not look like anything that the installed models know: {names}"
             error = UnknownKindsError if all(other.kind is None for other in found) else InputError
-            raise error(problem, _nearest(each) if np.isfinite(nearest) else _LEAVE_OUT)
+            raise error(problem, _nearest_kind_hint(each) if np.isfinite(nearest) else _HINT_WITHOUT)
 
 
-def _perhaps(found: Classification, kinds: Collection[str]) -> bool:
-    """Whether a mesh of no known kind may be of the only kind that the other shapes are of, or may be of."""
-    return found.fit is not None and found.fit.trust >= _PERHAPS and set(kinds) == {found.card.category}
+def _may_be_of_kind(found: Classification, kinds: Collection[str]) -> bool:
+    """Whether a mesh of uncertain kind may be of the kind of the other shapes, if these have only one."""
+    return found.fit is not None and found.fit.trust >= _MIN_PLAUSIBLE_TRUST and set(kinds) == {found.card.category}
 
 
-def _nearest(found: Classification) -> str:
-    """What to do about a shape of no known kind: the kind that comes nearest, and how to insist on it."""
+def _nearest_kind_hint(found: Classification) -> str:
+    """Hint for a shape of no known kind: the nearest kind, and how to insist on it."""
     name, trust = found.card.name, "" if found.fit is None else f", trust {found.fit.trust:.2f}"
     named = f"if it is one, name the model: --model {name} (in Python model={name!r})"
-    return f"nearest: {found.card.category}{trust}; {named}; {_LEAVE_OUT}"
+    return f"nearest: {found.card.category}{trust}; {named}; {_HINT_WITHOUT}"
 
 
 def other_kind(model: TrainedModel, shape: Shape, config: FitConfig) -> str | None:
-    """The kind that a repaired shape is of by the installed models, if that is another one than the model's."""
+    """The kind of a repaired shape by the installed models, if it differs from the model's; else None."""
     try:
         models = installed_models()
         readings = category_residuals(models, [shape], [config])
@@ -288,17 +317,17 @@ def other_kind(model: TrainedModel, shape: Shape, config: FitConfig) -> str | No
 def kinds_of(
     files: Mapping[str, Path], seed: int = 0, progress: ProgressCallback | None = None
 ) -> dict[str, str | None]:
-    """The kind of the shape in each file, by the readings of the included models: None where none is sure of it.
+    """Classify the shapes in files by their residuals for the included models; None if the kind is uncertain.
 
-    Of more than `_MOST_READ` files as many, evenly spread. `ModelError` if no model is included.
+    Of more than `_MAX_CLASSIFIED` files, that many are classified, evenly spaced. `ModelError` if no model is included.
     """
     models = [model for model in installed_models() if model.built_in]
     if not models:
-        raise _no_model()
+        raise _no_model_error()
     config, names = FitConfig(seed=seed), list(files)
-    read = [names[k] for k in np.linspace(0, len(names) - 1, min(len(names), _MOST_READ)).round().astype(int)]
+    sampled = [names[k] for k in np.linspace(0, len(names) - 1, min(len(names), _MAX_CLASSIFIED)).round().astype(int)]
     found: dict[str, str | None] = {}
-    for number, name in enumerate(read):
+    for number, name in enumerate(sampled):
         try:
             readings = category_residuals(models, [repair(load_shape(files[name])).shape], [config])[:, 0]
         except InputError:  # of no use to any model
@@ -306,12 +335,12 @@ def kinds_of(
         best = int(readings.argmin())
         found[name] = models[best].card.category if readings[best] <= FAMILIAR else None
         if progress is not None:
-            progress("looking for known kinds", "shapes", (number + 1) / len(read))
+            progress("looking for known kinds", "shapes", (number + 1) / len(sampled))
     return found
 
 
 def is_person(shape: Shape) -> bool:
-    """Whether the model of people is sure of a shape, without asking others; False if it is not installed."""
+    """Whether the included model of people recognises a shape with certainty; False if it is not installed."""
     people = [model for model in installed_models() if model.built_in and model.card.category == _PEOPLE]
     try:
         return bool(people) and category_residuals(people[:1], [repair(shape).shape], [FitConfig()])[0, 0] <= SURE
@@ -320,7 +349,7 @@ def is_person(shape: Shape) -> bool:
 
 
 def error_unit(name: UnitName, target: Shape) -> ErrorUnit:
-    """What errors on a target are told in; ``"auto"``: centimetres on a person, else the unit of its file.
+    """The unit of errors on a target; ``"auto"``: centimetres for a person, else the unit of its file.
 
     `OptionError` if there is no such unit.
     """
@@ -332,8 +361,9 @@ def error_unit(name: UnitName, target: Shape) -> ErrorUnit:
 
 
 def kind_notes(kinds: Mapping[str, str | None], folder: Path) -> list[str]:
-    """What is to be said of the `kinds_of` a folder, if most are known: which model knows them, or that they are of several
-    kinds. One shape of many is more likely misread than strange.
+    """Notes on the `kinds_of` the shapes of a folder, if most are known: the model that knows them, or a list of kinds.
+
+    Kinds of less than a tenth of the shapes are ignored, as they are probably misclassified.
     """
     names: dict[str, list[str]] = {}
     for name, kind in kinds.items():

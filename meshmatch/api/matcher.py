@@ -370,8 +370,8 @@ class Matcher:
         with self._model_lock, thread_limit(1), worker_slot(threading.Semaphore(self.threads)):
             choice = choose_model(clean, configs, self._model, self.progress)
             self._model = choice.model
-        begun = [_Preliminary(*each) for each in zip(choice.fits, choice.tried, strict=True)]
-        return choice.clean, [(each,) for each in choice.words], begun
+        begun = [_Preliminary(*each) for each in zip(choice.fits, choice.parts_tried, strict=True)]
+        return choice.clean, [(each,) for each in choice.notes], begun
 
     def _select_parts(self, clean: Repaired, config: FitConfig) -> tuple[Repaired, _Preliminary]:
         """Select the parts that the model knows, if a shape has large parts far apart; `InputError` if there are none.
@@ -443,7 +443,13 @@ class Matcher:
             return parallel_map(one, clean, configs, begun, labels, threads=gathering.in_progress, stop=stop)
 
     def _fit_one(
-        self, here: Repaired, config: FitConfig, begun: _Preliminary, gathering: Gathering, stop: threading.Event, label: str
+        self,
+        here: Repaired,
+        config: FitConfig,
+        begun: _Preliminary,
+        gathering: Gathering,
+        stop: threading.Event,
+        label: str,
     ) -> Fit:
         """Fit one shape as a task of the gathering; cancelled when ``stop`` is set."""
 

@@ -1,6 +1,4 @@
-"""`measure`: girths, lengths and angles of a shape that are defined by landmarks of another, or of the body that comes with
-the package.
-"""
+"""`measure`: girths, lengths and angles of a shape, defined by landmarks of another shape or of the included body."""
 
 from __future__ import annotations
 
@@ -30,7 +28,7 @@ from meshmatch.transfer.measurements import (
 )
 
 BODY = "body"
-"""As the source: a person in meshmatch's own files, with landmarks and measurements."""
+"""Source name of the included body: a person with landmarks and measurements."""
 
 
 def measure(
@@ -42,35 +40,36 @@ def measure(
     *,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[Measurements]:
-    """Measure a shape: girths, lengths and angles that are defined by landmarks of another.
+    """Measure girths, lengths and angles of a shape, defined by landmarks of another shape.
 
     Parameters
     ----------
     source
-        The shape that has the landmarks, as in `find_maps`; or ``"body"``: a person with 39 landmarks and 30 measurements,
-        which comes with meshmatch.
+        The shape with the landmarks, as in `find_maps`; or ``"body"``: a person with 39 landmarks and 30 measurements,
+        which is included in meshmatch.
     target
-        The shape that is measured, a mesh or a cloud of points.
+        The shape to measure, a mesh or point cloud.
     measurements
-        What is measured, or the path of a table of it. Needed of any source but ``"body"``.
+        The measurements, or the path of a table that defines them. Required unless the source is ``"body"``.
     landmarks
-        As in `transfer_landmarks`; without names of their own they are called 0, 1, 2, ... in their order. Needed of any
-        source but ``"body"``.
+        As in `transfer_landmarks`; landmarks without names are called 0, 1, 2, ... in their order. Required unless the
+        source is ``"body"``.
     match
         As in `find_maps`.
     rule
-        A length or an angle is nan where one of its landmarks is less confident than the minimum; a girth where more than a
-        quarter of it is, and where the map tears it.
+        Its ``minimum`` applies: a distance or an angle is nan if the confidence of one of its landmarks is below it. A girth
+        is nan if more than a quarter of its line is below it, or if the map is discontinuous along it.
 
     Returns
     -------
     Transferred
-        ``data.values`` (N,) in the unit of the target's file, angles in degrees, and the lines that were measured.
+        ``data`` is `Measurements`: ``values`` (N,) in the unit of the target's file, angles in degrees, and the measured
+        ``lines``.
 
     Raises
     ------
     MeshmatchError
-        A measurement names a landmark that the source does not have, or cannot be taken on it; or as for `find_maps`.
+        The source lacks a landmark of a measurement, or a measurement cannot be taken on it; or as for `find_maps`.
 
     Examples
     --------
@@ -91,20 +90,23 @@ def own_points(
     measurements: Sequence[Measurement] | str | Path | None = None,
     landmarks: Landmarks | ArrayLike | str | Path | None = None,
 ) -> MeasuringPoints:
-    """The points of a source, as of `measure`, by which measurements are taken."""
-    source, measurements, landmarks = measured_by(source, measurements, landmarks)
+    """The points of a source that its measurements need; parameters as in `measure`."""
+    source, measurements, landmarks = resolve_measure_inputs(source, measurements, landmarks)
     space = mesh_space(source) if isinstance(source, str | Path) else ""
     shape = as_shape(source, "source")
     given = load_measurements(measurements) if isinstance(measurements, str | Path) else each_once(measurements)
     return MeasuringPoints.of(shape, given_landmarks(landmarks, shape, space), given)
 
 
-def measured_by(
+def resolve_measure_inputs(
     source: ShapeLike,
     measurements: Sequence[Measurement] | str | Path | None,
     landmarks: Landmarks | ArrayLike | str | Path | None,
 ) -> tuple[ShapeLike, Sequence[Measurement] | str | Path, Landmarks | ArrayLike | str | Path]:
-    """The shape, measurements and landmarks that are meant; `OptionError` if something is missing."""
+    """Resolve the source, measurements and landmarks, with the defaults of the included body.
+
+    `OptionError` if measurements or landmarks are missing for another source.
+    """
     if is_body(source):
         folder = bundled_folder() / "measurements"
         own = folder / "body-measurements.csv", folder / "body-landmarks.csv"
@@ -118,12 +120,12 @@ def measured_by(
 
 
 def is_body(source: object) -> bool:
-    """Whether the word `BODY` is given for a shape."""
+    """Whether the source is `BODY`, the included body."""
     return isinstance(source, str | Path) and str(source) == BODY
 
 
 def meant_source(source: ShapeLike) -> ShapeLike:
-    """The same; of `BODY` its file."""
+    """Return the source; for `BODY`, the path of the included body."""
     return bundled_folder() / "measurements" / "body.ply" if is_body(source) else source
 
 

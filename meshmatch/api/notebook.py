@@ -1,4 +1,4 @@
-"""How results show themselves in a notebook: what is worth knowing in a few rows, and a small picture."""
+"""HTML of results in notebooks: a short table and a small picture."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _LOOK = Look(size=(720, 420))
 
 
 def result_html(title: str, rows: Mapping[str, str], draw: Callable[[], Composition] | None) -> str:
-    """A heading, the rows that say something, and what is drawn, if it can be: a page without scripts or other files."""
+    """Format a heading, the non-empty rows and a picture, if it can be drawn, as self-contained HTML without scripts."""
     picture = ""
     with suppress(MeshmatchError), tempfile.TemporaryDirectory() as folder, thread_limit(1):
         if draw is not None:
-            path = Path(folder, "shown.png")
+            path = Path(folder, "picture.png")
             draw().render(path, _LOOK)
             data = base64.b64encode(path.read_bytes()).decode()
             picture = f'<img alt="{escape(title)}" src="data:image/png;base64,{data}">'
@@ -41,19 +41,19 @@ def map_html(
     rotations: Rotations = (None, None),
     more: Mapping[str, str] | None = None,
 ) -> str:
-    """A map, and places that it matches in one color, on both shapes where they are known."""
+    """Format a map; with both shapes, corresponding points are drawn in the same color."""
 
     def draw() -> Composition:
         assert shapes is not None
         return compose_match(*shapes, found, rotations).named([shape.name for shape in shapes])
 
-    return carried_html(kind, found, None if shapes is None else draw, more)
+    return transfer_html(kind, found, None if shapes is None else draw, more)
 
 
-def carried_html(
+def transfer_html(
     kind: str, found: VertexMap, draw: Callable[[], Composition] | None, more: Mapping[str, str] | None = None
 ) -> str:
-    """What was made by a map: the map's verdict, and a picture of the result."""
+    """Format the result of a transfer: verdict and confidence of its map, and a picture."""
     confidence = float(found.confidence.mean())
     rows = {
         "verdict": "; ".join([found.verdict, *found.reasons]),

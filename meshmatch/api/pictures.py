@@ -1,4 +1,4 @@
-"""Pictures of shapes and of what is known about them, and the page that shows a map."""
+"""Pictures of shapes, maps, values and labels, and the interactive page of a map."""
 
 from __future__ import annotations
 
@@ -46,31 +46,31 @@ def picture(
     Parameters
     ----------
     shapes
-        Each as in `match`, files with their textures; or what a function of `meshmatch.render.compose` returned.
+        Each as in `match`; files are drawn with their textures. Or the result of a function of `meshmatch.render.compose`.
     path
         The .png to write.
     match
-        A match or a map of two shapes: corresponding points get one color.
+        The map between two shapes, as in `find_maps`: corresponding points get the same color.
     values
-        For each shape a number per vertex (V,), shown as a color map, or colors (V, 3 or 4) in 0..1.
+        For each shape, numbers per vertex (V,), drawn with a color map, or colors (V, 3 or 4) in 0..1.
     labels
-        For each shape one per vertex or face.
+        For each shape, one label per vertex or face.
     fit
-        The fit of one shape: its template is drawn over the shape, with the distance as a color map.
+        The fit of a single shape: the deformed template is drawn over the shape, colored by distance.
     look
-        Size, background, axes and side.
+        Size, background, axes and direction of view.
     names
         Captions below the shapes.
 
     Returns
     -------
     (width, height)
-        Of the picture, in pixels.
+        Size of the picture in pixels.
 
     Raises
     ------
     MeshmatchError
-        More than one of `match`, `values`, `labels` and `fit` is given; or one does not belong to the shapes.
+        More than one of `match`, `values`, `labels` and `fit` is given, or one does not belong to the shapes.
 
     Examples
     --------
@@ -101,7 +101,7 @@ def composed(
     title: str = "",
     limits: tuple[float, float] | None = None,
 ) -> Composition:
-    """What `picture` draws; ``title`` and ``limits`` are those of the color scale of ``values``."""
+    """Compose what `picture` draws; ``title`` and ``limits`` belong to the color scale of ``values``."""
     if isinstance(given, Composition):
         return given
     known = {"match": match, "values": values, "labels": labels, "fit": fit}
@@ -144,7 +144,7 @@ def composed(
 
 @dataclass(frozen=True, eq=False)
 class Page(PageReport):
-    """A page that was written, and the maps that it shows."""
+    """Report on a written page, with the maps that it shows."""
 
     maps: MapPair
 
@@ -160,31 +160,31 @@ def view(
     names: Sequence[str] | None = None,
     threads: int = 2,
 ) -> Page:
-    """Write a page that shows two shapes and the map between them: one .html file for any recent browser.
+    """Write an interactive page of two shapes and the map between them: one .html file for any recent browser.
 
     Parameters
     ----------
     source
-        As in `match`; textures are read where shapes are files.
+        As in `match`; if it is a path, its textures are shown.
     target
-        As in `match`.
+        As in `match`; if it is a path, its textures are shown.
     path
         The .html to write.
     match
         As in `find_maps`.
     up
-        The source's up axis where a map is given, such as "z"; guessed by default.
+        Up axis of the source, such as "z"; used if the map comes without fits, or is poor. Guessed by default.
     front
-        The axis that the source faces, such as "-y"; guessed by default.
+        Axis that the source faces, such as "-y"; used like ``up``. Guessed by default.
     names
-        Two captions instead of the shapes' own.
+        Captions of source and target, instead of the shapes' names.
     threads
-        How many threads search on the surfaces.
+        Number of threads.
 
     Returns
     -------
     Page
-        What was written.
+        Report on the written page: ``drawn`` vertices, ``notes``, ``size`` in bytes, and ``maps``.
 
     Raises
     ------
@@ -216,10 +216,13 @@ def view(
 def _rotations(
     source: ShapeLike, maps: MapPair, up: str | None, front: str | None
 ) -> tuple[Floats | None, Floats | None]:
-    """How the shapes stand: as they were fitted, if well; else the source as the user or its format says."""
+    """Rotations that make the shapes upright: from their fits unless these are poor, else for the source alone.
+
+    The source's then come from ``up`` and ``front``, or from its format if that is glTF.
+    """
     first, second = maps.rotations
     if first is not None and second is not None and maps.forward.verdict != "poor":
-        # The frame of a fit follows the trunk; what stands is to stay on its ground.
+        # The frame of a fit follows the trunk; standing shapes are to stay on the ground.
         pairs = (maps.source, first), (maps.target, second)
         first, second = (facing_alike(shape, shape.verts, shape.verts @ turn.T) for shape, turn in pairs)
         return first, second
@@ -233,8 +236,10 @@ def _rotations(
 def read_look(
     source: ShapeLike, shape: Shape, image: Path | None = None
 ) -> tuple[Appearance | None, Floats | None, str]:
-    """Textures and texture coordinates of a file, and what is to be said of them. A look that cannot be read is no reason to
-    show nothing, but an ``image`` that is (`InputError`).
+    """Read the textures and texture coordinates of a shape's file.
+
+    Return the appearance, the texture coordinates and a note. If the file's own textures cannot be read, the note says so
+    and vertex colors are used; if ``image`` is given and cannot be used, raise `InputError`.
     """
     if not isinstance(source, str | Path):
         return None, None, ""

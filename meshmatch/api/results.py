@@ -356,9 +356,10 @@ class Transferred(Brief, Generic[T]):
         Parameters
         ----------
         path
-            The output file. Mesh formats contain the target with the data. Colors: .ply, .glb, .obj or .off; .npy or .csv.
-            Values: .ply, .vtp or .vtk; .npy or .csv. Labels: .ply; .npy, .csv, .txt or .json. Skin weights: .npz or .json.
-            Landmarks: .csv, .json, .pp, .fcsv, .mrk.json or .tps. Measurements: .csv or .json.
+            The output file. Mesh formats contain the target with the data. Colors: .ply, .glb, .vrm (if the target is
+            one), .obj, .off, .vtp or .vtk; .npy or .csv. Values: .ply, .vtp or .vtk; .npy or .csv. Labels: .ply or .vtp;
+            .npy, .csv, .txt or .json. Skin weights: .npz or .json. Landmarks: .csv, .json, .pp, .fcsv, .mrk.json or .tps.
+            Measurements: .csv or .json.
 
         Raises
         ------

@@ -94,7 +94,7 @@ class RiggedResult(Brief):
     lost: str = ""
 
     def _repr_html_(self) -> str:
-        from meshmatch.api.notebook import carried_html
+        from meshmatch.api.notebook import transfer_html
         from meshmatch.render.compose import compose_labels
 
         heaviest, target = most_votes(self.weights.matrix), self.maps.target
@@ -103,7 +103,7 @@ class RiggedResult(Brief):
             "joints": f"{len(self.rig.joints)}, {len(self.unused)} of them without a vertex on the target",
             "clips": ", ".join(clip.name for clip in self.rig.clips),
         }
-        return carried_html("Rig", self.maps.forward, draw, more)
+        return transfer_html("Rig", self.maps.forward, draw, more)
 
     def save(self, path: str | Path) -> None:
         """Write the glb.

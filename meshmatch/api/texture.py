@@ -81,10 +81,10 @@ class TexturedResult(Brief):
     seconds: float
 
     def _repr_html_(self) -> str:
-        from meshmatch.api.notebook import carried_html
+        from meshmatch.api.notebook import transfer_html
 
         used = f"{'its own' if self.atlas.own else 'new'}; {100 * self.baked.used:.0f} % of the image is used"
-        return carried_html("Texture", self.maps.forward, self._drawn, {"texture coordinates": used})
+        return transfer_html("Texture", self.maps.forward, self._drawn, {"texture coordinates": used})
 
     def _drawn(self) -> Composition:
         """The target as its file will look."""

@@ -71,12 +71,12 @@ class WrapResult(MovedMesh):
     seconds: float
 
     def _repr_html_(self) -> str:
-        from meshmatch.api.notebook import carried_html
+        from meshmatch.api.notebook import transfer_html
         from meshmatch.render.compose import compose_shapes
 
         apart = f"{float(self.distance.mean()):.3g} on average, {float(self.distance.max()):.3g} at most"
         draw = partial(compose_shapes, [(self.shape, None)], plain=True)
-        return carried_html("Wrap", self.match.map, draw, {"distance to the surface": apart})
+        return transfer_html("Wrap", self.match.map, draw, {"distance to the surface": apart})
 
 
 def wrap(

@@ -100,10 +100,10 @@ def measure(
     """
     import numpy as np
 
-    from meshmatch.api.measure import measured_by, own_points
+    from meshmatch.api.measure import resolve_measure_inputs, own_points
     from meshmatch.transfer.measurements import check_measurements_suffix
 
-    path, defined, marks = measured_by(source, measurements, landmarks)
+    path, defined, marks = resolve_measure_inputs(source, measurements, landmarks)
     assert isinstance(path, Path)
     transfer = Transfer(path, target, output, maps, run, picture)
     console = transfer.console
