@@ -24,7 +24,7 @@ DEFAULT_COUNT = 12
 """Default number of shapes to fit."""
 SEARCH_STEPS = 400
 """Steps of the latent code search for a pointwise model; a normal fit takes 2,000 steps and five minutes. For a femur, 400
-steps changed residual and stretch from 0.0197 and 0.071 to 0.0185 and 0.057; 2,000 steps changed them to 0.0195 and 0.042."""
+steps changed residual and stretch from 0.0197 and 0.071 to 0.0185 and 0.057; 2,000 steps to 0.0195 and 0.042."""
 _NORMALISED = "normalised"  # subfolder of a prepared folder
 
 

@@ -1,4 +1,4 @@
-"""`meshmatch prepare` as a library: shapes made ready for training, with a template for them."""
+"""`prepare`: check and normalise shapes for training, and make a template for them."""
 
 from __future__ import annotations
 
@@ -37,43 +37,83 @@ from meshmatch.threads import parallel_map
 
 _ARRAYS = tuple(f"{name}.safetensors" for name in ("template", "points", "shapes"))
 _WRITTEN = (*_ARRAYS, "normalised", "prepared.json", "nodes.png")
-_MOST_SIDES = 200  # shapes among which sides are looked for: it takes a second or two a shape
-_AVERAGED = 60  # of which the mean is made
-_MOST_ALIKE = 0.8  # so many stand as the template does, or none is turned as if they did; set by hand
+_MAX_SIDES = 200  # shapes of a folder up to which mirror images are searched: it takes a second or two per shape
+_MAX_AVERAGED = 60  # shapes that are averaged
+# Share of the shapes that must be in the template's pose, up to a rotation; else none is rotated to it. Set by hand.
+_MIN_ALIKE = 0.8
 
 
 @dataclass(frozen=True, repr=False)
 class PrepareConfig(Brief):
     """How shapes are prepared.
 
-    The template is a shape of the folder, by its name, or any file; by default the first mesh where all are registered,
-    else the medoid: the shape that lies nearest to all others; or, of five or more that stand alike, the mean of those
-    that the medoid was fitted to. Shapes are turned to it by `align`, by default "rigid"; of registered ones
-    correspondence says whether they stand alike, which is "near"; of a hundred or more it is not asked, which is "none".
+    Attributes
+    ----------
+    nodes
+        How the nodes of the template are placed.
+    faces
+        Number of triangles after decimation.
+    decimate
+        How shapes are decimated, see `meshmatch.shapes.decimate.decimate`.
+    template
+        The template: the name of a shape in the folder, or any file. By default the first mesh if all shapes are registered,
+        else the medoid, the shape nearest to all others; of five or more shapes in the same pose, the mean of those to
+        which the medoid could be fitted, on its vertices.
+    align
+        How shapes are rotated to the template. By default "rigid"; for registered shapes "near" if their correspondence
+        shows that they share an orientation, and "none" for a hundred or more of them.
+    scale
+        Which size of every shape is scaled to that of the template: the "area", or the radius around the centroid
+        ("sphere").
+    mirror
+        Mirror shapes of the other side than most, or than a named template ("auto"); or never ("no").
+    landmarks
+        Folder or suffix of landmark files, see `find_landmarks`.
+    labels
+        (V,) part of every vertex in the file of a single shape, counted from 0; for the node strategy "parts".
     """
 
     nodes: NodeConfig = field(default_factory=lambda: NodeConfig(strategy="geodesic"))
-    faces: int = LOW_FACES  # triangles of the low resolution
-    decimate: Quality = "fast"  # how it is made, see `meshmatch.shapes.decimate.decimate`
+    faces: int = LOW_FACES
+    decimate: Quality = "fast"
     template: str | Path | None = None
     align: Align | None = None
-    scale: Scale = "area"  # which size of every shape is made that of the template
-    mirror: Mirroring = "auto"  # mirror those of the other side than most, or than a named template; or never
-    landmarks: str | Path | None = None  # a folder or suffix: where they are, see `find_landmarks`
-    labels: Int[Ints, " V"] | None = None  # part of every vertex of a single shape's file, from 0; for "parts"
+    scale: Scale = "area"
+    mirror: Mirroring = "auto"
+    landmarks: str | Path | None = None
+    labels: Int[Ints, " V"] | None = None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Prepared(Brief):
-    """The template, and the shapes that share its connectivity (or none)."""
+    """The result of `prepare`: a template, and the registered shapes.
+
+    Attributes
+    ----------
+    template
+        The template.
+    shapes
+        (N, V, 3) the template's vertices on each registered shape, in its own axes and unit, centered; N = 0 unless all
+        shapes are registered.
+    names
+        Names of the shapes' files.
+    notes
+        What was found and changed.
+    align
+        How shapes were rotated to the template.
+    mirrored
+        Names of the shapes that were mirrored.
+    landmarks
+        Number of known points on each shape.
+    """
 
     template: Template
-    shapes: Float[Floats32, "N V 3"]  # its vertices on each, in own axes and unit, centered; N = 0 if not registered
-    names: tuple[str, ...]  # files of the shapes
-    notes: tuple[str, ...]  # what was found and done
-    align: Align = "none"  # how shapes were turned to the template
-    mirrored: tuple[str, ...] = ()  # names of those that were mirrored
-    landmarks: int = 0  # how many points are known on each
+    shapes: Float[Floats32, "N V 3"]
+    names: tuple[str, ...]
+    notes: tuple[str, ...]
+    align: Align = "none"
+    mirrored: tuple[str, ...] = ()
+    landmarks: int = 0
 
 
 def prepare(
@@ -82,35 +122,36 @@ def prepare(
     config: PrepareConfig | None = None,
     progress: ProgressCallback | None = None,
 ) -> Prepared:
-    """Check, normalise and decimate every shape of a folder and make a template for them; or a template of one shape.
+    """Prepare a folder of shapes for training, or make a template from a single shape.
 
-    Writes ``template.safetensors`` and, of a folder, ``shapes.safetensors`` (registered shapes), ``points.safetensors``
-    (samples of all shapes in the template's frame), ``normalised/NAME.ply`` and ``prepared.json``. The folder appears
-    whole or not at all; one that an earlier call wrote is replaced. Shapes are registered if all have the vertex count
-    and triangles of the template's file.
+    The shapes of a folder are checked, normalised, decimated and aligned with the template. The output is
+    ``template.safetensors`` and, for a folder, ``shapes.safetensors`` (registered shapes), ``points.safetensors``
+    (samples of all shapes in the template's frame), ``normalised/NAME.ply`` and ``prepared.json``. For a folder, the output
+    is written completely or not at all, and replaces that of an earlier call. Shapes are registered if all have the vertex
+    count and triangles of the template's file.
 
     Parameters
     ----------
     shapes
         A folder of shapes, or one file.
     output
-        A new folder, or one that this wrote before.
+        A new folder, or the output of an earlier call.
     config
-        Template, nodes and decimation.
+        Template, nodes, alignment and decimation.
     progress
         As in `match`.
 
     Returns
     -------
     Prepared
-        The folder, its template, and notes on files that cannot be read.
+        The template, the registered shapes, and notes, for example on files that cannot be read.
 
     Raises
     ------
     InputError
-        No shape is usable, or the template is nothing like the shapes.
+        No shape is usable, or most shapes do not resemble the template.
     OptionError
-        There are no landmarks where they should be, or choices do not go together.
+        Landmark files are missing, or options contradict each other.
     TemplateError
         The nodes do not reach every vertex.
     OutputError
@@ -138,7 +179,7 @@ def prepare(
         if getattr(config, name) is not None:
             raise OptionError(f"{name} applies to a folder of shapes", "one shape is its own template")
     make_folder(output)
-    clean = _template_file(shapes)
+    clean = _read_template_shape(shapes)
     labels = config.labels
     if labels is not None:
         if len(labels) != clean.original.V:
@@ -157,17 +198,17 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
     notes: list[str] = []
     found, marks = _read_shapes(folder, config, notes, progress.between(0.0, 0.5))
     named = _named_template(folder, config, found)
-    chosen, why = _chosen(named, config, found)
-    stood = _standing(chosen, config, found, progress.between(0.5, 0.6))
-    if stood is None:
-        flags = _other_side(found, config, named, progress.between(0.5, 0.6))
+    chosen, why = _choose_template(named, config, found)
+    orientations = _compare_orientations(chosen, config, found, progress.between(0.5, 0.6))
+    if orientations is None:
+        flags = _find_mirror_images(found, config, named, progress.between(0.5, 0.6))
         turns: list[Float[Floats, "3 3"] | None] = [None] * len(found)
     else:
-        flags, turns = stood.turned(config.mirror != "no", others_than_most=named is None)
-    _mirror_some(found, marks, flags, notes)
-    if named is None and flags.any():  # of one side, another may lie nearest to all
-        chosen, why = _chosen(None, config, found)
-        turns = _turned_to(chosen, turns)
+        flags, turns = orientations.turned(config.mirror != "no", others_than_most=named is None)
+    _mirror_flagged(found, marks, flags, notes)
+    if named is None and flags.any():  # after mirroring, another shape may be the medoid
+        chosen, why = _choose_template(None, config, found)
+        turns = _turns_relative_to(chosen, turns)
     first, own = (found[chosen], chosen) if isinstance(chosen, int) else (chosen, None)
     low = low_mesh(first.shape, config.faces, config.decimate)
     vertices = first.kept_vertex[low[0]]
@@ -177,9 +218,9 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
     how: Align = config.align or found_how
     name = folder.resolve().name
     made, source = make_template(first.shape, name, config.nodes, low=low), first.original.name
-    middle = stood is not None and named is None
+    middle = orientations is not None and named is None
     if middle:
-        made, count = _in_the_middle(made, found, turns, config.nodes, progress.between(0.6, 0.8))
+        made, count = _mean_template(made, found, turns, config.nodes, progress.between(0.6, 0.8))
         source = f"the mean of {count} shapes, on the vertices of {source}" if count else source
     if named is None:
         notes.append(f"template: {source}{why}")
@@ -225,7 +266,7 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
 def _read_shapes(
     folder: Path, config: PrepareConfig, notes: list[str], progress: Progress
 ) -> tuple[list[Repaired], list[Float[Floats, "L 3"] | None]]:
-    """The usable shapes of a folder, repaired, and the landmarks of each."""
+    """Read and repair the usable shapes of a folder, with the landmarks of each; add notes on the others."""
     files = sorted(path for path in folder.glob("*") if suffix_of(path) in PLAIN_SUFFIXES)
     landmark_files = find_landmarks(config.landmarks, folder, files)
     pairs = [pair for pair in zip(files, landmark_files, strict=True) if pair[0] not in landmark_files]
@@ -253,8 +294,8 @@ def _read_shapes(
 
 
 @dataclass(frozen=True, eq=False)
-class _Stood:
-    """How each shape, and its mirror image, stands to a template that is only turned."""
+class _Orientations:
+    """How each shape, and its mirror image, is oriented relative to a template that is only rotated."""
 
     plain: Sequence[Standing]
     image: Sequence[Standing]
@@ -262,8 +303,11 @@ class _Stood:
     def turned(
         self, mirror: bool, others_than_most: bool
     ) -> tuple[Bool[Bools, " N"], list[Float[Floats, "3 3"] | None]]:
-        """Which shapes are to be mirrored: those of the other side than the template, or than most; and then how each is
-        turned to the template, which may be among them. None where a shape stands otherwise."""
+        """Decide which shapes to mirror, and how each is then rotated to the template.
+
+        Shapes of the other side than the template are mirrored; with ``others_than_most``, those of the other side than
+        most shapes, which may include the template. A rotation is None if the shape is in another pose.
+        """
         leads = np.log([other.stretch / one.stretch for one, other in zip(self.plain, self.image, strict=True)])
         flags = (leads < 0) & (mirror and have_sides(leads.tolist()))
         found = [other if flag else one for one, other, flag in zip(self.plain, self.image, flags, strict=True)]
@@ -273,40 +317,47 @@ class _Stood:
         return flags, turns
 
 
-def _turned_to(chosen: int | Repaired, turns: list[Float[Floats, "3 3"] | None]) -> list[Float[Floats, "3 3"] | None]:
-    """Rotations of shapes to one of them, from those to another; none where its own is not known."""
+def _turns_relative_to(
+    chosen: int | Repaired, turns: list[Float[Floats, "3 3"] | None]
+) -> list[Float[Floats, "3 3"] | None]:
+    """Rotations of the shapes to the ``chosen`` one, given their rotations to the template; None where unknown."""
     own = turns[chosen] if isinstance(chosen, int) else None
     return [None if own is None or each is None else own.T @ each for each in turns]
 
 
-def _standing(
+def _compare_orientations(
     chosen: int | Repaired, config: PrepareConfig, found: list[Repaired], progress: Progress
-) -> _Stood | None:
-    """How shapes stand to the template; None where they need not be turned, or stand otherwise."""
+) -> _Orientations | None:
+    """Compare the orientations of the shapes with the template.
+
+    Return None if no rotation is searched with these options and shapes, or if too many shapes are in another pose.
+    """
     N = len(found)
     whole = found[chosen].shape if isinstance(chosen, int) else chosen.shape
-    if config.align not in (None, "rigid") or whole.is_cloud or not FEWEST <= N <= _MOST_SIDES:
+    if config.align not in (None, "rigid") or whole.is_cloud or not FEWEST <= N <= _MAX_SIDES:
         return None
     if prepared_folder.same_faces(found[0], found):
         return None
     template, others = template_of(whole, whole.name, ViscousConfig()), 0
-    stood: list[list[Standing]] = []
+    orientations: list[list[Standing]] = []
     for each in found:
         sides = [each.shape, mirrored(each.shape)]
-        stood.append(parallel_map(lambda shape: standing(template, shape, config.nodes.seed), sides))
-        others += not any(side.alike for side in stood[-1])
-        if others > (1 - _MOST_ALIKE) * N:
+        orientations.append(parallel_map(lambda shape: standing(template, shape, config.nodes.seed), sides))
+        others += not any(side.alike for side in orientations[-1])
+        if others > (1 - _MIN_ALIKE) * N:
             return None
-        progress(len(stood) / N)
-    return _Stood([plain for plain, _ in stood], [image for _, image in stood])
+        progress(len(orientations) / N)
+    return _Orientations([plain for plain, _ in orientations], [image for _, image in orientations])
 
 
-def _other_side(
+def _find_mirror_images(
     found: list[Repaired], config: PrepareConfig, named: Repaired | int | None, progress: Progress
 ) -> Bool[Bools, " N"]:
-    """Which shapes are of the other side than most, or than the ``named`` template (a shape, or the number of one), as they
-    lie."""
-    if config.mirror == "no" or len(found) > _MOST_SIDES or prepared_folder.same_faces(found[0], found):
+    """Find mirror images by aligning the shapes.
+
+    Return flags for the shapes of the other side than most, or than the ``named`` template (a shape, or the index of one).
+    """
+    if config.mirror == "no" or len(found) > _MAX_SIDES or prepared_folder.same_faces(found[0], found):
         return np.zeros(len(found), bool)
     flags = other_side(found, config.scale, config.nodes.seed, progress)
     if flags.any() and named is not None:
@@ -319,10 +370,10 @@ def _other_side(
     return flags
 
 
-def _mirror_some(
+def _mirror_flagged(
     found: list[Repaired], marks: list[Float[Floats, "L 3"] | None], flags: Bool[Bools, " N"], notes: list[str]
 ) -> None:
-    """Mirror some shapes, in place, with their landmarks."""
+    """Mirror the flagged shapes and their landmarks, in place, and add a note."""
     for number in np.flatnonzero(flags):
         found[number] = repair(mirrored(found[number].original))
         if (known := marks[number]) is not None:
@@ -333,8 +384,8 @@ def _mirror_some(
         notes.append(f"{len(names)} of {len(found)} shapes are mirror images of the others, and were mirrored: {shown}")
 
 
-def _template_file(path: Path) -> Repaired:
-    """The shape of a file, repaired, if a template can be made of it; `InputError` otherwise."""
+def _read_template_shape(path: Path) -> Repaired:
+    """Read and repair the shape of a template; `InputError` if no template can be made from it."""
     try:
         return _check_size(repair(load_shape(path)))
     except InputError as error:
@@ -344,7 +395,7 @@ def _template_file(path: Path) -> Repaired:
 
 
 def _named_template(folder: Path, config: PrepareConfig, found: list[Repaired]) -> Repaired | int | None:
-    """The template that the config names: the number of one of the shapes that were found, or a shape of its own."""
+    """The template that the config names: the index of one of the shapes found, or another shape; None without a name."""
     if config.template is None:
         return None
     path = Path(config.template)
@@ -353,11 +404,13 @@ def _named_template(folder: Path, config: PrepareConfig, found: list[Repaired]) 
     for number, clean in enumerate(found):
         if wanted & {clean.original.name, Path(clean.original.name).stem}:
             return number
-    return _template_file(path)
+    return _read_template_shape(path)
 
 
-def _chosen(named: Repaired | int | None, config: PrepareConfig, found: list[Repaired]) -> tuple[int | Repaired, str]:
-    """The template's shape, or its number if it is one of those that were found; and why it was chosen."""
+def _choose_template(
+    named: Repaired | int | None, config: PrepareConfig, found: list[Repaired]
+) -> tuple[int | Repaired, str]:
+    """Choose the template: the index of one of the shapes found, or the named shape; and a note on why."""
     if named is not None:
         return named, ""
     number = next((k for k, clean in enumerate(found) if not clean.shape.is_cloud), 0)
@@ -367,22 +420,24 @@ def _chosen(named: Repaired | int | None, config: PrepareConfig, found: list[Rep
     return number, ", which lies nearest to all others on average"
 
 
-def _in_the_middle(
+def _mean_template(
     template: Template,
     found: list[Repaired],
     turns: list[Float[Floats, "3 3"] | None],
     nodes: NodeConfig,
     progress: Progress,
 ) -> tuple[Template, int]:
-    """A template of the same vertices in the middle of the shapes that stand as it does, and of how many; the same where
-    none of them is fitted."""
+    """Move the template's vertices to the mean of the shapes that are in its pose, up to a rotation.
+
+    Return the new template and the number of shapes averaged; the same template and 0 if none can be fitted.
+    """
     viscous, fits = ViscousConfig(seed=nodes.seed), []
     finer = with_more_nodes(template, viscous)
     alike = [(clean.shape, turn) for clean, turn in zip(found, turns, strict=True) if turn is not None]
-    some = np.unique(np.linspace(0, len(alike) - 1, min(len(alike), _AVERAGED)).astype(int))
-    for shape, turn in (alike[number] for number in some):
+    sampled = np.unique(np.linspace(0, len(alike) - 1, min(len(alike), _MAX_AVERAGED)).astype(int))
+    for shape, turn in (alike[number] for number in sampled):
         fits.append(fit_turned(finer, shape, turn, viscous))
-        progress(len(fits) / len(some))
+        progress(len(fits) / len(sampled))
     sound = believed(fits)
     if not sound:
         return template, 0
@@ -394,7 +449,7 @@ def _in_the_middle(
 def _template_landmarks(
     first: Repaired, own: Float[Floats, "L 3"] | None, marks: list[Float[Floats, "L 3"] | None]
 ) -> Float[Floats, "L 3"]:
-    """Landmarks of the template's shape, if all shapes have as many; `InputError` otherwise."""
+    """Landmarks of the template's shape; `InputError` if it lacks some, or the shapes have different numbers of them."""
     sizes = {len(each) for each in marks if each is not None}
     if len(sizes) > 1:
         problem = f"landmark files of {min(sizes)} and of {max(sizes)} points"
@@ -406,7 +461,7 @@ def _template_landmarks(
 
 
 def _check_size(clean: Repaired) -> Repaired:
-    """The same shape, if there is enough of it to learn from; `InputError` otherwise."""
+    """Return the shape; `InputError` if it has too few points or faces, or no area."""
     shape = clean.shape
     if shape.is_cloud and shape.V < MINIMUM_POINTS:
         places = "place" if shape.V == 1 else "places"

@@ -1,4 +1,4 @@
-"""Skeletons with their clips from one shape to another."""
+"""Transfer of skeletons, skin weights and animation clips between shapes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from meshmatch.api.bound import INFLUENCES
 from meshmatch.api.results import MapPair
 from meshmatch.api.transfer import MapLike, find_maps
-from meshmatch.api.upright import trust
+from meshmatch.api.upright import vertex_weights
 from meshmatch.arrays import Brief
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.fitting.search.frames import axis_vector
@@ -38,42 +38,43 @@ from meshmatch.transfer.retarget_clips import points_at_start, standing_clips
 from meshmatch.transfer.weight_files import SkinWeights, load_weights
 
 Pose = Literal["rest", "source"]
-"""How a rigged target stands: as it came, or as the source does."""
-# What copies of a figure are, set by hand: share of vertices that have common places on the source, and how far apart they
-# stand, in units of a copy's diagonal; looked for among so many meshes, the largest.
-_ALIKE, _BESIDE, _MOST_MESHES = 0.8, 0.1, 64
-_LIES, _TOLD = 0.5, 5  # the cosine between up and what was up in the file; names in a warning
-_EVEN = 1.05  # a joint's longest side over its shortest; set by hand
+"""Pose of a rigged target: as in its own file, or as the source's."""
+# Two meshes are copies of a figure if more than this share of their vertices maps to the same vertices of the source, and
+# they are farther apart than this, in units of a copy's diagonal. Searched among so many of the largest meshes. Set by hand.
+_COPY_SHARE, _COPY_DISTANCE, _MAX_MESHES = 0.8, 0.1, 64
+# A clip lies if the cosine between y and the file's up axis, as the clip moves it, is below this; names in a warning.
+_LYING_COSINE, _MAX_LISTED = 0.5, 5
+_MAX_ANISOTROPY = 1.05  # largest over smallest scale of a joint; set by hand
 check_rig_suffix = partial(tables.check_suffix, suffixes=(".glb", gltf_vrm.SUFFIX), what="rigs")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RiggedResult(Brief):
-    """The target with the source's skeleton.
+    """The target with the source's skeleton: the result of `transfer_rig`.
 
     Attributes
     ----------
     rig
-        The skeleton as it stands in the file: ``names``, ``parents``, ``joints``, ``clips``, and ``worlds()``, (N, 4, 4).
-        The first node is new and bears the name of the source's file.
+        The skeleton as in the written file: ``names``, ``parents``, ``joints``, ``clips``, and ``worlds()``, (N, 4, 4). Its
+        first node is new and has the name of the source's file.
     weights
-        Of each vertex of the target, for the joints.
+        Skin weights of the target's vertices for the joints.
     unused
-        Joints that move vertices of the source and none of the target.
+        Names of joints that move vertices of the source but none of the target.
     replaced
-        How many joints of a skeleton that the target had take no part any more.
+        Number of joints of the target's own skeleton that are no longer used.
     replaced_clips
-        The names of clips that moved these joints, and do so no more.
+        Names of the target's own clips that no longer move it.
     maps
-        The maps that were followed.
+        The maps that were used.
     glb
-        The file.
+        Content of the .glb file.
     source
         The source's file.
     original
-        The target's file, if it came from one.
+        The target's file, if it was read from one.
     lost
-        What of that file the glb does not hold, in words.
+        Description of what the target's file has and the glb does not.
 
     Examples
     --------
@@ -106,17 +107,18 @@ class RiggedResult(Brief):
         return transfer_html("Rig", self.maps.forward, draw, more)
 
     def save(self, path: str | Path) -> None:
-        """Write the glb.
+        """Write the rigged target.
 
         Parameters
         ----------
         path
-            Where to. As .vrm the bones of a target that is one become those of the skeleton that moves it now.
+            A .glb; or a .vrm, if the target is one: its humanoid bones then refer to the new skeleton.
 
         Raises
         ------
         OptionError
-            The suffix is another one; or it is .vrm, and the target is none, or nobody knows which bones are which.
+            The suffix is not supported; or it is .vrm, and the target is not a .vrm, or the humanoid bones of the new
+            skeleton are unknown.
         OutputError
             The file cannot be written.
         """
@@ -127,7 +129,10 @@ class RiggedResult(Brief):
 
 
 def write_rig(result: RiggedResult, output: Path, place: Path) -> None:
-    """Write an output where it waits to get its name. What it does not hold is told. Errors as `RiggedResult.save`."""
+    """Write the result for ``output`` to the temporary path ``place``; warn of what is lost.
+
+    Errors are as for `RiggedResult.save`.
+    """
     person, glb = check_rig_output(output, result.source, result.original), result.glb
     if person is not None:
         name = output if result.original is None else result.original
@@ -137,18 +142,19 @@ def write_rig(result: RiggedResult, output: Path, place: Path) -> None:
 
 
 def check_rig_output(path: Path, source: Path, target: Path | None) -> Person | None:
-    """The bones of a character, if the output is one. Ask before long work. `OptionError` for a suffix that holds no rig, or
-    where nobody knows which bones are which.
+    """Check an output before the transfer; return the humanoid bones for a .vrm, else None.
+
+    `OptionError` if the format does not support rigs, or the humanoid bones of the source's skeleton are unknown.
     """
     if check_rig_suffix(path) != gltf_vrm.SUFFIX:
         return None
     gltf_vrm.check_character(target, path)
     assert target is not None
 
-    def found(document: gltf.Document) -> Person | None:
+    def find_person(document: gltf.Document) -> Person | None:
         return gltf.understood(target, read_bytes(target), "scene makes", lambda body: person_of(document, body))
 
-    person = gltf.understood(source, read_bytes(source), "skeleton makes", found)
+    person = gltf.understood(source, read_bytes(source), "skeleton makes", find_person)
     if person is None:
         problem = f"{path.name} would be no character: which of its bones are a person's, {source.name} does not say"
         raise OptionError(
@@ -157,73 +163,80 @@ def check_rig_output(path: Path, source: Path, target: Path | None) -> Person | 
     return person
 
 
-def _tell_stretched(name: str, rig: Rig) -> None:
-    """Say that clips will look different where joints of the source are longer one way than another."""
+def _warn_of_stretched_joints(name: str, rig: Rig) -> None:
+    """Warn that clips will look different if joints of the source have a non-uniform scale."""
     sizes = np.linalg.svd(rig.worlds()[rig.joints][:, :3, :3], compute_uv=False)
-    stretched = rig.joints[sizes[:, 0] > _EVEN * sizes[:, 2]]
+    stretched = rig.joints[sizes[:, 0] > _MAX_ANISOTROPY * sizes[:, 2]]
     if len(stretched) and rig.clips:
         which = f"{len(stretched)} of {len(rig.joints)} joints of {name}, such as {rig.names[stretched[0]]},"
         warn(f"{which} have a scale that differs by axis, and clips will look different: apply it before the export")
 
 
-def _tell_lying(a: Shape, rig: Rig, weights: SkinWeights, up: str, target: str) -> None:
-    """Say that a target will lie in clips, if the source lies in its file, as far as the map knows, and in these."""
+def _warn_of_lying_clips(a: Shape, rig: Rig, weights: SkinWeights, up: str, target: str) -> None:
+    """Warn of clips in which the target will lie, since the source lies in its file and stays so in these clips."""
     if up in ("", "+y"):
         return
     top = int(rig.joints[np.asarray(weights.matrix.sum(axis=0)).ravel() > 0].min(initial=len(rig.names) - 1))
-    lie = [clip.name for clip in rig.clips if points_at_start(clip, rig, top, axis_vector(up))[UP] < _LIES]
+    lie = [clip.name for clip in rig.clips if points_at_start(clip, rig, top, axis_vector(up))[UP] < _LYING_COSINE]
     if lie:
-        named = "its clips" if len(lie) == len(rig.clips) else ", ".join(lie[:_TOLD]) + ", ..." * (len(lie) > _TOLD)
+        named = (
+            "its clips"
+            if len(lie) == len(rig.clips)
+            else ", ".join(lie[:_MAX_LISTED]) + ", ..." * (len(lie) > _MAX_LISTED)
+        )
         warn(f"{a.name} lies in its file, where {up} is up, and {target} will lie in {named}: export it with y up")
 
 
 def _refuse_copies(target: Shape, backward: VertexMap) -> None:
-    """Refuse a figure that stands in its scene several times: all its copies would follow the joints in one of them. Two
-    meshes in one place, such as a body and the outline that is drawn around it, are no copies.
+    """Raise `InputError` if the scene contains copies of a figure: all would follow the skeleton in one of them.
+
+    Two meshes in one place, such as a body and an outline drawn around it, are no copies.
     """
     ends = np.cumsum([count for _, count in target.meshes], dtype=np.int64).tolist()
     if len(ends) < 2 or ends[-1] != target.V:
         return
     blocks = [slice(*each) for each in pairwise([0, *ends])]
-    largest = sorted(blocks, key=lambda block: block.start - block.stop)[:_MOST_MESHES]
+    largest = sorted(blocks, key=lambda block: block.start - block.stop)[:_MAX_MESHES]
     for one, other in combinations(largest, 2):
         here, there = backward.index[one], backward.index[other]
-        if len(here) != len(there) or (here == there).mean() <= _ALIKE or 4 * len(np.unique(here)) < len(here):
-            continue  # the last: it was left out, and lies near few places
+        if len(here) != len(there) or (here == there).mean() <= _COPY_SHARE or 4 * len(np.unique(here)) < len(here):
+            continue  # the last condition: a mesh that was left out maps to few vertices
         own = target.verts[one]
-        if np.linalg.norm(own - target.verts[other], axis=1).mean() > _BESIDE * np.linalg.norm(np.ptp(own, axis=0)):
+        if np.linalg.norm(own - target.verts[other], axis=1).mean() > _COPY_DISTANCE * np.linalg.norm(
+            np.ptp(own, axis=0)
+        ):
             hint = "export it once; copies of what comes out move alike"
             raise InputError(f"{target.name} draws one figure several times, which one skeleton cannot move", hint)
 
 
 def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *, pose: Pose = "rest") -> RiggedResult:
-    """The target as it came, with the skeleton, skin weights and animation clips of the source.
+    """Transfer the skeleton, skin weights and animation clips of the source to the target.
 
-    Joints follow the skin around them. Weights are freed of strays, holes and tears. Clips keep the source's rotations, so
-    that a target in any pose plays them; what they move from place to place is scaled, and feet that hang from the root stay
-    on their legs.
+    Joints follow the skin around them. Stray weights, holes and discontinuities in the weights are removed. Clips keep the
+    rotations of the source, so that a target in any pose can play them; their translations are scaled, and feet that hang
+    from the root stay attached to the legs.
 
     Parameters
     ----------
     source
         A rigged .glb, .gltf or .vrm, or a file that Blender reads.
     target
-        The shape that receives the rig. Of a .glb, .gltf or .vrm everything is kept but a skeleton of its own; another
-        shape is turned upright by the skeleton, and keeps its texture or its one color.
+        The shape that receives the rig. A .glb, .gltf or .vrm keeps everything but its own skeleton. A shape from another
+        format is turned upright by the skeleton, and keeps its texture or single color.
     match
         As in `find_maps`.
     pose
-        Let the target stand as it came ("rest"), or as the source stands ("source").
+        Pose of the target in the file: its own ("rest"), or that of the source ("source").
 
     Returns
     -------
     RiggedResult
-        Its ``save("rigged.glb")`` writes the file.
+        The rigged target; ``save("rigged.glb")`` writes it.
 
     Raises
     ------
     MeshmatchError
-        The source has no skeleton, or the target draws copies of a mesh; or as for `find_maps`.
+        The source has no skeleton, or the target contains copies of a figure; or as for `find_maps`.
 
     Examples
     --------
@@ -241,7 +254,7 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     if physics := gltf.understood(source, data, "scene makes", lambda doc: gltf_vrm.springs_and_constraints(doc.json)):
         what = "a spring or constraint, which is" if physics == 1 else f"{physics} springs and constraints, which are"
         warn(f"{a.name} has {what} not transferred")
-    _tell_stretched(a.name, rig)
+    _warn_of_stretched_joints(a.name, rig)
     b = as_shape(target, "target")
     path, data, in_gltf = as_scene(target, b)
     hanging = gltf.understood(path, data, "scene makes", hanging_groups)
@@ -253,9 +266,9 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
             f"{', '.join(apart.values())} of {b.name or 'the target'} {keep} own skeleton, apart from what was matched"
         )
     _refuse_copies(b, maps.backward)
-    _tell_lying(a, rig, weights, maps.forward.source_up, b.name or "the target")
+    _warn_of_lying_clips(a, rig, weights, maps.forward.source_up, b.name or "the target")
     with thread_limit(1):
-        points, share = maps.forward.points(b), trust(a, maps)
+        points, share = maps.forward.points(b), vertex_weights(a, maps)
         turn = np.eye(3) if in_gltf else upright(a, points, share)
         ground = float((b.verts[b.valid] @ turn.T)[:, UP].min())
         carried = carry(rig, weights.matrix, a, points @ turn.T, share, ground)

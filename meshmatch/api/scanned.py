@@ -1,4 +1,4 @@
-"""A rig with shapes learned from scans, laid under a human template: what it may be trained on."""
+"""Training bodies from Meta's Momentum Human Rig, whose body shapes were learned from scans."""
 
 from __future__ import annotations
 
@@ -18,39 +18,39 @@ _FITTED_BY = "human"
 
 
 def scanned_bodies(folder: str | Path, share: float = 0.5, template: str | Path | None = None) -> Scanned:
-    """Bodies of Meta's Momentum Human Rig as `meshmatch.generators.bodies.Bodies` takes them.
+    """Read bodies of Meta's Momentum Human Rig for `meshmatch.generators.bodies.Bodies`.
 
-    The rig's body at rest is fitted with the included model, and the template laid onto it.
+    The included model is fitted to the rig's body in its rest pose, and the template is wrapped onto it.
 
     Parameters
     ----------
     folder
-        With ``lod3.fbx`` and ``compact_v6_1.model`` of a release (github.com/facebookresearch/MHR, Apache-2.0).
+        Folder with ``lod3.fbx`` and ``compact_v6_1.model`` of a release (github.com/facebookresearch/MHR, Apache-2.0).
     share
-        Of the generated people, 0 to 1.
+        Share (0..1) of the generated people that come from the rig.
     template
-        A human one; by default that of the included model.
+        A human template; by default that of the included model.
 
     Returns
     -------
     Scanned
-        The rig on the template's vertices.
+        The rig, with the template's vertices on its triangles.
 
     Raises
     ------
     InputError
-        A file is missing or is not what it should be.
+        A file is missing or invalid.
     OptionError
-        The share is none.
+        The share is not in 0..1.
     TemplateError
         The template is missing or damaged.
     """
     rig = read_momentum_rig(folder)
     body, matcher = Shape(rig.verts, rig.faces), Matcher(_FITTED_BY)
     model = matcher.model
-    fit, resting = matcher.fit(body), (model.template if template is None else read_template(template)).shape
-    near = fit.frame.undo(resting.verts + model.field(resting.verts).displaced(fit.vectors))
-    laid = wrap_onto(resting, near, body, np.zeros(resting.V, bool)).verts
+    fit, rest_template = matcher.fit(body), (model.template if template is None else read_template(template)).shape
+    near = fit.frame.undo(rest_template.verts + model.field(rest_template.verts).displaced(fit.vectors))
+    wrapped = wrap_onto(rest_template, near, body, np.zeros(rest_template.V, bool)).verts
     facing = vertex_normals(body.verts, body.faces)
-    found = Surface(body.verts, body.faces, facing).query(laid, vertex_normals(laid, resting.faces))
+    found = Surface(body.verts, body.faces, facing).query(wrapped, vertex_normals(wrapped, rest_template.faces))
     return Scanned(rig, body.faces[found.face], found.barycentric, share)

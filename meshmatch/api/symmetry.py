@@ -1,4 +1,4 @@
-"""`find_symmetry`: what lies across from what on one shape."""
+"""`find_symmetry`: map a nearly symmetric shape to itself, each vertex to its mirror counterpart."""
 
 from __future__ import annotations
 
@@ -23,24 +23,25 @@ from meshmatch.threads import thread_limit, worker_slot
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Symmetry(Brief):
-    """What `find_symmetry` found.
+    """The result of `find_symmetry`.
 
     Attributes
     ----------
     map
-        From the shape to itself: ``map.index[i]`` is the vertex that lies across from vertex i, with verdict and confidence.
+        From the shape to itself: ``map.index[i]`` is the mirror counterpart of vertex i. It has a verdict and confidence.
     normal
-        (3,) of the plane in which the shape is nearest to its mirror image, of length 1.
+        (3,) unit normal of the plane of symmetry, which brings the shape nearest to its mirror image.
     offset
-        Points x of the plane have x . normal = offset, in the unit of the file.
+        The plane consists of the points x with x . normal = offset, in the unit of the file.
     displacement
-        (V, 3) from the mirror image of its counterpart to each vertex; nan where the shape has no surface.
+        (V, 3) vector from the mirror image of a vertex's counterpart to the vertex; nan where the shape has no surface.
     along_normal
-        (V,) the same along the outward normal: positive where a place lies further out than its counterpart.
+        (V,) component of ``displacement`` along the outward normal: positive where the shape extends farther out than at
+        the counterpart.
     seconds
         Wall time.
     notes
-        What was changed in the shape before fitting.
+        Repairs of the shape before fitting.
 
     Examples
     --------
@@ -64,17 +65,17 @@ def find_symmetry(
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> Symmetry:
-    """Find what lies across from each vertex of a shape that is nearly symmetric: a head, a skull, a bird.
+    """Find the mirror counterpart of each vertex of a nearly symmetric shape: a head, a skull, a bird.
 
-    The shape is matched to its mirror image, from the planes that bring most of its surface near to itself. No model and no
-    other shape is needed; of a collection that is nearly symmetric, see `measure_asymmetry`.
+    The shape is matched to its mirror image, starting from the planes that bring most of its surface near to itself. No
+    model and no other shape is needed. For a collection of nearly symmetric shapes, see `measure_asymmetry`.
 
     Parameters
     ----------
     shape
-        A mesh, as of `match`.
+        A mesh, as in `match`.
     config
-        Its seed is used, and nothing else.
+        Only its seed is used.
     threads
         How many fits are made at once; 2 by default.
     progress
@@ -83,12 +84,13 @@ def find_symmetry(
     Returns
     -------
     Symmetry
-        With the verdict of its map: a shape that is not nearly symmetric in any plane is hardly good.
+        The map to the counterparts, and the plane. The verdict of the map is rarely good for a shape that is not nearly
+        symmetric in any plane.
 
     Raises
     ------
     MeshmatchError
-        The shape cannot be read, or is a cloud of points, or has large parts far apart.
+        The shape cannot be read, is a point cloud, or has large parts far apart.
 
     Examples
     --------
@@ -115,7 +117,7 @@ def find_symmetry(
         verdict=to_image.verdict,
         reasons=to_image.reasons,
     )
-    plane, displacement = _plane_of(original, across)
+    plane, displacement = _fit_plane(original, across)
     return Symmetry(
         map=across,
         normal=plane.normal,
@@ -127,8 +129,8 @@ def find_symmetry(
     )
 
 
-def _plane_of(shape: Shape, across: VertexMap) -> tuple[MirrorPlane, Float[Floats, "V 3"]]:
-    """The plane that brings a shape nearest to its mirror image, and (V, 3) from that to the shape."""
+def _fit_plane(shape: Shape, across: VertexMap) -> tuple[MirrorPlane, Float[Floats, "V 3"]]:
+    """Fit the plane of symmetry to counterparts; also return the displacements (V, 3) from their mirror images."""
     counterparts = across.apply(shape.verts_or_nan)
     known = np.isfinite(counterparts).all(axis=1) & np.isfinite(shape.verts_or_nan).all(axis=1)
     plane = MirrorPlane.between(shape.verts[known], counterparts[known], shape.vertex_areas[known])

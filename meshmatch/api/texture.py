@@ -1,4 +1,4 @@
-"""Textures from one shape to another."""
+"""Transfer of textures between shapes."""
 
 from __future__ import annotations
 
@@ -42,30 +42,30 @@ from meshmatch.transfer.unwrap import (
 if TYPE_CHECKING:
     from meshmatch.render.compose import Composition
 
-_CONTRADICTED = 0.1
-"""Of the surface that shares its places in the image: if more looks otherwise than what it shares them with, it must not."""
+_MAX_CONTRADICTED = 0.1
+"""Share of the surface with shared texels that may look different from the other places with these texels."""
 
-_WORTH_SAYING = 0.002
+_MIN_REPORTED = 0.002  # share of texels with several places that is reported
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TexturedResult(Brief):
-    """The target with its new texture.
+    """The target with its new texture: the result of `transfer_texture`.
 
     Attributes
     ----------
     dressed
-        The target with what was baked: ``uv`` (F, 3, 2), ``material``, the ``turn`` that lets it stand upright in a glb, and
-        ``tiles``: materials by the number of their tile, where the target's coordinates lie in several (UDIM).
+        The target with its new look: ``uv`` (F, 3, 2), ``material``, the rotation ``turn`` that makes it upright in a glb,
+        and ``tiles``: materials by tile number, if the target's texture coordinates lie in several tiles (UDIM).
     baked
-        What was baked: ``material``, its ``image`` (size, size, 4) uint8 (of the first tile, if there are several), and the
-        shares of the surface that are not trusted or discontinuous.
+        The baked texture: ``material``, its ``image`` (size, size, 4) uint8 (of the first tile, if there are several), and
+        the shares (0..1) of the surface with low confidence (``low``) and a discontinuous map (``torn``).
     atlas
-        The texture coordinates, and why the target's own were not used.
+        The texture coordinates, and a note on why the target's own were not used.
     maps
-        The maps that were followed.
+        The maps that were used.
     seconds
-        Time of unwrapping and baking.
+        Wall time of unwrapping and baking.
 
     Examples
     --------
@@ -87,7 +87,7 @@ class TexturedResult(Brief):
         return transfer_html("Texture", self.maps.forward, self._drawn, {"texture coordinates": used})
 
     def _drawn(self) -> Composition:
-        """The target as its file will look."""
+        """Compose a picture of the target with its texture."""
         from meshmatch.render.compose import compose_shapes
 
         with tempfile.TemporaryDirectory() as folder:
@@ -99,17 +99,17 @@ class TexturedResult(Brief):
     def save(self, path: str | Path) -> None:
         """Write a .glb, or an .obj with an .mtl and a .png of the same name.
 
-        A target of the same format stays the file that it was, but for its texture.
+        If the target's file has the same format, everything but the texture is kept.
 
         Parameters
         ----------
         path
-            Where to; its suffix chooses the format.
+            The output file; its suffix selects the format.
 
         Raises
         ------
         OptionError
-            The suffix is another one, or .glb and the target's coordinates lie in several tiles.
+            The suffix is not supported; or it is .glb, and the target's texture coordinates lie in several tiles.
         OutputError
             A file cannot be written.
         """
@@ -127,38 +127,39 @@ def transfer_texture(
     look: Appearance | None = None,
     progress: ProgressCallback | None = None,
 ) -> TexturedResult:
-    """Bake the texture of the source into a texture of the target.
+    """Transfer the texture of the source: bake it into a new texture of the target.
 
     Parameters
     ----------
     source
-        The shape with a texture, as in `find_maps`; textures and texture coordinates are read where shapes are files.
+        The shape with a texture, as in `find_maps`. Its texture and texture coordinates are read if it is a path.
     target
-        The mesh that receives it.
+        The mesh that receives the texture, as in `find_maps`. Its texture coordinates are read if it is a path.
     match
         As in `find_maps`.
     image
-        A picture for the source's texture coordinates, instead of the one that its file names.
+        An image for the source's texture coordinates, instead of the one that its file names; the source must be a path.
     uv
-        Reuse the target's texture coordinates if they are valid ("auto"); reuse them or fail ("keep"); unwrap the target
-        anew ("new"); or carry over those of the source ("source").
+        Texture coordinates of the target: reuse its own if they are valid ("auto"), reuse them or fail ("keep"), unwrap it
+        anew ("new"), or transfer those of the source ("source").
     options
-        Size, sampling and padding of the texture, and what is done where the map is not to be trusted.
+        Size, sampling and padding of the texture, and how texels of low confidence are handled.
     look
-        The source's appearance, where it is not a file; otherwise its vertex colors are baked.
+        The appearance of the source, instead of that of its file. By default, a source that is not a path is baked from its
+        vertex colors.
     progress
         As in `match`.
 
     Returns
     -------
     TexturedResult
-        Its ``save("target.glb")`` writes the target with its texture.
+        The target with its texture; ``save("target.glb")`` writes it.
 
     Raises
     ------
     MeshmatchError
-        The source has neither a texture nor colors, the target is a point cloud, its texture coordinates are to be kept
-        and are not valid; or as for `meshmatch.match`.
+        The source has neither a texture nor colors, the target is a point cloud, or its texture coordinates are to be kept
+        and are not valid; or as for `find_maps`.
 
     Examples
     --------
@@ -200,9 +201,9 @@ def transfer_texture(
     report = Progress(progress, mesh.name, "baking")
     with thread_limit(1):
         if atlas is None:
-            atlas = _carried(shape, look, maps, polygons, options.size)
+            atlas = _transfer_layout(shape, look, maps, polygons, options.size)
         elif atlas.shared:
-            atlas = _checked(
+            atlas = _check_shared(
                 atlas, bake.contradicted(shape, look, mesh, maps.backward, atlas), mesh, options, uv, polygons
             )
         tiles: dict[int, BakedMaterial] = {}
@@ -218,17 +219,17 @@ def transfer_texture(
 
 
 def tiles_of_file(path: Path, mesh: Shape, size: int) -> list[int]:
-    """The tiles (UDIM) that the coordinates of a target's file lie in, if each needs an image of its own of this size."""
+    """Numbers of the tiles (UDIM) of a target file's texture coordinates, if each needs its own image of this size."""
     own = None if mesh.is_cloud else load_coordinates(path, mesh)
     found = None if own is None else tiles_of(mesh, own, size)
     return [] if found is None else np.unique(found).tolist()
 
 
-def _checked(
+def _check_shared(
     atlas: Atlas, contradicted: float, mesh: Shape, options: BakeOptions, uv: Keep, polygons: Ints | None
 ) -> Atlas:
-    """Coordinates that give several places one place in the image, if these look alike; else new ones, or an error."""
-    if contradicted > _CONTRADICTED:
+    """Keep texture coordinates with shared texels if the places that share them look alike; else unwrap anew or raise."""
+    if contradicted > _MAX_CONTRADICTED:
         problem = f"they overlap, and {100 * contradicted:.0f} % of what lies there looks otherwise"
         return new_atlas(mesh, options.size, options.padding, uv, polygons, problem)
     words = (
@@ -237,8 +238,8 @@ def _checked(
     return replace(atlas, note=f"{words}, as to mirrored halves; these look alike, and are baked once")
 
 
-def _carried(shape: Shape, look: Appearance, maps: MapPair, polygons: Ints | None, size: int) -> Atlas:
-    """The coordinates of the source on the target; an error where places that look different would share one."""
+def _transfer_layout(shape: Shape, look: Appearance, maps: MapPair, polygons: Ints | None, size: int) -> Atlas:
+    """Transfer the source's texture coordinates; `OptionError` if places that look different would share texels."""
     coordinates, charts = source_layout(shape, look, maps.target, maps.backward, polygons)
     name = shape.name or "the source"
     if layers := too_many_layers(coordinates, size):
@@ -246,13 +247,13 @@ def _carried(shape: Shape, look: Appearance, maps: MapPair, polygons: Ints | Non
         raise OptionError(problem, "leave out --uv source")
     atlas = Atlas(coordinates, False, shared=shared_texels(coordinates))
     differ = bake.contradicted(shape, look, maps.target, maps.backward, atlas) if atlas.shared else 0.0
-    if differ * atlas.shared > _CONTRADICTED:
+    if differ * atlas.shared > _MAX_CONTRADICTED:
         problem = (
             f"the layout of {name} cannot be carried over: of its texels {100 * atlas.shared:.0f} % have several places"
         )
         raise OptionError(f"{problem}, which look different", "leave out --uv source")
     pieces = f"{charts} chart{'s' if charts != 1 else ''}"
     words = f"the layout of {name} ({pieces}) was carried over"
-    if atlas.shared > _WORTH_SAYING:
+    if atlas.shared > _MIN_REPORTED:
         words += f"; {100 * atlas.shared:.1f} % of its texels have several places and show one of them"
     return replace(atlas, note=words)

@@ -1,6 +1,6 @@
-"""Attributes from one shape to another: values, colors, labels, skin weights and landmarks; the maps they follow.
+"""Transfer of attributes between shapes: values, colors, labels, skin weights and landmarks, along a pair of maps.
 
-Shapes and ``match`` are as in `find_maps`. `ConfidenceRule` says what is done where the map is not to be trusted.
+Shapes and ``match`` are as in `find_maps`. `ConfidenceRule` says how values of low confidence are handled.
 """
 
 from __future__ import annotations
@@ -53,22 +53,23 @@ if TYPE_CHECKING:
 MapLike: TypeAlias = (
     "MatchResult | MapPair | VertexMap | str | Path | Matcher | Callable[[Shape, Shape], MatchResult | MapPair] | None"
 )
-"""What a transfer follows: a match or a map from source to target, its file, or who makes it when all else is
-checked: a `Matcher`, or a function of both shapes."""
+"""The map of a transfer: a match, maps, or a map from source to target, or the path of a map; a `Matcher` or a function of
+both shapes, which makes it after all other inputs are checked; or None."""
 
 
 def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> MapPair:
-    """The maps between two shapes that transfers follow; several transfers can share one pair.
+    """Find the maps between two shapes, for one or several transfers.
 
     Parameters
     ----------
     source
         The shape whose attributes are transferred, as in `match`.
     target
-        The shape that receives them.
+        The shape that receives them, as in `match`.
     match
-        A match or a map from source to target, or its path; or a `Matcher` that makes it. By default a new one, unless
-        both meshes have the same faces: then each vertex goes to the one of its number.
+        A `MatchResult`, a `MapPair`, or a `VertexMap` from source to target or its path; or a `Matcher` or a function of
+        both shapes that makes one. By default the shapes are matched, unless both are meshes with the same faces: then
+        each vertex is mapped to the vertex with the same index.
 
     Returns
     -------
@@ -110,12 +111,12 @@ def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> Ma
 
 
 def have_same_faces(source: Shape, target: Shape) -> bool:
-    """Whether two meshes are one in two poses: as many vertices, and the same triangles in the same order."""
+    """Whether two meshes have the same vertex count and the same triangles in the same order."""
     return source.V == target.V and source.F > 0 and np.array_equal(source.faces, target.faces)
 
 
 def vertex_to_vertex(source: Shape, target: Shape) -> MapPair:
-    """The maps between two poses of one mesh. Nothing judges them: their verdict is "unknown"."""
+    """Identity maps between two poses of one mesh. They are not judged: their verdict is "unknown"."""
     there, back = (VertexMap.between(a, b, np.arange(a.V)) for a, b in ((source, target), (target, source)))
     return MapPair(source, target, there, opposite=back)
 
@@ -129,7 +130,7 @@ def transfer_values(
     directions: bool = False,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[Floats]:
-    """Numbers of the source's vertices on the target's vertices, interpolated within the source's faces.
+    """Transfer numbers per vertex from the source to the target, interpolated within the source's faces.
 
     Parameters
     ----------
@@ -138,14 +139,14 @@ def transfer_values(
     target
         As in `find_maps`.
     values
-        (V_source,) or (V_source, D). Values that are not finite take no part.
+        (V_source,) or (V_source, D). Values that are not finite are ignored.
     match
         As in `find_maps`.
     directions
-        The values are directions (V_source, 3), such as normals: they turn as the surface turns from source to target,
-        and have unit length afterwards.
+        Treat the values as directions (V_source, 3), such as normals: they rotate with the surface from source to target,
+        and are normalised to unit length.
     rule
-        What is done where the map is not to be trusted.
+        How values of low confidence are handled.
 
     Returns
     -------
@@ -155,7 +156,7 @@ def transfer_values(
     Raises
     ------
     MeshmatchError
-        There is not a row for each vertex; or as for `find_maps`.
+        ``values`` does not have a row for each vertex of the source; or as for `find_maps`.
 
     Examples
     --------
@@ -202,7 +203,7 @@ def transfer_colors(
     colors: ArrayLike | Appearance | None = None,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[Floats]:
-    """Vertex colors of the source on the target's vertices, averaged in linear light.
+    """Transfer vertex colors from the source to the target, interpolated in linear light.
 
     Parameters
     ----------
@@ -213,10 +214,10 @@ def transfer_colors(
     match
         As in `find_maps`.
     colors
-        (V_source, 3 or 4), sRGB in 0..1, instead of the colors in the source's file; an `Appearance` is sampled with
-        its textures.
+        (V_source, 3 or 4) sRGB colors in 0..1, instead of the colors in the source's file; or an `Appearance`, whose
+        textures are sampled.
     rule
-        What is done where the map is not to be trusted.
+        How colors of low confidence are handled.
 
     Returns
     -------
@@ -239,7 +240,7 @@ def transfer_colors(
     blank = None
     if rule.blank is not None:
         chosen = checked_colors(as_numbers(rule.blank, "blank"))
-        blank = light(np.append(chosen, 1.0)[:4])  # opaque unless it says otherwise
+        blank = light(np.append(chosen, 1.0)[:4])  # opaque unless alpha is given
     maps = find_maps(source, target, match)
     with thread_limit(1):
         if given is not None:
@@ -256,7 +257,7 @@ def transfer_colors(
 def _write_colors(colors: Floats, maps: MapPair, file: Path | None, path: Path, final: Path) -> None:
     check_character(file, final)
     along_y = Path(maps.source.name).suffix.lower() in gltf.SUFFIXES
-    turn = turn_upright(maps, along_y) if path.suffix.lower() == ".glb" else None  # of an fbx a glb waits to become it
+    turn = turn_upright(maps, along_y) if path.suffix.lower() == ".glb" else None  # an fbx is first written as a glb
     tell_lost(file, final, save_colors(path, maps.target, colors, file, turn))
 
 
@@ -269,7 +270,7 @@ def transfer_labels(
     to: On | None = None,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[Labels]:
-    """Labels of the source's vertices or faces on the target: chosen by vote, never averaged.
+    """Transfer labels of vertices or faces from the source to the target: chosen by vote, never averaged.
 
     Parameters
     ----------
@@ -278,14 +279,14 @@ def transfer_labels(
     target
         As in `find_maps`.
     labels
-        (V_source,) or (F_source,) integers or words, or a path; `Labels` where their number does not tell whether they
-        belong to vertices or faces.
+        (V_source,) or (F_source,) integers or strings, or the path of a file; `Labels` if their number does not determine
+        whether they belong to vertices or faces.
     match
         As in `find_maps`.
     to
-        "vertices" or "faces" of the target; by default as on the source, and the points of a cloud.
+        Label the "vertices" or the "faces" of the target; by default as on the source. Of a point cloud, always the points.
     rule
-        What is done where the map is not to be trusted.
+        How labels of low confidence are handled.
 
     Returns
     -------
@@ -295,7 +296,7 @@ def transfer_labels(
     Raises
     ------
     MeshmatchError
-        The labels do not belong to the source, or are wanted for faces of a cloud; or as for `find_maps`.
+        The labels do not belong to the source, ``to`` is "faces" for a point cloud, or as for `find_maps`.
 
     Examples
     --------
@@ -326,8 +327,8 @@ def transfer_labels(
             confidence = confidence[target.faces].mean(axis=1)
         else:
             found = pull_labels(back, source, given.codes, of_face)
-        doubted = confidence < rule.minimum
-        found, low = replace_low_labels(found, doubted, target, blank is not None, rule.fill, kind == "faces")
+        is_low = confidence < rule.minimum
+        found, low = replace_low_labels(found, is_low, target, blank is not None, rule.fill, kind == "faces")
     labeled = named(found, given, kind, blank)
     return Transferred(labeled, confidence, low, maps, partial(_write_labels, labeled, target, file))
 
@@ -345,7 +346,7 @@ def transfer_weights(
     influences: int = 4,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[SkinWeights]:
-    """Skin weights of the source's vertices on the target's vertices.
+    """Transfer skin weights from the source to the target.
 
     Parameters
     ----------
@@ -354,18 +355,18 @@ def transfer_weights(
     target
         As in `find_maps`.
     weights
-        (V_source, J), dense, sparse or in a file.
+        (V_source, J) dense or sparse weights of J joints, or the path of a file.
     match
         As in `find_maps`.
     influences
-        How many joints may move a vertex; the heaviest are kept.
+        Maximum number of joints per vertex; those with the largest weights are kept.
     rule
-        Weights are filled in or kept where the map is not to be trusted, never left blank.
+        How weights of low confidence are handled: they can be filled or kept, but not left blank.
 
     Returns
     -------
     Transferred
-        ``data.matrix`` is sparse, (V_target, J); its rows sum to 1.
+        ``data.matrix`` is sparse, (V_target, J); its rows sum to 1, except for vertices that no joint moves.
 
     Raises
     ------
@@ -410,7 +411,7 @@ def transfer_landmarks(
     *,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[Landmarks]:
-    """Landmarks of the source at exact points of the target's surface.
+    """Transfer landmarks from the source to points of the target's surface.
 
     Parameters
     ----------
@@ -419,19 +420,19 @@ def transfer_landmarks(
     target
         As in `find_maps`.
     landmarks
-        Vertices (N,); positions (N, 3) in the source's frame, which stand for the nearest point of the source; or a
-        path.
+        Vertices (N,); positions (N, 3) in the source's frame, which are moved to the nearest point of the source; or the
+        path of a file.
     match
         As in `find_maps`.
     rule
-        Landmarks of less confidence than its minimum are missing on the target: a place near by would be no
-        measurement. A minimum of 0 keeps them all.
+        Landmarks with a confidence below its ``minimum`` are missing on the target, as a nearby point would not be a
+        measurement. A minimum of 0 keeps all of them.
 
     Returns
     -------
     Transferred
-        ``data.points`` (N, 3) in the target's frame and unit; also their vertex, or face and barycentric weights. Of
-        missing ones, nan and -1.
+        ``data.points`` (N, 3) in the target's frame and unit, also given as ``vertex``, or as ``face`` and ``barycentric``
+        weights. Missing landmarks have nan and -1.
 
     Raises
     ------
@@ -463,6 +464,7 @@ def _write_landmarks(landmarks: Landmarks, target: Shape, file: Path | None, pat
 
 
 def given_landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape, space: Space) -> Landmarks:
+    """Return landmarks of a source, given in any form of `transfer_landmarks`; ``space`` is the frame of its file."""
     if isinstance(landmarks, Landmarks):
         return landmarks
     if isinstance(landmarks, str | Path):

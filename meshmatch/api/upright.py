@@ -1,4 +1,4 @@
-"""How a target stands in its file, which its format does not say."""
+"""Find the rotation that makes a shape upright (up along y), if its file format does not define the up axis."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from meshmatch.threads import thread_limit
 from meshmatch.transfer.carry_rig import turn_of, upright
 
 
-def trust(source: Shape, maps: MapPair) -> Float[Floats, " V"]:
-    """How much each vertex of the source counts: by its area, and the confidence of the map."""
+def vertex_weights(source: Shape, maps: MapPair) -> Float[Floats, " V"]:
+    """Weights of the source's vertices: area times confidence of the map."""
     share = source.vertex_areas / max(source.area, 1e-300) * source.V
     return np.where(source.valid, (share + 1e-3) * (maps.forward.assumed_confidence + 1e-3), 0.0)
 
 
 def turn_of_fit(fit: object) -> Float[Floats, "3 3"] | None:
-    """The turn after which a shape stands along y, by its fit; None if that does not know how it stands."""
+    """The rotation that makes y the up axis of a fitted shape; None if the fit does not know its up axis."""
     return _turn_of_axis(fit.up) if isinstance(fit, Fit) else None
 
 
 def _turn_of_axis(name: str) -> Float[Floats, "3 3"] | None:
-    """The turn that takes an axis such as "+z" to y; None for an empty name."""
+    """The rotation that takes an axis, such as "+z", to y; None for an empty name."""
     if not name:
         return None
     up = np.zeros(3)
@@ -33,8 +33,10 @@ def _turn_of_axis(name: str) -> Float[Floats, "3 3"] | None:
 
 
 def turn_upright(maps: MapPair, along_y: bool) -> Float[Floats, "3 3"]:
-    """The turn about one axis, by right angles, after which the target stands along y: by its fit, or what the map says of
-    that, or else as the source does, if that stands ``along_y``; where neither is known, none.
+    """The rotation, by right angles about one axis, that makes y the target's up axis.
+
+    Its up axis comes from its fit, or from the map; else it is found from the source, if that stands ``along_y``. The
+    identity if the up axis is unknown.
     """
     known = None if maps.match is None else turn_of_fit(maps.match.target_fit)
     known = _turn_of_axis(maps.forward.target_up) if known is None else known
@@ -43,12 +45,14 @@ def turn_upright(maps: MapPair, along_y: bool) -> Float[Floats, "3 3"]:
     if not along_y:
         return np.eye(3)
     with thread_limit(1):
-        return upright(maps.source, maps.forward.points(maps.target), trust(maps.source, maps))
+        return upright(maps.source, maps.forward.points(maps.target), vertex_weights(maps.source, maps))
 
 
 def turn_of_moved(mesh: Shape, verts: Float[Floats, "V 3"], surface: Shape, fit: object) -> Float[Floats, "3 3"] | None:
-    """The same for a mesh that was moved onto a surface: by the fit of that, or else as the mesh stood, if it came from a
-    file with axes; None where it stands so, or that is not known.
+    """The rotation that makes y the up axis of a mesh that was moved onto a ``surface``.
+
+    The up axis comes from the ``fit`` of the surface, or else from the mesh as it was, if its file format defines axes. None
+    if the format of the surface's file defines y as up, or the up axis is unknown.
     """
     known = None if surface.upright else turn_of_fit(fit)
     if known is not None or surface.upright or not mesh.upright:

@@ -1,4 +1,4 @@
-"""A mesh of one's own on the surface of a scan."""
+"""`wrap`: deform a base mesh onto the surface of a scan."""
 
 from __future__ import annotations
 
@@ -35,28 +35,28 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class WrapResult(MovedMesh):
-    """A base on a scan.
+    """The base mesh on the surface of the scan: the result of `wrap`.
 
     Attributes
     ----------
     shape
-        The base's vertices and faces in their order, in the frame and unit of the scan.
+        The base in the frame and unit of the scan; vertices and faces in their original order.
     turns
-        (V, 3, 3) how each vertex was turned.
+        (V, 3, 3) rotation of the base at each vertex.
     distance
-        (V,) of each vertex to the scan's surface, unit of the scan.
+        (V,) distance of each vertex to the scan's surface, in the unit of the scan.
     free
-        (V,) True for a vertex that kept its shape and was not laid onto the scan.
+        (V,) True for a vertex that kept its local shape and was not projected onto the scan.
     match
         The match of base and scan.
     seconds
-        Time of the projection.
+        Wall time of the projection, excluding the match.
     original
-        The base's file, if it came from one.
+        The base's file, if it was read from one.
     binding
-        The base's skeleton, with its joints where the skin around them lies now; in a .glb it moves the mesh.
+        The base's skeleton, with joints that follow the skin around them; in a .glb it moves the mesh.
     turn
-        (3, 3) the rotation after which it stands along y, as a .glb does; None where it stands so, or that is not known.
+        (3, 3) rotation that makes y the up axis, as .glb requires; None if it is already, or the up axis is unknown.
 
     Examples
     --------
@@ -90,22 +90,22 @@ def wrap(
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> WrapResult:
-    """Lay a mesh of your own onto the surface of a scan: same vertices, same faces, the scan's form.
+    """Deform a base mesh onto the surface of a scan; its vertices and faces keep their order.
 
-    Both are matched, the base is deformed as the match says, and then drawn to the closest points of the scan that face
-    as it does, with a displacement that is smooth at first and ever finer.
+    The shapes are matched and the base is deformed along the match. Its vertices are then projected onto the nearest points
+    of the scan with similar normals, by a displacement field that is smooth at first and becomes finer.
 
     Parameters
     ----------
     base
-        The mesh to be laid on.
+        The mesh to deform.
     scan
         A mesh or point cloud of the same kind of shape.
     free
-        Numbers of the base's vertices (N,) that keep their shape and follow those around them, such as eyes and the
-        inside of a mouth.
+        (N,) vertices of the base that keep their local shape and follow those around them, such as eyes and the inside of
+        a mouth.
     model
-        As in `match`, but for implicit models.
+        As in `match`; implicit models are not supported.
     config
         As in `match`.
     landmarks
@@ -118,12 +118,12 @@ def wrap(
     Returns
     -------
     WrapResult
-        Its ``save("wrapped.obj")`` writes the mesh.
+        The deformed base; ``save("wrapped.obj")`` writes it.
 
     Raises
     ------
     MeshmatchError
-        The base is a point cloud, matches as a mirror image, or does not have a vertex that is free; or as for `match`.
+        The base is a point cloud, matches as a mirror image, or lacks a vertex in ``free``; or as for `match`.
 
     Examples
     --------
@@ -134,7 +134,7 @@ def wrap(
     mesh, surface = as_shape(base, "base"), as_shape(scan, "scan")
     if mesh.is_cloud:
         raise OptionError(f"{mesh.name or 'the base'} has no faces, and only a mesh can be wrapped", "give a mesh")
-    kept = _free(mesh, free)
+    kept = _vertex_mask(mesh, free)
     found = matching.match(
         mesh, surface, model=model, config=config, landmarks=landmarks, threads=threads, progress=progress
     )  # fmt: skip
@@ -154,8 +154,8 @@ def wrap(
     )
 
 
-def _free(base: Shape, numbers: ArrayLike) -> Bools:
-    """(V,) True for these vertices."""
+def _vertex_mask(base: Shape, numbers: ArrayLike) -> Bools:
+    """(V,) mask of these vertices; `InputError` if one does not exist."""
     rows = np.asarray(numbers)
     if rows.size and (rows.ndim != 1 or rows.dtype.kind not in "iu" or rows.min() < 0 or rows.max() >= base.V):
         hint = f"{base.name or 'the base'} has vertices 0 to {base.V - 1}"

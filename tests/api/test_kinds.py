@@ -63,7 +63,7 @@ def poor_fits(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def choose(*shapes: Shape, settled: TrainedModel | None = None) -> tuple[str, list[str]]:
     choice = kinds.choose_model([validated(shape) for shape in shapes], [CONFIG] * len(shapes), settled)
-    return choice.model.card.name, choice.words
+    return choice.model.card.name, choice.notes
 
 
 @pytest.mark.usefixtures("models")
@@ -163,7 +163,7 @@ def test_a_shape_that_is_said_to_be_a_part_is_not_fitted_to_tell_its_kind(monkey
     monkeypatch.setattr(classify, "Fitter", None)
     part, config = validated(ball("half 7 7 5.5", opened=True)), FitConfig(partial="yes")
     choice = kinds.choose_model([part, validated(ball("man 3 4 6"))], [config] * 2)
-    assert choice.model.card.name == "human" and "may be a part" in choice.words[0]
+    assert choice.model.card.name == "human" and "may be a part" in choice.notes[0]
     assert kinds.choose_model([part], [config]).model.card.name == "quadruped"  # alone, what reads it best
 
 
