@@ -219,5 +219,5 @@ def _refuse_to_choose(whole: Shape, parts: Parts, rivals: Sequence[frozenset[int
     """Raise `InputError`: several shapes of one kind, such as two people in one file."""
     firsts = sorted({min(each) for each in rivals})
     shares = " and ".join(f"part {n} ({100 * parts.shares[n - 1]:.0f} % of the area)" for n in firsts[:3])
-    problem = f"{whole.name or 'the shape'} holds several shapes of one kind: {shares} fit about equally well"
+    problem = f"{whole.name or 'the shape'} contains several shapes of one kind: {shares} fit about equally well"
     raise InputError(problem, f"choose one with --only {firsts[0]} or --only {firsts[1]} (only= of load_shape)")

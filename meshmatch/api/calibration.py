@@ -80,16 +80,16 @@ def calibrate(
     """
     folder, card = find_model(model)
     if card.correspondence:
-        raise ModelError(f"{card.name} learned correspondence: its fits are judged without others", "leave it as it is")
+        raise ModelError(f"{card.name} learned correspondence and needs no calibration", "its fits are judged as they are")
     if count < FEWEST:
-        raise OptionError(f"{count} shapes are too few to say what is usual", f"take {FEWEST} or more")
+        raise OptionError(f"{count} shapes are too few for a calibration", f"use {FEWEST} or more")
     given = list_shapes(as_path(shapes)) if isinstance(shapes, str | Path) else list(shapes)
     if len(given) < FEWEST:
         raise _too_few_error(len(given))
-    some = [given[k] for k in np.unique(np.linspace(0, len(given) - 1, min(count, len(given))).round().astype(int))]
+    chosen = [given[k] for k in np.unique(np.linspace(0, len(given) - 1, min(count, len(given))).round().astype(int))]
     config = FitConfig(latent=LatentRefineConfig(steps=SEARCH_STEPS))
     matcher = Matcher(folder, config, threads=threads, progress=progress)
-    fits = [fit for fit in matcher.fit_all(some, errors="return") if isinstance(fit, Fit) and fit.signs is not None]
+    fits = [fit for fit in matcher.fit_all(chosen, errors="return") if isinstance(fit, Fit) and fit.signs is not None]
     if len(fits) < FEWEST:
         raise _too_few_error(len(fits))
     usual = {"fits": len(fits), "residual": float(np.median([fit.residual for fit in fits]))}
@@ -100,7 +100,7 @@ def calibrate(
 
 
 def _too_few_error(count: int) -> InputError:
-    return InputError(f"{count} shapes that can be fitted are too few to say what is usual", f"give {FEWEST} or more")
+    return InputError(f"{count} shapes that can be fitted are too few for a calibration", f"give {FEWEST} or more")
 
 
 def list_shapes(folder: Path) -> list[Path]:

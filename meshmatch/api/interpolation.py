@@ -295,7 +295,7 @@ def _interpolate_implicit(
     refuse_changed(options, ("start", "stop", "resolution"))
     check_resolution(options.resolution)
     if len(shapes) != 2:
-        raise OptionError("an implicit model passes no shapes on the way", "give two shapes")
+        raise OptionError("an implicit model blends exactly two shapes", "give two shapes")
     moments = np.linspace(options.start, options.stop, frames).tolist()
     fits = matcher.fit_all(shapes, config)
     steps = []

@@ -207,9 +207,9 @@ class Matcher:
         # a single fit may use all requested threads; of several fits, each uses one
         inner = self._requested_threads if len(clean) == 1 else 1
         configs = configs_for(config or self.config, len(clean))
-        clean, kinds, begun = self._choose(clean, configs)
-        fits = self._fit_all(clean, configs, begun, Gathering(len(clean), self.threads, _BATCH_SIZE), inner)
-        return [replace(fit, notes=(*kind, *fit.notes)) for kind, fit in zip(kinds, fits, strict=True)]
+        clean, kind_notes, preliminary = self._choose_model(clean, configs)
+        fits = self._fit_all(clean, configs, preliminary, Gathering(len(clean), self.threads, _BATCH_SIZE), inner)
+        return [replace(fit, notes=(*kind, *fit.notes)) for kind, fit in zip(kind_notes, fits, strict=True)]
 
     def follow(self, shape: ShapeLike, last: Fit) -> Fit:
         """Fit the next frame of a sequence, starting from the fit of the previous frame.
@@ -329,14 +329,14 @@ class Matcher:
         if self._direct:
             return match_without_model(clean, configs, landmarks, self.threads, self.progress)
         try:
-            clean, kinds, begun = self._choose(clean, configs)
+            clean, kind_notes, preliminary = self._choose_model(clean, configs)
         except UnknownKindsError:
             return match_without_model(clean, configs, landmarks, self.threads, self.progress, unknown=True)
         if landmarks is not None:
             check_landmarks(self.model)
             pairs = landmark_vertices(clean, landmarks, configs)  # checked before the fits
         with thread_limit(1):
-            fits = self._fit_all(clean, configs, begun, Gathering(2, self.threads))
+            fits = self._fit_all(clean, configs, preliminary, Gathering(2, self.threads))
             known_pairs = None
             if landmarks is not None:
                 clean = [shape_of(fit) for fit in fits]
@@ -347,14 +347,14 @@ class Matcher:
             found, opposite = maps_of_fits(agreed, before, self.threads)
             if landmarks is not None:
                 found = judged_by_pairs(found, clean[1].original, pairs, agreed[1].frame.scale)
-        notes = tuple(dict.fromkeys((*(words for kind in kinds for words in kind), *fits[0].notes, *fits[1].notes)))
+        notes = tuple(dict.fromkeys((*(words for kind in kind_notes for words in kind), *fits[0].notes, *fits[1].notes)))
         result = MatchResult(found, *agreed, time.monotonic() - began, notes, before, self.threads, opposite)
         if self._auto and landmarks is None and found.verdict != "good" and are_whole_meshes(clean, agreed):
             with suppress(InputError):  # if the shapes cannot be matched directly, the model's map stays
                 result = match_without_model(clean, configs, None, self.threads, self.progress, guess=result)
         return replace(result, seconds=time.monotonic() - began)
 
-    def _choose(
+    def _choose_model(
         self, clean: Sequence[Repaired], configs: Sequence[FitConfig]
     ) -> tuple[list[Repaired], list[tuple[str, ...]], list[_Preliminary]]:
         """Choose the model by the shapes, unless it is given.
@@ -364,14 +364,14 @@ class Matcher:
         if not self._auto:
             with thread_limit(1):
                 found = [self._select_parts(*each) for each in zip(clean, configs, strict=True)]
-            return [each for each, _ in found], [()] * len(clean), [begun for _, begun in found]
-        from meshmatch.api.kinds import choose_model
+            return [each for each, _ in found], [()] * len(clean), [preliminary for _, preliminary in found]
+        from meshmatch.api.kind_notes import choose_model
 
         with self._model_lock, thread_limit(1), worker_slot(threading.Semaphore(self.threads)):
             choice = choose_model(clean, configs, self._model, self.progress)
             self._model = choice.model
-        begun = [_Preliminary(*each) for each in zip(choice.fits, choice.parts_tried, strict=True)]
-        return choice.clean, [(each,) for each in choice.notes], begun
+        preliminary = [_Preliminary(*each) for each in zip(choice.fits, choice.parts_tried, strict=True)]
+        return choice.clean, [(each,) for each in choice.notes], preliminary
 
     def _select_parts(self, clean: Repaired, config: FitConfig) -> tuple[Repaired, _Preliminary]:
         """Select the parts that the model knows, if a shape has large parts far apart; `InputError` if there are none.
@@ -407,11 +407,11 @@ class Matcher:
             found: Fit | MeshmatchError
             with gathering.task():
                 try:
-                    clean, kinds, begun = self._choose(
+                    clean, kind_notes, preliminary = self._choose_model(
                         [usable(as_shape(shapes[number], f"shape {number + 1}"))], [config]
                     )
-                    found = self._fit_one(clean[0], config, begun[0], gathering, stop, clean[0].shape.name)
-                    found = replace(found, notes=(*kinds[0], *found.notes))
+                    found = self._fit_one(clean[0], config, preliminary[0], gathering, stop, clean[0].shape.name)
+                    found = replace(found, notes=(*kind_notes[0], *found.notes))
                 except MeshmatchError as error:
                     found = error
             with counting:
@@ -427,7 +427,7 @@ class Matcher:
         self,
         clean: Sequence[Repaired],
         configs: Sequence[FitConfig],
-        begun: Sequence[_Preliminary],
+        preliminary: Sequence[_Preliminary],
         gathering: Gathering,
         inner: int = 1,
     ) -> list[Fit]:
@@ -435,18 +435,18 @@ class Matcher:
         stop, names = threading.Event(), [part.shape.name for part in clean]
         labels = [f"{name} ({number + 1})" if names.count(name) > 1 else name for number, name in enumerate(names)]
 
-        def one(here: Repaired, config: FitConfig, begun: _Preliminary, label: str) -> Fit:
+        def one(here: Repaired, config: FitConfig, preliminary: _Preliminary, label: str) -> Fit:
             with gathering.task():
-                return self._fit_one(here, config, begun, gathering, stop, label)
+                return self._fit_one(here, config, preliminary, gathering, stop, label)
 
         with thread_limit(inner):  # after an error or Ctrl-C, the other fits stop at their next progress report
-            return parallel_map(one, clean, configs, begun, labels, threads=gathering.in_progress, stop=stop)
+            return parallel_map(one, clean, configs, preliminary, labels, threads=gathering.in_progress, stop=stop)
 
     def _fit_one(
         self,
         here: Repaired,
         config: FitConfig,
-        begun: _Preliminary,
+        preliminary: _Preliminary,
         gathering: Gathering,
         stop: threading.Event,
         label: str,
@@ -460,8 +460,8 @@ class Matcher:
                 self.progress(stage, label, share)
 
         with gathering.together() if here.shape.V <= _MAX_BATCHED_VERTICES else nullcontext():
-            found = begun.fit or Fitter(self.model, config, report).fit(here.shape)
-        best = (found, here) if begun.tried else self._retry_with_parts(found, here, config, report)
+            found = preliminary.fit or Fitter(self.model, config, report).fit(here.shape)
+        best = (found, here) if preliminary.parts_tried else self._retry_with_parts(found, here, config, report)
         return self._refine_further(self._with_shape_and_notes(*best, config), config, report)
 
     def _with_shape_and_notes(self, fit: Fit, clean: Repaired, config: FitConfig) -> Fit:

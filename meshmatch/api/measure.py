@@ -114,7 +114,7 @@ def resolve_measure_inputs(
         return source, own[0] if measurements is None else measurements, own[1] if landmarks is None else landmarks
     if measurements is None or landmarks is None:
         what = "measurements" if measurements is None else "landmarks"
-        hint = f"give them; the word {BODY} stands for a person that has its own"
+        hint = f"give them, or use {BODY} as the source: an included person with its own"
         raise OptionError(f"with a source of your own the {what} are needed", hint)
     return source, measurements, landmarks
 

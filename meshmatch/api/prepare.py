@@ -274,7 +274,7 @@ def _read_shapes(
         raise InputError(f"no shapes in {folder}", f"files that end in {', '.join(PLAIN_SUFFIXES)} are read")
     inside = (path for path in folder.glob("[!.]*/**/*") if suffix_of(path) in PLAIN_SUFFIXES)
     if deeper := {path.relative_to(folder).parts[0] for path in inside}:
-        notes.append(f"left out, for they lie in folders of {folder.name}: shapes of {', '.join(sorted(deeper))}")
+        notes.append(f"left out, as subfolders of {folder.name} are not searched: shapes of {', '.join(sorted(deeper))}")
     found: list[Repaired] = []
     known: list[prepared_folder.KnownPoints | None] = []
     for number, (path, file) in enumerate(pairs):

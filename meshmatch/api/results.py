@@ -280,7 +280,7 @@ def shape_of(fit: Fit) -> Repaired:
     """The repaired shape of a fit; `OptionError` if the fit does not contain it."""
     if fit.repaired is None:
         hint = "make it with meshmatch.register or Matcher.fit, or read it with meshmatch.load_fit"
-        raise OptionError("this fit does not know its shape", hint)
+        raise OptionError("this fit does not contain its shape", hint)
     return fit.repaired
 
 
@@ -492,7 +492,7 @@ def measure_distance(
     with thread_limit(1):
         there, here = (repair(as_shape(each, what)).shape for each, what in ((shape, "shape"), (fitted, "fitted")))
         if here.is_cloud:
-            raise InputError(f"{here.name or 'what was fitted'} has no faces", "a cloud can be the shape alone")
+            raise InputError(f"{here.name or 'what was fitted'} has no faces", "only the shape may be a point cloud")
         for each, what in ((there, "the shape"), (here, "what was fitted")):
             if not each.vertex_areas.sum() > 0:
                 hint = "are all its points the same, or on a line?"

@@ -156,7 +156,7 @@ def check_rig_output(path: Path, source: Path, target: Path | None) -> Person | 
 
     person = gltf.understood(source, read_bytes(source), "skeleton makes", find_person)
     if person is None:
-        problem = f"{path.name} would be no character: which of its bones are a person's, {source.name} does not say"
+        problem = f"{path.name} would be no character: the humanoid bones of {source.name} are unknown"
         raise OptionError(
             problem, "end the name in .glb, or give a source that is a .vrm, or has the target's names of bones"
         )

@@ -230,7 +230,7 @@ def _check_shared(
 ) -> Atlas:
     """Keep texture coordinates with shared texels if the places that share them look alike; else unwrap anew or raise."""
     if contradicted > _MAX_CONTRADICTED:
-        problem = f"they overlap, and {100 * contradicted:.0f} % of what lies there looks otherwise"
+        problem = f"they overlap, and {100 * contradicted:.0f} % of the overlapping surface looks different"
         return new_atlas(mesh, options.size, options.padding, uv, polygons, problem)
     words = (
         f"{mesh.name}: its own texture coordinates give {100 * atlas.shared:.0f} % of their texels to several places"

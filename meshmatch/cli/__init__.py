@@ -1,3 +1,3 @@
-"""The command line: thin verbs that import nothing heavy before they need it, so that ``--help`` answers at once."""
+"""The command line: thin commands that import heavy modules only when needed, so that ``--help`` is fast."""
 
 from meshmatch.cli.boundary import main as main

@@ -1,4 +1,4 @@
-"""The tree of verbs."""
+"""The typer application with all commands."""
 
 import inspect
 from typing import Any
@@ -29,8 +29,8 @@ from meshmatch.cli.transfer_texture import transfer_texture
 from meshmatch.cli.wrap import wrap
 
 
-class _Verbs(TyperGroup):
-    """Says what is wrong with a word without "Value error", which typer has from pydantic."""
+class _Commands(TyperGroup):
+    """A command group that removes pydantic's prefix "Value error" from messages about invalid arguments."""
 
     def invoke(self, *context: Any) -> Any:
         try:
@@ -42,11 +42,11 @@ class _Verbs(TyperGroup):
 
 app = typer.Typer(
     name="meshmatch",
-    cls=_Verbs,
+    cls=_Commands,
     help="Dense matching of non-rigid 3D shapes: two meshes in, a vertex map out.",
     no_args_is_help=True,
     add_completion=False,
-    rich_markup_mode=None,  # plain text: it comes at once
+    rich_markup_mode=None,  # plain text is printed faster
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
@@ -66,8 +66,8 @@ def root(
 ) -> None:
     """Dense matching of non-rigid 3D shapes: two meshes in, a vertex map out.
 
-    Exit status: 0 done, 1 the data or a choice is wrong (one line says what), 2 the command line is wrong.
-    Words go to stderr, data to stdout. MESHMATCH_DEBUG=1 shows the traceback of every error.
+    Exit status: 0 success, 1 a problem with data or options (one line says what), 2 a wrong command line.
+    Messages go to stderr, data to stdout. MESHMATCH_DEBUG=1 shows the traceback of every error.
     """
 
 
@@ -81,6 +81,6 @@ for verb in (
     for parameter in inspect.signature(verb).parameters.values():
         for each in (parameter.default, *getattr(parameter.annotation, "__metadata__", ())):
             if isinstance(each, ParameterInfo):
-                each.readable = False  # readers say what may not be read, with status 1
+                each.readable = False  # unreadable files are reported by our readers, with status 1
     app.command()(verb)
 app.add_typer(models, name="models")

@@ -1,8 +1,8 @@
-"""The only place where an error becomes words and an exit status, and a warning words.
+"""Run the command line: turn errors into messages and exit statuses, and warnings into messages.
 
-0 done, 1 the user's data or choice (or too little memory for it, or a folder that may not be entered), 2 usage, 130
-interrupted, 143 killed by SIGTERM, 129 by SIGHUP. Anything that is not a `MeshmatchError` is a bug and keeps its
-traceback; with MESHMATCH_DEBUG=1 so does everything else.
+Exit status: 0 success, 1 a problem with the user's data or options (also too little memory, or a folder without
+permission), 2 a wrong command line, 130 interrupted, 143 killed by SIGTERM, 129 by SIGHUP. An exception that is not a
+`MeshmatchError` is a bug and keeps its traceback; with MESHMATCH_DEBUG=1, all errors do.
 """
 
 import errno
@@ -15,18 +15,18 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from meshmatch.cli.words import Console, stdout_refused
+from meshmatch.cli.words import Console, stdout_error
 from meshmatch.errors import MeshmatchError, MeshmatchWarning
 
 DEBUG_VARIABLE = "MESHMATCH_DEBUG"
 INTERRUPTED = 130
 _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-_USUAL = (signal.SIG_DFL, signal.default_int_handler)
-_TWICE = 1.0  # seconds within which a second signal is the same one: `timeout` sends two
+_DEFAULT_HANDLERS = (signal.SIG_DFL, signal.default_int_handler)
+_SAME_SIGNAL = 1.0  # seconds within which a second signal is ignored: `timeout` sends two
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line, by default the words after the process's name, and return its exit status."""
+    """Run the command line, by default with the arguments of the process, and return the exit status."""
     debug = os.environ.get(DEBUG_VARIABLE, "") not in ("", "0")
     with _kills_as_interrupts() as killed:
         try:
@@ -36,69 +36,69 @@ def main(arguments: Sequence[str] | None = None) -> int:
             killed.over = True
             if debug:
                 raise
-            if isinstance(error, KeyboardInterrupt) or killed.number:  # what is killed beside it may be missed first
+            if isinstance(error, KeyboardInterrupt) or killed.number:  # a killed child process may raise first
                 status = INTERRUPTED
             elif isinstance(error, MeshmatchError):
-                Console().trouble("error", error.message, error.hint)
+                Console().problem("error", error.message, error.hint)
                 return 1
             elif _no_memory(error):
-                Console().trouble("error", "there is not enough memory for this", "take smaller shapes, or free some")
+                Console().problem("error", "there is not enough memory for this", "use smaller shapes, or free memory")
                 return 1
             elif isinstance(error, PermissionError) and error.filename:
                 problem = f"cannot reach {os.fsdecode(error.filename)}: {error.strerror}"
-                Console().trouble("error", problem, "may you read and write there?")
+                Console().problem("error", problem, "may you read and write there?")
                 return 1
             else:
                 raise
     if killed.number and status:
         status = 128 + killed.number
     if status == INTERRUPTED or (killed.number and status):
-        with suppress(OSError):  # of a hang-up: the terminal may be gone
-            Console().trouble("interrupted" if status == INTERRUPTED else "killed", "no file is half-written")
+        with suppress(OSError):  # after SIGHUP, the terminal may be closed
+            Console().problem("interrupted" if status == INTERRUPTED else "killed", "no file is half-written")
     return status
 
 
 def _no_memory(error: BaseException) -> bool:
-    """Whether it says that there is no memory: torch has words for that, but no class."""
+    """Whether an error means that memory ran out; torch raises a `RuntimeError` for it."""
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "can't allocate memory" in str(error))
 
 
 class _Killed:
-    """Which signal came first, 0 if none did; and whether it is too late to stop anything."""
+    """State of signal handling: the first signal received (0 for none), and whether the program is over."""
 
     number, over = 0, False
 
 
 @contextmanager
 def _kills_as_interrupts() -> Iterator["_Killed"]:
-    """Inside, SIGTERM and SIGHUP end the program as Ctrl-C does (unless they have another handler), until it is over.
+    """Inside the block, let SIGTERM and SIGHUP raise KeyboardInterrupt as Ctrl-C does, unless they have a handler.
 
-    All three are remembered: where they hit an import, say, another exception may come of it.
+    The first signal is recorded, since it may surface as another exception, for example inside an import.
     """
     killed = _Killed()
-    came: list[float] = []
+    received: list[float] = []
     owner = os.getpid()
 
     def stop(number: int, frame: Any) -> None:
-        if os.getpid() != owner:  # forked from this one: such a process ends as if nothing had been said
+        if os.getpid() != owner:  # a forked process: restore the default behavior
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
             return
-        again = bool(came) and time.monotonic() - came[0] < _TWICE
-        came.append(time.monotonic())
+        again = bool(received) and time.monotonic() - received[0] < _SAME_SIGNAL
+        received.append(time.monotonic())
         killed.number = killed.number or number
         if not again and not killed.over:
             raise KeyboardInterrupt
 
-    ours = threading.current_thread() is threading.main_thread()
-    before = {number: signal.getsignal(number) for number in _SIGNALS if ours}
-    borrowed = {number: handler for number, handler in before.items() if handler in _USUAL}
-    for number in borrowed:
+    is_main_thread = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in _SIGNALS if is_main_thread}
+    replaced = {number: handler for number, handler in before.items() if handler in _DEFAULT_HANDLERS}
+    for number in replaced:
         signal.signal(number, stop)
     try:
         yield killed
     finally:
-        for number, handler in borrowed.items():
+        for number, handler in replaced.items():
             signal.signal(number, handler)
 
 
@@ -108,23 +108,23 @@ def _run(arguments: Sequence[str] | None) -> int:
     from meshmatch.cli.app import app
     from meshmatch.threads import set_threads
 
-    set_threads(1)  # before NumPy reads it: whoever needs more asks for them
+    set_threads(1)  # before NumPy reads it; commands raise it where they need more
     try:
-        with _warnings_as_words():
-            # not app(...): that would replace sys.excepthook, and a bug keeps Python's own traceback
+        with _warnings_as_messages():
+            # not app(...), which replaces sys.excepthook: bugs are to keep Python's own traceback
             get_command(app)(args=arguments, prog_name="meshmatch")
     except OSError as error:
         if error.errno != errno.ENOSPC or error.filename is not None:
             raise
-        raise stdout_refused(error) from error  # of --help and --version, which typer writes
+        raise stdout_error(error) from error  # from --help or --version, which typer writes
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     return 0
 
 
 @contextmanager
-def _warnings_as_words() -> Iterator[None]:
-    """Inside, each of our warnings is shown once, in a line, whatever Python was told to do with warnings."""
+def _warnings_as_messages() -> Iterator[None]:
+    """Inside the block, print each `MeshmatchWarning` once, as one line, regardless of Python's warning filters."""
     shown: set[str] = set()
     others = warnings.showwarning
 

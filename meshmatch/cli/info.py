@@ -158,7 +158,7 @@ def _part_lines(found: list[Json], count: int) -> list[str]:
 
 
 def _map(file: Path) -> Json:
-    from meshmatch.cli.words import known_number, map_record
+    from meshmatch.cli.words import number_or_none, map_record
     from meshmatch.maps.files import load_map
     from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN
 
@@ -171,7 +171,7 @@ def _map(file: Path) -> Json:
     record: Json = {"kind": "map"} | map_record(found, (found.source, found.target))
     if found.target_vertices == UNKNOWN:
         record["target_vertices"] = None
-    return record | {"confidence_mean": known_number(found.confidence.mean()), "direction": DIRECTION}
+    return record | {"confidence_mean": number_or_none(found.confidence.mean()), "direction": DIRECTION}
 
 
 def _no_map(file: Path) -> Json:

@@ -90,7 +90,7 @@ def interpolate(
                 threads=run.threads, progress=report,
             )  # fmt: skip
         for file, fit in zip(files, result.fits, strict=True):
-            words.refuse_poor(run.strict, fit.verdict, (f"{file.name}: {words.why(fit.reasons)}",))
+            words.raise_if_poor(run.strict, fit.verdict, (f"{file.name}: {words.join_reasons(fit.reasons)}",))
         # Names of the shapes that are passed, by their times.
         met = dict(zip(result.times, [file.name for file in files], strict=True))
         if sequence.plot is not None:
@@ -157,8 +157,8 @@ def _plot(path: Path, result: "meshmatch.Interpolation", met: dict[float, str]) 
 def _tell(console: Console, result: "meshmatch.Interpolation", files: list[Path], asked: str) -> None:
     console.say(*result.notes)
     for file, fit in zip(files, result.fits, strict=True):
-        console.say(f"{file.name}: {words.fit_words(fit)}")
-        words.tell_verdict(console, fit.verdict, fit.reasons, f"the fit of {file.name}")
+        console.say(f"{file.name}: {words.describe_fit(fit)}")
+        words.report_verdict(console, fit.verdict, fit.reasons, f"the fit of {file.name}")
     if asked == "auto" and result.place == "source":
         console.say(f"the files differ much in size: all shapes are in the place and unit of {files[0].name}")
     deviations = [step.deviation for step in result.steps if step.deviation is not None]

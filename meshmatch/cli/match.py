@@ -49,14 +49,14 @@ def match(
         a, b = how.load(source, target)
         result = how.match(a, b, run, console)
         found = result.map
-        words.refuse_poor(run.strict, found.verdict, found.reasons, "the map")
+        words.raise_if_poor(run.strict, found.verdict, found.reasons, "the map")
         meshmatch.save_map(temporary, found)
     if picture is not None:
         from meshmatch.render.compose import compose_match
 
         compose_match(a, b, found, result.rotations).named(names).render(picture)
-    words.tell_match(console, result, names)
-    words.tell_verdict(console, found.verdict, found.reasons, "the map")
+    words.report_match(console, result, names)
+    words.report_verdict(console, found.verdict, found.reasons, "the map")
     console.say(
         f"wrote {output}: for each of the {found.source_vertices} vertices of {names[0]} "
         f"its vertex of {names[1]} ({result.seconds:.1f} s)"
@@ -120,7 +120,7 @@ def register(
         matcher = matcher_for(how.model, how.configs()[0], run.threads)
         with console.progress() as matcher.progress:
             fit = matcher.fit(loaded)
-        words.refuse_poor(run.strict, fit.verdict, fit.reasons)
+        words.raise_if_poor(run.strict, fit.verdict, fit.reasons)
         plain = meshmatch.Shape(fit.points_in_file, fit.faces, output.stem)
         fitted = matcher.dense(fit) if dense else plain  # type: ignore[arg-type]
         turned = save_upright(temporary, fitted, None if loaded.upright else turn_of_fit(fit))
@@ -129,14 +129,14 @@ def register(
 
         compose_fit(loaded, fitted, None if how.implicit else fit.frame.turn).render(picture)
     console.say(*fit.notes)
-    console.say(f"fitted the template of {fit.model} to {loaded.name}: {words.fit_words(fit)}")
+    console.say(f"fitted the template of {fit.model} to {loaded.name}: {words.describe_fit(fit)}")
     apart: Json = {}
     if isinstance(fit, meshmatch.Fit):
         read = fit.repaired.shape if fit.repaired else loaded  # without parts that were left out
         distance = meshmatch.measure_distance(read, fitted, one_way=fit.partial)
         apart["distance"] = distance.as_dict()
         console.say(str(distance))
-    words.tell_verdict(console, fit.verdict, fit.reasons)
+    words.report_verdict(console, fit.verdict, fit.reasons)
     if turned:
         console.say("note: a node turns the template upright, along y")
     console.say(f"wrote {output}: {fitted.V} vertices, {fitted.F} faces ({fit.seconds:.1f} s)")
@@ -189,7 +189,7 @@ def _register_onto(
                 a, b, model=how.model, config=how.configs()[0], threads=run.threads, progress=report
             )  # fmt: skip
         found = result.map
-        words.refuse_poor(run.strict, found.verdict, found.reasons, "the registration")
+        words.raise_if_poor(run.strict, found.verdict, found.reasons, "the registration")
         moved = result.deformed_source()
         turn = turn_of_moved(a, moved.verts, b, result.target_fit)
         before, after = shape_normals(a, (moved.verts - a.verts)[None].astype(np.float32))
@@ -199,10 +199,10 @@ def _register_onto(
         from meshmatch.render.compose import compose_fit
 
         compose_fit(b, moved, result.rotations[1], what=f"the mesh of {names[0]}").render(picture)
-    words.tell_match(console, result, names)
+    words.report_match(console, result, names)
     apart = surfaces_apart(result, moved, b)
     console.say(str(apart))
-    words.tell_verdict(console, found.verdict, found.reasons, "the registration")
+    words.report_verdict(console, found.verdict, found.reasons, "the registration")
     if plan.is_turned(binding, turn):
         console.say(f"note: a node turns {names[0]} upright, along y")
     where = ", ".join(map(str, plan.files))

@@ -105,7 +105,7 @@ def verify(
             digest = registry.verify_model(name).weights_sha256
         except ModelError as error:
             checked.append({"name": name, "sha256": None, "problem": error.message})
-            Console().trouble(name, error.message, error.hint)
+            Console().problem(name, error.message, error.hint)
         else:
             checked.append({"name": name, "sha256": digest, "problem": ""})
             if not json:

@@ -1,7 +1,7 @@
-"""Options that several verbs share, and what is checked before the work: each group is spelled once, and `grouped` adds
-it to a verb's own options.
+"""Options that several commands share, and checks before the work.
 
-A group is built by `grouped` alone: the defaults of its fields are typer's descriptions of the options.
+Each group of options is a dataclass, and `grouped` adds its options to those of a command. The fields' defaults are typer's
+descriptions of the options, so only `grouped` can construct a group.
 """
 
 from __future__ import annotations
@@ -65,23 +65,23 @@ PAIRS_HELP = (
 
 
 def output_option(metavar: str, help: str) -> Any:
-    """The one option that every verb needs which writes."""
+    """The required option --output of commands that write files."""
     return Option(..., "--output", "-o", metavar=metavar, help=help)
 
 
 def optional(metavar: str, help: str) -> Any:
-    """An option that stands for nothing where it is not given."""
+    """An option that defaults to None."""
     return Option(None, metavar=metavar, help=help)
 
 
 def check_axes(up: Axis | None, front: Axis | None) -> None:
-    """Refuse up and front along one axis (`OptionError`)."""
+    """Raise `OptionError` if up and front lie along the same axis."""
     if up is not None and front is not None and up[-1] == front[-1]:
         raise OptionError(f"up ({up}) and front ({front}) lie along one axis", "choose two different axes")
 
 
 def check_truth(truth: Path | None, points: tuple[Path, Path] | None) -> bool:
-    """Whether the truth is known; refuse to be told it twice (`OptionError`)."""
+    """Whether the ground truth is given; `OptionError` if it is given twice."""
     if truth is not None and points is not None:
         raise OptionError("--truth and --points both give the ground truth", "choose one of them")
     return truth is not None or points is not None
@@ -90,10 +90,10 @@ def check_truth(truth: Path | None, points: tuple[Path, Path] | None) -> bool:
 def check_outputs(
     inputs: Iterable[Path | None], *outputs: Path | None, picture: Path | None = None, chart: Path | None = None
 ) -> None:
-    """Refuse, before the work, what could not be written after it. What is None is not wanted.
+    """Check, before the work, that the outputs can be written; None stands for an output that is not requested.
 
-    `OptionError` if the picture is no PNG, the chart of an unknown kind, or anything would replace an input or another
-    output; `OutputError` if picture or chart cannot be written. (Other outputs are claimed while the work is done.)
+    `OptionError` if the picture is no PNG, the chart has an unknown format, or an output would replace an input or another
+    output; `OutputError` if the picture or chart cannot be written. (Other outputs are opened during the work.)
     """
     if chart is not None:
         from meshmatch.render.charts import check_chart
@@ -101,27 +101,27 @@ def check_outputs(
         check_chart(chart)
     if picture is not None and picture.suffix.lower() != ".png":
         raise OptionError(f"{picture.name}: a picture is a PNG", "end the name in .png")
-    taken = {os.path.realpath(path): "is an input of this command" for path in inputs if path is not None}
+    used = {os.path.realpath(path): "is an input of this command" for path in inputs if path is not None}
     for path in (*outputs, chart, picture):
         if path is None:
             continue
-        real = os.path.realpath(path)  # Path.resolve refuses links that lead in a circle
-        if real in taken:
-            raise OptionError(f"cannot write {path}: it {taken[real]}", "choose another name for the output")
-        taken[real] = "is an output of this command already"
+        real = os.path.realpath(path)  # Path.resolve raises for circular links
+        if real in used:
+            raise OptionError(f"cannot write {path}: it {used[real]}", "choose another name for the output")
+        used[real] = "is an output of this command already"
     for path in (chart, picture):
         check_writable(path)
 
 
 def check_writable(path: Path | None) -> None:
-    """Refuse a file that cannot be written (`OutputError`), long before it is."""
+    """Raise `OutputError` if a file cannot be written, before the work."""
     if path is not None:
-        with suppress(_Enough), replace_on_success(path):
-            raise _Enough
+        with suppress(_IsWritable), replace_on_success(path):
+            raise _IsWritable
 
 
-class _Enough(Exception):
-    """The file can be made."""
+class _IsWritable(Exception):
+    """Raised where the file could be written, to discard it."""
 
 
 def load_truth(
@@ -130,8 +130,9 @@ def load_truth(
     shapes: tuple[meshmatch.Shape, meshmatch.Shape],
     files: tuple[Path, Path] | None = None,
 ) -> tuple[Ints, Ints] | None:
-    """True points on source and target, where they are known and have a position; the shapes' files may say the frame of
-    landmarks.
+    """Corresponding vertices of source and target, (N,) each, that have a position; None without ground truth.
+
+    The shapes' ``files`` may define the frame of landmarks.
     """
     import numpy as np
 
@@ -157,7 +158,7 @@ def load_truth(
 def _load_points(
     points: tuple[Path, Path], shapes: tuple[meshmatch.Shape, meshmatch.Shape], files: tuple[Path, Path] | None
 ) -> tuple[Ints, Ints]:
-    """Two lists of vertices; or else two files of landmarks."""
+    """Read two lists of vertices, or two files of landmarks."""
     from meshmatch.shapes import vertex_lists
     from meshmatch.shapes.landmark_files import mesh_space
     from meshmatch.transfer.landmarks import known_pairs
@@ -176,10 +177,10 @@ class Options:
     """A group of options."""
 
     given: Mapping[str, str] = {}
-    """Names of all options and arguments of the verb that stand on the command line, and their spelling there."""
+    """Options and arguments of the command that were given on the command line, with their spelling."""
 
     def refuse(self, names: Iterable[str], what: str, hint: str = "leave it out") -> None:
-        """Refuse options that were given and do not go with something (`OptionError`)."""
+        """Raise `OptionError` if one of the options was given, naming ``what`` it cannot be combined with."""
         for name in names:
             if name in self.given:
                 raise OptionError(f"{self.given[name]} does not go with {what}", hint)
@@ -192,14 +193,14 @@ class FitOptions(Options):
     model: str = Option(
         AUTO,
         metavar="NAME",
-        help="A model's name (see `meshmatch models list`), a model folder, auto: the installed model that knows the "
-        "shapes, or none: two shapes are matched directly.",
+        help="Name (see `meshmatch models list`) or folder of a model. auto: the installed model for this kind of shape. "
+        "none: match shapes directly, without a model.",
     )
     only: list[str] | None = Option(
         None,
         metavar="NAME",
-        help="Fit only this part: its number or, in a glb or gltf file, the name of its meshes, with * and ? as "
-        "wildcards; of a label map a label. May be repeated. `meshmatch info FILE` lists names and numbers.",
+        help="Fit only this part: its number; in a glb or gltf file, the name of its mesh (with * and ? as wildcards); in "
+        "a label map, a label. May be repeated. `meshmatch info FILE` lists names and numbers.",
     )
     without: list[str] | None = Option(
         None,
@@ -213,11 +214,11 @@ class FitOptions(Options):
         "codes; none: the network's prediction alone.",
     )
     up: Axis | None = Option(
-        None, help="Axis of the file that points up; with two shapes, of both. Default: detected.", case_sensitive=False
+        None, help="Axis that points up in the file, or in both files. Default: detected.", case_sensitive=False
     )
     front: Axis | None = Option(
         None,
-        help="Axis of the file that the shape faces; with two shapes, of both. Default: detected.",
+        help="Axis that the shape faces in the file, or in both files. Default: detected.",
         case_sensitive=False,
     )
     partial: bool | None = Option(
@@ -227,14 +228,14 @@ class FitOptions(Options):
     )
     mirror: Literal["auto", "no"] | None = Option(
         None,
-        help="Whether to try the mirror image of each shape too, as for left hands with a model of right hands. "
+        help="Whether to also try the mirror image of each shape, for example for left hands with a model of right hands. "
         "Default: as the model card says.",
     )
     try_harder: bool = Option(
         False,
         "--try-harder",
-        help="Where a fit is poor, search for longer: as a part in more orientations, and for parts of the "
-        "file that may be the shape.",
+        help="If a fit is poor, search longer: fit the shape as partial in more orientations, and try parts of the file "
+        "on their own.",
     )
     seed: Seed = 0
     device: str = Option(
@@ -243,7 +244,7 @@ class FitOptions(Options):
 
     @property
     def axes(self) -> tuple[tuple[Axis | None, Axis | None], ...]:
-        """Up and front of all shapes, or of each."""
+        """Up and front axes: one pair for all shapes, or one for each."""
         return ((self.up, self.front),)
 
     @property
@@ -252,9 +253,7 @@ class FitOptions(Options):
         return implicit_folder(self.model) is not None
 
     def load(self, *paths: Path) -> list[meshmatch.Shape]:
-        """Shapes; of scenes that have meshes of the chosen names, with weight on these alone. For an implicit model also
-        samples.
-        """
+        """Load shapes, with the parts selected by --only and --without. For an implicit model, also load samples."""
         if self.implicit:
             from meshmatch.implicit.samples import load_source
 
@@ -264,8 +263,10 @@ class FitOptions(Options):
         return load_shapes(paths, only=self.only or (), without=self.without or ())
 
     def check(self, not_implicit: Iterable[str] = ()) -> None:
-        """Refuse what does not go together (`OptionError`), before anything is loaded; ``not_implicit`` are options of the
-        verb that an implicit model does not obey, beside all of this group but the seed.
+        """Raise `OptionError` for contradicting options, before anything is loaded.
+
+        ``not_implicit`` are options of the command that do not apply to implicit models, in addition to all options of this
+        group except the model and the seed.
         """
         for up, front in self.axes:
             check_axes(up, front)
@@ -274,7 +275,7 @@ class FitOptions(Options):
             self.refuse([*sorted(own), *not_implicit], "an implicit model")
 
     def configs(self) -> tuple[meshmatch.FitConfig, ...]:
-        """The same for the library, one for each of `axes`."""
+        """The configs for the library, one for each pair of `axes`."""
         from meshmatch.fitting.fit_config import FitConfig
 
         partial: Literal["auto", "yes", "no"] = "auto" if self.partial is None else "yes" if self.partial else "no"
@@ -285,7 +286,7 @@ class FitOptions(Options):
         return tuple(replace(plain, up=up, front=front) for up, front in self.axes)
 
     def record(self, fit: meshmatch.Fit | meshmatch.ImplicitFit) -> dict[str, Any]:
-        """For --json; a fit knows which model was chosen."""
+        """Options for --json; the model is that of the fit if it was chosen automatically."""
         model = fit.model if self.model == AUTO else self.model
         return {"model": model, "seed": self.seed} | ({} if self.implicit else {"refine": self.refine})
 
@@ -308,7 +309,7 @@ class PairOptions(FitOptions):
         return source, (self.target_up or self.up, self.target_front or self.front)
 
     def pairs(self) -> tuple[Ints, Ints] | None:
-        """Vertices that are known to correspond."""
+        """Read the corresponding vertices of --landmarks; None without them."""
         from meshmatch.shapes.vertex_lists import load_pairs
 
         return None if self.known_pairs is None else load_pairs(self.known_pairs)
@@ -316,7 +317,7 @@ class PairOptions(FitOptions):
     def match(
         self, source: meshmatch.Shape, target: meshmatch.Shape, run: RunOptions, console: Console
     ) -> meshmatch.MatchResult:
-        """Match two shapes, with bars."""
+        """Match two shapes, showing progress bars."""
         from meshmatch.api.matching import match
 
         pairs = self.pairs()
@@ -329,7 +330,7 @@ class PairOptions(FitOptions):
 
 @dataclass(frozen=True)
 class RunOptions(Options):
-    """How a verb that takes long behaves."""
+    """Options of commands with longer computations."""
 
     strict: bool = Option(False, "--strict", help="Write nothing and exit with status 1 if a fit or map is poor.")
     json: Json = False
@@ -339,21 +340,21 @@ class RunOptions(Options):
 
 @dataclass(frozen=True)
 class RuleOptions(Options):
-    """What is written where the map is not to be trusted."""
+    """How values of low confidence are written."""
 
     fill: bool = Option(False, "--fill", help="Replace values of low confidence by those of their neighbours.")
     blank: str | None = optional("VALUE", "Write VALUE where confidence is low. Default: keep the transferred value.")
     min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Minimum confidence for a value to be trusted.")
 
     def rule(self, blank: float | str | Sequence[float] | None = None) -> meshmatch.ConfidenceRule:
-        """The same for the library; `blank` is what the text means."""
+        """The rule for the library; ``blank`` is the parsed value of --blank."""
         if self.fill and self.blank is not None:
             raise OptionError("--fill and --blank contradict each other", "choose one of them")
         return meshmatch.ConfidenceRule(self.min_confidence, self.fill, blank)
 
 
 def grouped(verb: Callable[..., None]) -> Callable[..., None]:
-    """A verb for typer: each parameter whose type is a group becomes the options of that group."""
+    """Turn a command into a function for typer: each parameter whose type is a group becomes the options of the group."""
     hints = get_type_hints(verb, include_extras=True)
     groups: dict[str, Any] = {}
     options: list[inspect.Parameter] = []

@@ -259,7 +259,7 @@ def _compose_fit(
     config = meshmatch.FitConfig(seed=shown.seed, up=look.up, front=look.front)
     with console.progress() as report:
         found = meshmatch.register(shape, model=fit, config=config, progress=report)
-    console.say(f"fitted the template of {fit} to {shape.name}: {words.fit_words(found)}")
+    console.say(f"fitted the template of {fit} to {shape.name}: {words.describe_fit(found)}")
     fitted = meshmatch.Shape(found.points_in_file, found.faces, f"{fit} on {shape.name}")
     return compose_fit(shape, fitted, found.frame.turn, shown.range)
 

@@ -51,7 +51,7 @@ def symmetry(
         config = meshmatch.FitConfig(seed=seed)
         with console.progress() as report:
             found = meshmatch.find_symmetry(loaded, config=config, threads=threads, progress=report)
-        words.refuse_poor(strict, found.map.verdict, found.map.reasons, "the map")
+        words.raise_if_poor(strict, found.map.verdict, found.map.reasons, "the map")
         meshmatch.save_map(temporary[0], found.map)
         if values is not None:
             numbers = np.column_stack([found.along_normal, found.displacement])
@@ -61,7 +61,7 @@ def symmetry(
     normal = " ".join(f"{each:.4g}" for each in found.normal)
     console.say(f"plane of symmetry: x . ({normal}) = {found.offset:.4g}")
     console.say(f"asymmetry along the normal: mean {apart.mean():.4g}, 95 % {np.quantile(apart, 0.95):.4g}")
-    words.tell_verdict(console, found.map.verdict, found.map.reasons, "the map")
+    words.report_verdict(console, found.map.verdict, found.map.reasons, "the map")
     console.say(f"wrote {output}: what lies across from the {loaded.V} vertices of {name} ({found.seconds:.1f} s)")
     if values is not None:
         console.say(f"wrote {values}: its asymmetry")

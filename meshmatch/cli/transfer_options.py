@@ -114,16 +114,16 @@ class Transfer:
         else:
             maps = meshmatch.find_maps(source, target, self.options.map or matched)
         found = maps.forward
-        words.refuse_poor(self.run.strict, found.verdict, found.reasons, "the map")
+        words.raise_if_poor(self.run.strict, found.verdict, found.reasons, "the map")
         a, b = self.names
         if maps.match is None and self.options.map is None:
             self.console.say(f"{a} and {b} have the same faces: each vertex goes to the one of its number")
         elif maps.match is None:
             self.console.say(f"used the map {self.options.map} from {a} to {b}")
         else:
-            words.tell_match(self.console, maps.match, (a, b))
+            words.report_match(self.console, maps.match, (a, b))
             self.console.say(f"matched {a} to {b} ({maps.match.seconds:.1f} s)")
-        words.tell_verdict(self.console, found.verdict, found.reasons, "the map")
+        words.report_verdict(self.console, found.verdict, found.reasons, "the map")
         return maps
 
     def tell_low(self, low: LowConfidence, minimum: float, what: str = "vertices") -> Json:
@@ -156,7 +156,7 @@ class Transfer:
         """For --json: what was done, and by which map."""
         record: Json = {"output": self.output} | own | words.map_record(maps.forward, self.names)
         record["map"] = self.options.map
-        record["confidence_mean"] = words.known_number(confidence)
+        record["confidence_mean"] = words.number_or_none(confidence)
         if maps.match is not None:
             record |= self.options.record(maps.match.source_fit) | {
                 "notes": list(maps.match.notes),

@@ -1,4 +1,4 @@
-"""How the verbs speak: words for people on stderr, data on stdout; and what they say about shapes, fits and maps."""
+"""Output of the commands: messages on stderr, data on stdout; and messages and JSON about fits and maps."""
 
 from __future__ import annotations
 
@@ -26,47 +26,47 @@ if TYPE_CHECKING:
 Json = dict[str, Any]
 """One JSON object; paths become strings."""
 _HINT = "is it the model's category? try --up and --front, or --try-harder, or leave out --strict to see the result"
-_MOST_PARTS = 1000  # of which --json tells the numbers
-_QUIET = 10.0  # seconds without a word, where nobody watches a bar
+_MAX_PARTS = 1000  # numbers of parts in the output of --json
+_LOG_INTERVAL = 10.0  # seconds between progress messages if stderr is no terminal
 
 
 @dataclass(frozen=True)
 class Console:
-    """Words on stderr. With ``quiet`` only warnings and errors are heard."""
+    """Messages on stderr; with ``quiet``, only warnings and errors."""
 
     quiet: bool = False
     _open: list[tuple[rich.console.Console, ProgressCallback]] = field(default_factory=list)
 
     def say(self, *lines: str) -> None:
-        """What was done."""
+        """Print messages, unless quiet."""
         if not self.quiet:
             for text in lines:
                 self._line("", text)
 
     def warn(self, text: str) -> None:
-        """A line that nobody should miss."""
+        """Print a warning, even if quiet."""
         self._line("warning", text)
 
-    def trouble(self, what: str, message: str, hint: str = "") -> None:
-        """What went wrong, in a line, and what to do about it."""
-        self._line(what, message)
+    def problem(self, label: str, message: str, hint: str = "") -> None:
+        """Print a problem with its label, such as "error", and a hint on what to do, even if quiet."""
+        self._line(label, message)
         if hint:
             self._line("hint", hint)
 
     @contextmanager
     def progress(self) -> Iterator[ProgressCallback]:
-        """A bar for each shape, drawn while the block runs and gone afterwards; in a log, a line every ten seconds."""
-        if self._open:  # the bars of a block around this one
+        """Show a progress bar for each shape inside the block; in a log, print a line every ten seconds instead."""
+        if self._open:  # an enclosing block shows bars already
             yield self._open[0][1]
             return
         console = _terminal()
         if self.quiet or not console.is_terminal:
-            yield (lambda stage, name, share: None) if self.quiet else self._lines()
+            yield (lambda stage, name, share: None) if self.quiet else self._log_progress()
             return
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-        name, what = (TextColumn(f"{{task.{text}}}", markup=False) for text in ("description", "fields[what]"))
-        with Progress(name, BarColumn(), what, TimeElapsedColumn(), console=console, transient=True) as bars:
+        name, stage_column = (TextColumn(f"{{task.{text}}}", markup=False) for text in ("description", "fields[what]"))
+        with Progress(name, BarColumn(), stage_column, TimeElapsedColumn(), console=console, transient=True) as bars:
             rows: dict[str, Any] = {}
 
             def report(stage: str, name: str, share: float) -> None:
@@ -80,7 +80,7 @@ class Console:
             finally:
                 self._open.clear()
 
-    def _lines(self) -> ProgressCallback:
+    def _log_progress(self) -> ProgressCallback:
         began = last = time.monotonic()
         lock = threading.Lock()
 
@@ -88,7 +88,7 @@ class Console:
             nonlocal last
             with lock:
                 now = time.monotonic()
-                if now - last < _QUIET:
+                if now - last < _LOG_INTERVAL:
                     return
                 last = now
             self.say(f"{name}: {stage}, {100 * share:.0f} % ({now - began:.0f} s)")
@@ -99,31 +99,31 @@ class Console:
         from rich.text import Text
 
         color = {"error": "bold red", "warning": "bold yellow", "hint": "dim"}.get(label, "bold")
-        words = Text(f"{label}: ", style=color) if label else Text()
+        line = Text(f"{label}: ", style=color) if label else Text()
         console = self._open[0][0] if self._open else _terminal()  # above the bars
         console.print(
-            words.append(visible(plain_text(text)).replace("\n", " "), style="default"), soft_wrap=True, highlight=False
+            line.append(visible(plain_text(text)).replace("\n", " "), style="default"), soft_wrap=True, highlight=False
         )
 
 
 def _terminal() -> rich.console.Console:
     from rich.console import Console as Terminal
 
-    return Terminal(stderr=True)  # made anew: it then follows a stderr that was redirected since
+    return Terminal(stderr=True)  # a new one each time, since stderr may have been redirected
 
 
-def known_number(value: float) -> float | None:
-    """A number as JSON has it: null for nan."""
+def number_or_none(value: float) -> float | None:
+    """The number for JSON; None for nan."""
     return None if math.isnan(value) else float(value)
 
 
 def print_json(record: Json) -> None:
-    """One JSON object on one line of stdout."""
+    """Print one JSON object on one line of stdout."""
     line = json.dumps(record, ensure_ascii=False, default=str)
     try:
-        line.encode(_coding())
+        line.encode(_encoding())
         plain = visible(line) == line
-    except UnicodeEncodeError:  # a terminal without these letters, or a file's name that is not UTF-8
+    except UnicodeEncodeError:  # stdout cannot encode it, or a file's name is not UTF-8
         plain = False
     if not plain:
         line = json.dumps(record, default=str)
@@ -131,7 +131,7 @@ def print_json(record: Json) -> None:
 
 
 def print_rows(rows: Sequence[Sequence[str]]) -> None:
-    """Text on stdout, one row a line, columns flush."""
+    """Print a table on stdout with aligned columns."""
     rows = [[cell.replace("\n", " ") for cell in row] for row in rows]
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
@@ -139,35 +139,35 @@ def print_rows(rows: Sequence[Sequence[str]]) -> None:
 
 
 def print_text(text: str) -> None:
-    """Text on stdout, letters that it cannot show as their numbers; `OutputError` if it is closed, or its disk full."""
-    coding, text = _coding(), visible(text)
+    """Print text on stdout, escaping characters that it cannot encode; `OutputError` if it is closed or its disk is full."""
+    encoding, text = _encoding(), visible(text)
     try:
         if sys.stdout is None:
             raise OSError(9, "it is closed")
-        sys.stdout.write(text.encode(coding, "backslashreplace").decode(coding))
+        sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding))
         sys.stdout.flush()
     except BrokenPipeError:
-        raise  # whoever read it has read enough
+        raise  # the reader, such as `head`, closed the pipe
     except OSError as error:
-        raise stdout_refused(error) from error
+        raise stdout_error(error) from error
 
 
-def stdout_refused(error: OSError) -> OutputError:
-    """The error for a stdout that takes nothing more.
+def stdout_error(error: OSError) -> OutputError:
+    """Make the error for a stdout that cannot be written.
 
-    What is still buffered goes nowhere: the interpreter would try again at its end, and say so in its own way.
+    Redirect it to the null device: the interpreter would otherwise flush the buffer at exit and print its own message.
     """
     with suppress(AttributeError, OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return OutputError(f"cannot write to stdout: {error.strerror}", "is the disk full, or stdout closed?")
 
 
-def _coding() -> str:
+def _encoding() -> str:
     return getattr(sys.stdout, "encoding", None) or "utf-8"
 
 
 def names_of(paths: Sequence[Path], names: Sequence[str] = ()) -> list[str]:
-    """Names to show, those of the files if none are given; where two files have the same, with their folders."""
+    """Names to show: ``names``, or those of the files; with folders where different files have the same name."""
     names = names or [path.name for path in paths]
     real: dict[str, set[str]] = {}
     for path, name in zip(paths, names, strict=True):
@@ -175,48 +175,48 @@ def names_of(paths: Sequence[Path], names: Sequence[str] = ()) -> list[str]:
     return [name if len(real[name]) == 1 else str(path) for path, name in zip(paths, names, strict=True)]
 
 
-def refuse_poor(strict: bool, verdict: str, reasons: Sequence[str], what: str = "the fit") -> None:
-    """With --strict, a poor fit or map is an error (`PoorFit`)."""
+def raise_if_poor(strict: bool, verdict: str, reasons: Sequence[str], what: str = "the fit") -> None:
+    """With --strict, raise `PoorFit` for a poor fit or map."""
     if strict and verdict == "poor":
-        raise PoorFit(f"{what} is poor, nothing was written: {why(reasons)}", _HINT)
+        raise PoorFit(f"{what} is poor, nothing was written: {join_reasons(reasons)}", _HINT)
 
 
-def tell_verdict(console: Console, verdict: str, reasons: Sequence[str], what: str = "the fit") -> None:
-    """A warning where it is poor, notes where it is fair."""
+def report_verdict(console: Console, verdict: str, reasons: Sequence[str], what: str = "the fit") -> None:
+    """Print a warning for a poor fit or map, and notes for a fair one."""
     if verdict == "poor":
-        console.warn(f"{what} is poor: {why(reasons)}")
+        console.warn(f"{what} is poor: {join_reasons(reasons)}")
     elif verdict != "good":
         console.say(*(f"note: {reason}" for reason in reasons))
 
 
-def why(reasons: Sequence[str]) -> str:
-    """The reasons of a verdict in one line."""
+def join_reasons(reasons: Sequence[str]) -> str:
+    """Join the reasons of a verdict in one line."""
     return "; ".join(reasons) or "no reason was given"
 
 
-def fit_words(fit: meshmatch.Fit | meshmatch.ImplicitFit) -> str:
-    """The verdict, and the axes where a model knows them."""
+def describe_fit(fit: meshmatch.Fit | meshmatch.ImplicitFit) -> str:
+    """Describe a fit by its verdict, and its axes if the model knows them."""
     if not isinstance(fit, meshmatch.Fit) or fit.model == NO_MODEL or not fit.axes:
         return f"{fit.verdict} fit"
     return f"{fit.verdict} fit, {fit.axes}"
 
 
-def tell_match(console: Console, result: meshmatch.MatchResult, names: Sequence[str]) -> None:
-    """What was repaired, and how both shapes were fitted."""
+def report_match(console: Console, result: meshmatch.MatchResult, names: Sequence[str]) -> None:
+    """Print the notes of a match and describe both fits."""
     console.say(*result.notes)
     for name, fit in zip(names, (result.source_fit, result.target_fit), strict=True):
-        console.say(f"{name}: {fit_words(fit)}")
+        console.say(f"{name}: {describe_fit(fit)}")
 
 
 def fit_record(name: str, fit: meshmatch.Fit | meshmatch.ImplicitFit) -> Json:
-    """A fit for --json; what an implicit model does not know is null."""
+    """Describe a fit for --json; values that are unknown for implicit models are null."""
     record: Json = {"shape": name, "verdict": fit.verdict, "reasons": fit.reasons}
     if not isinstance(fit, meshmatch.Fit):
         numbers = {key: getattr(fit, key) for key in ("residual", "missed", "invented")}
         record |= {key: None if math.isnan(value) else round(value, 4) for key, value in numbers.items()}
         return record | {"seconds": round(fit.seconds, 3), "seed": fit.seed}
     record |= {"trust": round(fit.trust, 4), "residual": float(fit.residual)}
-    record |= {"left_out_parts": fit.left_out[:_MOST_PARTS]} if fit.left_out else {}
+    record |= {"left_out_parts": fit.left_out[:_MAX_PARTS]} if fit.left_out else {}
     if fit.regularity is not None:
         record["regularity"] = {name: round(value, 5) for name, value in asdict(fit.regularity).items()}
     record |= {"up": fit.up or None, "front": fit.front or None}
@@ -224,6 +224,6 @@ def fit_record(name: str, fit: meshmatch.Fit | meshmatch.ImplicitFit) -> Json:
 
 
 def map_record(found: meshmatch.VertexMap, names: Sequence[str]) -> Json:
-    """A map for --json."""
+    """Describe a map for --json."""
     sizes = {"source_vertices": found.source_vertices, "target_vertices": found.target_vertices}
     return {"source": names[0], "target": names[1]} | sizes | {"verdict": found.verdict, "reasons": found.reasons}

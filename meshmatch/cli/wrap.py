@@ -68,11 +68,11 @@ def wrap(
                 progress=report,
             )  # fmt: skip
         found = result.match.map
-        words.refuse_poor(run.strict, found.verdict, found.reasons, "the map")
+        words.raise_if_poor(run.strict, found.verdict, found.reasons, "the map")
         binding = move_skeleton(base, result.shape, b.upright)
         plan.write(temporary, result.shape, result.turns, binding, result.turn)
-    words.tell_match(console, result.match, names)
-    words.tell_verdict(console, found.verdict, found.reasons, "the map")
+    words.report_match(console, result.match, names)
+    words.report_verdict(console, found.verdict, found.reasons, "the map")
     apart = result.distance[~result.free & a.valid]
     numbers = {"mean": apart.mean(), "95 %": np.quantile(apart, 0.95), "worst": apart.max()} if len(apart) else {}
     told = ", ".join(f"{what} {value:.4g}" for what, value in numbers.items())

@@ -128,7 +128,7 @@ def test_its_own_joints_go_where_the_skin_goes(body: Path) -> None:
     bent = longer * played(body, "bend", 1.0)
     lying = bent @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     now = Shape(lying, tube().faces, "body.glb")
-    binding = move_skeleton(body, now, stands=False)
+    binding = move_skeleton(body, now, is_upright=False)
     out = body.with_name("out.glb")
     save_moved(out, body, now, np.tile(np.eye(3), (V, 1, 1)), binding)
     assert np.allclose(played(out), bent, atol=1e-4)
@@ -160,7 +160,7 @@ def test_a_vrm_keeps_its_joints(body: Path) -> None:
     path.write_bytes(body.read_bytes())
     write_tube(path.with_suffix(".glb"), extensionsUsed=["VRMC_vrm"], extensions={"VRMC_vrm": {}})
     path.write_bytes(path.with_suffix(".glb").read_bytes())
-    assert move_skeleton(path, tube(), stands=True) is None
+    assert move_skeleton(path, tube(), is_upright=True) is None
 
 
 def test_a_body_whose_skeleton_cannot_be_followed_is_told(body: Path) -> None:

@@ -126,7 +126,7 @@ def test_what_cannot_be_matched_directly_keeps_the_map_of_its_model(
     def refuse(*_: Any, **__: Any) -> Any:
         raise InputError("its points lie on no surface")
 
-    monkeypatch.setattr(Matcher, "_choose", lambda self, clean, _: (clean, [(), ()], []))
+    monkeypatch.setattr(Matcher, "_choose_model", lambda self, clean, _: (clean, [(), ()], []))
     monkeypatch.setattr(Matcher, "_fit_all", lambda *_: fits)
     monkeypatch.setattr("meshmatch.api.matcher.maps_of_fits", lambda *_: (unsure, None))
     monkeypatch.setattr("meshmatch.api.matcher.match_without_model", refuse)

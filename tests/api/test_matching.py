@@ -75,7 +75,7 @@ def test_fits_of_other_templates_or_without_shapes_are_refused(matcher: Matcher,
     with pytest.raises(OptionError, match="another template") as caught:
         matcher.map(replace(fit, template_hash="0" * 16), fit)
     assert "human" in caught.value.hint
-    with pytest.raises(OptionError, match="does not know its shape"):
+    with pytest.raises(OptionError, match="does not contain its shape"):
         matcher.map(fit, replace(fit, repaired=None))
 
 

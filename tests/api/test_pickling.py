@@ -137,7 +137,7 @@ def test_files_of_fits_are_refused_in_words(folder: Path, result: MatchResult, t
     calls: list[tuple[type[MeshmatchError], str, Callable[[], object]]] = [
         (OptionError, "not a format for fits", lambda: save_fit(tmp_path / "a.npz", fit)),
         (OptionError, "without a model cannot be saved", lambda: save_fit(path, replace(fit, model="none"))),
-        (InputError, "does not know its shape", lambda: save_fit(path, replace(fit, repaired=None))),
+        (InputError, "does not contain its shape", lambda: save_fit(path, replace(fit, repaired=None))),
         (InputError, "MatchResult is not a fit", lambda: save_fit(path, result)),  # type: ignore[arg-type]
         (InputError, "not a fit's file|no such file", lambda: load_fit(path)),
     ]

@@ -108,7 +108,7 @@ def test_what_cannot_be_read_is_noted_and_left_out(folder: Path, tmp_path: Path,
     notes = "\n".join(made.notes)
     for name in ("broken.ply left out", "empty.off left out", "point.npy left out", "dirty.obj: 1 vertex"):
         assert name in notes
-    assert f"left out, for they lie in folders of {folder.name}: shapes of left" in made.notes
+    assert f"left out, as subfolders of {folder.name} are not searched: shapes of left" in made.notes
     assert len(made.names) == 4
 
 
