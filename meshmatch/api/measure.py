@@ -91,14 +91,14 @@ def own_points(
     landmarks: Landmarks | ArrayLike | str | Path | None = None,
 ) -> MeasuringPoints:
     """The points of a source that its measurements need; parameters as in `measure`."""
-    source, measurements, landmarks = resolve_measure_inputs(source, measurements, landmarks)
+    source, measurements, landmarks = measure_inputs(source, measurements, landmarks)
     space = mesh_space(source) if isinstance(source, str | Path) else ""
     shape = as_shape(source, "source")
     given = load_measurements(measurements) if isinstance(measurements, str | Path) else each_once(measurements)
     return MeasuringPoints.of(shape, given_landmarks(landmarks, shape, space), given)
 
 
-def resolve_measure_inputs(
+def measure_inputs(
     source: ShapeLike,
     measurements: Sequence[Measurement] | str | Path | None,
     landmarks: Landmarks | ArrayLike | str | Path | None,

@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from meshmatch.cli import options
 from meshmatch.cli.options import check_outputs, grouped, output_option
-from meshmatch.cli.words import Console, print_json, print_rows
+from meshmatch.cli.user_messages import Console, print_json, print_rows
 from meshmatch.collections.formula import parse
 from meshmatch.errors import OptionError
 from meshmatch.outputs import folder_on_success
@@ -22,62 +22,69 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AtlasOptions:
-    """What an atlas is, and what is found out about it."""
+    """Options of the atlas, and of the analyses of it."""
 
     modes: int = Option(100, min=1, metavar="N", help="Maximum number of modes to keep.")
     space: Literal["form", "shape", "keep", "remove"] | None = Option(
         None,
         "--space",
         "--scale",
-        help="form (or keep): shapes with their sizes, the default; shape (or remove): all scaled to one size.",
+        help="form (or keep): shapes with their sizes (default); shape (or remove): all shapes scaled to the same size.",
     )
     robust: bool = Option(False, "--robust", help="Reduce the influence of outliers among the shapes.")
     align_by: str = Option(
         "whole",
         metavar="PART",
-        help="Superimpose shapes of several parts by one, so that the pose of the others shows: its number (1 is the "
-        "largest), or its name in the template or in the files. each: every connected part alone, without their pose.",
+        help="Superimpose shapes with several parts by this part, so that the atlas has the pose of the others: its number "
+        "(1 is the largest), or its name in the template or in the files. whole: by all vertices. each: superimpose every "
+        "connected part on its own, which removes their relative pose.",
     )
     poor: bool = Option(False, "--poor", help="Include shapes whose fit is poor.")
     leave_out: list[str] | None = Option(
-        None, metavar="NAME", help="Leave out this shape, such as one that is cut; * and ? stand for any characters."
+        None,
+        metavar="NAME",
+        help="Leave out this shape, for example a cut one; * and ? are wildcards. May be repeated.",
     )
     groups: tuple[Path, Path] | None = Option(
-        None, metavar="A.txt B.txt", help="Compare two groups: files with the names of their shapes, one per line."
+        None,
+        metavar="A.txt B.txt",
+        help="Compare two groups, given as files with the names of their shapes, one per line.",
     )
     statistic: Literal["normal", "hotelling"] = Option(
         "normal",
         help="Compare displacements along the normal of the mean, or in all directions (Hotelling's T squared).",
     )
     metadata: Path | None = Option(
-        None, metavar="TABLE", help="What is known of each shape: a row each, with its name; .csv, .tsv or .txt."
+        None,
+        metavar="TABLE",
+        help="Covariates of the shapes: a table with a row per shape, by name; .csv, .tsv or .txt.",
     )
     model: str | None = Option(
         None,
         metavar="FORMULA",
-        help="Explain the shapes by columns of the table: 'shape ~ log(size) + sex * age', or 'form ~ ...' with their "
-        "sizes (Procrustes analysis of variance). size is that of scores.csv if the table has no such column.",
+        help="Explain the shapes by columns of --metadata (Procrustes analysis of variance): 'shape ~ log(size) + sex * "
+        "age', or 'form ~ ...' for shapes with their sizes. size is that of scores.csv if the table has no such column.",
     )
     blocks: str | None = Option(
         None,
         metavar="COLUMN",
-        help="Exchange only shapes with the same value here: the individual of paired or repeated measures.",
+        help="Permute only among shapes with the same value in this column, such as the individual of paired or repeated "
+        "measurements.",
     )
     symmetry: bool = Option(
         False,
         "--symmetry",
-        help="Compare shapes that are symmetric by themselves, such as heads, with their mirror images; with --sides, left "
-        "and right ones.",
+        help="Analyse asymmetry: compare shapes with their mirror images, such as heads, or with --sides the left with the "
+        "right shapes.",
     )
     individuals: str | None = Option(
         None,
         metavar="COLUMN",
-        help="With --symmetry: whose shape each is. Of individuals that were measured several times the error is told, too.",
+        help="With --symmetry: the individual of each shape. If individuals were measured several times, the measurement "
+        "error is reported too.",
     )
     sides: str | None = Option(
-        None,
-        metavar="COLUMN",
-        help="With --symmetry: which side of its individual each shape is, such as left or right.",
+        None, metavar="COLUMN", help="With --symmetry: the side of each shape, such as left or right."
     )
     permutations: int = Option(10_000, min=1, metavar="N", help="Maximum number of permutations in tests.")
     samples: int = Option(0, min=0, max=10_000, metavar="N", help="Number of random shapes to write.")
@@ -90,7 +97,7 @@ class AtlasOptions:
     seed: options.Seed = 0
 
     def check(self) -> None:
-        """Refuse a choice that nothing obeys (`OptionError`)."""
+        """Raise `OptionError` for options that have no effect or contradict each other."""
         if self.groups is None and self.model is None and not self.symmetry and self.statistic != "normal":
             hint = "add --groups A.txt B.txt, --model or --symmetry"
             raise OptionError("--statistic is for groups, models and symmetry, and there are none", hint)
@@ -119,7 +126,7 @@ class AtlasOptions:
 
     @property
     def scale(self) -> Literal["keep", "remove"]:
-        """Whether sizes are kept: as the model's formula says, if it is not said otherwise."""
+        """Whether sizes are kept or removed, by the model's formula if there is one, else by --space."""
         space = self.space if self.model is None else parse(self.model).space
         return "remove" if space in ("shape", "remove") else "keep"
 
@@ -141,8 +148,8 @@ def atlas(
     """Learn the mean and the modes of a collection.
 
     Writes arrays, tables, pictures, the modes as morph targets, and page.html with a slider for each of the first
-    modes. With --groups, also tests where two groups differ (permutation test, corrected for multiple comparisons);
-    with --model, how much of the variation the terms of a linear model explain, and where.
+    modes. With --groups, also tests where two groups differ (permutation test, corrected for multiple comparisons). With
+    --model, also computes how much of the variation the terms of a linear model explain, and where.
     """
     from meshmatch.collections.atlas_files import record, write_folder
     from meshmatch.collections.model_files import anova_rows
@@ -152,13 +159,13 @@ def atlas(
     console = Console(quiet)
     with folder_on_success(output) as folder, _shapes(fits, how) as shapes, thread_limit(threads):
         for name in (name for name, why in shapes.left_out.items() if why == "poor"):
-            console.warn(f"{name}: left out, for its fit is poor")
+            console.warn(f"{name}: left out, as its fit is poor")
         made = shapes.atlas(modes=how.modes, scale=how.scale, robust=how.robust, align_by=how.align_by)
         _warn(console, made, how)
         found = _find(console, made, shapes, how)
         names = write_folder(folder, made, found, rotation=shapes.rotation, title=output.name)
     about = record(made, found)
-    _tell(console, about)
+    _report(console, about)
     for table in ("model", "asymmetry"):
         if table in about and not json and not quiet:
             print_rows(anova_rows(about[table]))
@@ -168,7 +175,7 @@ def atlas(
 
 
 def _shapes(fits: str, how: AtlasOptions) -> AbstractContextManager["Registered"]:
-    """The shapes of a folder, whichever kind it is."""
+    """Open the registered shapes of a folder of fits or meshes."""
     from meshmatch.collections.collection import Collection
     from meshmatch.collections.registered import registered_meshes
     from meshmatch.collections.settle import read_about
@@ -191,8 +198,8 @@ def _warn(console: Console, made: Any, how: AtlasOptions) -> None:
     elif len(rows := outlying(made.distances)) and not how.robust:
         share = sum(made.scores[rows, 0] ** 2) / sum(made.scores[:, 0] ** 2)
         console.warn(
-            f"{some([made.names[k] for k in rows])}: unlike the others, and {100 * share:.0f} % of mode 1: "
-            "cut, broken, mirrored or of another kind? Leave out what is (--leave-out), or try --robust"
+            f"{some([made.names[k] for k in rows])}: unlike the others, and {100 * share:.0f} % of mode 1. "
+            "Leave out shapes that are cut, broken, mirrored or of another kind (--leave-out), or try --robust"
         )
 
 
@@ -204,7 +211,7 @@ def _find(console: Console, made: Any, shapes: "Registered", how: AtlasOptions) 
 
     comparison, names = None, ("A", "B")
     members: dict[str, str] = {}
-    if how.groups is not None:  # first: a wrong name is told before the long work
+    if how.groups is not None:  # first, so that a wrong name is reported before the long computation
         first, second = (read_group(path, shapes) for path in how.groups)
         names = how.groups[0].stem, how.groups[1].stem
         members = dict.fromkeys(first, names[0]) | dict.fromkeys(second, names[1])
@@ -217,7 +224,7 @@ def _find(console: Console, made: Any, shapes: "Registered", how: AtlasOptions) 
             how.model, how.metadata, blocks=how.blocks, kind=how.statistic, permutations=how.permutations, seed=how.seed
         )
         for name, column in explained.left_out.items():
-            console.warn(f"{name}: left out of the model, for its {column} is missing")
+            console.warn(f"{name}: left out of the model, as its {column} is missing")
     asymmetry = None
     if how.symmetry:
         asymmetry = measure_asymmetry(
@@ -233,18 +240,18 @@ def _find(console: Console, made: Any, shapes: "Registered", how: AtlasOptions) 
     )  # fmt: skip
 
 
-def _tell(console: Console, about: dict[str, Any]) -> None:
+def _report(console: Console, about: dict[str, Any]) -> None:
     shares = about["compactness"]
-    few = ", ".join(f"{100 * share:.1f} %" for share in shares[:3])
-    console.say(f"{about['shapes']} shapes, {about['modes']} modes; the first explain {few} of the variance")
+    first_shares = ", ".join(f"{100 * share:.1f} %" for share in shares[:3])
+    console.say(f"{about['shapes']} shapes, {about['modes']} modes; the first explain {first_shares} of the variance")
     name, apart = next(iter(about["furthest"].items()))
     console.say(f"furthest from the mean: {name}, by {apart:.4g} (root mean square over its surface)")
     if "measures" in about:
         found = about["measures"]
-        told = (
+        values = (
             f"{kind} {found[kind][-1]:.4g} ({found[f'{kind}_surface'][-1]:.4g} between surfaces)" for kind in _KINDS
         )
-        console.say(f"with {found['counts'][-1]} modes: {', '.join(told)}")
+        console.say(f"with {found['counts'][-1]} modes: {', '.join(values)}")
     if "groups" in about:
         found = about["groups"]
         first, second = found["names"]
@@ -267,8 +274,8 @@ def _tell(console: Console, about: dict[str, Any]) -> None:
         )
     if "asymmetry" in about:
         found = about["asymmetry"]
-        whose = "the sides differ by" if found["matching"] else "the mean differs from its mirror image by"
-        console.say(f"{whose} {found['of_mean']:.4g} on average; each individual: asymmetry.csv")
+        what = "the sides differ by" if found["matching"] else "the mean differs from its mirror image by"
+        console.say(f"{what} {found['of_mean']:.4g} on average; asymmetry.csv lists each individual")
 
 
 _KINDS = "generalisation", "specificity"

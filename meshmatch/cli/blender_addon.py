@@ -6,7 +6,7 @@ from pathlib import Path
 from meshmatch import __version__
 from meshmatch.blender import SCRIPTS
 from meshmatch.cli.options import Json, Quiet, output_option
-from meshmatch.cli.words import Console, print_json
+from meshmatch.cli.user_messages import Console, print_json
 from meshmatch.errors import OptionError
 from meshmatch.outputs import replace_on_success
 

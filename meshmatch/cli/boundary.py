@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from meshmatch.cli.words import Console, stdout_error
+from meshmatch.cli.user_messages import Console, stdout_error
 from meshmatch.errors import MeshmatchError, MeshmatchWarning
 
 DEBUG_VARIABLE = "MESHMATCH_DEBUG"

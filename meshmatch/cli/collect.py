@@ -1,4 +1,4 @@
-"""``meshmatch fit`` and ``map``: many shapes fitted once, and maps of any two of them."""
+"""``meshmatch fit`` and ``map``: fit the shapes of a collection, and map any two of them."""
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
@@ -11,7 +11,7 @@ from typer import Argument, Option
 import meshmatch
 from meshmatch.cli import options
 from meshmatch.cli.options import FitOptions, grouped, optional, output_option
-from meshmatch.cli.words import Console, map_record, print_json
+from meshmatch.cli.user_messages import Console, map_record, print_json
 from meshmatch.errors import OptionError, PoorFit
 from meshmatch.models.registry import AUTO, NO_MODEL, check_model
 from meshmatch.outputs import plain_text, replace_on_success
@@ -25,15 +25,15 @@ Scheduler = Annotated[
     str | None,
     Option(
         metavar="ADDRESS",
-        help="Run on the workers of a Dask scheduler, such as tcp://127.0.0.1:8786. They must see the same "
+        help="Run on the workers of a Dask scheduler, such as tcp://127.0.0.1:8786. They must have access to the same "
         "files (needs meshmatch[cluster]).",
     ),
 ]
 
 
-_NAMED = 5  # files that are no shapes, in one line
+_MAX_LISTED = 5  # ignored files in one message
 
-# The residual is in % of sqrt(area), the distance of the surfaces in the unit of the files.
+# Row of the table: the residual is in % of sqrt(area), the distance of the surfaces in the unit of the files.
 _ROW = "{:<28} {:<7} {:>6} {:>9} {:>9} {:>4} {:>6} {:>11} {:>8}"
 
 
@@ -46,26 +46,24 @@ def fit(
     agree: bool = Option(
         True,
         "--agree/--alone",
-        help="Refine all fits jointly, towards their mean stretch of the template (--agree), or each alone.",
+        help="Refine all fits jointly, towards a common stretch of the template (--agree), or each on its own (--alone).",
     ),
     sequence: bool = Option(
-        False,
-        "--sequence",
-        help="The shapes of the folder are frames of a sequence: each fit starts from the previous one.",
+        False, "--sequence", help="The shapes are frames of a sequence: each fit starts from the previous one."
     ),
     jobs: Jobs = None,
     scheduler: Scheduler = None,
-    strict: bool = Option(False, "--strict", help="Exit with 1 if a shape could not be fitted, or a fit is poor."),
+    strict: bool = Option(False, "--strict", help="Exit with status 1 if a shape cannot be fitted, or a fit is poor."),
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Fit every shape of a collection once.
 
-    Maps between any two of them, and atlases, follow from the fits. Each shape is reported when it is finished; one that
-    cannot be fitted does not stop the others. Without --model, shapes of another kind than the first are fitted by the
-    model of theirs, in FITS/KIND. Run the command again to continue after an interruption or to add shapes. With --model
-    none the template is built from the shapes themselves, in any pose and orientation; mirror images and cut shapes are
-    found. FITS/fits.csv lists the result of every shape.
+    Maps between any two shapes (`map`) and atlases (`atlas`) are made from the fits. Each shape is reported when it is
+    finished; a shape that cannot be fitted does not stop the others. Run the command again to continue after an
+    interruption or to add shapes. Without --model, the first shape decides the model; shapes of other kinds are fitted
+    with the models of their kinds, in FITS/KIND. With --model none, the template is built from the shapes themselves, in
+    any pose and orientation; mirror images and cut shapes are recognised. FITS/fits.csv lists the result of every shape.
     """
     from meshmatch.collections.fit_all import elsewhere_words
     from meshmatch.collections.setting import FAILED, LEFT_OUT
@@ -75,40 +73,40 @@ def fit(
         check_model(how.model)
     console = Console(quiet)
 
-    tell = _table(console)
+    report = _table(console)
     with console.progress() as progress:
         collection = meshmatch.Collection(output, scheduler or jobs, progress)
         made = collection.fit(
             shapes, model=how.model, config=how.configs()[0], only=how.only or (), without=how.without or (),
-            sequence=sequence, agree=agree, tell=tell,
+            sequence=sequence, agree=agree, tell=report,
         )  # fmt: skip
     counts = made.counts
-    told = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
+    verdicts = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
     chosen = f" (model {made.model})" if how.model == AUTO else ""
-    console.say(f"wrote {sum(record.fitted for record in made.records)} fits to {output}{chosen}: {told}")
+    console.say(f"wrote {sum(record.fitted for record in made.records)} fits to {output}{chosen}: {verdicts}")
     if others := [record.name for record in made.records if record.verdict == LEFT_OUT]:
-        console.say(f"not taken, for they are no shapes: {_some(others)}; see {output}/fits.csv")
+        console.say(f"ignored, as they are not shapes: {_summarize_files(others)}; see {output}/fits.csv")
     console.say(*elsewhere_words(made.elsewhere))
     if counts["poor"] and not how.try_harder:
-        console.say("the same command with --try-harder searches for longer where a fit is poor")
-    _tell_lengths(console, made.records, made.model)
+        console.say("to search longer for poor fits, run the same command with --try-harder")
+    _report_distances(console, made.records, made.model)
     if made.agreed:
-        console.say(f"{made.agreed} fits agreed on how the template stretches")
+        console.say(f"{made.agreed} fits were refined jointly, so that the template stretches alike")
     if json:
         print_json({"output": output, "model": made.model, "seed": how.seed, "agreed": made.agreed, "verdicts": counts})
     if strict and (counts["poor"] or counts[FAILED]):
-        raise PoorFit(f"not every fit is to be trusted: {told}", f"see {output}/fits.csv")
+        raise PoorFit(f"not every fit is to be trusted: {verdicts}", f"see {output}/fits.csv")
 
 
-def _tell_lengths(console: Console, records: "Sequence[Record]", model: str) -> None:
-    """Say how near the fits are, in the unit of the files; warn where these seem to have several, or are copies."""
+def _report_distances(console: Console, records: "Sequence[Record]", model: str) -> None:
+    """Print the distance of the fits from the shapes; warn of copied files, and of files that seem to differ in unit."""
     from meshmatch.collections.registered import mixed_units
 
     same = defaultdict(list)
     for each in (each for each in records if each.fitted and each.digest):
         same[each.digest].append(each.name)
     for names in (names for names in same.values() if len(names) > 1):
-        console.warn(f"{' and '.join(names)} are copies of one file: an atlas counts it as often")
+        console.warn(f"{' and '.join(names)} are copies of one file: an atlas counts each of them")
     near = [each for each in records if each.verdict in ("good", "fair") and each.distance >= 0 and each.scale > 0]
     if units := mixed_units([each.name for each in near], [each.scale for each in near]):
         console.warn(units)
@@ -117,19 +115,19 @@ def _tell_lengths(console: Console, records: "Sequence[Record]", model: str) -> 
         console.say(f"surfaces lie {mean:.2g} apart on average, {most:.2g} at most, in the unit of the files")
 
 
-def _some(files: Sequence[str]) -> str:
-    """Names of files; how many there are of each suffix, where they are more than a few."""
-    if len(files) <= _NAMED:
+def _summarize_files(files: Sequence[str]) -> str:
+    """List the names of files, or the number of files by suffix if there are many."""
+    if len(files) <= _MAX_LISTED:
         return ", ".join(plain_text(file) for file in files)
     counts = Counter(Path(file).suffix.lower() or "without a suffix" for file in files)
     return ", ".join(f"{number} {plain_text(suffix)}" for suffix, number in counts.most_common())
 
 
 def _table(console: Console) -> Callable[["Record"], None]:
-    """Says a row for each shape as it comes in, under a heading; and what is wrong with it."""
+    """Make a function that prints the row of a shape, after a heading, and its warnings and notes."""
     lines = count()
 
-    def tell(record: "Record") -> None:
+    def report(record: "Record") -> None:
         if not next(lines):
             console.say(
                 _ROW.format("shape", "verdict", "trust", "residual", "distance", "up", "front", "vertices", "seconds")
@@ -142,24 +140,23 @@ def _table(console: Console) -> Callable[["Record"], None]:
         if record.notes:
             console.say(f"{record.name}: {record.notes}")
 
-    return tell
+    return report
 
 
 def map(
     fits: Annotated[str, Argument(metavar="FITS", help="A folder that `meshmatch fit` made, or its URL.")],
     names: Annotated[
-        list[str] | None,
-        Argument(metavar="A B", help="Map the shape A to the shape B: their names, as in FITS/fits.csv."),
+        list[str] | None, Argument(metavar="A B", help="Names of two shapes, as in FITS/fits.csv: map A to B.")
     ] = None,
     *,
     output: str = output_option(
-        "MAPS", "The folder of the maps: the one from A to B is MAPS/A/B with a suffix. Of A and B also a file."
+        "MAPS", "The folder of the maps; the map from A to B is MAPS/A/B with a suffix. For a single map, also a file."
     ),
-    pairs: Path | None = optional("FILE", "Or pairs to map: the names of a source and a target per line."),
-    to: str | None = optional("NAME", "Or map every shape to this one."),
-    all_pairs: bool = Option(False, "--all", help="Or map every shape to every other."),
+    pairs: Path | None = optional("FILE", "Map these pairs: the names of a source and a target per line."),
+    to: str | None = optional("NAME", "Map every shape to this one."),
+    all_pairs: bool = Option(False, "--all", help="Map every shape to every other shape."),
     suffix: str = Option(
-        ".npz", "--format", metavar="SUFFIX", help="How maps are written: .npy, .npz, .csv, .txt, .mat or .json."
+        ".npz", "--format", metavar="SUFFIX", help="Format of the maps: .npy, .npz, .csv, .txt, .mat or .json."
     ),
     jobs: Jobs = None,
     scheduler: Scheduler = None,
@@ -168,15 +165,16 @@ def map(
 ) -> None:
     """Map shapes of a collection to each other.
 
-    Nothing is fitted again. Existing maps are kept unless the fits are newer.
+    Choose the maps by two names A B, --pairs, --to or --all. The fits are used as they are. Existing maps are kept unless
+    the fits are newer.
     """
     from meshmatch.collections.map_all import load_pairs
     from meshmatch.maps import MAP_SUFFIXES
 
     chosen = [bool(names), pairs is not None, to is not None, all_pairs].count(True)
     if chosen != 1:
-        several = "more than one choice of maps" if chosen else "no maps are chosen"
-        raise OptionError(several, "name two shapes, or give one of --pairs FILE, --to NAME and --all")
+        problem = "more than one choice of maps" if chosen else "no maps are chosen"
+        raise OptionError(problem, "name two shapes, or give one of --pairs FILE, --to NAME and --all")
     if names and len(names) != 2:
         given = "one name was given" if len(names) == 1 else f"{len(names)} names were given"
         raise OptionError(f"a map leads from one shape to another, and {given}", "name the source and the target")
@@ -199,13 +197,13 @@ def map(
 
 
 def _name_of(collection: "Collection", word: str) -> str:
-    """A name, which may be that of a file; `InputError` for what has no fit here."""
+    """The name of a shape, given by its name or file; `InputError` if it has no fit."""
     from meshmatch.shapes.input_files import stem_of
 
     known = collection.names
     found = next((name for name in (word, stem_of(Path(word))) if name in known), None)
     if found is None:
-        collection.pairs(word)  # says what is wrong with it
+        collection.pairs(word)  # raises the error
     return found or word
 
 

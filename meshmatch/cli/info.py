@@ -1,4 +1,4 @@
-"""``meshmatch info``: what is in a file."""
+"""``meshmatch info``: describe the content of a file."""
 
 from bisect import bisect_right
 from collections import Counter
@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from meshmatch.cli import options
-from meshmatch.cli.words import Json, print_json, print_rows
+from meshmatch.cli.user_messages import Json, print_json, print_rows
 from meshmatch.errors import InputError
 
 if TYPE_CHECKING:
     from meshmatch.shapes.parts import Parts
     from meshmatch.shapes.shape import Shape
 
-_ARRAYS = {  # of a .npz that is no map
+_ARRAYS = {  # arrays that identify a .npz that is not a map
     "atlas": {"mean", "modes", "deviations"},
     "blendshapes": {"names", "moves"},
     "skin weights": {"names", "joints", "weights"},
     "landmarks of several specimens": {"points", "specimens", "landmarks"},
     "registered shapes": {"points", "faces", "names"},
 }
-_SHOWN_PARTS, _MOST_PARTS = 20, 1000  # of a mesh: in words, and with --json
+_MAX_PARTS_SHOWN, _MAX_PARTS = 20, 1000  # parts of a mesh in the text, and with --json
 
 
 def info(
@@ -38,7 +38,7 @@ def info(
 ) -> None:
     """Describe a file: a shape, a map or a template.
 
-    Of a shape also what repair would do. Of other files that meshmatch writes or reads what they are. Nothing is written.
+    For a shape, also lists its parts and what the repair before fitting would change. Nothing is written.
     """
     from meshmatch.maps import MAP_SUFFIXES
 
@@ -71,13 +71,13 @@ def info(
 
 
 def _is_list(file: Path) -> bool:
-    """A .npy of one axis is a map, one of two is a cloud."""
+    """Whether a .npy has one axis: it is then a map, with two axes a point cloud."""
     from meshmatch.shapes.input_files import existing, read_npy
 
     try:
         return read_npy(existing(file, "")).ndim == 1
     except InputError:
-        return False  # whatever is wrong with it, the reader of shapes says it well
+        return False  # the reader of shapes reports the error
 
 
 def _shape(file: Path) -> Json:
@@ -86,7 +86,7 @@ def _shape(file: Path) -> Json:
     from meshmatch.shapes.parts import Parts
     from meshmatch.shapes.repair import repair
 
-    meshes = mesh_list(file)  # first: what it reads is gone before the shape itself needs memory
+    meshes = mesh_list(file)  # first, so that its memory is freed before the shape is loaded
     shape = load_shape(file)
     size = [float(length) for length in shape.bounds[1] - shape.bounds[0]]
     clean = repair(shape)
@@ -111,13 +111,13 @@ def _shape(file: Path) -> Json:
     about |= {"size": size, "area": shape.area, "colors": shape.colors is not None}
     usual = {"longest_along": long_axis(clean.shape), "unit_if_a_person": guess_unit(clean.shape)}
     repaired: Json = {"repaired_vertices": clean.shape.V, "repaired_faces": clean.shape.F}
-    if not shape.is_cloud:  # seams of texture coordinates are open edges before their vertices are merged
+    if not shape.is_cloud:  # seams of texture coordinates are open edges until their vertices are merged
         repaired["repaired_watertight"] = not any(clean.shape.edges.counts)
     return about | edges | parts | usual | {"repair": list(clean.notes)} | repaired | {"hash": shape.hash}
 
 
 def _materials(file: Path, shape: "Shape") -> Json:
-    """The materials of a file that has some, with the size of their images; or why these cannot be read."""
+    """List the materials of a file with the sizes of their images, or the reason why they cannot be read."""
     from meshmatch.shapes.textured_files import find_appearance
 
     try:
@@ -133,10 +133,10 @@ def _materials(file: Path, shape: "Shape") -> Json:
 
 
 def _parts(parts: "Parts", meshes: list[tuple[str, int]]) -> list[Json]:
-    """The largest parts of a mesh, and in which mesh of a scene each begins."""
+    """Describe the largest parts of a mesh, each with the mesh of the scene that has its first vertex."""
     ends = list(accumulate(count for _, count in meshes))
     found: list[Json] = []
-    for k in range(min(len(parts), _MOST_PARTS)):
+    for k in range(min(len(parts), _MAX_PARTS)):
         low, high = parts.bounds[k]
         about: Json = {"part": k + 1, "vertices": int(parts.counts[k]), "share_of_area": float(parts.shares[k])}
         about["size"] = [float(length) for length in high - low]
@@ -147,35 +147,35 @@ def _parts(parts: "Parts", meshes: list[tuple[str, int]]) -> list[Json]:
 
 
 def _part_lines(found: list[Json], count: int) -> list[str]:
-    """A line for each of the largest parts, as many as a reader takes in."""
+    """One line for each of the largest parts, up to a readable number."""
     lines = []
-    for each in found[:_SHOWN_PARTS]:
+    for each in found[:_MAX_PARTS_SHOWN]:
         size = " x ".join(f"{length:.3g}" for length in each["size"])
         name = f", {each['mesh']}" if "mesh" in each else ""
         share = f"{100 * each['share_of_area']:.3g} % of the area"
         lines.append(f"{each['part']}: {share}, {each['vertices']:,} vertices, {size}{name}")
-    return lines + ([f"and {count - _SHOWN_PARTS:,} more"] if count > _SHOWN_PARTS else [])
+    return lines + ([f"and {count - _MAX_PARTS_SHOWN:,} more"] if count > _MAX_PARTS_SHOWN else [])
 
 
 def _map(file: Path) -> Json:
-    from meshmatch.cli.words import number_or_none, map_record
+    from meshmatch.cli.user_messages import json_number, map_record
     from meshmatch.maps.files import load_map
     from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN
 
     try:
         found = load_map(file)
     except InputError:
-        if not (other := _no_map(file)):
+        if not (other := _not_a_map(file)):
             raise
         return other
     record: Json = {"kind": "map"} | map_record(found, (found.source, found.target))
     if found.target_vertices == UNKNOWN:
         record["target_vertices"] = None
-    return record | {"confidence_mean": number_or_none(found.confidence.mean()), "direction": DIRECTION}
+    return record | {"confidence_mean": json_number(found.confidence.mean()), "direction": DIRECTION}
 
 
-def _no_map(file: Path) -> Json:
-    """What a file is that might be a map by its suffix; nothing if that is not known either."""
+def _not_a_map(file: Path) -> Json:
+    """Describe a file with the suffix of a map that is not one; empty if its content is unknown."""
     from zipfile import BadZipFile, ZipFile
 
     if file.suffix.lower() != ".npz":
@@ -204,7 +204,7 @@ def _landmarks(file: Path) -> Json:
 
 
 def _folder(file: Path) -> Json:
-    """Fits of a collection, an atlas, or a model."""
+    """Describe a folder: the fits of a collection, an atlas, or a model."""
     import csv
 
     from meshmatch.collections.settle import read_about
@@ -214,11 +214,11 @@ def _folder(file: Path) -> Json:
 
     if (about := read_about(Store.of(file))) is not None:
         verdicts: Counter[str] = Counter()
-        if (file / "fits.csv").is_file():  # which is written last
+        if (file / "fits.csv").is_file():  # it is written last
             with (file / "fits.csv").open(encoding="utf-8", newline="") as table:
                 verdicts.update(str(row.get("verdict")) for row in csv.DictReader(table))
-        told = [f"{count} {verdict}" for verdict, count in verdicts.items()]
-        return {"kind": "fits of a collection", "model": about["model"], "shapes": told}
+        counts = [f"{count} {verdict}" for verdict, count in verdicts.items()]
+        return {"kind": "fits of a collection", "model": about["model"], "shapes": counts}
     if (file / "atlas.npz").is_file():
         return {"kind": "atlas"}
     if (file / CARD).is_file() or is_implicit(file):
@@ -231,12 +231,12 @@ def _folder(file: Path) -> Json:
 
 
 def _tensors(file: Path) -> Json:
-    """A fit, or a template."""
+    """Describe a fit or a template."""
     from meshmatch.maps.fit_files import load_words
     from meshmatch.models.registry import CARD, WEIGHTS
 
     if file.name == WEIGHTS and file.with_name(CARD).is_file():
-        raise InputError(f"{file} holds the weights of a model", f"meshmatch info {file.parent}")
+        raise InputError(f"{file} contains the weights of a model", f"meshmatch info {file.parent}")
     try:
         fit, _ = load_words(file)
     except InputError:

@@ -7,9 +7,9 @@ from typing import Literal
 from typer import Argument, Option
 
 import meshmatch
-from meshmatch.cli import words
+from meshmatch.cli import user_messages
 from meshmatch.cli.options import FitOptions, Options, RunOptions, check_outputs, grouped, optional, output_option
-from meshmatch.cli.words import Console, Json, print_json
+from meshmatch.cli.user_messages import Console, Json, print_json
 from meshmatch.errors import OptionError
 from meshmatch.models.registry import check_model
 from meshmatch.outputs import folder_on_success, replace_on_success
@@ -17,22 +17,23 @@ from meshmatch.outputs import folder_on_success, replace_on_success
 
 @dataclass(frozen=True)
 class SequenceOptions(Options):
-    """What the shapes between two shapes are."""
+    """Options of the sequence."""
 
     frames: int = Option(9, "--frames", "-n", min=2, max=1000, help="Number of shapes.")
-    through: list[Path] | None = optional("C", "A shape to pass through on the way. May be repeated.")
+    through: list[Path] | None = optional("C", "A shape to pass through between A and B. May be repeated.")
     start: float = Option(0.0, "--from", metavar="T", help="Time of the first shape, from -1; below 0 is before A.")
     stop: float = Option(1.0, "--to", metavar="T", help="Time of the last shape, up to 2; above 1 is beyond B.")
     mesh: Literal["source", "template"] = Option(
-        "source", help="Mesh that moves: that of A, with all its detail, or the model's template."
+        "source", help="Mesh that moves: the mesh of A, with all its detail (source), or the model's template."
     )
     blend: Literal["field", "codes"] = Option(
-        "field", help="Blend the local rotation and stretch of the surface (field), or the network's codes."
+        "field",
+        help="Blend the local rotation and stretch of the surface (field), or the network's latent codes (codes).",
     )
     place: Literal["auto", "files", "source"] = Option(
         "auto",
-        help="Position, orientation and size of the shapes. files: from those of A's file to those of B's; "
-        "source: all as A; auto: files, unless the files seem to have different units.",
+        help="Position, orientation and size of the shapes. files: changing from those in A's file to those in B's; "
+        "source: as in A's file throughout; auto: files, unless the files seem to have different units.",
     )
     resolution: int = Option(
         64,
@@ -41,7 +42,7 @@ class SequenceOptions(Options):
         help="Grid cells per side when the surfaces of an implicit model are extracted; an even number.",
     )
     format: Literal["ply", "obj", "off", "glb"] = Option("ply", help="Format of the files in a folder.")
-    plot: Path | None = optional("FILE", "Plot how well each shape keeps volume and distances: .png, .svg or .pdf.")
+    plot: Path | None = optional("FILE", "Plot how well each shape preserves volume and distances: .png, .svg or .pdf.")
 
 
 @grouped
@@ -51,7 +52,8 @@ def interpolate(
     target: Path = Argument(..., metavar="B", help="The shape at time 1."),
     output: Path = output_option(
         "OUT",
-        "No suffix: a new folder with a file for each shape. .png: all shapes in a row. .html: a page with a slider.",
+        "A new folder (a name without a suffix) with a file for each shape; a .png of all shapes in a row; or an .html page "
+        "with a slider.",
     ),
     sequence: SequenceOptions,
     how: FitOptions,
@@ -59,9 +61,9 @@ def interpolate(
 ) -> None:
     """Blend one shape into another, as a sequence.
 
-    The model's template is fitted to both, the fits are blended, and A's own mesh follows. Time 0 is A as in its
-    file; at time 1 A's mesh lies on B. Shapes given with --through are reached at even times in between. An implicit
-    model blends latent codes instead, and each shape has a mesh of its own.
+    The model's template is fitted to both shapes, the fits are blended, and the mesh of A follows. At time 0 it is A as
+    in its file; at time 1 it lies on B. Shapes given with --through are reached at evenly spaced times in between. An
+    implicit model blends latent codes instead, and each shape has its own mesh.
     """
     from meshmatch.api import interpolation
 
@@ -80,7 +82,7 @@ def interpolate(
         what = "a page needs shapes that share vertices, and the surfaces of an implicit model do not"
         raise OptionError(f"{output.name}: {what}", hint)
     console = Console(run.quiet)
-    # What cannot be written, a mistyped model and broken files are told before the long work.
+    # Outputs that cannot be written, an unknown model and broken files are reported before the long computation.
     with (replace_on_success if suffix else folder_on_success)(output) as temporary:
         check_model(how.model)
         shapes = how.load(*files)
@@ -90,24 +92,26 @@ def interpolate(
                 threads=run.threads, progress=report,
             )  # fmt: skip
         for file, fit in zip(files, result.fits, strict=True):
-            words.raise_if_poor(run.strict, fit.verdict, (f"{file.name}: {words.join_reasons(fit.reasons)}",))
-        # Names of the shapes that are passed, by their times.
-        met = dict(zip(result.times, [file.name for file in files], strict=True))
+            user_messages.raise_if_poor(
+                run.strict, fit.verdict, (f"{file.name}: {user_messages.join_reasons(fit.reasons)}",)
+            )
+        # Names of the given shapes by the times at which the sequence passes them.
+        key_shapes = dict(zip(result.times, [file.name for file in files], strict=True))
         if sequence.plot is not None:
-            _plot(sequence.plot, result, met)
+            _plot(sequence.plot, result, key_shapes)
         if suffix:
-            _WRITERS[suffix](temporary, result, met)
+            _WRITERS[suffix](temporary, result, key_shapes)
         else:
             moves = not how.implicit and sequence.mesh == "source"
             interpolation.save_folder(temporary, result, sequence.format, source if moves else None)
-    _tell(console, result, files, sequence.place)
+    _report(console, result, files, sequence.place)
     what = "surfaces" if how.implicit else f"shapes of {result.steps[0].shape.V} vertices"
     console.say(
         f"wrote {output}: {sequence.frames} {what}, from time {sequence.start:g} to {sequence.stop:g} "
         f"({result.seconds:.1f} s)"
     )
     if sequence.plot is not None:
-        console.say(f"drew {sequence.plot}: how well each shape keeps volume and distances")
+        console.say(f"drew {sequence.plot}: how well each shape preserves volume and distances")
     if run.json:
         chosen = {} if how.implicit else {"mesh": sequence.mesh, "blend": sequence.blend}
         print_json(
@@ -115,37 +119,37 @@ def interpolate(
         )
 
 
-def _draw_strip(path: Path, result: "meshmatch.Interpolation", met: dict[float, str]) -> None:
-    """All shapes in a row, each with its time, or the name of the shape that is passed then."""
+def _draw_strip(path: Path, result: "meshmatch.Interpolation", key_shapes: dict[float, str]) -> None:
+    """Draw all shapes in a row, labeled by time, or by the name of the given shape at that time."""
     from meshmatch.render.figures import Panel
     from meshmatch.render.picture import render_shapes
 
-    labels = [met.get(step.time, f"{step.time:.3g}") for step in result.steps]
+    labels = [key_shapes.get(step.time, f"{step.time:.3g}") for step in result.steps]
     pairs = zip(result.steps, labels, strict=True)
     render_shapes([Panel(step.shape, label=label, rotation=step.rotation) for step, label in pairs], path)
 
 
-def _write_page(path: Path, result: "meshmatch.Interpolation", met: dict[float, str]) -> None:
-    """In one frame, that of the first shape: what moves in the files moves on the page."""
+def _write_page(path: Path, result: "meshmatch.Interpolation", key_shapes: dict[float, str]) -> None:
+    """Write the page; all shapes are in the frame of the first one, so that motion in the files is visible."""
     from meshmatch.render.viewer.single_pages import write_motion
 
     shapes = [step.shape for step in result.steps]
     times = [step.time for step in result.steps]
     rotation = result.steps[0].rotation
     assert rotation is not None
-    title = " → ".join(met.values())
-    write_motion(path, shapes, times, rotation=rotation, met=met, title=title)
+    title = " → ".join(key_shapes.values())
+    write_motion(path, shapes, times, rotation=rotation, key_shapes=key_shapes, title=title)
 
 
 _WRITERS = {".png": _draw_strip, ".html": _write_page, ".htm": _write_page}
 
 
-def _plot(path: Path, result: "meshmatch.Interpolation", met: dict[float, str]) -> None:
+def _plot(path: Path, result: "meshmatch.Interpolation", key_shapes: dict[float, str]) -> None:
     from meshmatch.render.charts import draw_lines
 
     times = [step.time for step in result.steps]
     deviations = [step.deviation for step in result.steps if step.deviation is not None]
-    marks = {time: name for time, name in met.items() if times[0] <= time <= times[-1]}
+    marks = {time: name for time, name in key_shapes.items() if times[0] <= time <= times[-1]}
     lines = {
         "volume: |det F - det S|": (times, [each.volume for each in deviations]),
         "rigidity: |F'F - S'S|": (times, [each.arap for each in deviations]),
@@ -154,13 +158,13 @@ def _plot(path: Path, result: "meshmatch.Interpolation", met: dict[float, str]) 
     draw_lines(lines, path, xlabel, "mean deviation over the surface", marks)
 
 
-def _tell(console: Console, result: "meshmatch.Interpolation", files: list[Path], asked: str) -> None:
+def _report(console: Console, result: "meshmatch.Interpolation", files: list[Path], asked: str) -> None:
     console.say(*result.notes)
     for file, fit in zip(files, result.fits, strict=True):
-        console.say(f"{file.name}: {words.describe_fit(fit)}")
-        words.report_verdict(console, fit.verdict, fit.reasons, f"the fit of {file.name}")
+        console.say(f"{file.name}: {user_messages.describe_fit(fit)}")
+        user_messages.report_verdict(console, fit.verdict, fit.reasons, f"the fit of {file.name}")
     if asked == "auto" and result.place == "source":
-        console.say(f"the files differ much in size: all shapes are in the place and unit of {files[0].name}")
+        console.say(f"the files differ much in size: all shapes are in the position and unit of {files[0].name}")
     deviations = [step.deviation for step in result.steps if step.deviation is not None]
     if result.to_target is None or not deviations:
         return
@@ -174,7 +178,7 @@ def _tell(console: Console, result: "meshmatch.Interpolation", files: list[Path]
 def _record(result: "meshmatch.Interpolation", files: list[Path]) -> Json:
     shapes = []
     for file, time, fit in zip(files, result.times, result.fits, strict=True):
-        about = words.fit_record(str(file), fit)
+        about = user_messages.fit_record(str(file), fit)
         shapes.append(about | {"time": round(time, 9)})
     record: Json = {"shapes": shapes, "place": result.place, "frames": [step.record for step in result.steps]}
     if result.to_target is not None:

@@ -1,4 +1,4 @@
-"""``meshmatch match``, ``register`` and ``evaluate``: maps of two shapes, fits of one, and how good a map is."""
+"""``meshmatch match``, ``register`` and ``evaluate``."""
 
 from math import isinf
 from pathlib import Path
@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 from typer import Argument, Option
 
 import meshmatch
-from meshmatch.cli import options, words
+from meshmatch.cli import options, user_messages
 from meshmatch.cli.options import FitOptions, PairOptions, RunOptions, check_outputs, grouped, optional, output_option
-from meshmatch.cli.words import Console, Json, print_json, print_rows
+from meshmatch.cli.user_messages import Console, Json, print_json, print_rows
 from meshmatch.errors import OptionError
 from meshmatch.models.registry import check_model
 from meshmatch.outputs import replace_on_success
@@ -42,34 +42,36 @@ def match(
     how.check()
     check_suffix(output)
     check_outputs([source, target, how.known_pairs], output, picture=picture)
-    console, names = Console(run.quiet), words.names_of([source, target])
-    # What cannot be written, a mistyped model and broken files are told before the long work.
+    console, names = Console(run.quiet), user_messages.names_of([source, target])
+    # Outputs that cannot be written, an unknown model and broken files are reported before the long computation.
     with replace_on_success(output) as temporary:
         check_model(how.model)
         a, b = how.load(source, target)
         result = how.match(a, b, run, console)
         found = result.map
-        words.raise_if_poor(run.strict, found.verdict, found.reasons, "the map")
+        user_messages.raise_if_poor(run.strict, found.verdict, found.reasons, "the map")
         meshmatch.save_map(temporary, found)
     if picture is not None:
         from meshmatch.render.compose import compose_match
 
         compose_match(a, b, found, result.rotations).named(names).render(picture)
-    words.report_match(console, result, names)
-    words.report_verdict(console, found.verdict, found.reasons, "the map")
+    user_messages.report_match(console, result, names)
+    user_messages.report_verdict(console, found.verdict, found.reasons, "the map")
     console.say(
         f"wrote {output}: for each of the {found.source_vertices} vertices of {names[0]} "
         f"its vertex of {names[1]} ({result.seconds:.1f} s)"
     )
     if picture is not None:
-        console.say(f"drew {picture}: corresponding points in one color")
+        console.say(f"drew {picture}: corresponding points in the same color")
     if run.json:
-        fits = [words.fit_record(*each) for each in zip(names, (result.source_fit, result.target_fit), strict=True)]
+        fits = [
+            user_messages.fit_record(*each) for each in zip(names, (result.source_fit, result.target_fit), strict=True)
+        ]
         about = {"direction": DIRECTION, "confidence_mean": float(found.confidence.mean()), "notes": result.notes}
         about |= {"fits": fits, "seconds": round(result.seconds, 3)}
         print_json(
             {"output": output, "picture": picture}
-            | words.map_record(found, names)
+            | user_messages.map_record(found, names)
             | about
             | how.record(result.source_fit)
         )
@@ -81,24 +83,26 @@ def register(
     shape: Path = Argument(..., metavar="SHAPE", help="The shape to fit the template to."),
     output: Path = output_option(
         "MESH",
-        "The fitted template, in the frame and unit of SHAPE; with --onto, the mesh of SHAPE in those of TARGET: .ply, "
-        ".obj, .off, .stl, .glb, .vtp or .vtk.",
+        "The deformed mesh, in the frame and unit of the shape that it was fitted to: .ply, .obj, .off, .stl, .glb, .vtp "
+        "or .vtk.",
     ),
     how: FitOptions,
     run: RunOptions,
-    onto: Path | None = optional("TARGET", "Deform the mesh of SHAPE onto this shape instead, of any kind."),
-    template: Path | None = optional(
-        "MESH", "Deform this mesh, which may be your own, onto SHAPE: as the mesh with --onto SHAPE."
+    onto: Path | None = optional(
+        "TARGET", "Deform the mesh of SHAPE onto this shape, instead of the template onto SHAPE."
     ),
-    dense: bool = Option(False, "--dense", help="Write the template in its full resolution."),
+    template: Path | None = optional(
+        "MESH", "Deform this mesh onto SHAPE, instead of the model's template; same as `register MESH --onto SHAPE`."
+    ),
+    dense: bool = Option(False, "--dense", help="Write the template at its full resolution."),
     picture: Path | None = optional("PNG", "Draw the template over the shape, colored by distance."),
 ) -> None:
-    """Fit the template, or a shape, to another shape.
+    """Fit a template or another mesh to a shape.
 
-    This is a non-rigid registration: the model's template is deformed, and the shape stays where it is. Results for all
-    shapes have the same vertices and triangles in the same order. With more than one thread, results may differ in
-    the last bits. With --onto, the mesh of SHAPE is deformed onto TARGET, which stays where it is; an .obj from an .obj, or
-    a .glb from a .glb, keeps everything but the positions, as with `wrap`, which also draws it to the surface.
+    This is a non-rigid registration: the model's template is deformed, and SHAPE is not moved. Results for all shapes have
+    the same vertices and triangles in the same order. With --onto, the mesh of SHAPE is deformed onto TARGET; an .obj
+    written from an .obj, or a .glb from a .glb, keeps everything but the positions. `wrap` does the same and also projects
+    the mesh onto the surface. With more than one thread, results may differ in the last bits.
     """
     from meshmatch.api.matching import matcher_for
     from meshmatch.api.upright import turn_of_fit
@@ -120,7 +124,7 @@ def register(
         matcher = matcher_for(how.model, how.configs()[0], run.threads)
         with console.progress() as matcher.progress:
             fit = matcher.fit(loaded)
-        words.raise_if_poor(run.strict, fit.verdict, fit.reasons)
+        user_messages.raise_if_poor(run.strict, fit.verdict, fit.reasons)
         plain = meshmatch.Shape(fit.points_in_file, fit.faces, output.stem)
         fitted = matcher.dense(fit) if dense else plain  # type: ignore[arg-type]
         turned = save_upright(temporary, fitted, None if loaded.upright else turn_of_fit(fit))
@@ -129,14 +133,14 @@ def register(
 
         compose_fit(loaded, fitted, None if how.implicit else fit.frame.turn).render(picture)
     console.say(*fit.notes)
-    console.say(f"fitted the template of {fit.model} to {loaded.name}: {words.describe_fit(fit)}")
+    console.say(f"fitted the template of {fit.model} to {loaded.name}: {user_messages.describe_fit(fit)}")
     apart: Json = {}
     if isinstance(fit, meshmatch.Fit):
         read = fit.repaired.shape if fit.repaired else loaded  # without parts that were left out
         distance = meshmatch.measure_distance(read, fitted, one_way=fit.partial)
         apart["distance"] = distance.as_dict()
         console.say(str(distance))
-    words.report_verdict(console, fit.verdict, fit.reasons)
+    user_messages.report_verdict(console, fit.verdict, fit.reasons)
     if turned:
         console.say("note: a node turns the template upright, along y")
     console.say(f"wrote {output}: {fitted.V} vertices, {fitted.F} faces ({fit.seconds:.1f} s)")
@@ -145,7 +149,7 @@ def register(
     if run.json:
         record = {"output": output, "picture": picture, "vertices": fitted.V, "faces": fitted.F, "dense": dense}
         record |= apart | how.record(fit)
-        print_json(record | words.fit_record(loaded.name, fit) | {"notes": list(fit.notes)})
+        print_json(record | user_messages.fit_record(loaded.name, fit) | {"notes": list(fit.notes)})
 
 
 def surfaces_apart(
@@ -155,7 +159,7 @@ def surfaces_apart(
     unit: "UnitName" = "auto",
     one_way: bool = False,
 ) -> "meshmatch.SurfaceDistance":
-    """How far a mesh lies from the shape that it was laid on; one way from what is only a part, or if that is asked for."""
+    """Measure the distance between a mesh and the shape it was fitted to; one way, from the part, if one is partial."""
     parts = [isinstance(fit, meshmatch.Fit) and fit.partial for fit in (result.source_fit, result.target_fit)]
     begins = (moved, onto) if parts[0] and not onto.is_cloud else (onto, moved)
     return meshmatch.measure_distance(*begins, one_way=one_way or any(parts), unit=unit)
@@ -175,7 +179,7 @@ def _register_onto(
     from meshmatch.shapes.blend_shapes import shape_normals
     from meshmatch.shapes.moved_files import MovedFile
 
-    names = words.names_of([shape, onto])
+    names = user_messages.names_of([shape, onto])
     plan = MovedFile.planned(output, shape)
     check_outputs([shape, onto], *plan.files, picture=picture)
     plan.make_folders()
@@ -189,7 +193,7 @@ def _register_onto(
                 a, b, model=how.model, config=how.configs()[0], threads=run.threads, progress=report
             )  # fmt: skip
         found = result.map
-        words.raise_if_poor(run.strict, found.verdict, found.reasons, "the registration")
+        user_messages.raise_if_poor(run.strict, found.verdict, found.reasons, "the registration")
         moved = result.deformed_source()
         turn = turn_of_moved(a, moved.verts, b, result.target_fit)
         before, after = shape_normals(a, (moved.verts - a.verts)[None].astype(np.float32))
@@ -199,10 +203,10 @@ def _register_onto(
         from meshmatch.render.compose import compose_fit
 
         compose_fit(b, moved, result.rotations[1], what=f"the mesh of {names[0]}").render(picture)
-    words.report_match(console, result, names)
+    user_messages.report_match(console, result, names)
     apart = surfaces_apart(result, moved, b)
     console.say(str(apart))
-    words.report_verdict(console, found.verdict, found.reasons, "the registration")
+    user_messages.report_verdict(console, found.verdict, found.reasons, "the registration")
     if plan.is_turned(binding, turn):
         console.say(f"note: a node turns {names[0]} upright, along y")
     where = ", ".join(map(str, plan.files))
@@ -210,7 +214,9 @@ def _register_onto(
     if picture is not None:
         console.say(f"drew {picture}: the mesh over {names[1]}, and their distance")
     if run.json:
-        fits = [words.fit_record(*each) for each in zip(names, (result.source_fit, result.target_fit), strict=True)]
+        fits = [
+            user_messages.fit_record(*each) for each in zip(names, (result.source_fit, result.target_fit), strict=True)
+        ]
         record: Json = {"output": output, "picture": picture, "onto": onto, "vertices": moved.V, "faces": moved.F}
         record |= {"distance": apart.as_dict(), "verdict": found.verdict, "reasons": found.reasons}
         record |= {"fits": fits, "notes": result.notes}
@@ -224,9 +230,7 @@ def evaluate(
     target: Path = Argument(..., metavar="TARGET", help="The shape that it maps to."),
     truth: options.Truth = None,
     points: options.Points = None,
-    backward: Path | None = optional(
-        "MAP", "The map from TARGET to SOURCE, to measure how far both together lead astray."
-    ),
+    backward: Path | None = optional("MAP", "The map from TARGET to SOURCE, to measure bijectivity."),
     threshold: float | None = Option(
         None,
         min=0.0,
@@ -242,16 +246,16 @@ def evaluate(
 ) -> None:
     """Measure how good a map is.
 
-    Reports coverage and, between meshes, distortion, Dirichlet energy and folds. With --truth or --points also geodesic
-    errors on TARGET: in percent of the square root of its area, and in the unit of its file, or of a person in
-    centimetres with TARGET scaled to 1.9 square metres of skin. With --backward also how far from itself a vertex arrives
-    by both maps.
+    Reports coverage and, for meshes, distortion, Dirichlet energy and folds. With --truth or --points, also reports
+    geodesic errors on TARGET, in percent of the square root of its area and in the unit of its file; for a person in
+    centimetres, with TARGET scaled to 1.9 square metres of skin. With --backward, also reports bijectivity: the mean
+    distance between a vertex and where both maps together take it.
     """
-    told = options.check_truth(truth, points)
+    has_truth = options.check_truth(truth, points)
     if threshold is not None and isinf(threshold):
-        raise OptionError("--threshold must be a length, not inf", "leave it out for the usual one")
+        raise OptionError("--threshold must be a length, not inf", "leave it out for the default")
     for what, given in (("curve", curve), ("picture", picture), ("threshold", threshold)):
-        if given is not None and not told:
+        if given is not None and not has_truth:
             raise OptionError(f"a {what} of errors needs ground truth", "give it with --truth or --points")
     check_outputs([map_file, source, target, truth, backward, *(points or ())], chart=curve, picture=picture)
     shapes = meshmatch.load_shape(source), meshmatch.load_shape(target)
@@ -259,7 +263,7 @@ def evaluate(
     if map_file.is_dir():
         if backward is not None:
             raise OptionError(
-                "--backward does not go with a folder of fits", "leave it out: the folder knows the way back"
+                "--backward does not go with a folder of fits", "leave it out: the fits also give the map back"
             )
         both = meshmatch.Collection(map_file).maps_between(*shapes)
         found, back = both.forward, both.backward
@@ -309,11 +313,11 @@ def _rows(result: "Evaluation", threshold: float | None) -> list[tuple[str, str,
     if result.dirichlet is not None:
         rows.append(("dirichlet", f"{result.dirichlet:.3f}", "energy; 1 for an isometry"))
     if result.bijectivity is not None:
-        rows.append(("bijectivity", f"{result.bijectivity:.4f}", "sqrt(area), from where the ways there and back lead"))
+        rows.append(("bijectivity", f"{result.bijectivity:.4f}", "sqrt(area), from a vertex to its image by both maps"))
     if (folds := result.folds) is not None:
         rows += [
             ("flipped", f"{100 * folds.flipped:.2f} %", "of the source's area is turned over"),
-            ("crushed", f"{100 * folds.crushed:.2f} %", "is laid on less than a quarter of its area"),
+            ("crushed", f"{100 * folds.crushed:.2f} %", "is mapped to less than a quarter of its area"),
             ("stretch", f"{folds.stretch:.2f}", "median factor by which the surface is stretched or shrunk"),
         ]
     return rows

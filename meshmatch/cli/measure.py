@@ -10,7 +10,7 @@ import meshmatch
 from meshmatch.cli.options import RunOptions, grouped, optional, output_option
 from meshmatch.cli.targets import Gather, to_targets
 from meshmatch.cli.transfer_options import MapOptionsWithPairs, Picture, Transfer
-from meshmatch.cli.words import Json
+from meshmatch.cli.user_messages import Json
 from meshmatch.errors import warn
 from meshmatch.outputs import replace_on_success
 
@@ -100,10 +100,10 @@ def measure(
     """
     import numpy as np
 
-    from meshmatch.api.measure import resolve_measure_inputs, own_points
+    from meshmatch.api.measure import measure_inputs, own_points
     from meshmatch.transfer.measurements import check_measurements_suffix
 
-    path, defined, marks = resolve_measure_inputs(source, measurements, landmarks)
+    path, defined, marks = measure_inputs(source, measurements, landmarks)
     assert isinstance(path, Path)
     transfer = Transfer(path, target, output, maps, run, picture)
     console = transfer.console

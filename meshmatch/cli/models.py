@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from meshmatch.cli import options
-from meshmatch.cli.words import Console, print_json, print_rows, print_text
+from meshmatch.cli.user_messages import Console, print_json, print_rows, print_text
 from meshmatch.errors import ModelError
 from meshmatch.models import registry
 from meshmatch.models.card import card_to_json

@@ -25,7 +25,7 @@ from meshmatch.outputs import replace_on_success
 
 if TYPE_CHECKING:
     from meshmatch.arrays import Ints
-    from meshmatch.cli.words import Console
+    from meshmatch.cli.user_messages import Console
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
@@ -217,9 +217,7 @@ class FitOptions(Options):
         None, help="Axis that points up in the file, or in both files. Default: detected.", case_sensitive=False
     )
     front: Axis | None = Option(
-        None,
-        help="Axis that the shape faces in the file, or in both files. Default: detected.",
-        case_sensitive=False,
+        None, help="Axis that the shape faces in the file, or in both files. Default: detected.", case_sensitive=False
     )
     partial: bool | None = Option(
         None,

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from typer import Argument, Option
 
 import meshmatch
-from meshmatch.cli import options, words
+from meshmatch.cli import options, user_messages
 from meshmatch.cli.transfer_options import Transfer, ViewMapOptions
-from meshmatch.cli.words import Console, print_json
+from meshmatch.cli.user_messages import Console, print_json
 from meshmatch.errors import ModelError, OptionError, warn
 from meshmatch.models.registry import TEMPLATE, locate_model
 
@@ -156,7 +156,7 @@ def picture(
     made = _compose(shown, subjects, look, console)
     labels = [panel.label for panel in made.panels]
     own = [subject.name for subject, _ in subjects]
-    for k, (before, given) in enumerate(zip(own, name or words.names_of(shapes, own), strict=True)):
+    for k, (before, given) in enumerate(zip(own, name or user_messages.names_of(shapes, own), strict=True)):
         if name or given != before:
             labels[k] = labels[k].replace(before, given) if len(labels) > len(shapes) else given
     width, height = meshmatch.picture(made, output, look=look, names=labels if names else [""] * len(labels))
@@ -259,7 +259,7 @@ def _compose_fit(
     config = meshmatch.FitConfig(seed=shown.seed, up=look.up, front=look.front)
     with console.progress() as report:
         found = meshmatch.register(shape, model=fit, config=config, progress=report)
-    console.say(f"fitted the template of {fit} to {shape.name}: {words.describe_fit(found)}")
+    console.say(f"fitted the template of {fit} to {shape.name}: {user_messages.describe_fit(found)}")
     fitted = meshmatch.Shape(found.points_in_file, found.faces, f"{fit} on {shape.name}")
     return compose_fit(shape, fitted, found.frame.turn, shown.range)
 

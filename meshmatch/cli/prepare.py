@@ -8,7 +8,7 @@ from typing import Literal
 from typer import Argument, Option
 
 from meshmatch.cli.options import Json, Quiet, Seed, grouped, optional, output_option
-from meshmatch.cli.words import Console, print_json
+from meshmatch.cli.user_messages import Console, print_json
 from meshmatch.errors import MeshmatchError
 from meshmatch.progress import ProgressCallback
 

@@ -5,9 +5,9 @@ from pathlib import Path
 from typer import Argument, Option
 
 import meshmatch
-from meshmatch.cli import options, words
+from meshmatch.cli import options, user_messages
 from meshmatch.cli.options import check_outputs, optional, output_option
-from meshmatch.cli.words import Console, print_json
+from meshmatch.cli.user_messages import Console, print_json
 
 _NAMES = ("asymmetry", "displacement_x", "displacement_y", "displacement_z")
 
@@ -51,7 +51,7 @@ def symmetry(
         config = meshmatch.FitConfig(seed=seed)
         with console.progress() as report:
             found = meshmatch.find_symmetry(loaded, config=config, threads=threads, progress=report)
-        words.raise_if_poor(strict, found.map.verdict, found.map.reasons, "the map")
+        user_messages.raise_if_poor(strict, found.map.verdict, found.map.reasons, "the map")
         meshmatch.save_map(temporary[0], found.map)
         if values is not None:
             numbers = np.column_stack([found.along_normal, found.displacement])
@@ -61,12 +61,12 @@ def symmetry(
     normal = " ".join(f"{each:.4g}" for each in found.normal)
     console.say(f"plane of symmetry: x . ({normal}) = {found.offset:.4g}")
     console.say(f"asymmetry along the normal: mean {apart.mean():.4g}, 95 % {np.quantile(apart, 0.95):.4g}")
-    words.report_verdict(console, found.map.verdict, found.map.reasons, "the map")
+    user_messages.report_verdict(console, found.map.verdict, found.map.reasons, "the map")
     console.say(f"wrote {output}: what lies across from the {loaded.V} vertices of {name} ({found.seconds:.1f} s)")
     if values is not None:
         console.say(f"wrote {values}: its asymmetry")
     if json:
         record = {"output": output, "values": values, "normal": found.normal.tolist(), "offset": found.offset}
         record |= {"asymmetry": {"mean": float(apart.mean()), "95 %": float(np.quantile(apart, 0.95))}}
-        record |= words.map_record(found.map, [name, name])
+        record |= user_messages.map_record(found.map, [name, name])
         print_json(record | {"notes": list(found.notes), "seconds": round(found.seconds, 3)})

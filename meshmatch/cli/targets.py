@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
 from typer import Argument, Option
 
 from meshmatch.cli.options import check_outputs, check_writable
-from meshmatch.cli.words import Console, Json, print_json
+from meshmatch.cli.user_messages import Console, Json, print_json
 from meshmatch.collections.endings import USUAL
 from meshmatch.errors import InputError, OptionError
 from meshmatch.models.registry import check_model

@@ -25,7 +25,7 @@ from meshmatch.cli.options import (
     optional,
     output_option,
 )
-from meshmatch.cli.words import Console, print_json
+from meshmatch.cli.user_messages import Console, print_json
 from meshmatch.errors import InputError, OptionError, needs
 from meshmatch.models.card import ModelCard
 from meshmatch.models.registry import NO_MODEL, read_any_card

@@ -10,7 +10,7 @@ import meshmatch
 from meshmatch.cli.options import RuleOptions, RunOptions, grouped, optional, output_option
 from meshmatch.cli.targets import Gather, to_targets
 from meshmatch.cli.transfer_options import MapOptions, MapOptionsWithPairs, Picture, Source, Target, Transfer
-from meshmatch.cli.words import Json
+from meshmatch.cli.user_messages import Json
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import replace_on_success
 

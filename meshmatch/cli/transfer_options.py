@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 from typer import Argument, Option
 
 import meshmatch
-from meshmatch.cli import words
+from meshmatch.cli import user_messages
 from meshmatch.cli.options import PAIRS_HELP, PairOptions, RunOptions, check_outputs
-from meshmatch.cli.words import Console, Json
+from meshmatch.cli.user_messages import Console, Json
 from meshmatch.models.registry import check_model
 from meshmatch.outputs import replace_all_on_success
 
@@ -71,7 +71,7 @@ class Transfer:
 
     def __post_init__(self) -> None:
         self.console = Console(self.run.quiet)
-        self.names = words.names_of([self.source, self.target])
+        self.names = user_messages.names_of([self.source, self.target])
 
     @contextmanager
     def outputs(self, *read: Path | None, files: Sequence[Path] | None = None) -> Iterator[list[Path]]:
@@ -114,16 +114,16 @@ class Transfer:
         else:
             maps = meshmatch.find_maps(source, target, self.options.map or matched)
         found = maps.forward
-        words.raise_if_poor(self.run.strict, found.verdict, found.reasons, "the map")
+        user_messages.raise_if_poor(self.run.strict, found.verdict, found.reasons, "the map")
         a, b = self.names
         if maps.match is None and self.options.map is None:
             self.console.say(f"{a} and {b} have the same faces: each vertex goes to the one of its number")
         elif maps.match is None:
             self.console.say(f"used the map {self.options.map} from {a} to {b}")
         else:
-            words.report_match(self.console, maps.match, (a, b))
+            user_messages.report_match(self.console, maps.match, (a, b))
             self.console.say(f"matched {a} to {b} ({maps.match.seconds:.1f} s)")
-        words.report_verdict(self.console, found.verdict, found.reasons, "the map")
+        user_messages.report_verdict(self.console, found.verdict, found.reasons, "the map")
         return maps
 
     def tell_low(self, low: LowConfidence, minimum: float, what: str = "vertices") -> Json:
@@ -154,9 +154,9 @@ class Transfer:
 
     def record(self, own: Json, maps: MapPair, confidence: float) -> Json:
         """For --json: what was done, and by which map."""
-        record: Json = {"output": self.output} | own | words.map_record(maps.forward, self.names)
+        record: Json = {"output": self.output} | own | user_messages.map_record(maps.forward, self.names)
         record["map"] = self.options.map
-        record["confidence_mean"] = words.number_or_none(confidence)
+        record["confidence_mean"] = user_messages.json_number(confidence)
         if maps.match is not None:
             record |= self.options.record(maps.match.source_fit) | {
                 "notes": list(maps.match.notes),

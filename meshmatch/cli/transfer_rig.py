@@ -10,7 +10,7 @@ import meshmatch
 from meshmatch.cli.options import RunOptions, grouped, output_option
 from meshmatch.cli.targets import to_targets
 from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, Transfer
-from meshmatch.cli.words import Json
+from meshmatch.cli.user_messages import Json
 
 _NAMED = 8  # joints or clips that a note lists
 

@@ -10,7 +10,7 @@ import meshmatch
 from meshmatch.cli.options import RuleOptions, RunOptions, grouped, optional, output_option
 from meshmatch.cli.targets import to_targets
 from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, Transfer
-from meshmatch.cli.words import Console, Json
+from meshmatch.cli.user_messages import Console, Json
 from meshmatch.errors import OptionError
 
 _COLORS = (".ply", ".off")

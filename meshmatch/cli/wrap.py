@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 from typer import Argument
 
 import meshmatch
-from meshmatch.cli import words
+from meshmatch.cli import user_messages
 from meshmatch.cli.match import surfaces_apart
 from meshmatch.cli.options import PairOptions, RunOptions, check_outputs, grouped, optional, output_option
 from meshmatch.cli.transfer_options import Picture
-from meshmatch.cli.words import Console, print_json
+from meshmatch.cli.user_messages import Console, print_json
 from meshmatch.models.registry import check_model
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def wrap(
     how.check()
     check_mesh_suffix(output)
     how.refuse(["model"] if how.implicit else [], "wrap", "choose another model, or none")
-    console, names = Console(run.quiet), words.names_of([base, scan])
+    console, names = Console(run.quiet), user_messages.names_of([base, scan])
     check_outputs([base, scan, how.known_pairs, free], output, picture=picture)
     plan = MovedFile.planned(output, base)
     check_outputs([base, scan, how.known_pairs, free], *plan.files, picture=picture)
@@ -68,11 +68,11 @@ def wrap(
                 progress=report,
             )  # fmt: skip
         found = result.match.map
-        words.raise_if_poor(run.strict, found.verdict, found.reasons, "the map")
+        user_messages.raise_if_poor(run.strict, found.verdict, found.reasons, "the map")
         binding = move_skeleton(base, result.shape, b.upright)
         plan.write(temporary, result.shape, result.turns, binding, result.turn)
-    words.report_match(console, result.match, names)
-    words.report_verdict(console, found.verdict, found.reasons, "the map")
+    user_messages.report_match(console, result.match, names)
+    user_messages.report_verdict(console, found.verdict, found.reasons, "the map")
     apart = result.distance[~result.free & a.valid]
     numbers = {"mean": apart.mean(), "95 %": np.quantile(apart, 0.95), "worst": apart.max()} if len(apart) else {}
     told = ", ".join(f"{what} {value:.4g}" for what, value in numbers.items())
@@ -96,7 +96,7 @@ def wrap(
         record = {"output": output, "files": [str(file) for file in plan.files], "picture": picture, "vertices": a.V}
         record |= {"free": int(result.free.sum()), "distance": surfaces.as_dict()}
         record["vertices_to_surface"] = {key: float(each) for key, each in numbers.items()}
-        record |= words.map_record(found, names) | how.record(result.match.source_fit)
+        record |= user_messages.map_record(found, names) | how.record(result.match.source_fit)
         print_json(
             record | {"notes": list(result.match.notes), "seconds": round(result.match.seconds + result.seconds, 3)}
         )

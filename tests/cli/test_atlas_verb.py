@@ -86,7 +86,7 @@ def test_a_model_is_explained(run: Run, shapes: Path, tmp_path: Path) -> None:
     assert "kind: 2 categories (a 4, b 4), compared with a" in answer.err
     shutil.rmtree(output)
     answer = run(*words, "--model", "form ~ age", "--json", "-q")
-    assert "egg-0: left out of the model, for its age is missing" in answer.err
+    assert "egg-0: left out of the model, as its age is missing" in answer.err
     told = json.loads(answer.out)["model"]
     assert (told["formula"], told["shapes"], told["permutations"]) == ("form ~ age", 7, 100)
     assert told["left_out"] == {"egg-0": "age"}

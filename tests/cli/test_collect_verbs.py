@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from meshmatch.cli.collect import _tell_lengths
-from meshmatch.cli.words import Console
+from meshmatch.cli.user_messages import Console
 from meshmatch.collections.collection import Collection
 from meshmatch.collections.export import Export, Fits, export
 from meshmatch.collections.setting import Record
@@ -88,7 +88,7 @@ def test_lengths_have_one_unit_or_none_is_told(capsys: pytest.CaptureFixture[str
 def test_copies_of_one_file_are_told(capsys: pytest.CaptureFixture[str]) -> None:
     a = Record("a", "a.ply", "good", distance=0.2, furthest=3.0, scale=90.0, digest="1")
     _tell_lengths(Console(False), [a, replace(a, name="other", digest="2"), replace(a, name="again")], "none")
-    assert "warning: a and again are copies of one file: an atlas counts it as often" in capsys.readouterr().err
+    assert "warning: a and again are copies of one file: an atlas counts each of them" in capsys.readouterr().err
     _tell_lengths(Console(False), [a, replace(a, name="b", digest="2")], "none")
     assert "warning" not in capsys.readouterr().err
 

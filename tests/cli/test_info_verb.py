@@ -171,7 +171,7 @@ def test_a_fit_and_a_model(run: Run, tmp_path: Path) -> None:
     found = record(run, tmp_path / "egg")
     assert (found["kind"], found["name"], found["category"]) == ("model", "egg", "eggs")
     done = run("info", tmp_path / "egg" / "weights.safetensors")
-    assert done.status == 1 and "holds the weights of a model" in done.err
+    assert done.status == 1 and "contains the weights of a model" in done.err
     assert record(run, tmp_path / "egg" / "template.safetensors")["kind"] == "template"
 
 

@@ -11,7 +11,7 @@ import torch
 
 import meshmatch
 from meshmatch.cli.train import TrainOptions, _calibrate, _forecast
-from meshmatch.cli.words import Console
+from meshmatch.cli.user_messages import Console
 from meshmatch.generators.generator import Generator
 from meshmatch.generators.kinds import GENERATORS
 from meshmatch.models.card import ModelCard, read_card, write_card

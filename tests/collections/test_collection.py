@@ -390,7 +390,7 @@ def test_poor_fits_are_left_out_of_an_atlas(
     shutil.copy(folder / "fits" / "dancer.safetensors", folder / "fits" / "again.safetensors")
     output = tmp_path / "atlas"
     assert main(["atlas", str(folder), "-o", str(output), "-q", "--scale", "remove"]) == 0
-    assert capsys.readouterr().err == "warning: turned: left out, for its fit is poor\n"
+    assert capsys.readouterr().err == "warning: turned: left out, as its fit is poor\n"
     assert meshmatch.Atlas.load(output).names == ("again", "climber", "dancer")
     assert main(["atlas", str(tmp_path / "gone"), "-o", str(tmp_path / "b"), "-q"]) == 1
 
@@ -538,7 +538,7 @@ def test_every_file_of_a_folder_has_a_row(tmp_path: Path, capsys: pytest.Capture
     command = ["fit", str(scans), "-o", str(fits), "--model", "human", "--refine", "none", "--alone", "--jobs", "1"]
     assert main(command) == 0
     err = capsys.readouterr().err
-    assert f"not taken, for they are no shapes: README, more/notes.docx, points.npy, stack.tif; see {fits}" in err
+    assert f"ignored, as they are not shapes: README, more/notes.docx, points.npy, stack.tif; see {fits}" in err
     assert "wrote 2 fits" in err and "failed" not in err
     with (fits / "fits.csv").open(newline="") as table:
         rows = {row["name"]: (row["verdict"], row["reasons"]) for row in csv.DictReader(table)}
@@ -551,7 +551,7 @@ def test_every_file_of_a_folder_has_a_row(tmp_path: Path, capsys: pytest.Capture
         (scans / f"{number}.png").write_bytes(b"no shape")
     assert main(command) == 0
     err = capsys.readouterr().err
-    assert "they are no shapes: 3 .png, 1 without a suffix, 1 .docx, 1 .npy, 1 .tif; see" in err
+    assert "they are not shapes: 3 .png, 1 without a suffix, 1 .docx, 1 .npy, 1 .tif; see" in err
     _, left_out = find_sources([f"{scans}/*.[pt]*"])
     assert sorted(Path(each.file).name for each in left_out) == ["0.png", "1.png", "2.png", "stack.tif"]
 

@@ -112,8 +112,8 @@ def _terminal() -> rich.console.Console:
     return Terminal(stderr=True)  # a new one each time, since stderr may have been redirected
 
 
-def number_or_none(value: float) -> float | None:
-    """The number for JSON; None for nan."""
+def json_number(value: float) -> float | None:
+    """The number, or None for nan, which JSON does not have."""
     return None if math.isnan(value) else float(value)
 
 
