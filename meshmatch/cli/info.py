@@ -38,7 +38,8 @@ def info(
 ) -> None:
     """Describe a file: a shape, a map or a template.
 
-    For a shape, also lists its parts and what the repair before fitting would change. Nothing is written.
+    Accepts all files that meshmatch reads or writes. For a shape, also lists its parts and what the repair before fitting
+    would change. Nothing is written.
     """
     from meshmatch.maps import MAP_SUFFIXES
 

@@ -19,7 +19,7 @@ _Source = Annotated[
     Path,
     Argument(
         metavar="SRC",
-        help="Shape with the landmarks that measurements are defined by; or the word body: a person that comes with "
+        help="Shape with the landmarks that define the measurements; or the word body: an included person with its own "
         "landmarks and measurements.",
     ),
 ]
@@ -35,7 +35,7 @@ def _check_table(table: Path) -> None:
 
 
 def _table(table: Path, given: Mapping[str, Any], source: str, written: Mapping[str, Path]) -> str:
-    """Write the measurements of SRC, unless it is the body, and all targets as one table."""
+    """Write the measurements of all targets, and of SRC unless it is the included body, as one table."""
     import numpy as np
 
     from meshmatch.api.measure import is_body, own_points
@@ -71,15 +71,15 @@ def measure(
     *,
     source: _Source,
     target: _Target,
-    output: Path = output_option("FILE", "The measurements of TGT: .csv, or .json, which also has the lines measured."),
+    output: Path = output_option("FILE", "The measurements of TGT: .csv, or .json, which also has the measured lines."),
     measurements: Path | None = optional(
         "FILE",
-        "What is measured: a .csv with a row each, name,kind,landmark,landmark,... The kinds are distance (along straight "
-        "lines from landmark to landmark), girth (around what the first lies on, perpendicular to the line from the second "
-        "to the third) and angle (at the second of three, in degrees). Default of body: its own.",
+        "The measurements: a .csv with a row for each, name,kind,landmark,landmark,... The kinds are distance (along "
+        "straight lines through the landmarks), girth (around the part that the first landmark is on, perpendicular to the "
+        "line from the second to the third) and angle (at the second of three, in degrees). Default for body: its own.",
     ),
     landmarks: Path | None = optional(
-        "FILE", "Landmarks of SRC, in any format of `transfer-landmarks`. Default of body: its own."
+        "FILE", "Landmarks of SRC, in any format of `transfer-landmarks`. Default for body: its own."
     ),
     maps: MapOptionsWithPairs,
     run: RunOptions,
@@ -87,16 +87,16 @@ def measure(
         0.3,
         min=0.0,
         max=1.0,
-        help="A length or an angle is missing where a landmark is below this confidence, a girth where a quarter of it is.",
+        help="A distance or an angle is missing if a landmark is below this confidence, a girth if a quarter of it is.",
     ),
-    table: Path | None = optional("FILE", "With several targets, also one table of them all: .csv."),
+    table: Path | None = optional("FILE", "With several targets, also write one table of all: .csv."),
     picture: Picture = None,
 ) -> Json:
     """Measure a shape: girths, lengths, angles.
 
-    Each measurement is defined by landmarks of SRC, and taken where these lie on TGT, in the unit of its file. A girth is
-    as long as a tape around it: it does not follow hollows. `meshmatch measure body scan.ply -o scan.csv` takes 30 of a
-    person in any pose.
+    Each measurement is defined by landmarks of SRC, which are transferred to TGT, and is in the unit of TGT's file. A girth
+    is measured like with a tape: it does not follow hollows. `meshmatch measure body scan.ply -o scan.csv` takes 30
+    measurements of a person in any pose.
     """
     import numpy as np
 
@@ -114,15 +114,15 @@ def measure(
         found = result.data
         result.writer(temporary, output)
     console.say(_ROW.format("measurement", "value", "confidence"))
-    for name, value, sure in zip(found.names, found.values, found.confidence, strict=True):
-        told = "missing" if np.isnan(value) else f"{value:.4g}"
-        console.say(_ROW.format(name, told, "unknown" if np.isnan(sure) else f"{sure:.2f}"))
+    for name, value, confidence in zip(found.names, found.values, found.confidence, strict=True):
+        text = "missing" if np.isnan(value) else f"{value:.4g}"
+        console.say(_ROW.format(name, text, "unknown" if np.isnan(confidence) else f"{confidence:.2f}"))
     lost = int(np.isnan(found.values).sum())
     if lost:
-        why = "the map is not trusted there, or tears a girth"
+        why = "the confidence is too low there, or the map is discontinuous along a girth"
         console.warn(f"{transfer.names[1]}: {lost} of {len(found.names)} measurements are missing: {why}")
-    told = "in the unit of its file; angles in degrees" if "angle" in found.kinds else "in the unit of its file"
-    console.say(f"wrote {output}: {len(found.names) - lost} measurements of {transfer.names[1]}, {told}")
+    text = "in the unit of its file; angles in degrees" if "angle" in found.kinds else "in the unit of its file"
+    console.say(f"wrote {output}: {len(found.names) - lost} measurements of {transfer.names[1]}, {text}")
     if picture is not None:
         from meshmatch.render.compose import compose_lines
 

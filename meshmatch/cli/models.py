@@ -1,4 +1,4 @@
-"""``meshmatch models``: the trained models that are at hand."""
+"""``meshmatch models``: list and manage the trained models."""
 
 import re
 from json import loads
@@ -36,20 +36,20 @@ def list_all(json: options.Json = False) -> None:
         return
     rows = [("NAME", "CATEGORY", "CREATED", "FROM", "LICENCE", "LEARNED FROM")]
     for entry in entries:
-        where = "package" if entry.built_in else "own"
+        origin = "package" if entry.built_in else "own"
         card = entry.card
         if card is None:
-            rows.append((entry.name, "", "", where, "damaged", ""))
+            rows.append((entry.name, "", "", origin, "damaged", ""))
         else:
-            rows.append((entry.name, card.category, card.created, where, card.licence, _in_short(card.data)))
+            rows.append((entry.name, card.category, card.created, origin, card.licence, _shorten(card.data)))
     print_rows(rows)
     for entry in entries:
         if entry.problem:
             Console().warn(f"model {entry.name}: {entry.problem}")
 
 
-def _in_short(data: str) -> str:
-    """The first words of what a model learned from, without what stands in brackets."""
+def _shorten(data: str) -> str:
+    """Shorten the description of training data, without text in parentheses."""
     return shorten(re.sub(r" \([^)]*\)", "", data), 64, placeholder=" ...")
 
 
@@ -57,7 +57,7 @@ def _in_short(data: str) -> str:
 def show(name: Name, json: options.Json = False) -> None:
     """Show a model's card as JSON.
 
-    It names template, data, licence, recipe, time, errors and hashes. With --json it is on one line.
+    The card lists template, data, licence, recipe, training time, errors and hashes. With --json it is on one line.
     """
     card = card_to_json(registry.read_any_card(registry.locate_model(name)))
     if json:
@@ -74,7 +74,7 @@ def add(
 ) -> None:
     """Copy a model into your registry.
 
-    It is checked first, and gets the name on its card.
+    The model is checked first. Its name in the registry is the one on its card.
     """
     entry = registry.add_model(folder, replace=replace)
     Console().say(f"added model {entry.name} to {entry.folder.parent}")
@@ -94,7 +94,7 @@ def remove(name: Name, json: options.Json = False) -> None:
 @models.command()
 def verify(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME]...", help="Models to check; all if none is named.")
+        list[str] | None, typer.Argument(metavar="[NAME]...", help="Models to check. Default: all.")
     ] = None,
     json: options.Json = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""``meshmatch picture`` and ``meshmatch view``: pictures of what is known about shapes, and the page of a map."""
+"""``meshmatch picture`` and ``meshmatch view``: pictures of shapes, maps and values, and the interactive page of a map."""
 
 import re
 from dataclasses import dataclass
@@ -21,35 +21,37 @@ if TYPE_CHECKING:
     from meshmatch.templates.template import Template
 
 Subject: TypeAlias = "tuple[meshmatch.Shape | Template, Appearance | None]"
-"""What was named, with its textures or colors if it has any."""
+"""A shape or template to draw, with its textures or colors if it has any."""
 
 
 @dataclass(frozen=True)
 class PictureOptions:
-    """What is shown."""
+    """Options that select what is drawn."""
 
     map: Path | None = options.optional(
         "MAP",
-        "Map between two shapes, SOURCE TARGET, or a folder with the fits of both that `meshmatch fit` wrote: corresponding "
-        "points in the same color.",
+        "Draw corresponding points of two shapes, SOURCE TARGET, in the same color, by this map from the first to the "
+        "second, or by a folder of `meshmatch fit` with the fits of both.",
     )
-    confidence: bool = Option(False, "--confidence", help="With --map: show its confidence as a color map.")
+    confidence: bool = Option(
+        False, "--confidence", help="With --map: draw the confidence of the map with a color scale."
+    )
     truth: options.Truth = None
     points: options.Points = None
     unit: options.ErrorUnit = "auto"
     values: list[Path] | None = options.optional(
         "FILE",
-        "A number per vertex, shown as a color map (.npy or .csv), or three, shown as a color. Once for each shape.",
+        "Draw one number per vertex (.npy or .csv) with a color scale, or three as a color. Give it once for each shape.",
     )
-    title: str | None = options.optional("TEXT", "Title of the color scale: what --values are, with their unit.")
+    title: str | None = options.optional("TEXT", "Title of the color scale: the quantity of --values, with its unit.")
     range: tuple[float, float] | None = options.optional(
         "LOW HIGH", "Ends of the color scale. Default: chosen from the values."
     )
     labels: list[Path] | None = options.optional(
-        "FILE", "A label for each vertex or face (.npy, .csv, .txt or .json). Once for each shape."
+        "FILE", "Draw a label per vertex or face (.npy, .csv, .txt or .json). Give it once for each shape."
     )
     on: Literal["vertices", "faces"] | None = Option(
-        None, help="Whether the labels are of vertices or faces. Default: decided by their number."
+        None, help="Whether --labels belong to vertices or faces. Default: decided by their number."
     )
     fit: str | None = options.optional(
         "MESH|MODEL",
@@ -62,12 +64,12 @@ class PictureOptions:
 
     @property
     def files(self) -> list[Path | None]:
-        """All that is read beside the shapes."""
+        """All input files other than the shapes."""
         lists = [*(self.values or []), *(self.labels or []), *(self.points or ())]
         return [self.map, self.image, self.truth, None if self.fit is None else Path(self.fit), *lists]
 
     def check(self, count: int) -> None:
-        """Refuse what does not go together, for so many shapes (`OptionError`)."""
+        """Raise `OptionError` if options contradict each other, or the number of shapes."""
         known = options.check_truth(self.truth, self.points)
         each = {"--values": self.values, "--labels": self.labels}
         single = {"--fit": self.fit, "--image": self.image}
@@ -78,8 +80,8 @@ class PictureOptions:
         if self.map is not None and count != 2:
             raise OptionError(f"a map is of two shapes, not of {count}", "name the source, then the target")
         if self.map is None and (self.confidence or known):
-            who = "--confidence needs" if self.confidence else "--truth and --points need"
-            raise OptionError(f"{who} a map", "add --map")
+            what = "--confidence needs" if self.confidence else "--truth and --points need"
+            raise OptionError(f"{what} a map", "add --map")
         if self.confidence and known:
             raise OptionError("--confidence and the truth both color the shapes", "make a picture for each")
         for name, files in each.items():
@@ -100,17 +102,19 @@ class PictureOptions:
 
 @dataclass(frozen=True)
 class LookOptions:
-    """How it is shown."""
+    """Options of the view and the canvas."""
 
     view: Literal["quarter", "front", "left", "right", "back", "above"] = Option("quarter", help="Direction of view.")
-    up: options.Axis | None = Option(None, help="Axis of the files that points up. Default: detected.")
-    front: options.Axis | None = Option(None, help="Axis of the files that the shapes face. Default: detected.")
+    up: options.Axis | None = Option(None, help="Axis that points up in the files. Default: detected.")
+    front: options.Axis | None = Option(None, help="Axis that the shapes face in the files. Default: detected.")
     size: str | None = options.optional("WxH", "Width and height in pixels, such as 1200x800. Default: chosen to fit.")
-    background: str = Option("white", metavar="COLOR", help="white, dark, transparent, or a color such as #e8f0f8.")
+    background: str = Option(
+        "white", metavar="COLOR", help="Background: white, dark, transparent, or a color such as #e8f0f8."
+    )
     ground: bool = Option(True, "--ground/--no-ground", help="Draw shadows.")
 
     def look(self) -> "Look":
-        """The same for the library."""
+        """The look for the library."""
         from meshmatch.render.picture import VIEWS, Look
 
         options.check_axes(self.up, self.front)
@@ -131,19 +135,23 @@ def picture(
     shapes: list[Path] = Argument(
         ...,
         metavar="SHAPE...",
-        help="Shapes, side by side. A template bundle, or the name of a template or model, is drawn with its nodes.",
+        help="Shapes to draw side by side. A template, given as a file or by the name of a template or model, is drawn with "
+        "its nodes.",
     ),
     output: Path = options.output_option("PNG", "The picture."),
     shown: PictureOptions,
     how: LookOptions,
-    name: list[str] | None = options.optional("TEXT", "Caption of a shape, once for each. Default: the file's name."),
+    name: list[str] | None = options.optional(
+        "TEXT", "Caption of a shape; give it once for each shape. Default: the file's name."
+    ),
     names: bool = Option(True, "--names/--no-names", help="Draw the captions."),
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Draw shapes, maps and values on shapes.
 
-    Writes a PNG; no GPU, display or OpenGL is needed. Textures and colors of the files are shown where there are any.
+    Writes a PNG; no GPU, display or OpenGL is needed. Shapes with textures or colors are drawn with them, unless an option
+    selects something else.
     """
     shown.check(len(shapes))
     if name and len(name) != len(shapes):
@@ -167,7 +175,7 @@ def picture(
 
 
 def _load_subject(path: Path, shown: PictureOptions) -> Subject:
-    """Read a shape, or a template by its file or name, or that of a model."""
+    """Load a shape, or a template by its file, its name or the name of a model."""
     from meshmatch.api.pictures import read_look
 
     if (template := _template(path)) is not None:
@@ -195,15 +203,15 @@ def _template(path: Path) -> "Template | None":
     try:
         return load_template(locate_model(str(path)) / TEMPLATE)
     except ModelError:
-        return None  # a missing shape is told as such
+        return None  # then reported as a missing shape
 
 
 def _compose(shown: PictureOptions, subjects: list[Subject], look: "Look", console: Console) -> "Composition":
-    """Read what the options name, and compose the picture of it."""
+    """Read the files that the options name, and compose the picture."""
     from meshmatch.api.pictures import composed
     from meshmatch.render.compose import compose_shapes
 
-    shapes: list[Any] = [getattr(each, "shape", each) for each, _ in subjects]  # of a template its own
+    shapes: list[Any] = [getattr(each, "shape", each) for each, _ in subjects]  # the shapes of templates
     if shown.map is not None:
         return _compose_map(shown, shown.map, shapes, look)
     if shown.fit is not None:
@@ -247,7 +255,7 @@ def _compose_map(shown: PictureOptions, file: Path, shapes: "list[meshmatch.Shap
 def _compose_fit(
     shown: PictureOptions, fit: str, shape: "meshmatch.Shape", look: "Look", console: Console
 ) -> "Composition":
-    """The template over a shape, from the file of a fit or by a model, which is fitted now."""
+    """Compose a fitted template over a shape: read from a file, or fitted now by a model."""
     from meshmatch.render.compose import compose_fit
     from meshmatch.shapes.files import SUFFIXES
     from meshmatch.shapes.input_files import suffix_of
@@ -275,8 +283,9 @@ def view(
 ) -> None:
     """Write an interactive page of two shapes and a map.
 
-    Corresponding points have the same color; point at one shape to see the place on the other. The page is a single
-    file for any recent browser and needs no network. With --map, --up and --front give the orientation of SOURCE.
+    Corresponding points have the same color; point at one shape to see the corresponding point on the other. The page is
+    a single file for any recent browser and needs no network. With --map, --up and --front set the orientation of SOURCE
+    on the page.
     """
     from meshmatch.render.viewer.assembly import check_page
 

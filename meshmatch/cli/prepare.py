@@ -1,4 +1,4 @@
-"""``meshmatch prepare``: a template, and shapes made ready to learn from."""
+"""``meshmatch prepare``: prepare shapes and a template for training."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from meshmatch.progress import ProgressCallback
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """How shapes are made ready."""
+    """Options of the template and of the shapes."""
 
     template: str | None = optional(
         "SHAPE",
-        "The shape that becomes the template: a name in the folder, or any mesh or cloud. Default: the folder's "
-        "first if all are registered, otherwise the one closest to all others, or the mean of those that stand as it does.",
+        "The shape that becomes the template: a name in the folder, or any mesh or cloud. Default: the first shape if all "
+        "are registered, otherwise the shape closest to all others, or the mean of those in the same pose.",
     )
     align: Literal["none", "near", "rigid"] | None = Option(
         None,
@@ -29,16 +29,16 @@ class PrepareOptions:
         "hundred registered ones or more, otherwise rigid.",
     )
     scale: Literal["area", "sphere"] = Option(
-        "area", help="What is scaled to the template's: surface area, or the radius around the centroid."
+        "area", help="Scale shapes to the template's surface area, or to its radius around the centroid (sphere)."
     )
     mirror: Literal["auto", "no"] = Option(
         "auto",
-        help="Whether to find and mirror shapes that are mirror images of the others, such as left hands among right "
-        "ones; the model then tries both sides. Registered shapes are never mirrored.",
+        help="auto: find and mirror shapes that are mirror images of the others, such as left hands among right ones; the "
+        "model then tries both sides. Registered shapes are never mirrored.",
     )
     landmarks: str | None = optional(
         "WHERE",
-        "Known points of the shapes: a folder of NAME.npy, or the suffix of files beside the shapes, such as "
+        "Known points of the shapes: a folder with NAME.npy files, or the suffix of files next to the shapes, such as "
         ".landmarks.npy or .fcsv (docs/formats.md).",
     )
     strategy: Literal["parts", "spectral", "geodesic", "uniform"] = Option(
@@ -54,13 +54,13 @@ class PrepareOptions:
     grow_radii: bool = Option(
         False,
         "--grow-radii",
-        help="Where vertices are within reach of too few nodes, enlarge the radii of the nodes around them. Default: "
-        "add nodes, or use a milder strategy.",
+        help="If vertices are within reach of too few nodes, enlarge the radii of the nodes around them. Default: add "
+        "nodes, or use a milder strategy.",
     )
     faces: int = Option(10_000, min=100, help="Number of triangles after decimation.")
     decimate: Literal["fast", "meshlab"] = Option(
         "fast",
-        help="How shapes are decimated: fast, or by MeshLab, which is slower and gives better triangles (extra "
+        help="How shapes are decimated: fast, or by MeshLab, which is slower and gives better triangles (needs the extra "
         "`meshlab`).",
     )
     seed: Seed = 0
@@ -69,7 +69,7 @@ class PrepareOptions:
 @grouped
 def prepare(
     *,
-    shapes: Path = Argument(..., metavar="SHAPES", help="A folder of shapes, or the one shape of a template."),
+    shapes: Path = Argument(..., metavar="SHAPES", help="A folder of shapes, or a single shape to make a template of."),
     output: Path = output_option("FOLDER", "The output folder; made if needed."),
     how: PrepareOptions,
     json: Json = False,
@@ -103,7 +103,7 @@ def prepare(
     notes = [*made.notes]
     if found and not registered and not (quiet and not json):
         with console.progress() as progress:
-            notes += _kinds(made.names, output / "normalised", shapes, how.seed, progress)
+            notes += _kind_notes(made.names, output / "normalised", shapes, how.seed, progress)
     console.say(*notes)
     console.say(
         f"wrote {output}: a template of {template.shape.V} vertices and {template.K} nodes"
@@ -118,8 +118,10 @@ def prepare(
         print_json(record | found | {"notes": notes})
 
 
-def _kinds(names: Sequence[str], normalised: Path, folder: Path, seed: int, progress: ProgressCallback) -> list[str]:
-    """What is to be said of the kinds of the shapes that were made ready; nothing of this stops `prepare`."""
+def _kind_notes(
+    names: Sequence[str], normalised: Path, folder: Path, seed: int, progress: ProgressCallback
+) -> list[str]:
+    """Notes on the kinds of the prepared shapes; errors become notes, too."""
     from meshmatch.api.kinds import kind_notes, kinds_of
 
     places = {name: [normalised / f"{stem}.ply" for stem in (name, Path(name).stem)] for name in names}

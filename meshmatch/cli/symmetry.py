@@ -16,12 +16,12 @@ def symmetry(
     *,
     shape: Path = Argument(..., metavar="SHAPE", help="A mesh that is nearly symmetric, such as a head."),
     output: Path = output_option(
-        "MAP", "From SHAPE to itself; its suffix chooses the format: .npy, .npz, .csv, .txt, .mat or .json."
+        "MAP", "The map from SHAPE to itself; its suffix chooses the format: .npy, .npz, .csv, .txt, .mat or .json."
     ),
     values: Path | None = optional(
         "FILE",
-        "The asymmetry of each vertex, positive where a place lies further out than its counterpart, and the displacement "
-        "from the mirror image of that: .vtp or .vtk for ParaView and 3D Slicer, .ply, .csv or .npy.",
+        "The asymmetry of each vertex: its displacement from the mirror image of its counterpart, and the component along "
+        "the normal, positive if the vertex lies farther out. .vtp or .vtk for ParaView and 3D Slicer, .ply, .csv or .npy.",
     ),
     strict: bool = Option(False, "--strict", help="Write nothing and exit with status 1 if the map is poor."),
     threads: options.Threads = 2,
@@ -29,11 +29,11 @@ def symmetry(
     quiet: options.Quiet = False,
     json: options.Json = False,
 ) -> None:
-    """Find what lies across from each vertex of a shape.
+    """Find the mirror counterpart of each vertex of a shape.
 
-    The shape is matched to its own mirror image: index[i] of the map is the vertex that lies across from vertex i. The plane
-    in which both are nearest, and how much they differ, are printed in the unit of the file. Of a collection:
-    `meshmatch atlas --symmetry`.
+    The shape is matched to its own mirror image: index[i] of the map is the vertex on the other side that corresponds to
+    vertex i. Prints the plane of symmetry and the asymmetry, in the unit of the file. For the asymmetry of a collection,
+    see `meshmatch atlas --symmetry`.
     """
     import numpy as np
 
@@ -62,7 +62,7 @@ def symmetry(
     console.say(f"plane of symmetry: x . ({normal}) = {found.offset:.4g}")
     console.say(f"asymmetry along the normal: mean {apart.mean():.4g}, 95 % {np.quantile(apart, 0.95):.4g}")
     user_messages.report_verdict(console, found.map.verdict, found.map.reasons, "the map")
-    console.say(f"wrote {output}: what lies across from the {loaded.V} vertices of {name} ({found.seconds:.1f} s)")
+    console.say(f"wrote {output}: mirror counterparts of the {loaded.V} vertices of {name} ({found.seconds:.1f} s)")
     if values is not None:
         console.say(f"wrote {values}: its asymmetry")
     if json:

@@ -1,4 +1,4 @@
-"""One transfer to several targets: files, a folder of shapes, or a folder of fits; what is finished is kept."""
+"""Run a transfer to several targets: files, a folder of shapes, or a folder of fits; finished outputs are kept."""
 
 from __future__ import annotations
 
@@ -25,33 +25,34 @@ Verb = Callable[..., Json]
 
 
 class Gather(NamedTuple):
-    """How one table of all targets is written."""
+    """How one table with the results of all targets is written."""
 
     check: Callable[[Path], object]
-    """Refuses a path that cannot be such a table (`OptionError`)."""
+    """Checks the path of the table (`OptionError`)."""
     write: Callable[[Path, Mapping[str, Any], str, Mapping[str, Path]], str]
-    """From its path, the verb's arguments, the source's name and the outputs by name; says what was written."""
+    """Writes the table, given its path, the command's arguments, the source's name and the outputs by name; returns a
+    message on what was written."""
 
 
 _ROW = "{:<28} {:<8} {:>10} {:>8}"
-_NAMED = 5  # targets that the last line lists
+_MAX_LISTED = 5  # failed targets in the last message
 _SEVERAL = (
-    "Or several: files, patterns in quotes, a folder of shapes, or a folder of fits, whose maps are used; the output is a "
-    "folder then."
+    "Several are possible: files, quoted patterns, a folder of shapes, or a folder of fits, whose maps are used. The output "
+    "is then a folder."
 )
 
 
 def to_targets(transfer: str, gather: Gather | None = None) -> Callable[[Verb], Callable[..., None]]:
-    """Let a verb of one target, which returns its record for --json, take several.
+    """Let a command for one target, which returns its record for --json, accept several targets.
 
-    ``transfer`` is the function of `meshmatch` that it calls; ``gather`` is how the table is written that its option
-    ``table`` names.
+    ``transfer`` is the name of the function of `meshmatch` that the command calls; ``gather`` writes the table of its option
+    ``table``.
     """
 
     def wrapped(verb: Verb) -> Callable[..., None]:
         @wraps(verb)
         def called(*, target: list[Path], ending: str | None, **rest: Any) -> None:
-            if _several(target):
+            if _is_several(target):
                 _transfer_all(verb, transfer, target, ending, rest, gather)
                 return
             if ending is not None:
@@ -64,8 +65,8 @@ def to_targets(transfer: str, gather: Gather | None = None) -> Callable[[Verb], 
 
         found = USUAL[transfer]
         usual = f"{found.suffix}{', or as TGT' if found.own else ''}" if found.suffix else "as GARMENT"
-        words = f"With several targets, the suffix of each output. Default: {usual}."
-        format_ = Option(None, "--format", metavar="SUFFIX", help=words)
+        help_text = f"With several targets, the suffix of each output. Default: {usual}."
+        format_ = Option(None, "--format", metavar="SUFFIX", help=help_text)
         parameters = dict(inspect.signature(verb).parameters)
         hints = get_type_hints(verb, include_extras=True)
         one = hints["target"].__metadata__[0]
@@ -79,7 +80,7 @@ def to_targets(transfer: str, gather: Gather | None = None) -> Callable[[Verb], 
     return wrapped
 
 
-def _several(target: Sequence[Path]) -> bool:
+def _is_several(target: Sequence[Path]) -> bool:
     one = target[0]
     return len(target) > 1 or one.is_dir() or (not one.exists() and any(mark in str(one) for mark in "*?["))
 
@@ -87,7 +88,7 @@ def _several(target: Sequence[Path]) -> bool:
 def _transfer_all(
     verb: Verb, transfer: str, target: Sequence[Path], ending: str | None, rest: dict[str, Any], gather: Gather | None
 ) -> None:
-    """Transfer to each target, say a row for each, and fail in the end if one failed."""
+    """Transfer to each target and print a row for each; raise in the end if a transfer failed."""
     from meshmatch.collections.endings import ending_of
     from meshmatch.collections.setting import FAILED
     from meshmatch.collections.transfer_table import transfer_each
@@ -118,82 +119,89 @@ def _transfer_all(
     how = {name: value for name, value in rest.items() if name not in ("run", "output", "picture")}
     records: dict[str, Json] = {}
     warned: set[str] = set()
-    headed = False
+    has_header = False
 
-    def drawn(name: str) -> Path | None:
+    def picture_of(name: str) -> Path | None:
         return None if picture is None else picture / f"{name}.png"
 
-    def made(name: str, file: Path, path: Path) -> tuple[str, float | None]:
-        record = verb(**rest | {"target": file, "output": path, "picture": drawn(name)})
+    def transfer_one(name: str, file: Path, path: Path) -> tuple[str, float | None]:
+        record = verb(**rest | {"target": file, "output": path, "picture": picture_of(name)})
         records[name] = record
         return record["verdict"], record["confidence_mean"]
 
-    def tell(record: TransferRecord) -> None:
-        nonlocal headed
-        if not headed:
+    def report(record: TransferRecord) -> None:
+        nonlocal has_header
+        if not has_header:
             console.say(_ROW.format("target", "verdict", "confidence", "seconds"))
-            headed = True
+            has_header = True
         *_, confidence, seconds, _, _ = record.row()
         last = "kept" if record.kept else seconds
         console.say(_ROW.format(record.name, record.verdict, confidence, last).rstrip())
-        if record.error and record.error not in warned:  # what is wrong with the source is wrong for each target
+        if record.error and record.error not in warned:  # an error of the source repeats for each target
             warned.add(record.error)
             console.warn(f"{record.name}: {record.error}")
 
-    rows = transfer_each(found.files, output, endings, (verb.__name__, how, run.strict), made, tell, drawn)
+    rows = transfer_each(
+        found.files, output, endings, (verb.__name__, how, run.strict), transfer_one, report, picture_of
+    )
     written = {row.name: Path(row.output) for row in rows if row.verdict != FAILED}
     if gather is not None and table is not None and written:
         console.say(gather.write(table, rest, found.source, written))
-    told = [{"name": row.name, "file": row.file} | records.get(row.name, _record(row)) for row in rows]
-    _tell(console, output, rows, told, run.json)
+    results = [{"name": row.name, "file": row.file} | records.get(row.name, _record(row)) for row in rows]
+    _report_all(console, output, rows, results, run.json)
 
 
 def _record(row: TransferRecord) -> Json:
-    """For --json, of a target that nothing was done for."""
+    """The record for --json of a target that was kept or failed."""
     if row.kept:
         return {"output": row.output, "verdict": row.verdict, "kept": True}
     return {"verdict": row.verdict, "error": row.error}
 
 
-def _tell(console: Console, output: Path, rows: Sequence[TransferRecord], records: list[Json], json: bool) -> None:
+def _report_all(
+    console: Console, output: Path, rows: Sequence[TransferRecord], records: list[Json], json: bool
+) -> None:
+    """Print the summary of all transfers; raise `InputError` if one failed."""
     from meshmatch.collections.setting import FAILED
     from meshmatch.collections.transfer_table import TABLE
 
     counts = Counter(row.verdict for row in rows)
-    told = ", ".join(f"{counts[verdict]} {verdict}" for verdict in sorted(counts))
+    verdicts = ", ".join(f"{counts[verdict]} {verdict}" for verdict in sorted(counts))
     done = len(rows) - counts[FAILED]
-    console.say(f"{done} of {len(rows)} targets are in {output}: {told}; see {output / TABLE}")
+    console.say(f"{done} of {len(rows)} targets are in {output}: {verdicts}; see {output / TABLE}")
     if json:
         print_json({"output": output, "table": output / TABLE, "verdicts": counts, "targets": records})
     if counts[FAILED]:
         failed = [row for row in rows if row.verdict == FAILED]
-        names = ", ".join([row.name for row in failed[:_NAMED]] + (["..."] if len(failed) > _NAMED else []))
+        names = ", ".join([row.name for row in failed[:_MAX_LISTED]] + (["..."] if len(failed) > _MAX_LISTED else []))
         reasons = {row.error for row in failed}
         names += f", all for one reason: {reasons.pop()}" if len(reasons) < min(len(failed), 2) else ""
-        hint = "warnings above say why; the same command goes on with what is missing"
+        hint = "the warnings above say why; the same command continues with the missing ones"
         raise InputError(f"{len(failed)} of {len(rows)} targets failed: {names}", hint)
 
 
 def _check_table(table: Path, source: str, files: Mapping[str, Path], rest: Mapping[str, Any]) -> None:
-    """Refuse a table of all that could not be written afterwards (`OptionError`, `OutputError`)."""
+    """Check before the transfers that the table can be written (`OptionError`, `OutputError`)."""
     if source in files:
         problem = f"the source and a target are both called {source}"
-        raise OptionError(problem, "rename one: a table has specimens by name")
+        raise OptionError(problem, "rename one: the table lists specimens by name")
     check_outputs([*files.values(), rest["source"], rest["landmarks"], rest.get("measurements")], table)
     check_writable(table)
 
 
 def _check_folders(output: Path, picture: Path | None) -> None:
-    """Refuse files where folders are needed (`OptionError`)."""
+    """Raise `OptionError` if the output or picture is named like a file, where a folder is needed."""
     from meshmatch.shapes.files import SUFFIXES
 
     for path, what in ((output, "the output"), (picture, "the picture")):
         if path is not None and path.suffix.lower() in (*SUFFIXES, ".npz", ".csv", ".txt", ".json", ".png"):
-            raise OptionError(f"of several targets {what} is a folder, not {path.name}", "give a name without a suffix")
+            raise OptionError(
+                f"for several targets {what} is a folder, not {path.name}", "give a name without a suffix"
+            )
 
 
 def _changed(options: Any, **changes: Any) -> Any:
-    """A group of options with others; which were given stays known."""
+    """Copy a group of options with changes, keeping the record of which were given."""
     new = replace(options, **changes)
     object.__setattr__(new, "given", options.given)
     return new

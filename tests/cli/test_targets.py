@@ -164,8 +164,8 @@ def test_lists_patterns_and_pictures(run: Run, files: Path, stub: FakeMatching) 
 
 
 WRONG = [
-    ((*LABELS[:-1], "out.npy"), "of several targets the output is a folder, not out.npy"),
-    ((*LABELS, "--picture", "p.png"), "of several targets the picture is a folder, not p.png"),
+    ((*LABELS[:-1], "out.npy"), "for several targets the output is a folder, not out.npy"),
+    ((*LABELS, "--picture", "p.png"), "for several targets the picture is a folder, not p.png"),
     ((*LABELS[:-1], "taken"), "taken/transfers.csv is no table of transfers"),
     ((*LABELS[:2], "empty", *LABELS[3:]), "there are no shapes in empty"),
     ((*LABELS[:2], "in/b.ply", *LABELS[3:-1], "out.npy", "--format", "txt"), "--format is for several targets"),
