@@ -1,4 +1,4 @@
-"""``meshmatch train``: a model that is learned from shapes."""
+"""``meshmatch train``: train a model from shapes."""
 
 import math
 import os
@@ -41,10 +41,10 @@ if TYPE_CHECKING:
     from meshmatch.training.loop import StepReport
     from meshmatch.training.recipes import Recipe
 
-_FALLS = 0.99  # of the validation before
-_APART = 0.9  # of the steps: no later error is compared with the last
-_LOOKED = 10.0  # seconds of training after which its length is told
-_CODE_STEP = 0.06  # of a training step: a step of the search for a code, of a pointwise model
+_FALLING = 0.99  # the validation error is still falling if it is below this factor of an earlier one,
+_MAX_EARLIER = 0.9  # which was measured at this share of the steps at the latest
+_FORECAST_AFTER = 10.0  # seconds of training after which its duration is estimated
+_CODE_STEP = 0.06  # cost of a step of the latent code search of a pointwise model, in training steps
 _ENERGIES = ("volume", "arap", "blend")
 _IMPLICIT = (
     *("implicit", "preset", "shapes", "field", "rate", *_ENERGIES, "name", "category", "licence", "steps"),
@@ -54,41 +54,40 @@ _IMPLICIT = (
 
 @dataclass(frozen=True)
 class TrainOptions(Options):
-    """What is learned, and how."""
+    """Options of the training."""
 
     template: str | None = optional(
         "NAME",
-        "An included template (human-T, human-A, human-I, human-T-300), or a template file. Default: human-T; with the "
-        "preset paper human-T-300, which has the paper's 300 nodes.",
+        "An included template (human-T, human-A, human-I, human-T-300), or a template file. Default: human-T; with "
+        "--preset paper human-T-300, which has the paper's 300 nodes.",
     )
     shapes: Path | None = optional(
         "FOLDER",
-        "Learn from a folder that `meshmatch prepare` wrote, with its template; or, given a folder that `meshmatch "
-        "fit` wrote, continue training its model on the fits that are not poor. Default: generated shapes of a "
-        "--kind.",
+        "Train on a folder that `meshmatch prepare` wrote, with its template; or, given a folder that `meshmatch fit` "
+        "wrote, continue training its model on the fits that are not poor. Default: generated shapes of --kind.",
     )
     kind: Literal["human", "quadruped", "hand", "head"] | None = Option(
         None,
-        help="Learn from generated people, four-legged animals, right hands or heads (needs the extra `train`). "
+        help="Train on generated people, four-legged animals, right hands or heads (needs the extra `train`). "
         "Default: human.",
     )
     implicit: bool = Option(
         False,
         "--implicit",
-        help="Learn the signed distances of a folder of watertight meshes, clouds or .npz samples that share an "
-        "orientation, such as chairs, for `match` and `interpolate` (needs the extra `implicit`). --field: mls or "
+        help="Train an implicit model for `match` and `interpolate`: signed distances of a folder of watertight meshes, "
+        "clouds or .npz samples that share an orientation, such as chairs (needs the extra `implicit`). --field: mls or "
         "pointwise.",
     )
     unsupervised: bool = Option(False, "--unsupervised", help="Ignore the correspondence of registered shapes.")
     preset: Literal["default", "paper"] = Option(
         "default",
-        help="Training settings: the ones that measured best, or the paper's (with --implicit DIF-Net's, "
+        help="Training settings. default: the best in our measurements; paper: the paper's (with --implicit, DIF-Net's, "
         "for either --field).",
     )
     recipe: Path | None = optional(
         "FILE",
-        "Train as another model was: the card.json in its folder, or a part of one. Other options change single "
-        "settings of it; minutes, threads and device are not taken from it.",
+        "Use the settings of another model: the card.json in its folder, or a part of one. Other options override single "
+        "settings; minutes, threads and device are not taken from it.",
     )
     field: Literal["mls", "rbf", "pointwise"] | None = Option(
         None,
@@ -110,18 +109,18 @@ class TrainOptions(Options):
         None,
         metavar="WEIGHT",
         min=0.0,
-        help="Weight of both losses at blends of two latent codes (lambda_4 in the paper); 1 for models that "
-        "interpolate by codes. Default: the preset's.",
+        help="Weight of both losses at blends of two latent codes (lambda_4 in the paper); 1 for models that are used "
+        "with `interpolate --blend codes`. Default: the preset's.",
     )
     stiffness: float = Option(
         1.0,
         min=1e-6,
-        help="How firmly jointly refined fits keep a common stretch of the template; stored on the card. 1 suits "
+        help="How strongly jointly refined fits are kept at a common stretch of the template; stored on the card. 1 suits "
         "bodies; 0.05 suits shapes that differ more, such as organs.",
     )
     name: str | None = optional("NAME", "The model's name; default: the folder's.")
     category: str | None = optional(
-        "NAME", "The category it matches; default: the kind, or for a folder the model's name."
+        "NAME", "The category of shapes that the model matches; default: --kind, or with --shapes the model's name."
     )
     licence: str = Option("unstated", help="Terms of use of the weights; stored on the card.")
     steps: int | None = Option(None, min=1, help="Training steps; default: the preset's.")
@@ -133,54 +132,58 @@ class TrainOptions(Options):
     bodies: int | None = Option(
         None,
         min=0,
-        help="Number of bodies that are drawn once and reused; 0 (default) draws new ones throughout. "
-        "Preset paper: 1,000.",
+        help="Number of bodies that are generated once and reused; 0 generates new ones throughout. Default: 0; with "
+        "--preset paper 1,000.",
     )
     characters: float | None = Option(
         None,
         min=0.0,
         max=1.0,
         metavar="SHARE",
-        help="Share of bodies that wear clothes, are children, stylised or built of parts; most others are naked "
-        "adults. Default: 0.5; with the preset paper 0.",
+        help="Share of bodies that wear clothes, are children, stylised or made of parts; most others are naked "
+        "adults. Default: 0.5; with --preset paper 0.",
     )
     stylised: float | None = Option(
         None,
         min=0.0,
         max=1.0,
         metavar="SHARE",
-        help="Share of the --characters that have the proportions of cartoons. Default: 0.15.",
+        help="Share of the --characters with cartoon proportions. Default: 0.15.",
     )
     poses: Path | None = optional("FILE", "Poses to mix with the sampled ones: .npz, .json or .csv (docs/formats.md).")
-    pose_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies that stand in a pose of --poses.")
+    pose_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies with a pose from --poses.")
     mhr: Path | None = optional(
         "FOLDER",
         "Mix in bodies of Meta's Momentum Human Rig, whose shapes were learned from scans: lod3.fbx and compact_v6_1.model "
         "of its releases (github.com/facebookresearch/MHR).",
     )
-    mhr_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies that are of --mhr.")
+    mhr_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies from --mhr.")
     bf16: bool | None = Option(None, "--bf16/--no-bf16", help="bfloat16 arithmetic; default: the preset's choice.")
     tf32: bool | None = Option(
         None,
         "--tf32/--no-tf32",
-        help="Products with TensorFloat-32, on GPUs that have it; default: the preset's choice.",
+        help="TensorFloat-32 matrix products, on GPUs that support them; default: the preset's choice.",
     )
     compile: bool | None = Option(
-        None, "--compile/--no-compile", help="Compile the loss by torch, which takes a minute or two. Default: no."
+        None, "--compile/--no-compile", help="Compile the loss with torch, which takes a minute or two. Default: no."
     )
     device: Literal["auto", "cpu", "cuda", "mps"] = Option(
-        "auto", help="Where the network is trained. auto: a GPU of CUDA if there is one, else the CPU."
+        "auto", help="Where the network is trained. auto: a CUDA GPU if there is one, else the CPU."
     )
     draw: Literal["auto", "cpu", "device"] = Option(
-        "auto", help="Where batches are drawn: by --workers on the CPU, or on the device. auto: on a GPU of CUDA."
+        "auto",
+        help="Where training batches are generated: by --workers on the CPU, or on the --device. auto: on the device if it "
+        "is a CUDA GPU, else on the CPU.",
     )
-    workers: int | None = Option(None, min=0, help="Processes that draw batches on the CPU; default: the preset's.")
+    workers: int | None = Option(
+        None, min=0, help="Number of processes that generate batches on the CPU; default: the preset's."
+    )
     threads: Threads = 1
     seed: Seed = 0
     validate: Path | None = optional(
         "FOLDER",
-        "Measure on the registered shapes of another folder that `meshmatch prepare` wrote with the same template. "
-        "Default: on more of what is learned.",
+        "Measure the validation error on the registered shapes of another folder that `meshmatch prepare` wrote with the "
+        "same template. Default: on further shapes of the training's own kind.",
     )
     tensorboard: bool = Option(
         False, "--tensorboard", help="Also write curves for TensorBoard (needs the extra `tensorboard`)."
@@ -211,26 +214,26 @@ def train(
         from meshmatch.render.charts import check_chart
 
         check_chart(how.picture)
-        if how.picture.resolve().parent != output.resolve():  # which is not made yet
+        if how.picture.resolve().parent != output.resolve():  # that folder does not exist yet
             check_writable(how.picture)
-    first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs one speaks
+    first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs, only one prints
     console = Console(quiet or not first)
-    steps, learn, then = (_implicit if how.implicit else _by_template)(output, how, console)
+    steps, learn, then = (_plan_implicit if how.implicit else _plan_explicit)(output, how, console)
     if not how.fresh and (output / CHECKPOINT).is_file():
-        console.say(f"going on from the checkpoint in {output}; --fresh starts anew")
+        console.say(f"continuing from the checkpoint in {output}; --fresh starts again")
     reports: list[StepReport] = []
 
     def report(now: "StepReport") -> None:
         reports.append(now)
         if len(reports) == 1 or now.validation is not None or now.step == now.steps:
-            console.say(f"{now.words} ({now.seconds:.0f} s{_left(reports)})")
+            console.say(f"{now.words} ({now.seconds:.0f} s{_time_left(reports)})")
 
     with console.progress() as progress:
         try:
             learn(resume=not how.fresh, progress=_forecast(console, progress, steps, how, then), report=report)
         except KeyboardInterrupt:
             if (output / CHECKPOINT).is_file():
-                console.say("stopped; the same command goes on from the checkpoint")
+                console.say("stopped; the same command continues from the checkpoint")
             raise
         if first and how.shapes is not None and then is not None:
             _calibrate(console, output, how.shapes, how.threads, progress)
@@ -243,32 +246,32 @@ def train(
 def _forecast(
     console: Console, progress: ProgressCallback, steps: int, how: TrainOptions, then: "Recipe | None"
 ) -> ProgressCallback:
-    """The same progress, which tells after the first steps about how long the training takes, and what comes then."""
+    """Wrap the progress callback: after the first steps, print how long the training and the calibration will take."""
     from meshmatch.api.calibration import DEFAULT_COUNT, SEARCH_STEPS, list_shapes
     from meshmatch.fields.shape_functions import has_nodes
 
     began: tuple[float, float] | None = None
-    told = False
+    is_printed = False
 
     def report(stage: str, name: str, share: float) -> None:
-        nonlocal began, told
+        nonlocal began, is_printed
         progress(stage, name, share)
-        if told or name != "training" or not stage.startswith("step"):
+        if is_printed or name != "training" or not stage.startswith("step"):
             return
         now = time.monotonic()
         if began is None:  # the first step waits for its batch
             began = now, share
-        elif now - began[0] >= _LOOKED and share > began[1]:
+        elif now - began[0] >= _FORECAST_AFTER and share > began[1]:
             each = (now - began[0]) / (share - began[1]) / steps
             left = each * steps * (1 - share) / 60
-            words = [_about(left if how.minutes is None else min(left, how.minutes), "of training")]
+            durations = [_about(left if how.minutes is None else min(left, how.minutes), "of training")]
             if then is not None and how.shapes is not None:
                 fits = min(DEFAULT_COUNT, len(list_shapes(how.shapes)))
-                what = f"to fit {fits} of the shapes, which tells how far fits are to be trusted"
+                what = f"to calibrate the verdicts on fits of {fits} of the shapes"
                 pointwise = not has_nodes(then.network.field)
-                words.append(_about(each * fits * SEARCH_STEPS * _CODE_STEP / 60 if pointwise else 0, what))
-            console.say(", then ".join(words))
-            told = True
+                durations.append(_about(each * fits * SEARCH_STEPS * _CODE_STEP / 60 if pointwise else 0, what))
+            console.say(", then ".join(durations))
+            is_printed = True
 
     return report
 
@@ -278,42 +281,46 @@ def _about(minutes: float, what: str) -> str:
 
 
 def _calibrate(console: Console, output: Path, shapes: Path, threads: int, progress: ProgressCallback) -> None:
-    """Find what is usual of fits by a model that learned no correspondence."""
-    console.say("fitting some of the shapes, which tells how far fits by this model are to be trusted")
+    """Calibrate the verdicts of a model that was trained without correspondence."""
+    console.say("fitting some of the shapes, to calibrate the verdicts of the model")
     began = time.monotonic()
 
     def counted(stage: str, name: str, share: float) -> None:
         progress(stage, name, share)
         left = (time.monotonic() - began) * (1 - share) / share / 60 if stage == "shapes" else 0
         if left >= 1:
-            console.say(f"fitted {name}{_left_words(left)}")
+            console.say(f"fitted {name}{_format_time_left(left)}")
 
     try:
         usual = meshmatch.calibrate(output, shapes, threads=threads, progress=counted).metrics["usual"]
     except InputError as error:
-        console.say(f"note: what is usual of its fits is not known, and none will be good: {error.message}")
+        console.say(f"note: the model is not calibrated, and none of its fits will be good: {error.message}")
         return
     console.say(
-        f"fitted {usual['fits']} of the shapes: the template is stretched {math.exp(usual['stretch']):.2f}-fold, "
-        f"{100 * usual['residual']:.2g} % of sqrt(area) apart; other fits are judged beside that"
+        f"fitted {usual['fits']} of the shapes: the template is stretched {math.exp(usual['stretch']):.2f}-fold, and "
+        f"{100 * usual['residual']:.2g} % of sqrt(area) apart; other fits are judged relative to that"
     )
 
 
-def _left(reports: "list[StepReport]") -> str:
-    """Words for the time that the steps which are left will take, by those between the reports."""
+def _time_left(reports: "list[StepReport]") -> str:
+    """Text on the remaining training time, extrapolated from the reports; empty if it is unknown or over."""
     first, now = reports[0], reports[-1]
     if now.step in (first.step, now.steps):
         return ""
-    return _left_words((now.seconds - first.seconds) / (now.step - first.step) * (now.steps - now.step) / 60)
+    return _format_time_left((now.seconds - first.seconds) / (now.step - first.step) * (now.steps - now.step) / 60)
 
 
-def _left_words(minutes: float) -> str:
+def _format_time_left(minutes: float) -> str:
     return f", about {minutes:.0f} min left" if minutes >= 1 else ", less than a minute left"
 
 
-def _by_template(output: Path, how: TrainOptions, console: Console) -> "tuple[int, Callable[..., Any], Recipe | None]":
-    """The steps of a training that deforms a template of vertices, what runs it, and its recipe where the model must be
-    calibrated."""
+def _plan_explicit(
+    output: Path, how: TrainOptions, console: Console
+) -> "tuple[int, Callable[..., Any], Recipe | None]":
+    """Plan the training of an explicit model, with a template mesh.
+
+    Return the number of steps, the function that trains, and the recipe if the model has to be calibrated afterwards.
+    """
     from meshmatch.models.inference import training_device
     from meshmatch.training import train as training
     from meshmatch.training.recipes import going_on, recipe_for, small_data
@@ -337,7 +344,7 @@ def _by_template(output: Path, how: TrainOptions, console: Console) -> "tuple[in
         recipe = read_recipe(how.recipe, recipe, started=(start or how.start) is not None)
         changes = {name: value for name, value in changes.items() if name in (*how.given, "threads", "device", "draw")}
     recipe = recipe.changed(**changes)
-    training_device(wanted=recipe.train.device)  # before shapes are made
+    training_device(wanted=recipe.train.device)  # check it before shapes are generated
     facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, start or how.start)
     shapes, kind = fitted or how.shapes, _generated(how)
     learn = partial(training.train, output, shapes=shapes, kind=kind, recipe=recipe, facts=facts)
@@ -345,14 +352,14 @@ def _by_template(output: Path, how: TrainOptions, console: Console) -> "tuple[in
     return recipe.train.steps, partial(learn, validation=how.validate, tensorboard=how.tensorboard), then
 
 
-def _implicit(output: Path, how: TrainOptions, console: Console) -> tuple[int, Callable[..., Any], None]:
-    """The same of an implicit model."""
+def _plan_implicit(output: Path, how: TrainOptions, console: Console) -> tuple[int, Callable[..., Any], None]:
+    """Plan the training of an implicit model; results as in `_plan_explicit`."""
     how.refuse(sorted({each.name for each in fields(how)}.difference(_IMPLICIT)), "--implicit")
     if how.shapes is None or how.field == "rbf":
         raise OptionError("--implicit needs --shapes, and the field mls or pointwise", "give a folder of shapes")
     published = how.preset == "paper"
     field: Deformation = "mls" if how.field == "mls" or not (how.field or published) else "pointwise"
-    if field == "pointwise":  # DIF-Net's deformation: these are energies of the other
+    if field == "pointwise":  # DIF-Net's deformation; these energies belong to mls
         how.refuse(_ENERGIES, f"--implicit {'--field pointwise' if how.field else '--preset paper'}")
     with needs("torch", "implicit"):
         from meshmatch.implicit.network import ImplicitConfig
@@ -373,8 +380,9 @@ def _implicit(output: Path, how: TrainOptions, console: Console) -> tuple[int, C
 
 
 def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None, TrainedModel | None]":
-    """The shapes of a folder of fits and the model to go on with, which is that of the fits, if they are of one; none of any
-    other folder.
+    """The shapes of a folder of fits, and the model to continue training (None for fits without a model).
+
+    (None, None) if --shapes is not a folder of fits.
     """
     from meshmatch.collections.settle import is_collection
 
@@ -395,18 +403,19 @@ def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None
     if collection.model == NO_MODEL:
         if how.start is not None:
             hint = "fit the shapes with it first (`meshmatch fit ... --model`), and train on those fits"
-            raise OptionError(f"{how.shapes} holds fits without a model, and --start goes on with one", hint)
+            raise OptionError(f"{how.shapes} contains fits without a model, which --start cannot continue", hint)
         console.say(f"learning from {len(found.verts)} of {len(collection.names)} fits in {how.shapes}")
         return found, None
     start = as_model(how.start or collection.model)
     console.say(
-        f"going on with {start.card.name}, from {len(found.verts)} of {len(collection.names)} fits in {how.shapes}"
+        f"continuing the training of {start.card.name}, with {len(found.verts)} of {len(collection.names)} "
+        f"fits in {how.shapes}"
     )
     return found, start
 
 
 def _generated(how: TrainOptions) -> "Kind | Bodies | None":
-    """What is to be generated; nothing where a folder of shapes is learned, unless both are asked for."""
+    """The generated shapes to train on; None with --shapes, unless options of generated bodies are given too."""
     from meshmatch.generators.bodies import Bodies
     from meshmatch.generators.kinds import Kind
     from meshmatch.generators.pose_files import load_poses
@@ -429,7 +438,7 @@ def _generated(how: TrainOptions) -> "Kind | Bodies | None":
 
 
 def _draw(console: Console, picture: Path, reports: "list[StepReport]") -> None:
-    """The losses of a run."""
+    """Plot the losses of a run."""
     if not reports:
         console.say(f"{picture} was not drawn: the run ended before its first report")
         return
@@ -445,19 +454,22 @@ def _draw(console: Console, picture: Path, reports: "list[StepReport]") -> None:
 def _summary(
     console: Console, output: Path, steps: int, reports: "list[StepReport]", picture: Path | None, json: bool
 ) -> None:
+    """Print a summary of the trained model."""
     card = read_any_card(output)
     if isinstance(card, ModelCard) and (distance := card.metrics.get("validation", {}).get("distance")):
-        before = [now.validation for now in reports if now.validation is not None and now.step <= _APART * card.steps]
-        falls = f", {'still falling' if distance < _FALLS * before[-1] else 'no longer falling'}" if before else ""
-        on = card.recipe.get("validation") or "shapes that were not learned"
-        console.say(f"off by {100 * distance:.2g} % of sqrt(area) on {on}{falls}")
+        before = [
+            now.validation for now in reports if now.validation is not None and now.step <= _MAX_EARLIER * card.steps
+        ]
+        falls = f", {'still falling' if distance < _FALLING * before[-1] else 'no longer falling'}" if before else ""
+        on = card.recipe.get("validation") or "shapes that were not trained on"
+        console.say(f"validation error: {100 * distance:.2g} % of sqrt(area) on {on}{falls}")
     own = shlex.quote(str(output))
     console.say(
-        f"wrote model {card.name}, learned from {card.data}, to {output} after step {card.steps}; use it with "
+        f"wrote model {card.name}, trained on {card.data}, to {output} after step {card.steps}; use it with "
         f"--model {own}, or add it: meshmatch models add {own}"
     )
     if card.steps < steps:
-        console.say(f"unfinished: step {card.steps:,} of {steps:,}; the same command goes on")
+        console.say(f"unfinished: step {card.steps:,} of {steps:,}; the same command continues")
     if json:
         record = {"output": output, "picture": picture, "model": card.name, "steps": card.steps}
         found = {"metrics": card.metrics} if isinstance(card, ModelCard) else {"shapes": len(card.shapes)}

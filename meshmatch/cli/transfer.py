@@ -1,4 +1,4 @@
-"""The verbs that transfer what vertices, faces or points have: colors, labels, skin weights, landmarks."""
+"""Commands that transfer attributes: ``transfer-color``, ``-labels``, ``-weights`` and ``-landmarks``."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,26 +25,24 @@ def transfer_color(
     target: Target,
     output: Path = output_option(
         "FILE",
-        "TGT with colors (.ply, .glb, .vrm, .obj, .off, .vtp or .vtk), or colors alone (.npy or .csv). With --values: .npy "
-        "or .csv, or TGT with them (.ply, .vtp or .vtk).",
+        "TGT with colors (.ply, .glb, .vrm, .obj, .off, .vtp or .vtk), or colors alone (.npy or .csv). With --values: TGT "
+        "with the values (.ply, .vtp or .vtk), or values alone (.npy or .csv).",
     ),
     maps: MapOptions,
     rules: RuleOptions,
     run: RunOptions,
     values: Path | None = optional(
-        "FILE", "Transfer these numbers, a row per vertex of SRC (.npy, .csv, or a .vtp with arrays), not its colors."
+        "FILE", "Transfer these numbers instead of colors: a row per vertex of SRC (.npy, .csv, or a .vtp with arrays)."
     ),
     directions: bool = Option(
-        False,
-        "--directions",
-        help="The numbers of --values are directions, such as normals: turn them with the surface.",
+        False, "--directions", help="--values are directions, such as normals: rotate them with the surface."
     ),
     picture: Picture = None,
 ) -> Json:
     """Transfer vertex colors, or other numbers per vertex.
 
-    They are interpolated within the faces of SRC. The VALUE of --blank is a number, one number for each column
-    (1,0,0), or a color (#ff0000).
+    Values are interpolated within the faces of SRC. The VALUE of --blank is a number, one number per column (1,0,0), or a
+    color (#ff0000).
     """
     from meshmatch.shapes.dressed_files import tell_lost
     from meshmatch.transfer import value_files
@@ -67,7 +65,7 @@ def transfer_color(
             found = value_files.Values(result.data, given.names)
             tell_lost(target, output, value_files.save_values(temporary, found, result.maps.target, target))
     b = result.maps.target
-    low = transfer.tell_low(result.low, rule.minimum)
+    low = transfer.report_low(result.low, rule.minimum)
     what = "colors" if given is None else f"{columns} number{'s' if columns > 1 else ''} each"
     transfer.console.say(f"wrote {output}: {what} for the {b.V} vertices of {transfer.names[1]}")
     if picture is not None:
@@ -93,15 +91,15 @@ def transfer_labels(
     target: Target,
     output: Path = output_option("FILE", "Labels: .npy, .csv, .txt or .json, or TGT as .ply or .vtp."),
     labels: Path = Option(
-        ..., metavar="FILE", help="A whole number or a word per vertex or face of SRC: .npy, .csv, .txt or .json."
+        ..., metavar="FILE", help="An integer or a word per vertex or face of SRC: .npy, .csv, .txt or .json."
     ),
     maps: MapOptions,
     rules: RuleOptions,
     run: RunOptions,
     on: On | None = Option(
-        None, help="Whether FILE labels vertices or faces. Default: decided by the number of labels."
+        None, help="Whether --labels belong to vertices or faces. Default: decided by their number."
     ),
-    to: On | None = Option(None, help="Whether to label vertices or faces of TGT. Default: as in FILE."),
+    to: On | None = Option(None, help="Whether to label vertices or faces of TGT. Default: as in --labels."),
     picture: Picture = None,
 ) -> Json:
     """Transfer labels of vertices or faces.
@@ -122,7 +120,7 @@ def transfer_labels(
         result = meshmatch.transfer_labels(a, target, given, transfer, to=to, rule=rule)
         found = result.data
         result.writer(temporary, output)
-    low = transfer.tell_low(result.low, rule.minimum, found.on)
+    low = transfer.report_low(result.low, rule.minimum, found.on)
     used = len(np.unique(found.codes))
     transfer.console.say(
         f"wrote {output}: {used} different labels on the {len(found.codes)} {found.on} of {transfer.names[1]}"
@@ -131,9 +129,9 @@ def transfer_labels(
         from meshmatch.render.compose import compose_labels
 
         names = [str(name) for name in given.names]
-        theirs = np.where(found.codes < len(names), found.codes, -1)  # a blank comes after the names
+        codes = np.where(found.codes < len(names), found.codes, -1)  # the code of a blank follows those of the names
         faces = given.on == "faces", found.on == "faces"
-        transfer.draw(result.maps, compose_labels((a, result.maps.target), (given.codes, theirs), names, faces))
+        transfer.draw(result.maps, compose_labels((a, result.maps.target), (given.codes, codes), names, faces))
     record = {"picture": picture, "from": given.on, "to": found.on, "labels": used} | low
     return transfer.record(record, result.maps, float(result.maps.backward.confidence.mean()))
 
@@ -147,9 +145,7 @@ def transfer_weights(
     output: Path = output_option("FILE", "Skin weights of TGT: .npz or .json."),
     maps: MapOptions,
     run: RunOptions,
-    weights: Path | None = optional(
-        "FILE", "Skin weights of SRC: .npz, .json, .glb or .vrm. Default: the skin in SRC."
-    ),
+    weights: Path | None = optional("FILE", "Skin weights of SRC: .npz, .json, .glb or .vrm. Default: those in SRC."),
     influences: int = Option(4, min=1, help="Maximum number of joints per vertex."),
     fill: bool = Option(False, "--fill", help="Replace weights of low confidence by those of their neighbours."),
     min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Minimum confidence for weights to be trusted."),
@@ -157,7 +153,8 @@ def transfer_weights(
 ) -> Json:
     """Transfer skin weights.
 
-    They are interpolated within the faces of SRC; each vertex keeps its heaviest joints, and their weights sum to 1.
+    Weights are interpolated within the faces of SRC. Each vertex keeps the joints with the largest weights, which then sum
+    to 1.
     """
     import numpy as np
 
@@ -179,7 +176,7 @@ def transfer_weights(
         result = meshmatch.transfer_weights(a, b, given, transfer, influences=influences, rule=rule)
         matrix = result.data.matrix
         result.writer(temporary, output)
-    low = transfer.tell_low(result.low, min_confidence)
+    low = transfer.report_low(result.low, min_confidence)
     bare = int((np.diff(matrix.indptr) == 0).sum())
     if bare:
         transfer.console.warn(f"{bare} of the {b.V} vertices have no weights: no joint moves them on {a.name}")
@@ -221,8 +218,8 @@ def _landmark_table(table: Path, given: Mapping[str, Any], source: str, written:
         warn(units)
     lost = {name: int(np.isnan(points).any(axis=1).sum()) for name, points in specimens.items()}
     missing = ", ".join(f"{count} of {name}" for name, count in lost.items() if count)
-    told = f"wrote {table}: {len(own.names)} landmarks of {len(specimens)} specimens, {source} among them"
-    return told + (f"; missing are {missing}" if missing else "")
+    message = f"wrote {table}: {len(own.names)} landmarks of {len(specimens)} specimens, {source} included"
+    return message + (f"; missing are {missing}" if missing else "")
 
 
 @grouped
@@ -236,24 +233,25 @@ def transfer_landmarks(
         ...,
         "--landmarks",
         metavar="FILE",
-        help="Landmarks of SRC, as vertices or positions: .csv, .txt, .npy or .json, MeshLab's .pp, 3D Slicer's .fcsv and "
-        ".mrk.json, Amira's .landmarkAscii, .pts, .tps, or Morphologika's .txt.",
+        help="Landmarks of SRC, as vertices or positions: .csv, .txt, .npy, .json, .pts, .tps, MeshLab's .pp, 3D Slicer's "
+        ".fcsv and .mrk.json, Amira's .landmarkAscii, or Morphologika's .txt.",
     ),
     maps: MapOptionsWithPairs,
     run: RunOptions,
     min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Landmarks below this confidence are missing on TGT."),
     table: Path | None = optional(
         "FILE",
-        "With several targets, also one table of all specimens, SRC among them: .csv, .tps, Morphologika's .txt, or .npz.",
+        "With several targets, also write one table of all specimens, including SRC: .csv, .tps, Morphologika's .txt, or "
+        ".npz.",
     ),
     picture: Picture = None,
 ) -> Json:
     """Transfer landmarks to points of another surface.
 
-    For each landmark, .csv and .json files have its vertex, position, face with barycentric weights, and confidence;
-    .pp, .fcsv and .mrk.json files its name and position, .tps files positions alone. A position in FILE stands for the
-    nearest point of SRC. Landmarks below --min-confidence, as on a part that TGT lacks, are named in a warning, and missing
-    in the files: NA in .tps. --min-confidence 0 keeps them all.
+    Positions in --landmarks are moved to the nearest point of SRC. For each landmark, .csv and .json files contain its
+    vertex, position, face with barycentric weights, and confidence; .pp, .fcsv and .mrk.json files its name and position;
+    .tps files its position. Landmarks below --min-confidence, for example on a part that TGT lacks, are listed in a warning
+    and missing in the output (NA in .tps). --min-confidence 0 keeps all of them.
     """
     import numpy as np
 
@@ -271,9 +269,9 @@ def transfer_landmarks(
         result.writer(temporary, output)
     low = np.flatnonzero(found.missing)
     if len(low):
-        told = [f"{found.names[k]} ({found.confidence[k]:.2f})" for k in low[:10].tolist()]
+        first_ones = [f"{found.names[k]} ({found.confidence[k]:.2f})" for k in low[:10].tolist()]
         more = f" and {len(low) - 10} more" if len(low) > 10 else ""
-        listed = f"{', '.join(told)}{more}"
+        listed = f"{', '.join(first_ones)}{more}"
         console.warn(f"{transfer.names[1]}: missing are landmarks of confidence below {min_confidence:g}: {listed}")
     console.say(f"wrote {output}: {len(found.names) - len(low)} landmarks on {transfer.names[1]}")
     if picture is not None:

@@ -15,26 +15,26 @@ from meshmatch.cli.user_messages import Json
 @to_targets("transfer_garment")
 def transfer_garment(
     *,
-    garment: Path = Argument(..., metavar="GARMENT", help="Mesh that sits on SRC: clothes, hair, a hat, shoes."),
+    garment: Path = Argument(..., metavar="GARMENT", help="Mesh that SRC wears: clothes, hair, a hat, shoes."),
     source: Source,
     target: Target,
     output: Path = output_option(
         "FILE",
-        "GARMENT on TGT. An .obj from an .obj, or a .glb from a .glb, keeps everything but the positions; materials "
-        "and images of an .obj are copied beside it. Other formats keep less, and say what is lost.",
+        "GARMENT on TGT. An .obj written from an .obj, or a .glb from a .glb, keeps everything but the positions; materials "
+        "and images of an .obj are copied next to it. Other formats keep less; a warning lists what is lost.",
     ),
     maps: MapOptions,
     run: RunOptions,
     join: bool = Option(
-        False, "--join", help="Write TGT, a .glb, .gltf or .vrm, with GARMENT in it, as one .glb or .vrm."
+        False, "--join", help="Write TGT (a .glb, .gltf or .vrm) and GARMENT together, as one .glb or .vrm."
     ),
     picture: Picture = None,
 ) -> Json:
-    """Transfer clothes, hair or other things that are worn.
+    """Transfer clothes, hair or other worn meshes.
 
-    GARMENT must lie on SRC, in its place and unit. Its vertices follow SRC to TGT, with their distance from the skin
-    turned and scaled as the body is there, and are pushed out where they would sink below the skin of TGT. Vertex
-    order, polygons, texture coordinates, groups and materials stay. In a .glb GARMENT moves with the skeleton of TGT.
+    GARMENT must be in place on SRC, in the same frame and unit. Its vertices follow SRC to TGT and keep their offsets from
+    the skin, rotated and scaled as the body is there; vertices that would sink below the skin of TGT are pushed out. Vertex
+    order, polygons, texture coordinates, groups and materials are kept. In a .glb, GARMENT moves with the skeleton of TGT.
     """
     from meshmatch.shapes.moved_files import MovedFile
 
@@ -50,7 +50,7 @@ def transfer_garment(
     a, b = result.maps.source, result.maps.target
     if not result.sits:
         where = f"{100 * result.below:.0f} % of it lies below the skin and {100 * result.far:.0f} % far from it"
-        console.warn(f"{garment.name} seems not to sit on {transfer.names[0]}, in this pose: {where}")
+        console.warn(f"{garment.name} seems not to fit {transfer.names[0]} in this pose: {where}")
     if b.is_cloud:
         console.say(f"note: {transfer.names[1]} is a point cloud: nothing was pushed out of it")
     elif len(result.pushed):

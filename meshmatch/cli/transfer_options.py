@@ -1,4 +1,4 @@
-"""What the verbs share that take something from one shape to another: the map, the picture, the words."""
+"""Shared parts of the transfer commands: options of the map, outputs, pictures, messages and records."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Picture = Annotated[Path | None, Option(metavar="PNG", help="Draw both shapes wi
 
 @dataclass(frozen=True)
 class MapOptions(PairOptions):
-    """A map from a file, or how the shapes are matched."""
+    """Options of the map: its file, or how the shapes are matched."""
 
     for_matching: ClassVar[tuple[str, ...]] = (
         *("up", "front", "source_up", "source_front", "target_up", "target_front"),
@@ -39,28 +39,28 @@ class MapOptions(PairOptions):
         None,
         "--map",
         metavar="MAP",
-        help="Map from the first shape to the second, as `meshmatch match` writes it, or a folder with the fits of "
-        "both that `meshmatch fit` wrote. Default: match them now.",
+        help="Use this map from the first shape to the second, as `meshmatch match` writes it, or a folder of `meshmatch "
+        "fit` with the fits of both. Default: match the shapes.",
     )
 
 
 @dataclass(frozen=True)
 class MapOptionsWithPairs(MapOptions):
-    """The same for a verb whose --landmarks are what it transfers."""
+    """The same, for commands whose --landmarks are the data to transfer."""
 
     known_pairs: Path | None = Option(None, "--pairs", metavar="FILE", help=PAIRS_HELP)
 
 
 @dataclass(frozen=True)
 class ViewMapOptions(MapOptions):
-    """The same for the viewer, where the axes also say how a shape stands."""
+    """The same for the viewer, where the axes also set the orientation on the page."""
 
     for_matching = MapOptions.for_matching[2:]
 
 
 @dataclass
 class Transfer:
-    """One transfer between two files: calling it with the loaded shapes finds the maps and says so."""
+    """One transfer between two files; calling it with the loaded shapes finds the maps and reports on them."""
 
     source: Path
     target: Path
@@ -75,9 +75,9 @@ class Transfer:
 
     @contextmanager
     def outputs(self, *read: Path | None, files: Sequence[Path] | None = None) -> Iterator[list[Path]]:
-        """Temporary paths that become the output, or its ``files``, when all went well.
+        """Yield temporary paths that become the output, or its ``files``, if the block succeeds.
 
-        What cannot be written, and options that do not go together, are told before the work; ``read`` are other inputs.
+        Outputs that cannot be written and contradicting options are reported before the work; ``read`` are other inputs.
         """
         from meshmatch.shapes.formats.gltf_vrm import check_character
 
@@ -90,26 +90,26 @@ class Transfer:
         check_outputs([self.source, self.target, self.options.map, *read], *files, picture=self.picture)
         with replace_all_on_success(files) as temporary:
             if self.options.map is None:
-                check_model(self.options.model)  # a mistyped name is told before the long work
+                check_model(self.options.model)  # an unknown model is reported before the long computation
             yield temporary
 
     @property
-    def _asks_for_a_match(self) -> bool:
-        """Whether an option was given that only a match can follow."""
+    def _has_matching_options(self) -> bool:
+        """Whether an option was given that requires matching the shapes."""
         return any(name in self.options.given for name in self.options.for_matching)
 
     def __call__(self, source: meshmatch.Shape, target: meshmatch.Shape) -> MapPair:
-        """The maps, from the file, by the same faces or by matching; judged if --strict was given."""
+        """Find the maps: from a file, by equal faces, or by matching. With --strict, raise `PoorFit` for a poor map."""
         from meshmatch.api.transfer import have_same_faces, vertex_to_vertex
 
         def matched(a: meshmatch.Shape, b: meshmatch.Shape) -> meshmatch.MatchResult:
-            if self.options.only or self.options.without:  # a fit's weights, no attribute to carry
+            if self.options.only or self.options.without:  # weights of the fit, which are not transferred
                 a, b = self.options.load(self.source, self.target)
             return self.options.match(a, b, self.run, self.console)
 
         if self.options.map is not None and self.options.map.is_dir():
             maps = meshmatch.Collection(self.options.map).maps_between(source, target)
-        elif self.options.map is None and not self._asks_for_a_match and have_same_faces(source, target):
+        elif self.options.map is None and not self._has_matching_options and have_same_faces(source, target):
             maps = vertex_to_vertex(source, target)
         else:
             maps = meshmatch.find_maps(source, target, self.options.map or matched)
@@ -117,7 +117,7 @@ class Transfer:
         user_messages.raise_if_poor(self.run.strict, found.verdict, found.reasons, "the map")
         a, b = self.names
         if maps.match is None and self.options.map is None:
-            self.console.say(f"{a} and {b} have the same faces: each vertex goes to the one of its number")
+            self.console.say(f"{a} and {b} have the same faces: each vertex is mapped to the one with the same index")
         elif maps.match is None:
             self.console.say(f"used the map {self.options.map} from {a} to {b}")
         else:
@@ -126,13 +126,13 @@ class Transfer:
         user_messages.report_verdict(self.console, found.verdict, found.reasons, "the map")
         return maps
 
-    def tell_low(self, low: LowConfidence, minimum: float, what: str = "vertices") -> Json:
-        """Say how many values are not trusted and what became of them; the same for --json."""
+    def report_low(self, low: LowConfidence, minimum: float, what: str = "vertices") -> Json:
+        """Report how many values have low confidence and how they were handled; return the numbers for --json."""
         kept = low.low - low.filled - low.blank
         parts = (
             (low.filled, "filled in from their neighbours"),
             (low.blank, "left blank"),
-            (kept, "transferred all the same"),
+            (kept, "kept as transferred"),
         )
         became = ", ".join(f"{count} {done}" for count, done in parts if count > 0)
         if low.low:
@@ -153,7 +153,7 @@ class Transfer:
         self.console.say(f"drew {self.picture}: both shapes with what was transferred")
 
     def record(self, own: Json, maps: MapPair, confidence: float) -> Json:
-        """For --json: what was done, and by which map."""
+        """The record for --json: the results of the command and the map that was used."""
         record: Json = {"output": self.output} | own | user_messages.map_record(maps.forward, self.names)
         record["map"] = self.options.map
         record["confidence_mean"] = user_messages.json_number(confidence)

@@ -12,7 +12,7 @@ from meshmatch.cli.targets import to_targets
 from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, Transfer
 from meshmatch.cli.user_messages import Json
 
-_NAMED = 8  # joints or clips that a note lists
+_MAX_LISTED = 8  # joints or clips in a note
 
 
 @grouped
@@ -27,15 +27,15 @@ def transfer_rig(
     maps: MapOptions,
     run: RunOptions,
     pose: Literal["rest", "source"] = Option(
-        "rest", help="How TGT stands in the file. rest: as it came; source: as SRC stands."
+        "rest", help="Pose of TGT in the output: its own (rest), or that of SRC (source)."
     ),
     picture: Picture = None,
 ) -> Json:
     """Transfer a skeleton, skin weights and animation clips.
 
-    SRC is a rigged .glb, .gltf or .vrm, or a file that Blender reads. Of a TGT in these formats everything is kept but a
-    skeleton of its own; another TGT is turned upright. The skeleton has the bones and names of SRC; its clips play on TGT
-    in whatever pose it came.
+    SRC is a rigged .glb, .gltf or .vrm, or a file that Blender reads. A TGT in one of these formats keeps everything but its
+    own skeleton; a TGT in another format is turned upright. The new skeleton has the bones and names of SRC, and its clips
+    play on TGT in any pose.
     """
     from meshmatch.api.rig import check_rig_output, write_rig
 
@@ -47,17 +47,17 @@ def transfer_rig(
         write_rig(result, output, temporary)
     joints, clips = len(result.rig.joints), [clip.name for clip in result.rig.clips]
     if result.unused:
-        many, names = len(result.unused), _listed(result.unused)
-        have = "joint that moves" if many == 1 else "joints that move"
+        count, names = len(result.unused), _listed(result.unused)
+        have = "joint that moves" if count == 1 else "joints that move"
         console.warn(
-            f"{many} {have} {transfer.names[0]} {'has' if many == 1 else 'have'} no vertex on the target: {names}"
+            f"{count} {have} {transfer.names[0]} {'has' if count == 1 else 'have'} no vertex on the target: {names}"
         )
     if result.replaced:
         console.say(f"note: the skeleton that {transfer.names[1]} had ({result.replaced} joints) is replaced")
     if result.replaced_clips:
-        many, names = len(result.replaced_clips), _listed(result.replaced_clips)
-        moved = "clip moved that skeleton, and does" if many == 1 else "clips moved that skeleton, and do"
-        console.warn(f"{many} {moved} so no more: {names}")
+        count, names = len(result.replaced_clips), _listed(result.replaced_clips)
+        what = "clip of that skeleton no longer moves" if count == 1 else "clips of that skeleton no longer move"
+        console.warn(f"{count} {what} anything: {names}")
     played = f", {len(clips)} clip{'s' if len(clips) != 1 else ''}" if clips else ""
     console.say(f"wrote {output}: {transfer.names[1]} with {joints} joints{played}")
     if picture is not None:
@@ -74,4 +74,4 @@ def transfer_rig(
 
 
 def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+    return ", ".join(names[:_MAX_LISTED]) + (", ..." if len(names) > _MAX_LISTED else "")

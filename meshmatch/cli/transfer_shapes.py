@@ -10,7 +10,7 @@ from meshmatch.cli.targets import to_targets
 from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, Transfer
 from meshmatch.cli.user_messages import Json
 
-_NAMED = 8  # shapes that a warning lists
+_MAX_LISTED = 8  # blendshapes or clips in a warning
 
 
 @grouped
@@ -21,14 +21,14 @@ def transfer_shapes(
     target: Target,
     output: Path = output_option(
         "FILE",
-        "TGT with the blendshapes: .glb, .vrm of a .vrm or, with Blender installed, .fbx, .usdz or .blend. Or .npz for "
-        "their names and displacements; or a new folder (a name without a suffix), which gets an .obj for each shape.",
+        "TGT with the blendshapes: .glb, .vrm (if TGT is one) or, with Blender installed, .fbx, .usdz or .blend. Or their "
+        "names and displacements (.npz); or a new folder (a name without a suffix) with an .obj for each blendshape.",
     ),
     shapes: list[Path] | None = Option(
         None,
         metavar="FILE",
-        help="The blendshapes, if they are not in SRC: a folder of meshes with the vertices of SRC, each named as its shape "
-        "is; or .npz or .glb. May be repeated, a mesh each.",
+        help="The blendshapes, if they are not in SRC: a folder of meshes with the vertices of SRC, named like the "
+        "blendshapes; a .npz or .glb; or a single mesh. May be repeated for several meshes.",
     ),
     maps: MapOptions,
     run: RunOptions,
@@ -36,10 +36,10 @@ def transfer_shapes(
 ) -> Json:
     """Transfer blendshapes (morph targets).
 
-    These are the expressions of a face, for instance. SRC is a .glb, .gltf or .vrm with morph targets, a file that
-    Blender reads, or any mesh with --shapes. Displacements turn and grow with the surface; eyes, teeth and other
-    separate parts move with what surrounds them; closed lips and lids stay closed. Of a TGT in these formats everything
-    is kept; clips that animate the shapes come along.
+    These are, for instance, facial expressions. SRC is a .glb, .gltf or .vrm with morph targets, a file that Blender reads,
+    or any mesh with --shapes. Displacements are rotated and scaled with the surface; eyes, teeth and other separate parts
+    move with what surrounds them; closed lips and lids stay closed. A TGT in one of these formats keeps everything else.
+    Clips that animate the blendshapes are transferred too.
     """
     import numpy as np
 
@@ -57,16 +57,17 @@ def transfer_shapes(
             result.save(output)
     names, clips = result.shapes.names, [clip.name for clip in result.shapes.clips]
     if result.still:
-        listed = ", ".join(result.still[:_NAMED]) + (", ..." if len(result.still) > _NAMED else "")
+        listed = ", ".join(result.still[:_MAX_LISTED]) + (", ..." if len(result.still) > _MAX_LISTED else "")
         console.warn(f"{len(result.still)} of {len(names)} shapes move no vertex of {transfer.names[1]}: {listed}")
     if clips and output.suffix.lower() in ("", ".npz"):
         console.warn(
-            f"{output.name} holds no clips: {', '.join(clips[:_NAMED])}{', ...' if len(clips) > _NAMED else ''}"
+            f"{output.name} cannot contain clips: {', '.join(clips[:_MAX_LISTED])}"
+            f"{', ...' if len(clips) > _MAX_LISTED else ''}"
         )
         clips = []
     played = f", {len(clips)} clip{'s' if len(clips) != 1 else ''}" if clips else ""
-    many = f"{len(names)} blendshape{'s' if len(names) != 1 else ''}"
-    console.say(f"wrote {output}: {transfer.names[1]} with {many}{played} ({result.seconds:.1f} s)")
+    shown = f"{len(names)} blendshape{'s' if len(names) != 1 else ''}"
+    console.say(f"wrote {output}: {transfer.names[1]} with {shown}{played} ({result.seconds:.1f} s)")
     if picture is not None:
         from meshmatch.render.compose import compose_values
 

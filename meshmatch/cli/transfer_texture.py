@@ -13,22 +13,22 @@ from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, 
 from meshmatch.cli.user_messages import Console, Json
 from meshmatch.errors import OptionError
 
-_COLORS = (".ply", ".off")
-_WORTH_SAYING = 0.002  # of the surface
+_COLOR_SUFFIXES = (".ply", ".off")  # formats with vertex colors instead of textures
+_MIN_REPORTED = 0.002  # share of the surface
 
 
 @dataclass(frozen=True)
 class TextureOptions:
-    """What is baked, and how."""
+    """Options of the texture."""
 
     image: Path | None = optional("FILE", "Image for the texture coordinates of SRC, instead of its own.")
     uv: Literal["auto", "keep", "new", "source"] = Option(
         "auto",
-        help="Texture coordinates of TGT. auto: reuse valid ones; keep: reuse or fail; new: unwrap; source: carry over "
-        "those of SRC.",
+        help="Texture coordinates of TGT. auto: reuse its own if they are valid, else unwrap; keep: reuse its own or fail; "
+        "new: unwrap; source: transfer those of SRC.",
     )
     size: int = Option(2048, metavar="TEXELS", help="Width and height of the texture.")
-    samples: int = Option(2, metavar="N", help="N x N samples per texel at seams and fine detail of SRC.")
+    samples: int = Option(2, metavar="N", help="Average N x N samples per texel at seams and fine detail of SRC.")
     padding: int = Option(
         8,
         metavar="TEXELS",
@@ -44,8 +44,8 @@ def transfer_texture(
     target: Target,
     output: Path = output_option(
         "FILE",
-        "TGT with its texture: .glb, .vrm of a .vrm, or .obj (with an .mtl and images of the same name). As .ply or .off, "
-        "and for a point cloud, it gets vertex colors instead.",
+        "TGT with its texture: .glb, .vrm (if TGT is one), or .obj (with an .mtl and images of the same name). With .ply or "
+        ".off, or if TGT is a point cloud, it gets vertex colors instead.",
     ),
     texture: TextureOptions,
     maps: MapOptions,
@@ -55,10 +55,10 @@ def transfer_texture(
 ) -> Json:
     """Transfer the textures of one shape to another.
 
-    Color, normals, roughness, metal, occlusion and emission: each texel takes those of the corresponding point of SRC,
-    from its materials and images or from its vertex colors. The VALUE of --blank is a color such as #808080, or 0 for
-    transparent. A glb or an obj keeps everything else of a TGT in the same format: nodes, skins, clips, groups,
-    polygons. Another TGT is turned upright in a glb.
+    Each texel gets the color, normal, roughness, metalness, occlusion and emission of the corresponding point of SRC, from
+    its materials and images or its vertex colors. The VALUE of --blank is a color such as #808080, or 0 for transparent. A
+    glb or obj written for a TGT of the same format keeps everything else: nodes, skins, clips, groups, polygons. A TGT in
+    another format is turned upright in a glb.
     """
     from meshmatch.api.texture import tiles_of_file
     from meshmatch.shapes import textured_files
@@ -68,9 +68,9 @@ def transfer_texture(
     size, uv, image = texture.size, texture.uv, texture.image
     blank = parse_color(rules.blank)
     rule = rules.rule(blank)
-    textured_files.check_textured(output, _COLORS)
+    textured_files.check_textured(output, _COLOR_SUFFIXES)
     a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
-    painted = b.is_cloud or output.suffix.lower() in _COLORS
+    painted = b.is_cloud or output.suffix.lower() in _COLOR_SUFFIXES
     if painted and uv in ("keep", "source"):
         hint = f"leave out --uv {uv}" if b.is_cloud else "end the output in .glb or .obj for a texture"
         raise OptionError(f"{b.name} gets vertex colors, which need no texture coordinates", hint)
@@ -92,14 +92,14 @@ def transfer_texture(
         if painted:
             done = meshmatch.transfer_colors(a, target, transfer, colors=look, rule=rule)
             done.writer(temporary[0], output)
-            record, pair = transfer.tell_low(done.low, rule.minimum), done.maps
+            record, pair = transfer.report_low(done.low, rule.minimum), done.maps
         else:
             with transfer.console.progress() as report:
                 made = meshmatch.transfer_texture(
                     a, target, transfer, uv=uv, options=baking, look=look, progress=report
                 )
             made.dressed.write(output, temporary)
-            record, pair = _tell_baked(transfer.console, made, rule, texture), made.maps
+            record, pair = _report_baked(transfer.console, made, rule, texture), made.maps
             if made.dressed.turned and output.suffix.lower() == ".glb":
                 turn = made.dressed.turn
                 transfer.console.say(f"note: a node turns {b.name} upright, along y")
@@ -110,7 +110,7 @@ def transfer_texture(
         from meshmatch.render.compose import compose_shapes
 
         result = meshmatch.load_shape(output)
-        if painted:  # the picture shows it as the target's file has it
+        if painted:  # in the orientation of the target's file
             result = replace(result, verts=b.verts)
         elif turn is not None:
             result = replace(result, verts=result.verts @ turn)
@@ -119,10 +119,10 @@ def transfer_texture(
     return transfer.record(record, pair, float(pair.backward.confidence.mean()))
 
 
-def _tell_baked(
+def _report_baked(
     console: Console, made: "meshmatch.TexturedResult", rule: "meshmatch.ConfidenceRule", texture: TextureOptions
 ) -> Json:
-    """What came out, in words and for --json."""
+    """Report on the baked texture; return the numbers for --json."""
     from meshmatch.maps.folds import Folds
 
     baked, atlas, maps = made.baked, made.atlas, made.maps
@@ -132,18 +132,18 @@ def _tell_baked(
     if baked.low:
         became = "filled in from its surroundings" if rule.fill else "kept" if rule.blank is None else "left blank"
         console.say(f"{100 * baked.low:.1f} % of the surface has less confidence than {rule.minimum:g}: {became}")
-    if baked.torn > _WORTH_SAYING:
+    if baked.torn > _MIN_REPORTED:
         console.say(f"note: the map is discontinuous on {100 * baked.torn:.1f} % of the surface; colors are cut there")
     if folds is not None:
         console.say(
             f"the map turns over {100 * folds.flipped:.2f} % of the surface and crushes {100 * folds.crushed:.2f} %; "
             f"the median stretch is {folds.stretch:.2f}-fold"
         )
-    whose = "own" if atlas.own else "source" if texture.uv == "source" else "new"
-    words = {"own": "its own texture coordinates", "source": "texture coordinates of the source"}
-    laid = words.get(whose, "new texture coordinates")
-    console.say(f"{laid}: {100 * baked.used:.0f} % of the texture lies on the surface ({made.seconds:.1f} s)")
-    uv = {"size": texture.size, "uv": whose, "uv_note": atlas.note, "used": baked.used}
+    origin = "own" if atlas.own else "source" if texture.uv == "source" else "new"
+    names = {"own": "its own texture coordinates", "source": "texture coordinates of the source"}
+    coordinates = names.get(origin, "new texture coordinates")
+    console.say(f"{coordinates}: {100 * baked.used:.0f} % of the texture is used ({made.seconds:.1f} s)")
+    uv = {"size": texture.size, "uv": origin, "uv_note": atlas.note, "used": baked.used}
     low = {"min_confidence": rule.minimum, "low_confidence_share": baked.low}
     low |= {"blank_share": baked.low * (rule.blank is not None), "filled_share": baked.low * rule.fill}
     return (

@@ -21,26 +21,26 @@ if TYPE_CHECKING:
 def wrap(
     *,
     base: Path = Argument(..., metavar="BASE", help="Your mesh."),
-    scan: Path = Argument(..., metavar="SCAN", help="The shape whose surface it is laid on."),
+    scan: Path = Argument(..., metavar="SCAN", help="The shape onto whose surface it is deformed."),
     output: Path = output_option(
         "FILE",
-        "BASE on SCAN. An .obj from an .obj, or a .glb from a .glb, keeps everything but the positions; materials "
-        "and images of an .obj are copied beside it. Other formats keep less, and say what is lost.",
+        "BASE on SCAN. An .obj written from an .obj, or a .glb from a .glb, keeps everything but the positions; materials "
+        "and images of an .obj are copied next to it. Other formats keep less; a warning lists what is lost.",
     ),
     how: PairOptions,
     run: RunOptions,
     free: Path | None = optional(
         "FILE",
-        "Vertices of BASE that keep their shape and follow those around them, such as eyes and the inside of the mouth: "
-        'a number per line, counted from 0 (.txt, .csv or .npy), or the members of each part, {"eyes": [17, 18]} (.json).',
+        "Vertices of BASE that keep their local shape and follow those around them, such as eyes and the inside of the "
+        'mouth: a number per line, counted from 0 (.txt, .csv or .npy), or lists by part, {"eyes": [17, 18]} (.json).',
     ),
     picture: Picture = None,
 ) -> None:
-    """Lay a mesh of your own onto a scan.
+    """Deform your own mesh onto the surface of a scan.
 
-    Its vertex order, polygons, texture coordinates and groups stay. BASE is matched to SCAN, deformed, and drawn onto
-    the surface, smoothly at first and ever finer. Printed are, in the unit of SCAN, the distance of its vertices from the
-    surface, and how far both surfaces lie apart.
+    BASE is matched to SCAN, deformed along the match, and projected onto the surface, smoothly at first and then in finer
+    steps. Its vertex order, polygons, texture coordinates and groups are kept. Prints, in the unit of SCAN, the distance
+    of its vertices from the surface, and the distance between the two surfaces.
     """
     import numpy as np
 
@@ -60,7 +60,7 @@ def wrap(
     with replace_all_on_success(plan.files) as temporary:
         check_model(how.model)
         a, b = how.load(base, scan)
-        rows = _members(free, a)
+        rows = _read_vertices(free, a)
         pairs = how.pairs()
         with console.progress() as report:
             result = meshmatch.wrap(
@@ -75,14 +75,14 @@ def wrap(
     user_messages.report_verdict(console, found.verdict, found.reasons, "the map")
     apart = result.distance[~result.free & a.valid]
     numbers = {"mean": apart.mean(), "95 %": np.quantile(apart, 0.95), "worst": apart.max()} if len(apart) else {}
-    told = ", ".join(f"{what} {value:.4g}" for what, value in numbers.items())
+    distances = ", ".join(f"{what} {value:.4g}" for what, value in numbers.items())
     kept = f"; {len(np.unique(rows))} vertices kept their shape" if len(rows) else ""
-    console.say(f"vertices to {names[1]} (whose sqrt(area) is {np.sqrt(b.area):.4g}): {told}{kept}")
-    # What is free, such as eyes, is not to lie on the scan.
+    console.say(f"vertices to {names[1]} (whose sqrt(area) is {np.sqrt(b.area):.4g}): {distances}{kept}")
+    # Free parts, such as eyes, are not meant to lie on the scan.
     surfaces = surfaces_apart(result.match, result.shape, b, "file", one_way=bool(result.free.any()))
     console.say(str(surfaces))
     if binding is not None and output.suffix.lower() == ".glb":
-        console.say(f"the {len(binding.rig.joints)} joints of {names[0]} have moved along")
+        console.say(f"the {len(binding.rig.joints)} joints of {names[0]} were moved with it")
     if plan.is_turned(binding, result.turn):
         console.say(f"note: a node turns {names[0]} upright, along y")
     written = ", ".join(map(str, plan.files))
@@ -102,8 +102,8 @@ def wrap(
         )
 
 
-def _members(file: Path | None, base: "meshmatch.Shape") -> "Ints":
-    """The vertices that a file names, alone or in parts."""
+def _read_vertices(file: Path | None, base: "meshmatch.Shape") -> "Ints":
+    """Read vertices from a file, as one list or by part; empty without a file."""
     import numpy as np
 
     from meshmatch.shapes.vertex_lists import load_points

@@ -102,7 +102,9 @@ def test_clothes_stay_where_they_read_as_well(reads: Reads) -> None:
 def test_two_bodies_are_for_the_user_to_choose_from(reads: Reads) -> None:
     reads({BODY.V: 3.7})
     scene = together("two.ply", BODY, second(BODY))
-    with pytest.raises(InputError, match=r"two\.ply contains several shapes of one kind: part 1 .* and part 2 ") as caught:
+    with pytest.raises(
+        InputError, match=r"two\.ply contains several shapes of one kind: part 1 .* and part 2 "
+    ) as caught:
         find_known_parts(loaders(), scene, CONFIG)
     assert "--only 1 or --only 2" in caught.value.hint
 

@@ -128,7 +128,7 @@ def test_from_few_registered_shapes_to_a_map(run: Run, tmp_path: Path, monkeypat
     assert answer.status == 0 and "after step 3;" in answer.err
     assert "going on" not in answer.err
     again = run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", *words)
-    assert "going on from the checkpoint" in again.err
+    assert "continuing from the checkpoint" in again.err
     card = read_card(tmp_path / "mine" / "card.json")
     assert card.frame == {"orientation": "near", "scale": "area"}
     assert card.stiffness == 0.1

@@ -206,7 +206,7 @@ LANDMARKS = ("transfer-landmarks", "a.ply", "in", "--landmarks", "points.txt", "
 def test_landmarks_of_all_are_one_table(run: Run, files: Path, stub: FakeMatching, format: str) -> None:
     words = *LANDMARKS, "--format", format, "--table", "all.npz"
     answer = well(run(*words))
-    assert "wrote all.npz: 2 landmarks of 3 specimens, a among them" in answer.err
+    assert "wrote all.npz: 2 landmarks of 3 specimens, a included" in answer.err
     with np.load("all.npz") as found:
         assert (found["specimens"].tolist(), found["landmarks"].tolist()) == (["a", "b", "sub/c"], ["0", "1"])
         assert np.array_equal(found["points"][0], load_shape("a.ply").verts[[0, 5]])

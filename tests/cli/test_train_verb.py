@@ -82,9 +82,9 @@ def test_defaults(run: Run, stub: Recorder, tmp_path: Path) -> None:
     assert called["start"] is None
     assert called["recipe"] == recipe_for()
     assert "step 2 of 2: total 0.25, validation 0.0321 (8 s)" in answer.err
-    assert "off by 3.2 % of sqrt(area) on shapes that were not learned, still falling" in answer.err
+    assert "validation error: 3.2 % of sqrt(area) on shapes that were not trained on, still falling" in answer.err
     assert f"meshmatch models add '{tmp_path / 'my own'}'" in answer.err
-    assert "unfinished: step 2 of 13,000; the same command goes on" in answer.err
+    assert "unfinished: step 2 of 13,000; the same command continues" in answer.err
 
 
 def test_a_card_is_a_recipe_and_options_change_it(run: Run, stub: Recorder, tmp_path: Path) -> None:
@@ -259,7 +259,10 @@ def test_a_prepared_folder_brings_its_template(
     words = ("-o", tmp_path / "ready", "--nodes", "60", "--radius", "0.3", "-q")
     assert run("prepare", tmp_path / "eggs", *words).status == 0
     answer = run("train", "-o", tmp_path / "mine", "--shapes", tmp_path / "ready")
-    assert (answer.status, "off by 3.2 % of sqrt(area) on the learned shapes, drawn anew" in answer.err) == (0, True)
+    assert (answer.status, "validation error: 3.2 % of sqrt(area) on the learned shapes, drawn anew" in answer.err) == (
+        0,
+        True,
+    )
     assert stub.bodies == ()
     assert (stub.called["template"], stub.called["category"]) == ("eggs", "mine")
     assert stub.called["data"] == "2 registered shapes of ready"
