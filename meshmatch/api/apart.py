@@ -29,7 +29,7 @@ from meshmatch.shapes.repair import NOT_TRUSTED, Repaired
 from meshmatch.shapes.shape import Shape
 
 Loader = Callable[[], TrainedModel]
-# A larger set of parts, such as a body with its clothes, is preferred while its residual exceeds the best one by at n_fits
+# A larger set of parts, such as a body with its clothes, is preferred while its residual exceeds the best one by at most
 # this (units of sqrt(area)).
 _RESIDUAL_MARGIN = 0.003
 _MIN_RIVAL_AREA = 0.5  # area of another shape that may be meant instead, as a share of the area of the best one

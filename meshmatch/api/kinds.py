@@ -155,7 +155,7 @@ class Choice:
     fits
         The fit of each shape by the model, if one was needed to find its kind.
     parts_tried
-        Whether the parts of each shape were parts_tried on their own.
+        Whether the parts of each shape were tried on their own.
     """
 
     model: TrainedModel

@@ -473,7 +473,7 @@ class Matcher:
         if config.for_model(self.model).refine != config.refine:
             notes.append(f"model {self.model.card.name} is pointwise and has no nodes: its code was refined instead")
         if fit.verdict == "poor" and not config.try_harder and may_contain_known_parts(clean, config):
-            notes.append(f"{prefix}--try-harder (in Python FitConfig(try_harder=True)) searches for longer")
+            notes.append(f"{prefix}--try-harder (in Python FitConfig(try_harder=True)) searches longer")
         return replace(fit, repaired=clean, left_out=clean.left_out, notes=(*notes, *fit.notes))
 
     def _refine_jointly(

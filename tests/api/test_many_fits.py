@@ -148,8 +148,8 @@ def test_so_many_shapes_are_in_progress_and_of_large_ones_one_for_each_thread(
         return some_fit(shape.verts, shape.faces)
 
     monkeypatch.setattr(Fitter, "fit", fit)
-    monkeypatch.setattr(matching, "_TOGETHER", 2)
-    monkeypatch.setattr(matching, "_SMALL", small)
+    monkeypatch.setattr(matching, "_BATCH_SIZE", 2)
+    monkeypatch.setattr(matching, "_MAX_BATCHED_VERTICES", small)
     many = [replace(shapes[0], name=str(number)) for number in range(12)]
     found = Matcher("human", QUICK, threads=2).fit_all(many, errors=errors)
     assert [fit.repaired.shape.name for fit in found] == [shape.name for shape in many]

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from meshmatch.cli.collect import _tell_lengths
+from meshmatch.cli.collect import _report_distances
 from meshmatch.cli.user_messages import Console
 from meshmatch.collections.collection import Collection
 from meshmatch.collections.export import Export, Fits, export
@@ -78,18 +78,18 @@ def test_what_is_said(fits: Path, run: Run) -> None:
 
 def test_lengths_have_one_unit_or_none_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     fit = Record("a", "a.ply", "good", distance=0.2, furthest=3.0, scale=90.0)
-    _tell_lengths(Console(False), [fit, replace(fit, name="b", scale=110.0)], "none")
+    _report_distances(Console(False), [fit, replace(fit, name="b", scale=110.0)], "none")
     assert "surfaces lie 0.2 apart on average, 3 at most, in the unit of the files" in capsys.readouterr().err
-    _tell_lengths(Console(False), [fit, replace(fit, name="metres", scale=0.09)], "none")
+    _report_distances(Console(False), [fit, replace(fit, name="metres", scale=0.09)], "none")
     told = " ".join(capsys.readouterr().err.split())
     assert told == "warning: a is 1,000 times as large as metres: do the files have one unit?"
 
 
 def test_copies_of_one_file_are_told(capsys: pytest.CaptureFixture[str]) -> None:
     a = Record("a", "a.ply", "good", distance=0.2, furthest=3.0, scale=90.0, digest="1")
-    _tell_lengths(Console(False), [a, replace(a, name="other", digest="2"), replace(a, name="again")], "none")
+    _report_distances(Console(False), [a, replace(a, name="other", digest="2"), replace(a, name="again")], "none")
     assert "warning: a and again are copies of one file: an atlas counts each of them" in capsys.readouterr().err
-    _tell_lengths(Console(False), [a, replace(a, name="b", digest="2")], "none")
+    _report_distances(Console(False), [a, replace(a, name="b", digest="2")], "none")
     assert "warning" not in capsys.readouterr().err
 
 
