@@ -74,7 +74,7 @@ class AtlasOptions:
     symmetry: bool = Option(
         False,
         "--symmetry",
-        help="Analyse asymmetry: compare shapes with their mirror images, such as heads, or with --sides the left with the "
+        help="Analyse asymmetry: compare each shape, such as a head, with its mirror image, or with --sides the left with the "
         "right shapes.",
     )
     individuals: str | None = Option(

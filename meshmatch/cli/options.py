@@ -214,10 +214,10 @@ class FitOptions(Options):
         "codes; none: the network's prediction alone.",
     )
     up: Axis | None = Option(
-        None, help="Axis that points up in the file, or in both files. Default: detected.", case_sensitive=False
+        None, help="Up axis of all input shapes, in their files. Default: detected.", case_sensitive=False
     )
     front: Axis | None = Option(
-        None, help="Axis that the shape faces in the file, or in both files. Default: detected.", case_sensitive=False
+        None, help="Axis that all input shapes face, in their files. Default: detected.", case_sensitive=False
     )
     partial: bool | None = Option(
         None,
@@ -293,9 +293,7 @@ class FitOptions(Options):
 class PairOptions(FitOptions):
     """How two shapes are matched."""
 
-    source_up: Axis | None = Option(
-        None, help="Up axis of the first shape, where the two differ.", case_sensitive=False
-    )
+    source_up: Axis | None = Option(None, help="Up axis of the first shape, if the two differ.", case_sensitive=False)
     source_front: Axis | None = Option(None, help="Front axis of the first shape.", case_sensitive=False)
     target_up: Axis | None = Option(None, help="Up axis of the second shape.", case_sensitive=False)
     target_front: Axis | None = Option(None, help="Front axis of the second shape.", case_sensitive=False)

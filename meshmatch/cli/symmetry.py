@@ -20,8 +20,8 @@ def symmetry(
     ),
     values: Path | None = optional(
         "FILE",
-        "The asymmetry of each vertex: its displacement from the mirror image of its counterpart, and the component along "
-        "the normal, positive if the vertex lies farther out. .vtp or .vtk for ParaView and 3D Slicer, .ply, .csv or .npy.",
+        "The asymmetry of each vertex along its normal, positive if it lies farther out than its counterpart, and its "
+        "displacement from the mirror image of that: .vtp or .vtk for ParaView and 3D Slicer, .ply, .csv or .npy.",
     ),
     strict: bool = Option(False, "--strict", help="Write nothing and exit with status 1 if the map is poor."),
     threads: options.Threads = 2,

@@ -404,7 +404,7 @@ def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None
         if how.start is not None:
             hint = "fit the shapes with it first (`meshmatch fit ... --model`), and train on those fits"
             raise OptionError(f"{how.shapes} contains fits without a model, which --start cannot continue", hint)
-        console.say(f"learning from {len(found.verts)} of {len(collection.names)} fits in {how.shapes}")
+        console.say(f"training on {len(found.verts)} of {len(collection.names)} fits in {how.shapes}")
         return found, None
     start = as_model(how.start or collection.model)
     console.say(

@@ -250,8 +250,8 @@ def transfer_landmarks(
 
     Positions in --landmarks are moved to the nearest point of SRC. For each landmark, .csv and .json files contain its
     vertex, position, face with barycentric weights, and confidence; .pp, .fcsv and .mrk.json files its name and position;
-    .tps files its position. Landmarks below --min-confidence, for example on a part that TGT lacks, are listed in a warning
-    and missing in the output (NA in .tps). --min-confidence 0 keeps all of them.
+    .tps files its position. Landmarks of low confidence, for example on a part that TGT lacks, are listed in a warning and
+    missing in the output (NA in .tps). --min-confidence 0 keeps all of them.
     """
     import numpy as np
 

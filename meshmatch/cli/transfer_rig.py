@@ -22,7 +22,7 @@ def transfer_rig(
     source: Source,
     target: Target,
     output: Path = output_option(
-        "FILE", "TGT with the rig: .glb, .vrm of a .vrm or, with Blender installed, .fbx, .usdz, .dae or .blend."
+        "FILE", "TGT with the rig: .glb, .vrm (if TGT is one) or, with Blender installed, .fbx, .usdz, .dae or .blend."
     ),
     maps: MapOptions,
     run: RunOptions,

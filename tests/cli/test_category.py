@@ -102,7 +102,7 @@ def test_from_fits_without_a_model_to_a_map(run: Run, tmp_path: Path) -> None:
     answer = run("train", "--shapes", tmp_path / "fits", *mine, "--start", "human")
     assert answer.status == 1 and "holds fits without a model" in answer.err
     answer = run("train", "--shapes", tmp_path / "fits", *mine)
-    assert answer.status == 0 and "learning from 3 of 3 fits" in answer.err
+    assert answer.status == 0 and "training on 3 of 3 fits" in answer.err
     card = read_card(tmp_path / "mine" / "card.json")
     assert card.frame == {"orientation": "rigid", "scale": "area"} and card.correspondence
     assert (card.category, card.data, card.steps) == ("mine", "3 fits of fits, without a model", 3)
