@@ -365,7 +365,7 @@ class Matcher:
             with thread_limit(1):
                 found = [self._select_parts(*each) for each in zip(clean, configs, strict=True)]
             return [each for each, _ in found], [()] * len(clean), [preliminary for _, preliminary in found]
-        from meshmatch.api.kind_notes import choose_model
+        from meshmatch.api.kinds import choose_model
 
         with self._model_lock, thread_limit(1), worker_slot(threading.Semaphore(self.threads)):
             choice = choose_model(clean, configs, self._model, self.progress)

@@ -138,7 +138,7 @@ def _write_page(path: Path, result: "meshmatch.Interpolation", key_shapes: dict[
     rotation = result.steps[0].rotation
     assert rotation is not None
     title = " → ".join(key_shapes.values())
-    write_motion(path, shapes, times, rotation=rotation, key_shapes=key_shapes, title=title)
+    write_motion(path, shapes, times, rotation=rotation, met=key_shapes, title=title)
 
 
 _WRITERS = {".png": _draw_strip, ".html": _write_page, ".htm": _write_page}
