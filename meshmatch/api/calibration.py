@@ -80,7 +80,9 @@ def calibrate(
     """
     folder, card = find_model(model)
     if card.correspondence:
-        raise ModelError(f"{card.name} learned correspondence and needs no calibration", "its fits are judged as they are")
+        raise ModelError(
+            f"{card.name} learned correspondence and needs no calibration", "its fits are judged as they are"
+        )
     if count < FEWEST:
         raise OptionError(f"{count} shapes are too few for a calibration", f"use {FEWEST} or more")
     given = list_shapes(as_path(shapes)) if isinstance(shapes, str | Path) else list(shapes)

@@ -48,7 +48,9 @@ def save_fit(path: str | Path, fit: Fit) -> None:
     check_fit(fit)
     check_suffix(path, (_SUFFIX,), "fits")
     if fit.model == NO_MODEL:
-        raise OptionError("a fit without a model cannot be saved: its template is the other shape", "save the map: save_map")
+        raise OptionError(
+            "a fit without a model cannot be saved: its template is the other shape", "save the map: save_map"
+        )
     if fit.repaired is None and not isinstance(fit, PlacedFit):
         raise InputError("this fit does not contain its shape", "make it with meshmatch.register or Matcher.fit")
     write_fit(path, fit, shape=None if fit.repaired is None else fit.repaired.original)

@@ -340,14 +340,16 @@ class Matcher:
             known_pairs = None
             if landmarks is not None:
                 clean = [shape_of(fit) for fit in fits]
-                pulled, known_pairs = fits_with_landmarks(self.model, clean, fits, pairs, configs)
-                fits = [self._with_shape_and_notes(*each) for each in zip(pulled, clean, configs, strict=True)]
+                guided, known_pairs = fits_with_landmarks(self.model, clean, fits, pairs, configs)
+                fits = [self._with_shape_and_notes(*each) for each in zip(guided, clean, configs, strict=True)]
             before = fits[0], fits[1]
             agreed = self._refine_jointly(before, configs[0], known_pairs)
             found, opposite = maps_of_fits(agreed, before, self.threads)
             if landmarks is not None:
                 found = judged_by_pairs(found, clean[1].original, pairs, agreed[1].frame.scale)
-        notes = tuple(dict.fromkeys((*(words for kind in kind_notes for words in kind), *fits[0].notes, *fits[1].notes)))
+        notes = tuple(
+            dict.fromkeys((*(words for kind in kind_notes for words in kind), *fits[0].notes, *fits[1].notes))
+        )
         result = MatchResult(found, *agreed, time.monotonic() - began, notes, before, self.threads, opposite)
         if self._auto and landmarks is None and found.verdict != "good" and are_whole_meshes(clean, agreed):
             with suppress(InputError):  # if the shapes cannot be matched directly, the model's map stays
@@ -399,10 +401,10 @@ class Matcher:
 
     def _fit_each(self, shapes: Sequence[ShapeLike], configs: Sequence[FitConfig]) -> list[Fit | MeshmatchError]:
         """Fit each shape; errors take the place of fits."""
-        done, counting, stop = 0, threading.Lock(), threading.Event()
+        done, counter_lock, stop = 0, threading.Lock(), threading.Event()
         gathering = Gathering(len(shapes), self.threads, _BATCH_SIZE)
 
-        def one(number: int, config: FitConfig) -> Fit | MeshmatchError:
+        def fit_one(number: int, config: FitConfig) -> Fit | MeshmatchError:
             nonlocal done
             found: Fit | MeshmatchError
             with gathering.task():
@@ -414,14 +416,14 @@ class Matcher:
                     found = replace(found, notes=(*kind_notes[0], *found.notes))
                 except MeshmatchError as error:
                     found = error
-            with counting:
+            with counter_lock:
                 done += 1
                 if self.progress is not None:
                     self.progress("shapes", f"{done} of {len(shapes)}", done / len(shapes))
             return found
 
         with thread_limit(1):
-            return parallel_map(one, range(len(shapes)), configs, threads=gathering.in_progress, stop=stop)
+            return parallel_map(fit_one, range(len(shapes)), configs, threads=gathering.in_progress, stop=stop)
 
     def _fit_all(
         self,
@@ -435,16 +437,16 @@ class Matcher:
         stop, names = threading.Event(), [part.shape.name for part in clean]
         labels = [f"{name} ({number + 1})" if names.count(name) > 1 else name for number, name in enumerate(names)]
 
-        def one(here: Repaired, config: FitConfig, preliminary: _Preliminary, label: str) -> Fit:
+        def fit_one(part: Repaired, config: FitConfig, preliminary: _Preliminary, label: str) -> Fit:
             with gathering.task():
-                return self._fit_one(here, config, preliminary, gathering, stop, label)
+                return self._fit_one(part, config, preliminary, gathering, stop, label)
 
         with thread_limit(inner):  # after an error or Ctrl-C, the other fits stop at their next progress report
-            return parallel_map(one, clean, configs, preliminary, labels, threads=gathering.in_progress, stop=stop)
+            return parallel_map(fit_one, clean, configs, preliminary, labels, threads=gathering.in_progress, stop=stop)
 
     def _fit_one(
         self,
-        here: Repaired,
+        clean: Repaired,
         config: FitConfig,
         preliminary: _Preliminary,
         gathering: Gathering,
@@ -459,9 +461,9 @@ class Matcher:
             if self.progress is not None:
                 self.progress(stage, label, share)
 
-        with gathering.together() if here.shape.V <= _MAX_BATCHED_VERTICES else nullcontext():
-            found = preliminary.fit or Fitter(self.model, config, report).fit(here.shape)
-        best = (found, here) if preliminary.parts_tried else self._retry_with_parts(found, here, config, report)
+        with gathering.together() if clean.shape.V <= _MAX_BATCHED_VERTICES else nullcontext():
+            found = preliminary.fit or Fitter(self.model, config, report).fit(clean.shape)
+        best = (found, clean) if preliminary.parts_tried else self._retry_with_parts(found, clean, config, report)
         return self._refine_further(self._with_shape_and_notes(*best, config), config, report)
 
     def _with_shape_and_notes(self, fit: Fit, clean: Repaired, config: FitConfig) -> Fit:

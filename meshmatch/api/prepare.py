@@ -190,13 +190,13 @@ def prepare(
     made = make_template(clean.shape, shapes.stem, config.nodes, labels=labels, low=low)
     made = replace(made, source=shapes.name)
     save_template(made, output / "template.safetensors")
-    none = np.zeros((0, made.shape.V, 3), np.float32)
-    return Prepared(made, none, (shapes.name,), tuple(clean.notes))
+    no_shapes = np.zeros((0, made.shape.V, 3), np.float32)
+    return Prepared(made, no_shapes, (shapes.name,), tuple(clean.notes))
 
 
 def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress: Progress) -> Prepared:
     notes: list[str] = []
-    found, marks = _read_shapes(folder, config, notes, progress.between(0.0, 0.5))
+    found, landmarks = _read_shapes(folder, config, notes, progress.between(0.0, 0.5))
     named = _named_template(folder, config, found)
     chosen, why = _choose_template(named, config, found)
     orientations = _compare_orientations(chosen, config, found, progress.between(0.5, 0.6))
@@ -205,62 +205,68 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
         turns: list[Float[Floats, "3 3"] | None] = [None] * len(found)
     else:
         flags, turns = orientations.turned(config.mirror != "no", others_than_most=named is None)
-    _mirror_flagged(found, marks, flags, notes)
+    _mirror_flagged(found, landmarks, flags, notes)
     if named is None and flags.any():  # after mirroring, another shape may be the medoid
         chosen, why = _choose_template(None, config, found)
         turns = _turns_relative_to(chosen, turns)
-    first, own = (found[chosen], chosen) if isinstance(chosen, int) else (chosen, None)
-    low = low_mesh(first.shape, config.faces, config.decimate)
-    vertices = first.kept_vertex[low[0]]
-    stack = prepared_folder.registered_stack(first, found, vertices, notes)
+    template_shape, own_index = (found[chosen], chosen) if isinstance(chosen, int) else (chosen, None)
+    low = low_mesh(template_shape.shape, config.faces, config.decimate)
+    vertices = template_shape.kept_vertex[low[0]]
+    stack = prepared_folder.registered_stack(template_shape, found, vertices, notes)
     registered = len(stack) > 0
-    found_how = prepared_folder.rotation_range(stack, first.original.verts[vertices]) if registered else "rigid"
-    how: Align = config.align or found_how
+    default_align = (
+        prepared_folder.rotation_range(stack, template_shape.original.verts[vertices]) if registered else "rigid"
+    )
+    align: Align = config.align or default_align
     name = folder.resolve().name
-    made, source = make_template(first.shape, name, config.nodes, low=low), first.original.name
-    middle = orientations is not None and named is None
-    if middle:
+    made, source = make_template(template_shape.shape, name, config.nodes, low=low), template_shape.original.name
+    use_mean = orientations is not None and named is None
+    if use_mean:
         made, count = _mean_template(made, found, turns, config.nodes, progress.between(0.6, 0.8))
         source = f"the mean of {count} shapes, on the vertices of {source}" if count else source
     if named is None:
         notes.append(f"template: {source}{why}")
     made = replace(made, source=f"{source} of {folder.name}")
-    template_marks = None
+    template_landmarks = None
     if config.landmarks is not None:
-        template_marks = _template_landmarks(first, None if own is None else marks[own], marks)
-        template_marks = made.shape.verts[cKDTree(first.shape.verts[low[0]]).query(template_marks)[1]]
+        template_landmarks = _template_landmarks(
+            template_shape, None if own_index is None else landmarks[own_index], landmarks
+        )
+        template_landmarks = made.shape.verts[cKDTree(template_shape.shape.verts[low[0]]).query(template_landmarks)[1]]
     samples, frames, residuals = prepared_folder.collect_samples(
-        *(made, found, marks, template_marks, turns, how, config.scale, config.nodes.seed),
-        progress.between(0.8 if middle else 0.6, 1.0),
+        *(made, found, landmarks, template_landmarks, turns, align, config.scale, config.nodes.seed),
+        progress.between(0.8 if use_mean else 0.6, 1.0),
     )
     if not registered and np.median(residuals) > MAX_RESIDUAL:
-        far = f"aligned, they lie {100 * np.median(residuals):.0f} % of sqrt(area) apart"
+        distance_note = f"aligned, they lie {100 * np.median(residuals):.0f} % of sqrt(area) apart"
         hint = "name one of the shapes with --template, or try another --align or --scale"
-        raise InputError(f"most shapes of the folder do not resemble the template {name}: {far}", hint)
+        raise InputError(f"most shapes of the folder do not resemble the template {name}: {distance_note}", hint)
     stems = [Path(clean.original.name).stem for clean in found]
     make_folder(output / "normalised")
     for clean, stem, frame, residual in zip(found, stems, frames, residuals, strict=True):
-        label = stem if stems.count(stem) == 1 else clean.original.name
-        large = clean.shape.F > config.faces
-        small = decimate(clean.shape, config.faces, config.decimate) if large else clean.shape
-        normal = Shape(frame.apply(small.verts), small.faces, small.name)
-        save_shape(output / "normalised" / f"{label}.ply", normal)
+        file_stem = stem if stems.count(stem) == 1 else clean.original.name
+        is_large = clean.shape.F > config.faces
+        decimated = decimate(clean.shape, config.faces, config.decimate) if is_large else clean.shape
+        normalised = Shape(frame.apply(decimated.verts), decimated.faces, decimated.name)
+        save_shape(output / "normalised" / f"{file_stem}.ply", normalised)
         if residual > MAX_RESIDUAL and not registered:
-            apart = f"aligned, it lies {100 * residual:.0f} % of sqrt(area) away"
-            notes.append(f"{clean.original.name} differs much from the template: {apart}")
+            distance = f"aligned, it lies {100 * residual:.0f} % of sqrt(area) away"
+            notes.append(f"{clean.original.name} differs much from the template: {distance}")
     save_template(made, output / "template.safetensors")
     arrays = {name: getattr(samples, name) for name in prepared_folder.ARRAYS}
     save_arrays(output / "points.safetensors", arrays, {"align": samples.align, "scale": samples.scale})
     save_arrays(output / "shapes.safetensors", {"verts": stack})
     names = tuple(clean.original.name for clean in found)
     turned = tuple(name for name, flag in zip(names, flags, strict=True) if flag)
-    words: dict[str, Any] = {"names": names, "registered": registered, "notes": notes, "template": made.hash}
-    words |= {"source": source, "align": how, "scale": config.scale, "mirrored": turned}
-    words["landmarks"] = samples.landmarks.shape[1]
-    words["frames"] = [{"scale": f.scale, "rotation": f.rotation.tolist(), "center": f.center.tolist()} for f in frames]
-    words |= {"apart": [round(residual, 5) for residual in residuals], "config": asdict(config.nodes)}
-    (output / "prepared.json").write_text(json.dumps(words, indent=1), encoding="utf-8")
-    return Prepared(made, stack, names, tuple(notes), how, turned, samples.landmarks.shape[1])
+    record: dict[str, Any] = {"names": names, "registered": registered, "notes": notes, "template": made.hash}
+    record |= {"source": source, "align": align, "scale": config.scale, "mirrored": turned}
+    record["landmarks"] = samples.landmarks.shape[1]
+    record["frames"] = [
+        {"scale": f.scale, "rotation": f.rotation.tolist(), "center": f.center.tolist()} for f in frames
+    ]
+    record |= {"apart": [round(residual, 5) for residual in residuals], "config": asdict(config.nodes)}
+    (output / "prepared.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
+    return Prepared(made, stack, names, tuple(notes), align, turned, samples.landmarks.shape[1])
 
 
 def _read_shapes(
@@ -272,9 +278,11 @@ def _read_shapes(
     pairs = [pair for pair in zip(files, landmark_files, strict=True) if pair[0] not in landmark_files]
     if not pairs:
         raise InputError(f"no shapes in {folder}", f"files that end in {', '.join(PLAIN_SUFFIXES)} are read")
-    inside = (path for path in folder.glob("[!.]*/**/*") if suffix_of(path) in PLAIN_SUFFIXES)
-    if deeper := {path.relative_to(folder).parts[0] for path in inside}:
-        notes.append(f"left out, as subfolders of {folder.name} are not searched: shapes of {', '.join(sorted(deeper))}")
+    nested = (path for path in folder.glob("[!.]*/**/*") if suffix_of(path) in PLAIN_SUFFIXES)
+    if subfolders := {path.relative_to(folder).parts[0] for path in nested}:
+        notes.append(
+            f"left out, as subfolders of {folder.name} are not searched: shapes of {', '.join(sorted(subfolders))}"
+        )
     found: list[Repaired] = []
     known: list[prepared_folder.KnownPoints | None] = []
     for number, (path, file) in enumerate(pairs):
