@@ -246,43 +246,54 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     if pose not in get_args(Pose):
         raise OptionError(f"invalid pose {pose!r}", f"choose one of {', '.join(get_args(Pose))}")
     source = as_path(source)
-    a = load_shape(source)
+    source_shape = load_shape(source)
     if source.suffix.lower() not in gltf.SUFFIXES:
-        raise InputError(f"{a.name} has no skeleton", f"rigs come in {', '.join(gltf.SUFFIXES)}")
+        raise InputError(f"{source_shape.name} has no skeleton", f"rigs come in {', '.join(gltf.SUFFIXES)}")
     data = read_bytes(source)
-    rig, weights = read_rig(source, data), load_weights(source, a)
-    if physics := gltf.understood(source, data, "scene makes", lambda doc: gltf_vrm.springs_and_constraints(doc.json)):
-        what = "a spring or constraint, which is" if physics == 1 else f"{physics} springs and constraints, which are"
-        warn(f"{a.name} has {what} not transferred")
-    _warn_of_stretched_joints(a.name, rig)
-    b = as_shape(target, "target")
-    path, data, in_gltf = as_scene(target, b)
-    hanging = gltf.understood(path, data, "scene makes", hanging_groups)
-    maps = find_maps(a, b, match)
-    apart = gltf.understood(path, data, "scene makes", lambda document: figures_apart(document, maps.forward.index))
-    if apart:
-        keep = "keeps its" if len(apart) == 1 else "keep their"
-        warn(
-            f"{', '.join(apart.values())} of {b.name or 'the target'} {keep} own skeleton, apart from what was matched"
+    rig, weights = read_rig(source, data), load_weights(source, source_shape)
+    if n_constraints := gltf.understood(
+        source, data, "scene makes", lambda doc: gltf_vrm.springs_and_constraints(doc.json)
+    ):
+        what = (
+            "a spring or constraint, which is"
+            if n_constraints == 1
+            else f"{n_constraints} springs and constraints, which are"
         )
-    _refuse_copies(b, maps.backward)
-    _warn_of_lying_clips(a, rig, weights, maps.forward.source_up, b.name or "the target")
+        warn(f"{source_shape.name} has {what} not transferred")
+    _warn_of_stretched_joints(source_shape.name, rig)
+    target_shape = as_shape(target, "target")
+    path, data, in_gltf = as_scene(target, target_shape)
+    rigid_groups = gltf.understood(path, data, "scene makes", hanging_groups)
+    maps = find_maps(source_shape, target_shape, match)
+    kept_figures = gltf.understood(
+        path, data, "scene makes", lambda document: figures_apart(document, maps.forward.index)
+    )
+    if kept_figures:
+        keeps = "keeps its" if len(kept_figures) == 1 else "keep their"
+        warn(
+            f"{', '.join(kept_figures.values())} of {target_shape.name or 'the target'} {keeps} own skeleton, "
+            "apart from what was matched"
+        )
+    _refuse_copies(target_shape, maps.backward)
+    _warn_of_lying_clips(source_shape, rig, weights, maps.forward.source_up, target_shape.name or "the target")
     with thread_limit(1):
-        points, share = maps.forward.points(b), vertex_weights(a, maps)
-        turn = np.eye(3) if in_gltf else upright(a, points, share)
-        ground = float((b.verts[b.valid] @ turn.T)[:, UP].min())
-        carried = carry(rig, weights.matrix, a, points @ turn.T, share, ground)
-        pulled = pull_weights(maps.backward, weights.matrix, INFLUENCES)
-        unknown = beyond(b, points, a.faces)
-        found = rigid(clean_weights(pulled, b, INFLUENCES, unknown), hanging)
+        points, share = maps.forward.points(target_shape), vertex_weights(source_shape, maps)
+        turn = np.eye(3) if in_gltf else upright(source_shape, points, share)
+        ground = float((target_shape.verts[target_shape.valid] @ turn.T)[:, UP].min())
+        carried = carry(rig, weights.matrix, source_shape, points @ turn.T, share, ground)
+        pulled_weights = pull_weights(maps.backward, weights.matrix, INFLUENCES)
+        unknown = beyond(target_shape, points, source_shape.faces)
+        target_weights = rigid(clean_weights(pulled_weights, target_shape, INFLUENCES, unknown), rigid_groups)
         standing, posed = carried.bind, carried.source_pose
         standing = posed if pose == "source" else replace(standing, clips=standing_clips(standing, posed))
-        binding = Binding(standing, carried.bind.worlds(), *joint_table(found), turn)
-        glb, replaced = gltf.understood(path, data, "scene makes", lambda document: rigged(document, binding, apart))
-    before, after = (np.asarray(each.sum(axis=0)).ravel() > 0 for each in (weights.matrix, found))
+        binding = Binding(standing, carried.bind.worlds(), *joint_table(target_weights), turn)
+        glb, replaced = gltf.understood(
+            path, data, "scene makes", lambda document: rigged(document, binding, kept_figures)
+        )
+    before, after = (np.asarray(each.sum(axis=0)).ravel() > 0 for each in (weights.matrix, target_weights))
     unused = tuple(weights.names[joint] for joint in np.flatnonzero(before & ~after))
-    moving = SkinWeights(found, weights.names)
+    skin = SkinWeights(target_weights, weights.names)
     original = as_path(target) if isinstance(target, str | Path) else None
-    glb, lost = with_look(glb, original, b)
-    made = remembering(glb, b)
-    return RiggedResult(standing, moving, unused, replaced.joints, replaced.clips, maps, made, source, original, lost)
+    glb, lost = with_look(glb, original, target_shape)
+    output = remembering(glb, target_shape)
+    return RiggedResult(standing, skin, unused, replaced.joints, replaced.clips, maps, output, source, original, lost)
