@@ -73,7 +73,7 @@ def test_from_a_folder_to_a_map(run: Run, eggs: Path, tmp_path: Path) -> None:
     assert run("prepare", eggs, "-o", tmp_path / "out", *FEW, *AS_THEY_ARE).status == 0
     answer = run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", "--steps", "3")
     assert answer.status == 0, answer.err
-    assert "learned from 3 shapes of out, without correspondence" in answer.err
+    assert "trained on 3 shapes of out, without correspondence" in answer.err
     card = read_card(tmp_path / "mine" / "card.json")
     assert card.frame == {"orientation": "none", "scale": "area"}
     assert (card.steps, card.category) == (3, "mine")
@@ -100,7 +100,7 @@ def test_from_fits_without_a_model_to_a_map(run: Run, tmp_path: Path) -> None:
     assert answer.status == 0, answer.err
     mine = ("-o", tmp_path / "mine", "--steps", "3")
     answer = run("train", "--shapes", tmp_path / "fits", *mine, "--start", "human")
-    assert answer.status == 1 and "holds fits without a model" in answer.err
+    assert answer.status == 1 and "contains fits without a model" in answer.err
     answer = run("train", "--shapes", tmp_path / "fits", *mine)
     assert answer.status == 0 and "training on 3 of 3 fits" in answer.err
     card = read_card(tmp_path / "mine" / "card.json")
@@ -126,7 +126,7 @@ def test_from_few_registered_shapes_to_a_map(run: Run, tmp_path: Path, monkeypat
     words = ("--steps", "3", "--seed", "2", "--stiffness", "0.1")
     answer = run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", *words)
     assert answer.status == 0 and "after step 3;" in answer.err
-    assert "going on" not in answer.err
+    assert "continuing" not in answer.err
     again = run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", *words)
     assert "continuing from the checkpoint" in again.err
     card = read_card(tmp_path / "mine" / "card.json")
@@ -182,7 +182,7 @@ def test_known_points_and_preset_reach_the_training(
     )
     assert answer.status == 0, answer.err
     assert called["calibrated"] == (tmp_path / "mine", tmp_path / "out")
-    assert "none will be good: few shapes" in answer.err
+    assert "none of its fits will be good: few shapes" in answer.err
     assert called["known"] == (2 if registered else 3, 1, 3)
     assert (called["category"], called["licence"], called["resume"]) == ("egg", "CC0", False)
     assert (called["recipe"].network.encoder, called["stiffness"]) == ("point", 0.2)

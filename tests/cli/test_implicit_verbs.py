@@ -54,7 +54,7 @@ def test_a_folder_becomes_a_model_and_goes_on(folder: Path, tmp_path: Path, caps
     assert main([*words, "2"]) == 0
     heard = capsys.readouterr()
     assert json.loads(heard.out)["steps"] == 2
-    assert "going on" in heard.err
+    assert "continuing" in heard.err
 
 
 @pytest.mark.parametrize(
