@@ -267,7 +267,7 @@ def _forecast(
             durations = [_about(left if how.minutes is None else min(left, how.minutes), "of training")]
             if then is not None and how.shapes is not None:
                 fits = min(DEFAULT_COUNT, len(list_shapes(how.shapes)))
-                what = f"to calibrate the verdicts on fits of {fits} of the shapes"
+                what = f"to fit {fits} of the shapes, to calibrate the verdicts"
                 pointwise = not has_nodes(then.network.field)
                 durations.append(_about(each * fits * SEARCH_STEPS * _CODE_STEP / 60 if pointwise else 0, what))
             console.say(", then ".join(durations))
@@ -297,8 +297,8 @@ def _calibrate(console: Console, output: Path, shapes: Path, threads: int, progr
         console.say(f"note: the model is not calibrated, and none of its fits will be good: {error.message}")
         return
     console.say(
-        f"fitted {usual['fits']} of the shapes: the template is stretched {math.exp(usual['stretch']):.2f}-fold, and "
-        f"{100 * usual['residual']:.2g} % of sqrt(area) apart; other fits are judged relative to that"
+        f"fitted {usual['fits']} of the shapes: the template is stretched {math.exp(usual['stretch']):.2f}-fold and lies "
+        f"{100 * usual['residual']:.2g} % of sqrt(area) from them (medians); other fits are judged relative to that"
     )
 
 

@@ -351,8 +351,8 @@ def test_a_run_without_a_report_has_no_picture(
 @pytest.mark.parametrize(
     ("field", "minutes", "words"),
     [
-        ("mls", None, "about 10 min of training, then less than a minute to fit 9 of the shapes, which tells"),
-        ("pointwise", None, r"about 10 min of training, then about \d+ min to fit 9 of the shapes, which tells"),
+        ("mls", None, "about 10 min of training, then less than a minute to fit 9 of the shapes, to calibrate"),
+        ("pointwise", None, r"about 10 min of training, then about \d+ min to fit 9 of the shapes, to calibrate"),
         ("pointwise", 3.0, r"about 3 min of training, then about \d+ min to fit 9 "),
         (None, None, "about 10 min of training$"),
     ],
@@ -398,4 +398,6 @@ def test_fits_that_calibrate_a_model_are_told_of(
     begun, first, fourth, _, done = capsys.readouterr().err.splitlines()
     assert begun.startswith("fitting some of the shapes")
     assert first == "fitted 1 of 12, about 16 min left" and fourth == "fitted 4 of 12, about 12 min left"
-    assert done.startswith("fitted 12 of the shapes: the template is stretched 1.11-fold, 1 % of sqrt(area) apart")
+    assert done.startswith(
+        "fitted 12 of the shapes: the template is stretched 1.11-fold and lies 1 % of sqrt(area) from them"
+    )
