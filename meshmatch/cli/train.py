@@ -183,7 +183,7 @@ class TrainOptions(Options):
     validate: Path | None = optional(
         "FOLDER",
         "Measure the validation error on the registered shapes of another folder that `meshmatch prepare` wrote with the "
-        "same template. Default: on further shapes of the training's own kind.",
+        "same template. Default: on further samples of the training data.",
     )
     tensorboard: bool = Option(
         False, "--tensorboard", help="Also write curves for TensorBoard (needs the extra `tensorboard`)."
