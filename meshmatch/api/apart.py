@@ -48,7 +48,7 @@ class KnownParts:
     ----------
     clean
         The repaired parts, with the correspondence to all vertices of the file.
-    readings
+    residuals
         (M,) `category_residual` by each model; infinite for models that were not evaluated.
     row
         Index of the model with the lowest residual.
@@ -57,7 +57,7 @@ class KnownParts:
     """
 
     clean: Repaired
-    readings: Float[Floats, " M"]
+    residuals: Float[Floats, " M"]
     row: int
     fit: Fit | None = None
 
@@ -110,10 +110,10 @@ def find_known_parts(
                 clean.append(rest)
     if not sets:
         return None
-    readings = Readings(models, [each.shape for each in clean], [config] * len(clean))
-    found = readings.found
+    evaluator = Readings(models, [each.shape for each in clean], [config] * len(clean))
+    found = evaluator.found
     for rows in order or [range(len(models))]:
-        readings.ask(rows, range(len(clean)))
+        evaluator.ask(rows, range(len(clean)))
         if found.min() <= FAMILIAR:
             break
     value = found.min(axis=0)

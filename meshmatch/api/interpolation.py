@@ -396,6 +396,6 @@ def save_folder(path: str | Path, result: Interpolation, kind: str = "ply", orig
             plan.make_folders()
             plan.write(plan.files, step.shape, turns, turn=turn)
         frames = [{"file": name} | step.record for name, step in zip(names, result.steps, strict=True)]
-        words = {"times_of_the_shapes": list(result.times), "place": result.place, "frames": frames}
-        (folder / "frames.json").write_text(json.dumps(words, indent=1) + "\n", encoding="utf-8")
+        record = {"times_of_the_shapes": list(result.times), "place": result.place, "frames": frames}
+        (folder / "frames.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     return names

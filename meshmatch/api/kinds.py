@@ -86,8 +86,8 @@ def category_residuals(
 
     The residual is infinite for pairs that are not evaluated, and where a model cannot be evaluated on a shape.
     """
-    readings = Readings([model.load for model in models], shapes, configs)
-    found = readings.found
+    evaluator = Readings([model.load for model in models], shapes, configs)
+    found = evaluator.found
     parts = [_is_part(shape, config) for shape, config in zip(shapes, configs, strict=True)]
     boundary = [
         np.inf if shape.is_cloud else part * boundary_length(shape) / np.sqrt(shape.area)
@@ -95,15 +95,15 @@ def category_residuals(
     ]
     first, *others = np.argsort(boundary, kind="stable").tolist()
     for rows in _order(models):
-        readings.ask(rows, [first])
+        evaluator.ask(rows, [first])
         if found[:, first].min() <= sure:
             break
     known = found[:, first].min() <= KNOWN
     kind = models[int(found[:, first].argmin())].card.category
     same = [row for row, model in enumerate(models) if model.card.category == kind and known]
-    readings.ask(same, others)
+    evaluator.ask(same, others)
     unknown = [number for number in others if found[:, number].min() > KNOWN and not (known and parts[number])]
-    readings.ask([row for row in range(len(models)) if row not in same], unknown)
+    evaluator.ask([row for row in range(len(models)) if row not in same], unknown)
     return found
 
 
@@ -185,10 +185,10 @@ def choose_model(
         models.append(Installed.loaded(settled))
     shapes = [each.shape for each in clean]
     Progress(progress, shapes[0].name).stage("looking for its kind")(0.0)
-    readings = category_residuals(models, shapes, configs)
-    if np.isinf(readings).all():
+    residuals = category_residuals(models, shapes, configs)
+    if np.isinf(residuals).all():
         raise _no_model_error()
-    found = _classify_all(models, readings, shapes, configs, progress)
+    found = _classify_all(models, residuals, shapes, configs, progress)
     clean = list(clean)
     parts_tried = [known.kind is None or each.far_parts > 0 for known, each in zip(found, clean, strict=True)]
     for number in np.flatnonzero(parts_tried).tolist():
@@ -197,11 +197,11 @@ def choose_model(
         loaders, whole = [model.load for model in models], clean[number].original
         if (alone := find_known_parts(loaders, whole, config, _order(models), progress)) is not None:
             card = models[alone.row].card
-            clean[number], readings[:, number] = alone.clean, alone.readings
+            clean[number], residuals[:, number] = alone.clean, alone.residuals
             found[number] = Classification(card.category, card, alone.fit)
         refuse_far_parts(clean[number])
     shapes = [each.shape for each in clean]
-    _refuse_unknown(models, readings, found, shapes, configs)
+    _refuse_unknown(models, residuals, found, shapes, configs)
     names: dict[str, str] = {} if settled is None else {settled.card.category: "the shapes before"}
     for shape, kind in zip(shapes, [each.kind for each in found], strict=True):
         if kind is not None and kind not in names and names:
@@ -210,9 +210,9 @@ def choose_model(
             raise InputError(problem, f"match shapes of one kind; {_HINT_MODEL}")
         if kind is not None:
             names.setdefault(kind, shape.name)
-    common = next(iter(names), models[int(readings.sum(1).argmin())].card.category)
+    common = next(iter(names), models[int(residuals.sum(1).argmin())].card.category)
     rows = [row for row, model in enumerate(models) if model.card.category == common]
-    chosen = settled or models[min(rows, key=lambda row: readings[row].sum())].load()
+    chosen = settled or models[min(rows, key=lambda row: residuals[row].sum())].load()
     suffix = "" if chosen.card.name == common else f" (model {chosen.card.name})"
     notes = [
         f"{shape.name or 'the shape'}: {each.kind}{suffix}"
@@ -237,7 +237,7 @@ def _uncertain_note(shape: Shape, found: Classification, assumed: str) -> str:
 
 def classify_shapes(
     models: Sequence[Installed],
-    readings: Float[Floats, "M S"],
+    residuals: Float[Floats, "M S"],
     shapes: Sequence[Shape],
     configs: Sequence[FitConfig],
     progress: ProgressCallback | None = None,
@@ -246,14 +246,14 @@ def classify_shapes(
 
     `InputError` for a complete mesh that is not of the kind whose model has the lowest residual.
     """
-    found = _classify_all(models, readings, shapes, configs, progress)
-    _refuse_unknown(models, readings, found, shapes, configs)
+    found = _classify_all(models, residuals, shapes, configs, progress)
+    _refuse_unknown(models, residuals, found, shapes, configs)
     return found
 
 
 def _classify_all(
     models: Sequence[Installed],
-    readings: Float[Floats, "M S"],
+    residuals: Float[Floats, "M S"],
     shapes: Sequence[Shape],
     configs: Sequence[FitConfig],
     progress: ProgressCallback | None,
@@ -268,12 +268,12 @@ def _classify_all(
         known, fit = classify(best.load(), shape, column[row], config, progress)
         return Classification(kind if known else None, best.card, fit)
 
-    return parallel_map(classify_one, shapes, configs, readings.T)
+    return parallel_map(classify_one, shapes, configs, residuals.T)
 
 
 def _refuse_unknown(
     models: Sequence[Installed],
-    readings: Float[Floats, "M S"],
+    residuals: Float[Floats, "M S"],
     found: Sequence[Classification],
     shapes: Sequence[Shape],
     configs: Sequence[FitConfig],
@@ -281,7 +281,7 @@ def _refuse_unknown(
     kinds = {each.kind for each in found if each.kind is not None}
     if not kinds and len(found) > 1:
         kinds = {each.card.category for each in found}
-    for shape, config, each, nearest in zip(shapes, configs, found, readings.min(0), strict=True):
+    for shape, config, each, nearest in zip(shapes, configs, found, residuals.min(0), strict=True):
         unknown = each.kind is None and not shape.is_cloud and not may_show_part(shape, config)
         if unknown and not _may_be_of_kind(each, kinds):
             names = ", ".join(sorted({model.card.category for model in models}))
@@ -306,10 +306,10 @@ def other_kind(model: TrainedModel, shape: Shape, config: FitConfig) -> str | No
     """The kind of a repaired shape by the installed models, if it differs from the model's; else None."""
     try:
         models = installed_models()
-        readings = category_residuals(models, [shape], [config])
-        if models[int(readings.argmin())].card.category == model.card.category:
+        residuals = category_residuals(models, [shape], [config])
+        if models[int(residuals.argmin())].card.category == model.card.category:
             return None
-        return classify_shapes(models, readings, [shape], [config])[0].kind
+        return classify_shapes(models, residuals, [shape], [config])[0].kind
     except (InputError, ModelError):
         return None
 
@@ -329,11 +329,11 @@ def kinds_of(
     found: dict[str, str | None] = {}
     for number, name in enumerate(sampled):
         try:
-            readings = category_residuals(models, [repair(load_shape(files[name])).shape], [config])[:, 0]
+            residuals = category_residuals(models, [repair(load_shape(files[name])).shape], [config])[:, 0]
         except InputError:  # of no use to any model
-            readings = np.full(len(models), np.inf)
-        best = int(readings.argmin())
-        found[name] = models[best].card.category if readings[best] <= FAMILIAR else None
+            residuals = np.full(len(models), np.inf)
+        best = int(residuals.argmin())
+        found[name] = models[best].card.category if residuals[best] <= FAMILIAR else None
         if progress is not None:
             progress("looking for known kinds", "shapes", (number + 1) / len(sampled))
     return found

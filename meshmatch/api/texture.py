@@ -232,10 +232,10 @@ def _check_shared(
     if contradicted > _MAX_CONTRADICTED:
         problem = f"they overlap, and {100 * contradicted:.0f} % of the overlapping surface looks different"
         return new_atlas(mesh, options.size, options.padding, uv, polygons, problem)
-    words = (
+    note_text = (
         f"{mesh.name}: its own texture coordinates give {100 * atlas.shared:.0f} % of their texels to several places"
     )
-    return replace(atlas, note=f"{words}, as to mirrored halves; these look alike, and are baked once")
+    return replace(atlas, note=f"{note_text}, as to mirrored halves; these look alike, and are baked once")
 
 
 def _transfer_layout(shape: Shape, look: Appearance, maps: MapPair, polygons: Ints | None, size: int) -> Atlas:
@@ -253,7 +253,7 @@ def _transfer_layout(shape: Shape, look: Appearance, maps: MapPair, polygons: In
         )
         raise OptionError(f"{problem}, which look different", "leave out --uv source")
     pieces = f"{charts} chart{'s' if charts != 1 else ''}"
-    words = f"the layout of {name} ({pieces}) was carried over"
+    note_text = f"the layout of {name} ({pieces}) was carried over"
     if atlas.shared > _MIN_REPORTED:
-        words += f"; {100 * atlas.shared:.1f} % of its texels have several places and show one of them"
-    return replace(atlas, note=words)
+        note_text += f"; {100 * atlas.shared:.1f} % of its texels have several places and show one of them"
+    return replace(atlas, note=note_text)

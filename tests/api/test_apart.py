@@ -68,7 +68,7 @@ def test_the_parts_that_are_known_are_kept_and_the_others_said(reads: Reads) -> 
     asked = reads({BODY.V: 3.7})
     scene = together("scan.ply", BODY, floor(BODY), pack(BODY))
     alone = find_known_parts(loaders(), scene, CONFIG)
-    assert alone is not None and alone.fit is None and alone.readings == pytest.approx([0.037])
+    assert alone is not None and alone.fit is None and alone.residuals == pytest.approx([0.037])
     body = int(Parts.of(scene).number[0])
     assert alone.clean.left_out == tuple({1, 2, 3} - {body})
     assert alone.clean.shape.V == BODY.V and len(alone.clean.original_to_repaired) == scene.V
@@ -182,7 +182,7 @@ def test_a_model_that_knows_some_parts_spares_the_others(reads: Reads) -> None:
     asked = reads({BODY.V: 3.7})
     scene = together("scan.ply", BODY, floor(BODY))
     alone = find_known_parts(loaders(2), scene, CONFIG, [[0], [1]])
-    assert alone is not None and alone.row == 0 and np.isinf(alone.readings[1])
+    assert alone is not None and alone.row == 0 and np.isinf(alone.residuals[1])
     assert len(asked) == len(set(asked))
 
 
