@@ -74,8 +74,8 @@ class AtlasOptions:
     symmetry: bool = Option(
         False,
         "--symmetry",
-        help="Analyse asymmetry: compare each shape, such as a head, with its mirror image, or with --sides the left with the "
-        "right shapes.",
+        help="Analyse asymmetry: compare each shape, such as a head, with its mirror image, or with --sides the left with "
+        "the right shapes.",
     )
     individuals: str | None = Option(
         None,
