@@ -1,1 +1,1 @@
-"""Geometry of plain arrays: frames, oriented points, triangles."""
+"""Geometry on plain arrays: frames, oriented points, triangles."""

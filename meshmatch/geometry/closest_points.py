@@ -1,7 +1,7 @@
-"""Rigid motions of one set of oriented points onto another by iterative closest points, from many starts at once.
+"""Rigid registration of oriented point sets by iterative closest points (ICP), from many starts at once.
 
-Both sets look for their closest, normals included, with robust weights (Besl and McKay 1992; Geman and McClure). All starts
-take a step together: what they ask is asked at once, and NumPy is called a few times rather than for each.
+Correspondences run both ways and compare normals too, with robust weights (Besl and McKay 1992; Geman and McClure). All
+starts take each step together, so that one query and a few NumPy calls serve all of them.
 """
 
 from __future__ import annotations
@@ -12,79 +12,92 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints, nearest, with_normals
 
-# Set by hand, in units of sqrt(area): the scale of robust weights, and the distance from which on a point counts as far.
-_SCALE, _CAP = 0.1, 0.2
-_STILL = 1e-4  # a step that changes no entry of a pose by more is the last one
+# Set by hand, in units of sqrt(area): scale of the robust weights, and the distance at which residuals are capped.
+_ROBUST_SCALE, _MAX_DISTANCE = 0.1, 0.2
+_POSE_TOLERANCE = 1e-4  # iteration stops once no entry of a pose changes by more
 
 
 class ClosestPoints:
-    """Two sets of points, both about their middles; poses are those of the target: the shape is near ``to_world(target)``.
+    """Two centered point sets. Poses are those of the target: ``pose.to_world(target)`` approximates the shape.
 
-    Of both, points whose numbers are in ``asking`` look for their closest among all of the other; all of them without it.
+    ``queries`` are the rows of the shape and of the target that search for their closest point among all points of the
+    other set; by default all rows.
     """
 
     def __init__(
         self,
         shape: OrientedPoints,
         target: OrientedPoints,
-        asking: tuple[Int[Ints, " P"], Int[Ints, " Q"]] | None = None,
+        queries: tuple[Int[Ints, " P"], Int[Ints, " Q"]] | None = None,
     ) -> None:
         self._shape, self._target = shape, target
         self._features = shape.features, target.features
-        self._own, self._other = (shape, target) if asking is None else (shape.rows(asking[0]), target.rows(asking[1]))
+        self._shape_queries, self._target_queries = (
+            (shape, target) if queries is None else (shape.rows(queries[0]), target.rows(queries[1]))
+        )
 
-    def _asked(
+    def _transformed_queries(
         self, turns: Float[Floats, "N 3 3"], centers: Float[Floats, "N 3"]
     ) -> tuple[Float[Floats, "N P 6"], Float[Floats, "N Q 6"]]:
-        """Points of the shape in each pose, and of the target in the world: what asks is moved, and not what is asked."""
-        (own, other), back = (self._own, self._other), turns.transpose(0, 2, 1)
-        here = with_normals((own.points - centers[:, None]) @ turns, own.normals @ turns)
-        return here, with_normals(other.points @ back + centers[:, None], other.normals @ back)
+        """Query points of the shape in each pose's local frame, and query points of the target in the world frame.
 
-    def _closest(
+        The queries are transformed rather than the sets they search, so that the search structures stay valid.
+        """
+        (shape_queries, target_queries), back = (self._shape_queries, self._target_queries), turns.transpose(0, 2, 1)
+        here = with_normals((shape_queries.points - centers[:, None]) @ turns, shape_queries.normals @ turns)
+        return here, with_normals(target_queries.points @ back + centers[:, None], target_queries.normals @ back)
+
+    def _correspondences(
         self, here: Float[Floats, "N P 6"], there: Float[Floats, "N Q 6"]
     ) -> tuple[Int[Ints, "N P"], Int[Ints, "N Q"]]:
-        """Of points of the shape those of the target that are closest, and the other way around."""
+        """Indices of the closest target point for each shape query, and of the closest shape point for each target
+        query.
+        """
         to_target = nearest(self._features[1], here.reshape(-1, 6)).reshape(here.shape[:2])
         return to_target, nearest(self._features[0], there.reshape(-1, 6)).reshape(there.shape[:2])
 
     def residuals(self, poses: list[RigidPose]) -> Float[Floats, " N"]:
-        """Mean capped distance there and back in each pose, normals included."""
-        here, there = self._asked(*_stacked(poses))
-        to_target, to_shape = self._closest(here, there)
+        """Mean capped distance both ways for each pose, normals included."""
+        here, there = self._transformed_queries(*_stack_poses(poses))
+        to_target, to_shape = self._correspondences(here, there)
         far = np.linalg.norm(here - self._features[1][to_target], axis=2)
         back = np.linalg.norm(there - self._features[0][to_shape], axis=2)
-        return np.asarray(0.5 * np.minimum(far, _CAP).mean(1) + 0.5 * np.minimum(back, _CAP).mean(1))
+        return np.asarray(0.5 * np.minimum(far, _MAX_DISTANCE).mean(1) + 0.5 * np.minimum(back, _MAX_DISTANCE).mean(1))
 
     def nearer(self, poses: list[RigidPose], steps: int) -> list[RigidPose]:
-        """Poses after some steps from others, or fewer where they stand still before."""
-        turns, centers = _stacked(poses)
-        own, other, going = self._own, self._other, np.arange(len(poses))
-        weight = np.repeat([1 / len(own.points), 1 / len(other.points)], [len(own.points), len(other.points)])
+        """Poses after at most ``steps`` iterations from the given ones; converged poses stop early."""
+        turns, centers = _stack_poses(poses)
+        shape_queries, target_queries, active = self._shape_queries, self._target_queries, np.arange(len(poses))
+        weight = np.repeat(
+            [1 / len(shape_queries.points), 1 / len(target_queries.points)],
+            [len(shape_queries.points), len(target_queries.points)],
+        )
         for _ in range(steps):
-            R, c = turns[going], centers[going]
-            to_target, to_shape = self._closest(*self._asked(R, c))
-            here, there = (np.broadcast_to(each.points, (len(R), *each.points.shape)) for each in (own, other))
+            R, c = turns[active], centers[active]
+            to_target, to_shape = self._correspondences(*self._transformed_queries(R, c))
+            here, there = (
+                np.broadcast_to(each.points, (len(R), *each.points.shape)) for each in (shape_queries, target_queries)
+            )
             source = np.concatenate([self._target.points[to_target], there], 1)
-            place = (np.concatenate([here, self._shape.points[to_shape]], 1) - c[:, None]) @ R
-            off = np.square(source - place).sum(2)
-            turn, shift = _motions(source, place, weight / np.square(1.0 + off / _SCALE**2))
-            turns[going], centers[going] = R @ turn, (R @ shift[..., None])[..., 0] + c
+            destination = (np.concatenate([here, self._shape.points[to_shape]], 1) - c[:, None]) @ R
+            squared = np.square(source - destination).sum(2)
+            turn, shift = _kabsch_batch(source, destination, weight / np.square(1.0 + squared / _ROBUST_SCALE**2))
+            turns[active], centers[active] = R @ turn, (R @ shift[..., None])[..., 0] + c
             moves = np.maximum(np.abs(turn - np.eye(3)).max((1, 2)), np.abs(shift).max(1))
-            going = going[moves >= _STILL]
-            if not len(going):
+            active = active[moves >= _POSE_TOLERANCE]
+            if not len(active):
                 break
         return [RigidPose(*pose) for pose in zip(turns, centers, strict=True)]
 
 
-def _stacked(poses: list[RigidPose]) -> tuple[Float[Floats, "N 3 3"], Float[Floats, "N 3"]]:
+def _stack_poses(poses: list[RigidPose]) -> tuple[Float[Floats, "N 3 3"], Float[Floats, "N 3"]]:
     return np.array([pose.rotation for pose in poses]), np.array([pose.center for pose in poses])
 
 
-def _motions(
+def _kabsch_batch(
     source: Float[Floats, "N P 3"], place: Float[Floats, "N P 3"], weights: Float[Floats, "N P"]
 ) -> tuple[Float[Floats, "N 3 3"], Float[Floats, "N 3"]]:
-    """As `meshmatch.geometry.frames.kabsch`, of many."""
+    """Rotations and translations of N weighted point sets, as by `meshmatch.geometry.frames.kabsch`."""
     weights = (weights / np.maximum(weights.sum(1, keepdims=True), 1e-30))[:, None]
     a, b = weights @ source, weights @ place
     spread = (place - b).transpose(0, 2, 1) @ (weights.transpose(0, 2, 1) * (source - a))

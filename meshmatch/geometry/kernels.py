@@ -1,8 +1,8 @@
-"""Kernels of moving least squares: how much a node weighs at a distance, up to its support radius; and whether the nodes
-that reach a point are enough.
+"""Kernels of moving least squares: a node's weight by distance, up to its support radius, and whether a point has
+enough nodes.
 
-This is the one place of a new kernel: its name in `Kernel`, its function in `KERNELS`. The functions take NumPy arrays
-and torch tensors alike.
+To add a kernel, add its name to `Kernel` and its functions to `KERNELS` and `CURVATURES`. The functions take NumPy
+arrays and torch tensors alike.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.trees import cKDTree
 
 Kernel = Literal["cubic", "smooth"]
-# Smallest accepted eigenvalue of the scaled moment matrix, relative to its trace. Set by hand, as are the numbers below.
+# Smallest accepted eigenvalue of the scaled moment matrix, relative to its trace. This and the next constant are set by
+# hand.
 MINIMUM_EIGENVALUE = 1e-6
-_WIDE = 10.0
+_MAX_SCALE_RATIO = 10.0  # of the support radius to the farthest node, see `support_scale`
 
 
 def _cubic(distance: Any, radius: Any) -> tuple[Any, Any]:
-    """(1 - d/r)^3, the NeurIPS 2022 paper's; its gradient is set to 0 at the node by symmetry."""
+    """(1 - d/r)^3, the kernel of the NeurIPS 2022 paper; its gradient at the node is set to 0 by symmetry."""
     inside = (1 - distance / radius).clip(min=0)
     slope = -3 * inside**2 / (radius * distance.clip(min=1e-30))
     return inside**3, slope * (distance > 0)
@@ -48,7 +49,8 @@ def _smooth_curvature(distance: Any, radius: Any) -> Any:
     return 24 * (1 - (distance / radius) ** 2).clip(min=0) / radius**4
 
 
-# (distance, radius) -> (ds/dd) / d of the slope s above; of the cubic one it has no limit at the node, and is set to 0
+# (distance, radius) -> (ds/dd) / d of the slope s above. That of the cubic kernel has no limit at the node and is set
+# to 0.
 CURVATURES: dict[Kernel, Callable[[Any, Any], Any]] = {"cubic": _cubic_curvature, "smooth": _smooth_curvature}
 
 
@@ -66,9 +68,12 @@ def support_pairs(
 def support_scale(
     row: Int[Ints, " N"], column: Int[Ints, " N"], radii: Float[Floats, " K"], P: int, distance: Float[Floats, " N"]
 ) -> Float[Floats, " P"]:
-    """In what length offsets from each of P points are measured: the largest radius of a node that reaches it, so that
-    moment matrices are as well conditioned among wide nodes as among narrow ones; or, where that is `_WIDE` times the
-    largest ``distance`` of a node from its point, the latter: nodes lie no more in a plane for reaching further."""
+    """Length (P,) by which the offsets from each point are divided in moment matrices.
+
+    It is the largest radius of a node that reaches the point, so that matrices are equally well conditioned for wide
+    and narrow supports. If that is `_MAX_SCALE_RATIO` times the largest ``distance`` of any node from its point, it is
+    that distance: wider supports do not make nodes more coplanar.
+    """
     if radii.min() == radii.max():
         scale = np.full(P, radii.mean())
     else:
@@ -76,7 +81,7 @@ def support_scale(
         np.maximum.at(scale, row, radii[column])
         scale = np.where(scale > 0, scale, radii.mean())
     farthest = distance.max(initial=0.0)
-    return np.where((scale > _WIDE * farthest) & (farthest > 0), farthest, scale)
+    return np.where((scale > _MAX_SCALE_RATIO * farthest) & (farthest > 0), farthest, scale)
 
 
 def poorly_supported(
@@ -86,7 +91,9 @@ def poorly_supported(
     kernel: Kernel = "smooth",
     margin: float = 30.0,
 ) -> Int[Ints, " N"]:
-    """Indices of the points without four non-coplanar nodes in reach, with a safety margin."""
+    """Indices of the points without four clearly non-coplanar nodes in reach; ``margin`` multiplies
+    `MINIMUM_EIGENVALUE`.
+    """
     radii = np.broadcast_to(np.asarray(radius, np.float64), (len(nodes),))
     row, column = support_pairs(points, nodes, radii)
     offset = points[row] - nodes[column]

@@ -1,4 +1,4 @@
-"""SciPy's tree of points, of which we always ask several at once: its answers are arrays."""
+"""SciPy's k-d tree, typed for queries of several points at once: the results are arrays."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from meshmatch.arrays import Floats, Ints
 
     class cKDTree(_cKDTree):
-        """As SciPy's."""
+        """SciPy's k-d tree."""
 
         def query(self, x: ArrayLike, k: Any = 1, **options: Any) -> tuple[Floats, Ints]:  # type: ignore[override]
-            """Distances to the nearest points, and their numbers."""
+            """Distances to the nearest points, and their indices."""
 
 else:
     cKDTree = _cKDTree
