@@ -1,4 +1,4 @@
-"""Similarities between coordinate systems, rigid poses, and the best rigid motion between points."""
+"""Similarities between coordinate systems, rigid poses, and the least-squares rigid motion between point sets."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from meshmatch.errors import InputError
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Frame(Brief, Pickled):
-    """A similarity from a file's coordinates to a model's, and back; for a shape that is known by its mirror image, a
-    reflection too.
+    """A similarity between a file's coordinates and a model's; with a reflection for a shape that matches in mirror
+    image.
 
     Attributes
     ----------
     scale
         Length of one model unit, in the unit of the file.
     rotation
-        (3, 3) acts on column vectors; determinant -1 of a reflection.
+        (3, 3) acts on column vectors; its determinant is -1 for a reflection.
     center
         (3,) the model's origin, in the file's coordinates.
 
@@ -32,9 +32,9 @@ class Frame(Brief, Pickled):
     >>> frame.undo(frame.apply([[2.0, 0.0, 0.0]]))
     """
 
-    scale: float  # length in the file that becomes 1; positive
-    rotation: Float[Floats, "3 3"]  # applied after centering; orthonormal, determinant +1, or -1 in the mirror
-    center: Float[Floats, " 3"]  # the file's point that becomes the origin
+    scale: float  # file length that becomes 1; positive
+    rotation: Float[Floats, "3 3"]  # applied after centering; orthonormal, determinant +1, or -1 for a mirrored frame
+    center: Float[Floats, " 3"]  # file point that becomes the origin
 
     def __post_init__(self) -> None:
         rotation = read_only(self.rotation, np.float64, "a frame's rotation")
@@ -44,15 +44,15 @@ class Frame(Brief, Pickled):
             raise InputError(f"a frame needs a (3, 3) rotation and a (3,) center, not {rotation.shape}, {center.shape}")
         if not (scale.ndim == 0 and np.isfinite(scale) and scale > 0 and np.isfinite(center).all()):
             raise InputError(f"a frame's scale must be positive and finite, not {self.scale}", "has it any size?")
-        small = (np.abs(rotation) < 2).all()  # else the product could overflow
-        if not (small and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)):
+        is_bounded = (np.abs(rotation) < 2).all()  # larger entries could overflow in the product
+        if not (is_bounded and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)):
             raise InputError("a frame's rotation must be orthonormal")
         for name, value in (("scale", float(scale)), ("rotation", rotation), ("center", center)):
             object.__setattr__(self, name, value)
 
     @classmethod
     def identity(cls) -> Frame:
-        """The frame that changes nothing.
+        """The identity frame.
 
         Returns
         -------
@@ -63,16 +63,16 @@ class Frame(Brief, Pickled):
 
     @property
     def mirrored(self) -> bool:
-        """Whether left becomes right."""
+        """Whether the frame contains a reflection."""
         return bool(np.linalg.det(self.rotation) < 0)
 
     @property
     def turn(self) -> Float[Floats, "3 3"]:
-        """The rotation; of a mirrored frame, the one with the same up and front."""
+        """The rotation; for a mirrored frame, the rotation with the same up and front axes."""
         return self.rotation * [[-1], [1], [1]] if self.mirrored else self.rotation
 
     def apply(self, points: ArrayLike) -> Float[Floats, "... 3"]:
-        """From the file to the model: ``((points - center) @ rotation.T) / scale``.
+        """Transform points from the file to the model: ``((points - center) @ rotation.T) / scale``.
 
         Parameters
         ----------
@@ -87,7 +87,7 @@ class Frame(Brief, Pickled):
         return ((np.asarray(off_torch(points), np.float64) - self.center) @ self.rotation.T) / self.scale
 
     def undo(self, points: ArrayLike) -> Float[Floats, "... 3"]:
-        """From the model back to the file.
+        """Transform points from the model back to the file.
 
         Parameters
         ----------
@@ -102,7 +102,7 @@ class Frame(Brief, Pickled):
         return (np.asarray(off_torch(points), np.float64) * self.scale) @ self.rotation + self.center
 
     def compose(self, outer: Frame) -> Frame:
-        """This frame first, then `outer`: ``self.compose(outer).apply(x) = outer.apply(self.apply(x))``.
+        """Apply this frame first, then `outer`: ``self.compose(outer).apply(x) = outer.apply(self.apply(x))``.
 
         Parameters
         ----------
@@ -112,42 +112,42 @@ class Frame(Brief, Pickled):
         Returns
         -------
         Frame
-            Both in one.
+            The composition.
         """
         return Frame(self.scale * outer.scale, outer.rotation @ self.rotation, self.undo(outer.center))
 
 
 @dataclass(frozen=True, eq=False)
 class RigidPose:
-    """Where a body's own (local) coordinates lie in the world: world = rotation local + center."""
+    """Pose of a body in the world: world = rotation @ local + center."""
 
     rotation: Float[Floats, "3 3"]  # orthonormal, determinant +1
-    center: Float[Floats, " 3"]  # the world's point that is the local origin
+    center: Float[Floats, " 3"]  # position of the local origin in the world
 
     @classmethod
     def identity(cls) -> RigidPose:
-        """Local coordinates that are the world's."""
+        """The pose whose local coordinates are world coordinates."""
         return cls(np.eye(3), np.zeros(3))
 
     def to_local(self, points: Float[Floats, "... 3"]) -> Float[Floats, "... 3"]:
-        """Points of the world in local coordinates."""
+        """Transform points from world to local coordinates."""
         return (points - self.center) @ self.rotation
 
     def to_world(self, points: Float[Floats, "... 3"]) -> Float[Floats, "... 3"]:
-        """Points of local coordinates in the world."""
+        """Transform points from local to world coordinates."""
         return points @ self.rotation.T + self.center
 
     def __matmul__(self, inner: RigidPose) -> RigidPose:
-        """The pose of what has pose ``inner`` in this pose's local coordinates."""
+        """Composition: the world pose of a body whose pose relative to this one is ``inner``."""
         return RigidPose(self.rotation @ inner.rotation, self.rotation @ inner.center + self.center)
 
     @property
     def frame(self) -> Frame:
-        """The same as a `Frame` from the world into local coordinates."""
+        """The same transformation as a `Frame` from world to local coordinates."""
         return Frame(1.0, self.rotation.T, self.center)
 
     def angle_to(self, other: RigidPose) -> float:
-        """Angle between the rotations of two poses, degrees."""
+        """Angle between the rotations of two poses, in degrees."""
         cosine = (np.trace(self.rotation.T @ other.rotation) - 1) / 2
         return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
@@ -155,9 +155,9 @@ class RigidPose:
 def kabsch(
     source: Float[Floats, "N 3"], target: Float[Floats, "N 3"], weights: Float[Floats, " N"] | None = None
 ) -> RigidPose:
-    """Best rigid motion by least squares (Kabsch 1976): ``pose.to_world(source)`` is close to ``target``.
+    """Least-squares rigid motion (Kabsch 1976): ``pose.to_world(source)`` approximates ``target``.
 
-    Weights are not negative; without them all points count the same.
+    Weights must be nonnegative; by default all points count equally.
     """
     if weights is None:
         a, b = source.mean(0), target.mean(0)
