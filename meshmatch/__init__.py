@@ -1,7 +1,7 @@
 """Dense matching of non-rigid 3D shapes.
 
-The public names below are loaded when they are first used: importing `meshmatch` itself costs nothing heavy. They are
-described on the site, whose pages docs/reference lists.
+The public names are imported on first use, so that importing `meshmatch` itself is cheap. The site describes them; its
+pages are listed in docs/reference.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ if TYPE_CHECKING:
     from meshmatch.transfer.measurements import Measurement as Measurement
     from meshmatch.transfer.measurements import Measurements as Measurements
 
-_NAMES = {
+_PUBLIC = {
     "api.blend_shapes": "BlendShapesResult transfer_shapes",
     "api.calibration": "calibrate",
     "api.fits": "load_fit save_fit",
@@ -129,28 +129,28 @@ _NAMES = {
     "transfer.bake": "BakeOptions",
     "transfer.measurements": "Measurement Measurements",
 }
-_HOMES = {name: f"meshmatch.{module}" for module, names in _NAMES.items() for name in names.split()}
+_MODULE_OF = {name: f"meshmatch.{module}" for module, names in _PUBLIC.items() for name in names.split()}
 
-__all__ = ["__version__", *sorted(_HOMES)]  # noqa: PLE0604  (names come from __getattr__)
+__all__ = ["__version__", *sorted(_MODULE_OF)]  # noqa: PLE0604  (names come from __getattr__)
 
 
 def __getattr__(name: str) -> object:
-    if name not in _HOMES:
+    if name not in _MODULE_OF:
         raise AttributeError(f"module 'meshmatch' has no attribute {name!r}")
     from importlib import import_module
 
     from meshmatch.errors import needs
 
-    extra = "implicit" if _HOMES[name].startswith("meshmatch.implicit") else "train"
+    extra = "implicit" if _MODULE_OF[name].startswith("meshmatch.implicit") else "train"
     with needs("torch", extra):
-        value = getattr(import_module(_HOMES[name]), name)
-    globals()[name] = value  # next time without this function
+        value = getattr(import_module(_MODULE_OF[name]), name)
+    globals()[name] = value  # later accesses bypass this function
     return value
 
 
 def __dir__() -> list[str]:
-    """Without what needs torch where that is not installed, so that `help` and `inspect` go through."""
+    """All public names, but without torch only those that do not need it, so that `help` and `inspect` work."""
     from importlib.util import find_spec
 
-    lacking = () if find_spec("torch") else ("meshmatch.implicit.", "meshmatch.training.")
-    return sorted(name for name in __all__ if not _HOMES.get(name, "").startswith(lacking))
+    unavailable = () if find_spec("torch") else ("meshmatch.implicit.", "meshmatch.training.")
+    return sorted(name for name in __all__ if not _MODULE_OF.get(name, "").startswith(unavailable))

@@ -1,4 +1,4 @@
-"""``python -m meshmatch`` is the command `meshmatch`."""
+"""``python -m meshmatch`` runs the command `meshmatch`."""
 
 import sys
 

@@ -1,8 +1,8 @@
-"""Array types in one dialect: ``Float[Floats, "V 3"]`` is a float64 array of V rows and 3 columns.
+"""Array annotations with shapes: ``Float[Floats, "V 3"]`` is a float64 array of V rows and 3 columns.
 
-The shape is jaxtyping's (https://docs.kidger.site/jaxtyping); a type checker sees the array type alone. Modules that
-use it begin with ``from __future__ import annotations``, so that annotations cost nothing when they are loaded; and
-jaxtyping is not loaded for them either, unless it was before, as tests do.
+The shapes are jaxtyping's (https://docs.kidger.site/jaxtyping); type checkers see only the array type. Modules that use
+them begin with ``from __future__ import annotations``, so that annotations cost nothing at import time. jaxtyping
+itself is not imported unless it already was, as in the tests.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ else:
 
     class Bool:
         def __class_getitem__(cls, what: tuple[Any, str]) -> Any:
-            """The array type alone."""
+            """Return the array type alone."""
             return what[0]
 
     Float = Int = UInt8 = Bool
@@ -41,7 +41,7 @@ Bools = NDArray[np.bool_]
 
 
 class TensorLike(Protocol):
-    """A tensor of torch for annotations, which load no torch; see `is_tensor`."""
+    """A torch tensor, for annotations that do not import torch; see `is_tensor`."""
 
     def detach(self) -> Any: ...
 
@@ -52,12 +52,12 @@ SomeTensor = TypeVar("SomeTensor", bound=TensorLike)
 
 
 def read_only(values: Any, dtype: type, label: str) -> NDArray[Any]:
-    """The values as a contiguous, read-only array of their own; an array that is all of this already is shared.
+    """The values as a contiguous, read-only array; copied unless they are one already that owns its data.
 
-    `InputError` if the values are not numbers, or rows differ in length; ``label`` says whose they are.
+    `InputError` if the values are not numbers, or rows differ in length; ``label`` names them in the message.
     """
-    own = isinstance(values, np.ndarray) and values.dtype == dtype and values.base is None
-    if own and values.flags.c_contiguous and not values.flags.writeable:
+    owns_data = isinstance(values, np.ndarray) and values.dtype == dtype and values.base is None
+    if owns_data and values.flags.c_contiguous and not values.flags.writeable:
         shared: NDArray[Any] = values
         return shared
     try:
@@ -71,14 +71,14 @@ def read_only(values: Any, dtype: type, label: str) -> NDArray[Any]:
 
 
 def frozen(array: NDArray[Any]) -> NDArray[Any]:
-    """The same array, read-only from now on."""
+    """Make an array read-only and return it."""
     array.setflags(write=False)
     return array
 
 
 class Pickled:
-    """A frozen dataclass that pickles its fields: what was derived of them stays behind, and arrays that were read-only
-    are so again.
+    """Mixin for frozen dataclasses: pickle the fields without cached values, and restore arrays that were read-only as
+    such.
     """
 
     def __getstate__(self) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -93,15 +93,15 @@ class Pickled:
 
 
 class Brief:
-    """A dataclass (``repr=False``) that shows its arrays by their sizes: one line, whatever it holds."""
+    """Mixin for dataclasses with ``repr=False``: a one-line repr that gives arrays by their sizes."""
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({', '.join(self._shown(each) for each in fields(self) if each.repr)})"  # type: ignore[arg-type]
+        return f"{type(self).__name__}({', '.join(self._format(each) for each in fields(self) if each.repr)})"  # type: ignore[arg-type]
 
-    def _shown(self, field: Field[Any]) -> str:
+    def _format(self, field: Field[Any]) -> str:
         value = getattr(self, field.name)
         shape = getattr(value, "shape", ())
-        if shape and isinstance(shape, tuple):  # of arrays, sparse ones too, and tensors
+        if shape and isinstance(shape, tuple):  # arrays, sparse arrays and tensors
             return f"{field.name}: {' x '.join(map(str, shape))}"
         if isinstance(value, tuple | list | dict) and len(value) > 3:
             return f"{field.name}: {len(value)} items"
@@ -109,49 +109,51 @@ class Brief:
 
 
 def table_html(title: str, rows: Mapping[str, str]) -> str:
-    """A heading and a table for a notebook, of the rows that say something."""
+    """A heading and a table as HTML for a notebook; rows with empty values are left out."""
     left = '<td style="text-align:left">'
     lines = [f"<tr>{left}{escape(name)}</td>{left}{escape(value)}</td></tr>" for name, value in rows.items() if value]
     return f"<b>{escape(title)}</b><table>{''.join(lines)}</table>"
 
 
 def off_torch(values: Any) -> Any:
-    """A tensor of torch, or a list of them, as NumPy has it: without its gradient, in the memory of the CPU. Anything else
-    as it is. `TypeError` for a tensor that holds no plain numbers, such as a sparse one.
+    """Convert a torch tensor, or a list of them, to NumPy: detached from its gradient, in CPU memory. Return anything
+    else as is.
+
+    `TypeError` for a tensor that is not dense or not of numbers, such as a sparse one.
     """
     if isinstance(values, list | tuple):
-        some = len(values) > 0 and is_tensor(values[0])
-        return [off_torch(each) for each in values] if some else values
+        are_tensors = len(values) > 0 and is_tensor(values[0])
+        return [off_torch(each) for each in values] if are_tensors else values
     if not is_tensor(values):
         return values
     try:
         try:
             return values.numpy(force=True)
-        except TypeError:  # a type that NumPy does not have, such as bfloat16
+        except TypeError:  # a type that NumPy lacks, such as bfloat16
             return values.float().numpy(force=True)
     except (RuntimeError, NotImplementedError) as error:
         raise TypeError(str(error).splitlines()[0]) from error
 
 
 def is_tensor(values: Any) -> bool:
-    """Whether this is a tensor of torch, which is not loaded for it."""
+    """Whether this is a torch tensor, judged by its methods, without importing torch."""
     return hasattr(values, "detach") and hasattr(values, "numpy")
 
 
 def as_array(values: Any, name: str, hint: str = "") -> NDArray[Any]:
-    """The values as an array of whatever they are; `InputError` where there is none, such as rows of different lengths."""
+    """The values as an array of any type; `InputError` if they do not form one, such as rows of different lengths."""
     try:
         return np.asarray(off_torch(values))
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: not an array ({error})", hint) from error
 
 
-@np.errstate(invalid="ignore")  # of a nan that is rounded; it is refused
+@np.errstate(invalid="ignore")  # rounding nan; nan is refused
 def whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
-    """An array of integers, which may be given as floats; `InputError` for anything else."""
+    """Convert integers, which may be given as floats, to int64; `InputError` for anything else."""
     array = as_array(values, label)
-    whole = array.dtype.kind == "f" and np.array_equal(array, np.round(array))
-    if whole and (np.abs(array.astype(np.float64)) < 2**53).all():
+    is_whole = array.dtype.kind == "f" and np.array_equal(array, np.round(array))
+    if is_whole and (np.abs(array.astype(np.float64)) < 2**53).all():
         return array.astype(np.int64)  # MATLAB's numbers are doubles
     if array.dtype.kind not in "iu":
         raise InputError(f"{label} must be whole numbers, not {array.dtype}")
@@ -159,14 +161,16 @@ def whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
 
 
 def as_numbers(values: ArrayLike | TensorLike, name: str, finite: bool = False) -> Floats:
-    """An array of numbers; `InputError` where they are something else, such as words or rows of different lengths."""
+    """Convert values to float64; `InputError` if they are not numbers, or rows differ in length, or, if ``finite``, any
+    is not.
+    """
     try:
-        found = np.asarray(off_torch(values))
-        if found.dtype.kind == "c":
+        array = np.asarray(off_torch(values))
+        if array.dtype.kind == "c":
             raise TypeError("complex ones have two parts")
-        found = found.astype(np.float64, copy=False)
+        array = array.astype(np.float64, copy=False)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} must be numbers ({error})", "pass an array, one row for each vertex") from error
-    if finite and not np.isfinite(found).all():
+    if finite and not np.isfinite(array).all():
         raise InputError(f"{name} must be finite, but holds nan or infinite values")
-    return found
+    return array

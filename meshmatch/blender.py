@@ -1,7 +1,7 @@
-"""Files that Blender turns into glb, and glb into: fbx, blend, dae and usd.
+"""Conversion of fbx, blend, dae and usd files from and to glb by Blender.
 
-Blender is large, global, and its readers were not made for files of strangers: it runs as a process of its own, which may
-take only so much time and memory, and runs no scripts of a file (``_blender/convert.py``).
+Blender is large, keeps global state, and its readers are not hardened against malicious files. It runs in a separate
+process, with limits on time and memory, and does not execute scripts in files (``_blender/convert.py``).
 """
 
 from __future__ import annotations
@@ -20,44 +20,46 @@ from typing import NamedTuple
 from meshmatch.errors import InputError, OptionError, OutputError, warn
 
 SUFFIXES = (".fbx", ".usdz", ".usd", ".usda", ".usdc", ".dae", ".blend")
-"""Files that are read by way of a glb."""
-WRITTEN = (".fbx", ".usdz", ".dae", ".blend")
-"""Files that are written by way of a glb: all but .dae hold their images."""
-VARIABLE = "MESHMATCH_BLENDER"
-"""The environment variable that names Blender, or a Python that has the package bpy."""
+"""Formats that are read through a glb."""
+WRITABLE = (".fbx", ".usdz", ".dae", ".blend")
+"""Formats that are written through a glb; all but .dae embed their images."""
+ENVIRONMENT_VARIABLE = "MESHMATCH_BLENDER"
+"""Environment variable with the path of Blender, or of a Python that has the package bpy."""
 SCRIPTS = Path(__file__).with_name("_blender")
-"""The folder of what runs inside Blender, by its Python."""
-_LARGEST = 1 << 30  # bytes of a file that is read
-_SECONDS = 300
-_KEPT = 4  # files that are not converted again while the process lasts: a verb reads each several times
-_MAC = "/Applications/Blender.app/Contents/MacOS/Blender"
+"""Folder of the code that Blender's Python runs."""
+_MAX_BYTES = 1 << 30  # maximum size of an input file, in bytes
+_TIMEOUT = 300
+_CACHE_SIZE = 4  # converted files to keep in memory: a command reads each several times
+_MAC_PROGRAM = "/Applications/Blender.app/Contents/MacOS/Blender"
 _HINT = (
-    f"install Blender (blender.org), or `pip install bpy` for a Python 3.11 of its own, and set {VARIABLE} to that "
-    "program"
+    "install Blender (blender.org), or `pip install bpy` for a Python 3.11 of its own, and set "
+    f"{ENVIRONMENT_VARIABLE} to that program"
 )
-_POLYGONS = "with polygons"  # what the script says of a file that has some
-_done: OrderedDict[tuple[str, int, int], tuple[bytes, bool]] = OrderedDict()
+_POLYGONS_LINE = "with polygons"  # output line of the script for a file with polygons
+_cache: OrderedDict[tuple[str, int, int], tuple[bytes, bool]] = OrderedDict()
 _lock = threading.Lock()
 
 
-class _Trouble(NamedTuple):
-    """Why Blender did not convert a file, and what to do if that is not for want of a good file."""
+class _Failure(NamedTuple):
+    """Why Blender did not convert a file, and a hint unless the file is at fault."""
 
     why: str
     hint: str = ""
 
 
 def is_converted(path: Path) -> bool:
-    """Whether a file is read or written by way of a glb."""
+    """Whether a file is read or written through a glb."""
     return path.suffix.lower() in SUFFIXES
 
 
 def command(name: str) -> list[str]:
-    """How Blender is started with a script; `OptionError`, which names the file that needs it, if it is not there."""
-    named = os.environ.get(VARIABLE, "")
-    program = shutil.which(named) if named else shutil.which("blender") or shutil.which(_MAC)
-    if named and program is None:
-        raise OptionError(f"there is no program {named} ({VARIABLE})", _HINT)
+    """The command that runs a script in Blender; `OptionError`, which names the file that needs it, if Blender is not
+    found.
+    """
+    configured = os.environ.get(ENVIRONMENT_VARIABLE, "")
+    program = shutil.which(configured) if configured else shutil.which("blender") or shutil.which(_MAC_PROGRAM)
+    if configured and program is None:
+        raise OptionError(f"there is no program {configured} ({ENVIRONMENT_VARIABLE})", _HINT)
     if program is None and importlib.util.find_spec("bpy") is not None:
         program = sys.executable
     if program is None:
@@ -68,72 +70,74 @@ def command(name: str) -> list[str]:
 
 
 def glb_of(path: Path) -> bytes:
-    """The glb that a file becomes: in meters, y up, with materials, skeletons, clips and morph targets.
+    """Convert a file to glb: in meters, y up, with materials, skeletons, clips and morph targets.
 
     `InputError` if Blender cannot read it, `OptionError` if there is no Blender.
     """
-    return _converted(path)[0]
+    return _convert(path)[0]
 
 
 def has_polygons(path: Path) -> bool:
-    """Whether a file has faces of more than three corners, of which its glb has triangles; errors as `glb_of`."""
-    return _converted(path)[1]
+    """Whether a file has faces with more than three corners, which its glb has as triangles; errors as for `glb_of`."""
+    return _convert(path)[1]
 
 
-def _converted(path: Path) -> tuple[bytes, bool]:
-    found = path.stat()
-    key = os.path.realpath(path), found.st_mtime_ns, found.st_size
+def _convert(path: Path) -> tuple[bytes, bool]:
+    """The glb of a file, and whether the file has polygons; cached."""
+    stat = path.stat()
+    key = os.path.realpath(path), stat.st_mtime_ns, stat.st_size
     with _lock:
-        if key not in _done:
-            if found.st_size > _LARGEST:
-                raise InputError(f"{path.name} is larger than {_LARGEST >> 30} GiB", "export it as .glb")
+        if key not in _cache:
+            if stat.st_size > _MAX_BYTES:
+                raise InputError(f"{path.name} is larger than {_MAX_BYTES >> 30} GiB", "export it as .glb")
             with tempfile.TemporaryDirectory(prefix="meshmatch-") as folder:
                 glb = Path(folder, "converted.glb")
-                said = _run(path, glb)
-                if isinstance(said, _Trouble):
-                    hint = said.hint or _other_export(path)
-                    raise InputError(f"{path.name} cannot be read: {said.why}", hint)
-                _done[key] = glb.read_bytes(), _POLYGONS in said
-        _done.move_to_end(key)
-        while len(_done) > _KEPT:
-            _done.popitem(last=False)
-        return _done[key]
+                lines = _run(path, glb)
+                if isinstance(lines, _Failure):
+                    hint = lines.hint or _export_hint(path)
+                    raise InputError(f"{path.name} cannot be read: {lines.why}", hint)
+                _cache[key] = glb.read_bytes(), _POLYGONS_LINE in lines
+        _cache.move_to_end(key)
+        while len(_cache) > _CACHE_SIZE:
+            _cache.popitem(last=False)
+        return _cache[key]
 
 
-def _other_export(path: Path) -> str:
-    """What to do about a file that Blender does not read."""
+def _export_hint(path: Path) -> str:
+    """A hint for a file that Blender cannot read."""
     with path.open("rb") as file:
-        written_out = path.suffix.lower() == ".fbx" and file.read(1) == b";"
-    return "export it as a binary .fbx, or as .glb" if written_out else "is it damaged? export it as .glb"
+        is_ascii = path.suffix.lower() == ".fbx" and file.read(1) == b";"
+    return "export it as a binary .fbx, or as .glb" if is_ascii else "is it damaged? export it as .glb"
 
 
 def check_written(path: Path) -> None:
-    """Refuse, before the work, a file that Blender cannot write, or if there is no Blender (`OptionError`)."""
-    if path.suffix.lower() not in WRITTEN:
-        raise OptionError(f"{path.name}: {path.suffix} files are only read", f"write one of {', '.join(WRITTEN)}")
+    """`OptionError` if Blender cannot write this format, or there is no Blender. Call it before long work."""
+    if path.suffix.lower() not in WRITABLE:
+        raise OptionError(f"{path.name}: {path.suffix} files are only read", f"write one of {', '.join(WRITABLE)}")
     command(path.name)
 
 
 def from_glb(glb: Path, place: Path, path: Path) -> dict[Path, bytes]:
-    """Write to ``place`` what a glb becomes as the file ``path``; the images of a dae, which belong beside it with its name
-    before theirs and are not there yet, are returned.
+    """Convert a glb to the format of ``path``, and write it to ``place``; return the images of a dae that do not exist
+    yet.
 
-    `OutputError` if Blender cannot, `OptionError` if there is none or an image would replace another file.
+    Their keys are paths next to ``path``, whose stem their names begin with. `OutputError` if Blender fails,
+    `OptionError` if there is no Blender or an image would replace another file.
     """
     with tempfile.TemporaryDirectory(prefix="meshmatch-") as folder:
         output = Path(folder, path.name)
-        said = _run(glb, output)
-        if isinstance(said, _Trouble):
-            hint = said.hint or "write a .glb, and open that in the other program"
-            raise OutputError(f"cannot write {path}: {said.why}", hint)
-        made = [file for file in sorted(Path(folder).iterdir()) if file != output and file.is_file()]
-        new = [file for file in made if not is_converted(file) and _is_new(path.parent / file.name, file, path)]
+        lines = _run(glb, output)
+        if isinstance(lines, _Failure):
+            hint = lines.hint or "write a .glb, and open that in the other program"
+            raise OutputError(f"cannot write {path}: {lines.why}", hint)
+        images = [file for file in sorted(Path(folder).iterdir()) if file != output and file.is_file()]
+        new = [file for file in images if not is_converted(file) and _is_new(path.parent / file.name, file, path)]
         shutil.copyfile(output, place)
         return {path.parent / file.name: file.read_bytes() for file in new}
 
 
 def _is_new(copy: Path, file: Path, path: Path) -> bool:
-    """Whether a file that belongs to an output is not beside it yet; `OptionError` if another one has its name."""
+    """Whether ``copy`` does not exist yet; `OptionError` if a different file of that name does."""
     if not copy.exists():
         return True
     if not copy.is_file() or copy.read_bytes() != file.read_bytes():
@@ -142,30 +146,32 @@ def _is_new(copy: Path, file: Path, path: Path) -> bool:
     return False
 
 
-def _run(source: Path, output: Path) -> _Trouble | list[str]:
-    """Let Blender convert a file; why it did not, or the lines that it said. What it leaves out is told."""
+def _run(source: Path, output: Path) -> _Failure | list[str]:
+    """Convert a file with Blender. Return the lines of its output, or a failure; issue a warning for each note among
+    them.
+    """
     script = SCRIPTS / "convert.py"
-    theirs = (source if output.suffix == ".glb" else output).name  # the other one is ours, and temporary
-    words = [*command(theirs), str(script)]
-    words += ["--", str(source.absolute()), str(output.absolute())]
-    with tempfile.TemporaryFile() as said:
+    name = (source if output.suffix == ".glb" else output).name  # of the user's file; the other one is temporary
+    arguments = [*command(name), str(script)]
+    arguments += ["--", str(source.absolute()), str(output.absolute())]
+    with tempfile.TemporaryFile() as log:
         try:
             done = subprocess.run(
-                words, stdin=subprocess.DEVNULL, stdout=said, stderr=subprocess.STDOUT, timeout=_SECONDS, check=False
+                arguments, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, timeout=_TIMEOUT, check=False
             )
         except subprocess.TimeoutExpired:
-            return _Trouble(f"Blender took longer than {_SECONDS // 60} minutes")
+            return _Failure(f"Blender took longer than {_TIMEOUT // 60} minutes")
         except OSError as error:
-            return _Trouble(f"Blender cannot be started: {error.strerror}", _HINT)
-        said.seek(max(0, said.tell() - 100_000))
-        lines = said.read().decode(errors="replace").splitlines()
+            return _Failure(f"Blender cannot be started: {error.strerror}", _HINT)
+        log.seek(max(0, log.tell() - 100_000))
+        lines = log.read().decode(errors="replace").splitlines()
     if done.returncode:
-        worth = [line.strip() for line in lines if line.strip() and not line.startswith((" ", "note: "))]
-        why = (worth or [f"Blender ended with status {done.returncode}"])[-1].split("Error: ")[-1]
-        return _Trouble(why, _HINT if "No module named 'bpy'" in why else "")
+        messages = [line.strip() for line in lines if line.strip() and not line.startswith((" ", "note: "))]
+        why = (messages or [f"Blender ended with status {done.returncode}"])[-1].split("Error: ")[-1]
+        return _Failure(why, _HINT if "No module named 'bpy'" in why else "")
     if not output.is_file():
-        return _Trouble("Blender wrote nothing", f"is {words[0]} Blender? {_HINT}")
+        return _Failure("Blender wrote nothing", f"is {arguments[0]} Blender? {_HINT}")
     notes = dict.fromkeys(line.removeprefix("note: ") for line in lines if line.startswith("note: "))
     for line in list(notes)[:8]:
-        warn(f"{theirs}: {line}")
+        warn(f"{name}: {line}")
     return lines

@@ -1,7 +1,7 @@
-"""What is computed from one object alone: once, whatever threads ask for it, and kept as long as the object lives.
+"""Values computed from one object: once, whichever threads request them, and kept as long as the object lives.
 
-This is for functions that take time. What an object knows of itself at little cost is a `functools.cached_property`; what
-is looked up by a value, such as a file's name, has a `functools.lru_cache`.
+For functions that take time. Use `functools.cached_property` for cheap properties of an object, and
+`functools.lru_cache` for lookups by value, such as a file's name.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from functools import wraps
 from threading import RLock
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from meshmatch.gathering import asking_alone
+from meshmatch.gathering import unbatched
 
 Owner = TypeVar("Owner")
 P = ParamSpec("P")
@@ -20,32 +20,32 @@ _ATTRIBUTE = "_derived"
 
 
 class _Store:
-    """What was derived of one object."""
+    """Values derived from one object."""
 
     def __init__(self) -> None:
         self.values: dict[Any, Any] = {}
-        self.lock = RLock()  # one derivation may need another
+        self.lock = RLock()  # reentrant: one derivation may need another
 
 
 def derived(derive: Callable[Concatenate[Owner, P], Value]) -> Callable[Concatenate[Owner, P], Value]:
-    """Let a function of an object, and of hashable arguments, compute once for each object."""
+    """Decorate a function of an object, and of hashable arguments, so that it computes once per object and arguments."""
 
     @wraps(derive)
-    def once(owner: Owner, /, *args: P.args, **kwargs: P.kwargs) -> Value:
+    def wrapper(owner: Owner, /, *args: P.args, **kwargs: P.kwargs) -> Value:
         store, key = _store_of(owner), (derive, args, tuple(sorted(kwargs.items())))
         with store.lock:
             if key not in store.values:
-                with asking_alone():  # others may wait for the lock
+                with unbatched():  # a batch could deadlock: its other callers may wait for this lock
                     store.values[key] = derive(owner, *args, **kwargs)
             value: Value = store.values[key]
             return value
 
-    return once
+    return wrapper
 
 
-def remember(once: Callable[[Owner], Value], owner: Owner, value: Value) -> None:
-    """Say what a function that is `derived` would compute of an object."""
-    _store_of(owner).values[once.__wrapped__, (), ()] = value  # type: ignore[attr-defined]
+def remember(function: Callable[[Owner], Value], owner: Owner, value: Value) -> None:
+    """Store the value that a `derived` function would compute for an object."""
+    _store_of(owner).values[function.__wrapped__, (), ()] = value  # type: ignore[attr-defined]
 
 
 def _store_of(owner: Any) -> _Store:

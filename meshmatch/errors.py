@@ -1,7 +1,7 @@
-"""The one error family: what is wrong in a line, and a hint what to do about it.
+"""The library's errors and warnings: a line that says what is wrong, and a hint on what to do about it.
 
-Everything that the user's data or choices can cause is a `MeshmatchError`; anything else is a bug and keeps
-its traceback. What is worth a word but stops nothing is a `MeshmatchWarning`.
+Whatever the user's data or choices can cause is a `MeshmatchError`; any other exception is a bug and keeps its
+traceback. What users should know, but need not stop for, is a `MeshmatchWarning`.
 """
 
 import warnings
@@ -9,13 +9,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 LONGEST = 300
-"""Letters of a message or a hint; of a longer one the middle is left out."""
-_UNSEEN = dict.fromkeys((*range(32), *range(127, 160), 0x2028, 0x2029, *range(0x202A, 0x202F), *range(0x2066, 0x206A)))
-_SHOWN = {code: "\ufffd" for code in _UNSEEN if chr(code) not in "\t\n"}
+"""Maximum length of a message or a hint, in characters; longer ones are elided in the middle."""
+_INVISIBLE = dict.fromkeys(
+    (*range(32), *range(127, 160), 0x2028, 0x2029, *range(0x202A, 0x202F), *range(0x2066, 0x206A))
+)
+_REPLACEMENTS = {code: "\ufffd" for code in _INVISIBLE if chr(code) not in "\t\n"}
 
 
 class MeshmatchError(Exception):
-    """Something that the user can put right. All errors of the library are of this class.
+    """An error that the user can correct; the base class of all errors of the library.
 
     Parameters
     ----------
@@ -37,11 +39,11 @@ class MeshmatchError(Exception):
         super().__init__(self.message)
 
     def __reduce__(self) -> tuple[type["MeshmatchError"], tuple[str, str]]:
-        return type(self), (self.message, self.hint)  # the hint survives a process pool
+        return type(self), (self.message, self.hint)  # keeps the hint across a process pool
 
 
 class MeshmatchWarning(UserWarning):
-    """Something about a file that the user should know: what was left out, or taken in another way than it is written.
+    """A warning about a file: what was left out, or read differently than it is written.
 
     Examples
     --------
@@ -51,7 +53,7 @@ class MeshmatchWarning(UserWarning):
 
 
 def warn(text: str) -> None:
-    """Warn in one line (`MeshmatchWarning`). The command line shows each line once; in Python it is a usual warning."""
+    """Issue a one-line `MeshmatchWarning`. The command line shows each line once; in Python it is an ordinary warning."""
     warnings.warn(_line(text), MeshmatchWarning, stacklevel=2)
 
 
@@ -68,7 +70,7 @@ class TemplateError(MeshmatchError):
 
 
 class OptionError(MeshmatchError):
-    """A choice that does not exist, or does not go with the others."""
+    """An unknown choice, or one that does not fit the others."""
 
 
 class OutputError(MeshmatchError):
@@ -80,10 +82,10 @@ class PoorFit(MeshmatchError):
 
 
 def visible(text: str) -> str:
-    """Text that cannot command a terminal: control characters and those that turn the order of letters round become
-    U+FFFD; tabs and new lines stay.
+    """Text that cannot control a terminal: control characters and bidirectional overrides become U+FFFD; tabs and new
+    lines stay.
     """
-    return text.translate(_SHOWN)
+    return text.translate(_REPLACEMENTS)
 
 
 def _line(text: str) -> str:
@@ -93,7 +95,7 @@ def _line(text: str) -> str:
 
 @contextmanager
 def needs(library: str, extra: str) -> Iterator[None]:
-    """Around an import: a missing library is said as the user's choice, with the extra that brings it (`OptionError`)."""
+    """Wrap an import: a missing library becomes an `OptionError` with the extra that installs it."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -1,9 +1,9 @@
-"""Questions of several threads that are answered together.
+"""Batching of calls from several threads into one.
 
-Work on many things at once, such as fits of many shapes, asks the same costly function again and again about a little: a
-network about a few clouds, say, whose weights are read from memory each time. Tasks of a `Gathering` wait for
-one another with what they ask, and one of them answers for all. Nothing else of their work has to know, but that who holds
-a lock has to ask alone (`asking_alone`): others may need it before they ask.
+Concurrent tasks, such as fits of many shapes, often call the same costly function with little input each: a network for
+a few clouds, say, whose weights are read from memory every time. Tasks of a `Gathering` wait for one another with such
+calls, and one of them answers the whole batch. Callers need not know about it, with one exception: a thread that holds
+a lock has to call unbatched (`unbatched`), because others may need the lock before they join the batch.
 """
 
 from __future__ import annotations
@@ -15,111 +15,119 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from meshmatch.threads import lent_slot, worker_slot
+from meshmatch.threads import released_slot, worker_slot
 
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")
-_PATIENCE = 0.5  # seconds that a question waits for others at most: another task may be long at something else
+_MAX_WAIT = 0.5  # maximum wait for a full batch, in seconds: another task may be busy with something else for long
 
-_of_thread = threading.local()
+_thread_state = threading.local()
 
 
 @dataclass(frozen=True, eq=False)
-class _Asked:
+class _Call:
+    """A pending call."""
+
     answer: Callable[[Sequence[Any]], Sequence[Any]]
     question: Any
-    found: Future[Any] = field(default_factory=Future)
+    result: Future[Any] = field(default_factory=Future)
 
 
 class Gathering:
-    """Tasks of so many ``threads`` that ask ``together``, so many at a time.
+    """Batches the calls of ``tasks`` tasks that share ``threads`` threads, ``together`` calls at a time.
 
-    A task that asks waits, and its thread is free for another task meanwhile: so many more are in progress than there are
-    threads. Questions are answered when enough of them wait, or all tasks that are left, and at the latest after half a
-    second. No task waits where there are no more tasks than threads.
+    A task that waits for a batch releases its thread to another task, so more tasks are in progress than there are
+    threads. A batch is run once it is full, or every remaining task waits, and after half a second at the latest.
+    Nothing is batched if there are no more tasks than threads.
     """
 
     def __init__(self, tasks: int, threads: int, together: int = 1) -> None:
-        self._enough = together if tasks > threads else 1
-        self.in_progress = min(tasks, threads + together) if self._enough > 1 else threads
-        self._left = tasks
+        self._batch_size = together if tasks > threads else 1
+        self.in_progress = min(tasks, threads + together) if self._batch_size > 1 else threads
+        self._n_left = tasks
         self.slots = threading.Semaphore(threads)
-        self._waiting: list[_Asked] = []
+        self._waiting: list[_Call] = []
         self._changed = threading.Condition()
 
     @contextmanager
     def task(self) -> Iterator[None]:
-        """One of the tasks; it waits for a free thread first."""
+        """Run the block as one of the tasks; waits for a free thread first."""
         try:
             with worker_slot(self.slots):
                 yield
         finally:
             with self._changed:
-                self._left -= 1
-                self._changed.notify_all()  # perhaps all that are left wait
+                self._n_left -= 1
+                self._changed.notify_all()  # every remaining task may be waiting now
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """What this thread asks by `gathered` in the block, inside its `task`, it asks together with other tasks."""
-        with _asking_in(self if self._enough > 1 else None):
+        """Batch the calls by `gathered` that this thread makes in the block, inside its `task`."""
+        with _use_gathering(self if self._batch_size > 1 else None):
             yield
 
     def ask(self, answer: Callable[[Sequence[Question]], Sequence[Answer]], question: Question) -> Answer:
-        """The answer to one question, by a function of several; what that raises, all hear who asked together."""
-        mine, patient = _Asked(answer, question), True
+        """The answer to one question, from a function that answers several.
+
+        An error in the function is raised in every caller of the batch.
+        """
+        own, notified = _Call(answer, question), True
         with self._changed:
-            self._waiting.append(mine)
-        while not mine.found.done():
+            self._waiting.append(own)
+        while not own.result.done():
             with self._changed:
-                taken: list[_Asked] = []
-                if mine in self._waiting and (self._due or not patient):
-                    taken, self._waiting = self._waiting, []
-            if taken:
-                self._answer(taken)
+                batch: list[_Call] = []
+                if own in self._waiting and (self._is_due or not notified):
+                    batch, self._waiting = self._waiting, []
+            if batch:
+                self._run_batch(batch)
             else:
-                with lent_slot(), self._changed:
-                    patient = self._changed.wait_for(
-                        lambda: mine.found.done() or (mine in self._waiting and self._due), _PATIENCE
+                with released_slot(), self._changed:
+                    notified = self._changed.wait_for(
+                        lambda: own.result.done() or (own in self._waiting and self._is_due), _MAX_WAIT
                     )
-        found: Answer = mine.found.result()
-        return found
+        result: Answer = own.result.result()
+        return result
 
     @property
-    def _due(self) -> bool:
-        return len(self._waiting) >= min(self._enough, self._left)
+    def _is_due(self) -> bool:
+        """Whether the waiting calls make up a batch."""
+        return len(self._waiting) >= min(self._batch_size, self._n_left)
 
-    def _answer(self, taken: Sequence[_Asked]) -> None:
-        for answer in dict.fromkeys(each.answer for each in taken):
-            asked = [each for each in taken if each.answer == answer]
+    def _run_batch(self, batch: Sequence[_Call]) -> None:
+        for answer in dict.fromkeys(each.answer for each in batch):
+            calls = [each for each in batch if each.answer == answer]
             try:
-                found = answer([each.question for each in asked])
+                answers = answer([each.question for each in calls])
             except BaseException as error:
-                for each in asked:
-                    each.found.set_exception(error)
+                for each in calls:
+                    each.result.set_exception(error)
             else:
-                for each, value in zip(asked, found, strict=True):
-                    each.found.set_result(value)
+                for each, value in zip(calls, answers, strict=True):
+                    each.result.set_result(value)
         with self._changed:
             self._changed.notify_all()
 
 
 def gathered(answer: Callable[[Sequence[Question]], Sequence[Answer]], question: Question) -> Answer:
-    """The answer to a question by a function of several: together with others', in the block of `Gathering.together`."""
-    gathering: Gathering | None = getattr(_of_thread, "gathering", None)
+    """The answer to one question, from a function that answers several: batched inside `Gathering.together`, alone
+    outside.
+    """
+    gathering: Gathering | None = getattr(_thread_state, "gathering", None)
     return answer([question])[0] if gathering is None else gathering.ask(answer, question)
 
 
 @contextmanager
-def asking_alone() -> Iterator[None]:
-    """What this thread asks in the block, it asks without others."""
-    with _asking_in(None):
+def unbatched() -> Iterator[None]:
+    """Do not batch the calls that this thread makes in the block."""
+    with _use_gathering(None):
         yield
 
 
 @contextmanager
-def _asking_in(gathering: Gathering | None) -> Iterator[None]:
-    before, _of_thread.gathering = getattr(_of_thread, "gathering", None), gathering
+def _use_gathering(gathering: Gathering | None) -> Iterator[None]:
+    before, _thread_state.gathering = getattr(_thread_state, "gathering", None), gathering
     try:
         yield
     finally:
-        _of_thread.gathering = before
+        _thread_state.gathering = before

@@ -1,4 +1,6 @@
-"""Locks between processes that end with their owner, however it ends: nothing has to be removed after a kill."""
+"""Locks between processes. The system releases them when their owner ends, even if it is killed, so none has to be
+removed.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,10 +11,10 @@ from meshmatch.errors import OutputError
 
 @contextmanager
 def locked(path: Path, busy: str, hint: str, wait: float = 0.0) -> Iterator[None]:
-    """Hold the lock of a file; wait for it up to so many seconds.
+    """Hold the lock of a file; wait for it for up to ``wait`` seconds.
 
-    Another holder may be of this process or of any other. `OutputError` with these words if there is one, or if the file
-    cannot be made.
+    The lock excludes this process as well as others. `OutputError` with ``busy`` and ``hint`` if it is held elsewhere,
+    or if the file cannot be created.
     """
     from filelock import FileLock, Timeout
 

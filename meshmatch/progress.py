@@ -1,22 +1,22 @@
-"""Reports of how far long work has come: the callback that users pass, and how stages share one bar."""
+"""Progress reports of long work: the callback that users pass, and how stages share one progress bar."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-# Called with the stage ("orientation"), the name of the shape, and the share of the stage that is done (0..1).
+# Called with the stage ("orientation"), the name of the shape, and the finished share of the stage (0..1).
 ProgressCallback = Callable[[str, str, float], None]
 
 
 @dataclass(frozen=True)
 class Progress:
-    """A range of one progress bar; calling it with a share (0..1) of that range reports it."""
+    """A range of a progress bar; call it with a share (0..1) of that range to report it."""
 
-    callback: ProgressCallback | None = None  # without one nothing happens
-    name: str = ""  # the shape that is worked on
-    stage_name: str = ""  # what is going on
-    start: float = 0.0  # where on the bar of the stage this range lies
+    callback: ProgressCallback | None = None  # None: nothing is reported
+    name: str = ""  # of the shape
+    stage_name: str = ""  # the current stage
+    start: float = 0.0  # share of the stage's bar where this range begins
     end: float = 1.0
 
     def __call__(self, share: float) -> None:
@@ -28,10 +28,10 @@ class Progress:
         return replace(self, stage_name=name, start=start, end=end)
 
     def named(self, name: str) -> Progress:
-        """This range, as another stage."""
+        """The same range of another stage's bar."""
         return replace(self, stage_name=name)
 
     def between(self, start: float, end: float) -> Progress:
-        """A part of this range; both ends are shares of it."""
+        """A subrange; both ends are shares (0..1) of this range."""
         width = self.end - self.start
         return replace(self, start=self.start + start * width, end=self.start + end * width)

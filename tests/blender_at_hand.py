@@ -22,7 +22,7 @@ def found() -> bool:
     return True
 
 
-needs_blender = pytest.mark.skipif(not found(), reason=f"needs Blender ({blender.VARIABLE})")
+needs_blender = pytest.mark.skipif(not found(), reason=f"needs Blender ({blender.ENVIRONMENT_VARIABLE})")
 
 
 def run_inside(script: Path, *words: str | Path) -> str:
@@ -41,4 +41,4 @@ def stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, does: str = "shutil.
     )
     program.write_text(source)
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setenv(blender.VARIABLE, str(program))
+    monkeypatch.setenv(blender.ENVIRONMENT_VARIABLE, str(program))

@@ -47,7 +47,7 @@ def test_tasks_ask_together_and_each_hears_its_own_answer() -> None:
 
 
 def test_questions_wait_until_they_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gathering, "_PATIENCE", 30.0)
+    monkeypatch.setattr(gathering, "_MAX_WAIT", 30.0)
     squares = Squares()
     run(8, 2, 4, lambda number: [gathered(squares, number) for _ in range(20)])
     assert sum(squares.asked) == 160 and max(squares.asked) <= 6
@@ -102,7 +102,7 @@ def test_an_error_is_heard_by_all_who_asked_together_and_by_nobody_later() -> No
 
 
 def test_who_asks_no_more_or_fails_keeps_nobody_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gathering, "_PATIENCE", 90.0)
+    monkeypatch.setattr(gathering, "_MAX_WAIT", 90.0)
     squares = Squares()
 
     def work(number: int) -> int:
@@ -118,7 +118,7 @@ def test_who_asks_no_more_or_fails_keeps_nobody_waiting(monkeypatch: pytest.Monk
 
 def test_what_is_computed_once_for_all_is_asked_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first holds a lock that the others need before they can ask."""
-    monkeypatch.setattr(gathering, "_PATIENCE", 90.0)
+    monkeypatch.setattr(gathering, "_MAX_WAIT", 90.0)
     squares = Squares()
 
     class Owner:

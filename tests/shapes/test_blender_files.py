@@ -99,7 +99,7 @@ os._exit(0)
 
 def test_a_file_goes_through_a_glb_both_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stand_in(tmp_path, monkeypatch)
-    for suffix in blender.WRITTEN:
+    for suffix in blender.WRITABLE:
         meshmatch.save_shape(tmp_path / f"tube{suffix}", tube())
         assert (tmp_path / f"tube{suffix}").read_bytes()[:4] == b"glTF"
         back = meshmatch.load_shape(tmp_path / f"tube{suffix}")
@@ -137,17 +137,17 @@ def test_a_file_is_converted_once_until_it_changes(tmp_path: Path, monkeypatch: 
 
 
 def test_without_blender_the_line_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(blender.VARIABLE, raising=False)
+    monkeypatch.delenv(blender.ENVIRONMENT_VARIABLE, raising=False)
     monkeypatch.setattr("shutil.which", lambda name: None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     path = tmp_path / "a.fbx"
     path.write_bytes(b"Kaydara FBX Binary  ")
     with pytest.raises(OptionError, match="needs Blender") as error:
         meshmatch.load_shape(path)
-    assert "pip install bpy" in error.value.hint and blender.VARIABLE in error.value.hint
+    assert "pip install bpy" in error.value.hint and blender.ENVIRONMENT_VARIABLE in error.value.hint
     with pytest.raises(OptionError, match="needs Blender"):
         meshmatch.save_shape(tmp_path / "b.blend", tube())
-    monkeypatch.setenv(blender.VARIABLE, "/no/such/blender")
+    monkeypatch.setenv(blender.ENVIRONMENT_VARIABLE, "/no/such/blender")
     with pytest.raises(OptionError, match="there is no program"):
         meshmatch.load_shape(path)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["a.fbx"]
@@ -173,7 +173,7 @@ def test_an_fbx_of_text_is_to_be_exported_as_another(tmp_path: Path, monkeypatch
 )
 def test_trouble_in_blender_is_one_line(does: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stand_in(tmp_path, monkeypatch, does)
-    monkeypatch.setattr(blender, "_SECONDS", 5 if "sleep" not in does else 1)
+    monkeypatch.setattr(blender, "_TIMEOUT", 5 if "sleep" not in does else 1)
     (tmp_path / "a.fbx").write_bytes(b"x")
     began = time.monotonic()
     with pytest.raises(InputError, match=words):
@@ -192,10 +192,10 @@ def test_a_program_that_is_not_blender_is_told(
     (tmp_path / "a.fbx").write_bytes(b"x")
     with pytest.raises(InputError, match=words) as caught:
         meshmatch.load_shape(tmp_path / "a.fbx")
-    assert blender.VARIABLE in caught.value.hint
+    assert blender.ENVIRONMENT_VARIABLE in caught.value.hint
     with pytest.raises(OutputError, match=words) as failed:
         meshmatch.save_shape(tmp_path / "b.fbx", tube())
-    assert blender.VARIABLE in failed.value.hint
+    assert blender.ENVIRONMENT_VARIABLE in failed.value.hint
     assert not (tmp_path / "b.fbx").exists()
 
 
@@ -293,7 +293,7 @@ def test_works_of_an_artist_beside_shapes_of_a_folder_are_left_alone(tmp_path: P
 
 
 @needs_blender
-@pytest.mark.parametrize("suffix", blender.WRITTEN)
+@pytest.mark.parametrize("suffix", blender.WRITABLE)
 def test_blender_keeps_place_skeleton_and_weights(suffix: str, tmp_path: Path) -> None:
     before = write_tube(tmp_path / "tube.glb", clips=suffix != ".dae")  # whose joints stand as a clip begins
     path = tmp_path / f"tube{suffix}"
@@ -334,7 +334,7 @@ def test_clips_that_a_format_does_not_hold_are_told(suffix: str, tmp_path: Path)
 
 
 @needs_blender
-@pytest.mark.parametrize("suffix", blender.WRITTEN)
+@pytest.mark.parametrize("suffix", blender.WRITABLE)
 def test_blender_keeps_an_image(suffix: str, tmp_path: Path) -> None:
     sample = Path("templates/samples/dancer-textured.glb")
     path = tmp_path / f"dancer{suffix}"
@@ -362,7 +362,7 @@ def test_blender_writes_a_textured_mesh_as_fbx(tmp_path: Path) -> None:
 
 
 @needs_blender
-@pytest.mark.parametrize("suffix", blender.WRITTEN)
+@pytest.mark.parametrize("suffix", blender.WRITABLE)
 def test_blender_keeps_each_image_of_a_material(suffix: str, tmp_path: Path) -> None:
     """An fbx took the color for the normals and the emission; what a format does not hold is told."""
     colors = {"color": (200, 40, 40), "normal": (128, 128, 255), "surface": (255, 60, 180), "glow": (10, 220, 90)}
@@ -495,7 +495,7 @@ def test_axes_and_unit_are_the_headers_and_images_those_of_the_folder(tmp_path: 
 
 
 @needs_blender
-@pytest.mark.parametrize("suffix", blender.WRITTEN)
+@pytest.mark.parametrize("suffix", blender.WRITABLE)
 def test_a_file_that_is_cut_short_is_one_line(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"tube{suffix}"
     meshmatch.save_shape(path, tube())
