@@ -1,10 +1,10 @@
-"""Run by Blender: a file that it reads becomes a glb, or a glb a file that it writes.
+"""Script that Blender runs: convert a file that Blender reads to glb, or a glb to a format that Blender writes.
 
     blender --background --factory-startup --python convert.py -- INPUT OUTPUT
     python convert.py INPUT OUTPUT          # a Python that has the package bpy
 
-INPUT may come from anybody: its scripts and drivers do not run, memory and output are bounded, and images and libraries
-that lie outside its folder are left out. What the user should know goes to stdout, in lines that begin with "note: ".
+INPUT is not trusted: its scripts and drivers do not run, memory and output are limited, and images and libraries
+outside its folder are left out. Notes for the user go to stdout, in lines that begin with "note: ".
 """
 
 import contextlib
@@ -17,8 +17,8 @@ MEMORY = 8 << 30  # bytes of address space
 LARGEST = 1 << 32  # bytes of the output
 
 
-def bound():
-    """Bound what this process may take, where the system can."""
+def limit_resources():
+    """Limit the memory and output of this process, where the system can."""
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 
@@ -31,26 +31,26 @@ def note(text):
     print(f"note: {text}", flush=True)
 
 
-def start():
-    """An empty scene, in which no file may run scripts."""
+def open_empty_scene():
+    """Open an empty scene in which no file may run scripts."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.context.preferences.filepaths.use_scripts_auto_execute = False
     bpy.context.preferences.filepaths.use_file_compression = True
 
 
 def operator(*names):
-    """The first of the operators that this Blender has."""
+    """The first of the operators that this version of Blender has."""
     for name in names:
-        group, _, own = name.partition(".")
-        if own in dir(getattr(bpy.ops, group)):
-            return getattr(getattr(bpy.ops, group), own)
+        group, _, member = name.partition(".")
+        if member in dir(getattr(bpy.ops, group)):
+            return getattr(getattr(bpy.ops, group), member)
     raise SystemExit(f"Blender {bpy.app.version_string} has no {names[-1]}")
 
 
-def call(found, **options):
-    """Call an operator with those of the options that this Blender knows."""
-    known = found.get_rna_type().properties.keys()
-    found(**{name: value for name, value in options.items() if name in known})
+def call(function, **options):
+    """Call an operator with the options that this version of Blender knows."""
+    known = function.get_rna_type().properties.keys()
+    function(**{name: value for name, value in options.items() if name in known})
 
 
 def read(path):
@@ -59,7 +59,7 @@ def read(path):
         bpy.ops.wm.open_mainfile(filepath=path, load_ui=False, use_scripts=False)
     elif suffix == ".fbx":
         call(operator("import_scene.fbx"), filepath=path, use_image_search=False, ignore_leaf_bones=False)
-        call_clips_by_name()
+        strip_object_names()
     elif suffix == ".dae":
         call(operator("wm.collada_import"), filepath=path, keep_bind_info=True)
     elif suffix in (".usd", ".usda", ".usdc", ".usdz"):
@@ -70,8 +70,8 @@ def read(path):
         call(operator("import_scene.gltf"), filepath=path, disable_bone_shape=True, guess_original_bind_pose=False)
 
 
-def leave_out_strangers(folder):
-    """Remove images and libraries from outside the folder of the file, and such as are not there."""
+def remove_external_files(folder):
+    """Remove images and libraries that are missing or outside the folder of the file."""
     names = {}
     for kind in (bpy.data.libraries, bpy.data.images):
         for each in list(kind):
@@ -91,74 +91,80 @@ def leave_out_strangers(folder):
         note(f"left out files that are missing or outside its folder: {first}")
 
 
-def shown():
+def rendered_meshes():
     """The objects with a mesh that a render draws, also those of collections that others draw copies of."""
     found = list(bpy.context.scene.objects)
-    for each in found:  # which grows
+    for each in found:  # the list grows in the loop
         if each.instance_type == "COLLECTION" and each.instance_collection is not None and not each.hide_render:
             found += [other for other in each.instance_collection.all_objects if other not in found]
     return [each for each in found if each.type == "MESH" and not each.hide_render]
 
 
-def hide_what_is_not_rendered():
-    """Hide the objects of collections that are left out of the scene's views, or of renders, such as the widgets of a rig:
-    exporters go by what objects say themselves. What only a view hides is told.
+def hide_unrendered():
+    """Hide objects of collections that are excluded from the scene's view layers, or from renders, such as the widgets
+    of a rig.
+
+    Exporters look at the flags of the objects alone. Issue a note on objects that only the viewport hides: these are
+    exported.
     """
     layers = [each.layer_collection for each in bpy.context.scene.view_layers if each.use]
-    kept = set()
-    for each in layers:  # which grows
+    rendered = set()
+    for each in layers:  # the list grows in the loop
         if not each.exclude and not each.collection.hide_render:
-            kept.update(each.collection.objects)
+            rendered.update(each.collection.objects)
             layers += each.children
     objects = list(bpy.context.scene.objects)
     for each in objects:
-        if layers and each not in kept:
+        if layers and each not in rendered:
             each.hide_render = True
-    veiled = [each.name for each in objects if each.type == "MESH" and not each.hide_render and not each.visible_get()]
-    if veiled:
-        names = ", ".join(veiled[:4]) + (", ..." if len(veiled) > 4 else "")
+    hidden = [each.name for each in objects if each.type == "MESH" and not each.hide_render and not each.visible_get()]
+    if hidden:
+        names = ", ".join(hidden[:4]) + (", ..." if len(hidden) > 4 else "")
         note(f"read as well, because renders show what only the view hides: {names} (--without leaves it out)")
 
 
 def prepare():
-    """Make ready for the exporters what they would lose: with shape keys anywhere they apply no modifiers."""
-    with_shapes = [each for each in shown() if each.data.shape_keys]
+    """Apply modifiers that the exporters would ignore: they apply none if any mesh has shape keys.
+
+    Return whether the exporter shall apply modifiers itself.
+    """
+    with_shapes = [each for each in rendered_meshes() if each.data.shape_keys]
     modified = [each.name for each in with_shapes if any(one.type != "ARMATURE" for one in each.modifiers)]
     if modified:
         note(f"modifiers are left out of meshes with shape keys: {', '.join(modified[:4])}")
     if with_shapes:
-        for each in shown():
+        for each in rendered_meshes():
             if not each.data.shape_keys and not each.library:
                 apply_modifiers(each)
     return not with_shapes
 
 
-def apply_modifiers(thing):
-    """Put what the modifiers of an object make in place of its mesh, but for a skeleton's."""
-    skeletons = [each for each in thing.modifiers if each.type == "ARMATURE" and each.show_viewport]
-    others = [each for each in thing.modifiers if each.type != "ARMATURE"]
+def apply_modifiers(item):
+    """Replace an object's mesh by the result of its modifiers, except armature modifiers."""
+    skeletons = [each for each in item.modifiers if each.type == "ARMATURE" and each.show_viewport]
+    others = [each for each in item.modifiers if each.type != "ARMATURE"]
     if not others:
         return
     for each in skeletons:
         each.show_viewport = False
     graph = bpy.context.evaluated_depsgraph_get()
-    made = bpy.data.meshes.new_from_object(thing.evaluated_get(graph), preserve_all_data_layers=True, depsgraph=graph)
-    made.name = thing.data.name
-    thing.data = made
+    mesh = bpy.data.meshes.new_from_object(item.evaluated_get(graph), preserve_all_data_layers=True, depsgraph=graph)
+    mesh.name = item.data.name
+    item.data = mesh
     for each in others:
-        thing.modifiers.remove(each)
+        item.modifiers.remove(each)
     for each in skeletons:
         each.show_viewport = True
 
 
-def tell_polygons():
-    """Say whether there are faces of more than three corners."""
-    if any(face.loop_total > 3 for each in shown() for face in each.data.polygons):
+def report_polygons():
+    """Report whether there are faces with more than three corners."""
+    if any(face.loop_total > 3 for each in rendered_meshes() for face in each.data.polygons):
         print("with polygons", flush=True)
 
 
 def image_above(socket):
-    """The socket of the first image that something is made of; None if there is none."""
+    """The output socket of the first image texture upstream of a socket; None if there is none."""
     for link in socket.links:
         if link.from_node.type == "TEX_IMAGE":
             return link.from_socket
@@ -168,8 +174,8 @@ def image_above(socket):
     return None
 
 
-def call_clips_by_name():
-    """Take from the names of clips those of objects, which an fbx puts before them, once each time it is written."""
+def strip_object_names():
+    """Strip object names from the names of clips: fbx exporters prepend them, once for each export."""
     for action in list(bpy.data.actions):
         name = action.name
         for each in bpy.data.objects:
@@ -179,10 +185,12 @@ def call_clips_by_name():
 
 
 def bind_clips():
-    """Let clips fit only the objects that play them: an fbx gets each for all objects whose properties have the names of
-    its own, and "location" is a property of all. Each gets a curve without keys, for a property of these objects alone.
+    """Make each clip fit only the objects that play it.
+
+    The fbx exporter writes a clip for every object that has the properties which the clip animates, and every object
+    has a "location". Each clip gets a curve without keys, for a custom property that only its own objects have.
     """
-    marks = {}
+    markers = {}
     for each in bpy.data.objects:
         data = each.animation_data
         if data is None:
@@ -191,27 +199,27 @@ def bind_clips():
             if user.action is None:
                 continue
             slot = getattr(user, "action_slot", None)  # since Blender 4.4
-            mark = marks.setdefault((user.action.name, slot and slot.identifier), f"clip {len(marks)}")
-            each[mark] = 0.0
+            marker = markers.setdefault((user.action.name, slot and slot.identifier), f"clip {len(markers)}")
+            each[marker] = 0.0
             for curves in curves_of(user.action, slot):
-                if curves.find(f'["{mark}"]') is None:
-                    curves.new(f'["{mark}"]')
+                if curves.find(f'["{marker}"]') is None:
+                    curves.new(f'["{marker}"]')
 
 
 def curves_of(action, slot):
-    """The lists of an action's curves."""
+    """The collections of curves of an action."""
     if slot is None:
         return [action.fcurves]
     bags = [strip.channelbag(slot) for layer in action.layers for strip in layer.strips]
     return [bag.fcurves for bag in bags if bag is not None]
 
 
-def tell_clips(suffix):
-    """Tell which clips a format leaves out: of shapes, or all but one."""
+def note_lost_clips(suffix):
+    """Issue a note on clips that a format cannot hold: clips of shape keys, or all clips but one."""
     names = {}
     if suffix == ".fbx":
-        moved = [each.animation_data for each in bpy.data.shape_keys if each.animation_data is not None]
-        for data in moved:
+        animations = [each.animation_data for each in bpy.data.shape_keys if each.animation_data is not None]
+        for data in animations:
             names |= dict.fromkeys(track.name for track in data.nla_tracks)
             names |= {data.action.name: None} if data.action is not None else {}
         if names:
@@ -227,52 +235,57 @@ def tell_clips(suffix):
         note(f"a {suffix} file holds one clip: of {len(names)} only {next(iter(names))}")
 
 
-def lay_images_bare():
-    """Lay images directly on their materials: exporters do not look behind the product with a color."""
+def connect_images():
+    """Connect images directly to their materials: exporters do not see them behind a multiplication by a color."""
     for material in bpy.data.materials:
         for node in material.node_tree.nodes if material.use_nodes else ():
             if node.type == "BSDF_PRINCIPLED" and (image := image_above(node.inputs["Base Color"])) is not None:
                 material.node_tree.links.new(image, node.inputs["Base Color"])
 
 
-def packed(name, pixels, size):
-    """A new image inside the file."""
-    made = bpy.data.images.new(name, *size, is_data=True)
-    made.pixels.foreach_set(pixels)
-    made.update()
-    made.pack()
-    return made
+def new_packed_image(name, pixels, size):
+    """Create an image that is packed into the file."""
+    image = bpy.data.images.new(name, *size, is_data=True)
+    image.pixels.foreach_set(pixels)
+    image.update()
+    image.pack()
+    return image
 
 
 def split_channels():
-    """Give roughness and metal, which glTF has as channels of one image, images of their own: exporters look for these."""
+    """Give roughness and metalness, which glTF stores as channels of one image, separate images, as exporters expect."""
     import numpy as np
 
-    made = {}
+    images = {}
     for material in bpy.data.materials:
         for node in list(material.node_tree.nodes) if material.use_nodes else ():
             if node.type != "BSDF_PRINCIPLED":
                 continue
             for socket, channel in (("Roughness", 1), ("Metallic", 2)):
-                found = image_above(node.inputs[socket])
-                if found is None or found.node.image is None:
+                upstream = image_above(node.inputs[socket])
+                if upstream is None or upstream.node.image is None:
                     continue
-                image = found.node.image
-                if (image.name, channel) not in made:
+                image = upstream.node.image
+                if (image.name, channel) not in images:
                     pixels = np.empty(len(image.pixels), np.float32)
                     image.pixels.foreach_get(pixels)
                     grey = pixels.reshape(-1, image.channels)[:, [min(channel, image.channels - 1)] * 4].copy()
                     grey[:, 3] = 1.0
-                    made[image.name, channel] = packed(f"{material.name} {socket.lower()}", grey.ravel(), image.size)
-                own = material.node_tree.nodes.new("ShaderNodeTexImage")
-                own.image = made[image.name, channel]
-                for link in found.node.inputs["Vector"].links:
-                    material.node_tree.links.new(link.from_socket, own.inputs["Vector"])
-                material.node_tree.links.new(own.outputs["Color"], node.inputs[socket])
+                    images[image.name, channel] = new_packed_image(
+                        f"{material.name} {socket.lower()}", grey.ravel(), image.size
+                    )
+                texture = material.node_tree.nodes.new("ShaderNodeTexImage")
+                texture.image = images[image.name, channel]
+                for link in upstream.node.inputs["Vector"].links:
+                    material.node_tree.links.new(link.from_socket, texture.inputs["Vector"])
+                material.node_tree.links.new(texture.outputs["Color"], node.inputs[socket])
 
 
 def name_images():
-    """Give packed images file names of their own: fbx goes by these, and all that are empty would be one image."""
+    """Give packed images unique file names.
+
+    The fbx exporter identifies images by their file names, and would merge all images without one.
+    """
     taken = set()
     for image in bpy.data.images:
         if image.packed_file is None:
@@ -283,8 +296,8 @@ def name_images():
         image.filepath_raw = f"//{name}.{'jpg' if image.file_format == 'JPEG' else 'png'}"
 
 
-def tell_layers(suffix):
-    """Tell which images of materials a format leaves out."""
+def note_lost_images(suffix):
+    """Issue a note on images of materials that a format cannot hold."""
     lost = {}
     for material in bpy.data.materials:
         for node in material.node_tree.nodes if material.use_nodes else ():
@@ -318,7 +331,8 @@ def write(path, apply):
         )  # fmt: skip
     elif suffix == ".dae":
         stem = os.path.splitext(os.path.basename(path))[0]
-        for image in list(bpy.data.images):  # renamed ones move in it; its file lies beside the dae, among others
+        # a copy: renaming reorders the list; the files are written next to the dae, so they get its name
+        for image in list(bpy.data.images):
             image.name = f"{stem}-{image.name}"
         call(operator("wm.collada_export"), filepath=path, use_texture_copies=True, apply_modifiers=apply)
     elif suffix == ".blend":
@@ -333,21 +347,21 @@ def write(path, apply):
 
 
 def main(source, output):
-    bound()
-    start()
+    limit_resources()
+    open_empty_scene()
     read(source)
-    hide_what_is_not_rendered()
-    if not shown():
+    hide_unrendered()
+    if not rendered_meshes():
         raise SystemExit("there is no mesh in it")
-    leave_out_strangers(os.path.dirname(source))
+    remove_external_files(os.path.dirname(source))
     suffix = os.path.splitext(output)[1].lower()
     if suffix == ".glb":
-        tell_polygons()
+        report_polygons()
     else:
-        lay_images_bare()
+        connect_images()
     if suffix in (".fbx", ".usdz", ".dae"):
-        tell_clips(suffix)
-        tell_layers(suffix)
+        note_lost_clips(suffix)
+        note_lost_images(suffix)
     if suffix == ".fbx":
         bind_clips()
         split_channels()
@@ -358,7 +372,7 @@ def main(source, output):
 
 
 def run():
-    """The exit status. Why there is no output is the last line."""
+    """Convert, and return the exit status. On failure the last line of output says why."""
     try:
         words = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
         main(*map(os.path.abspath, words))
@@ -370,4 +384,4 @@ def run():
 
 status = run()
 sys.stdout.flush()
-os._exit(status)  # where a file's drivers were refused, Blender does not end by itself
+os._exit(status)  # Blender does not exit by itself after it refused a file's drivers

@@ -1,7 +1,7 @@
-"""meshmatch in Blender: two objects, and what is to go from one to the other.
+"""Blender add-on: transfers between a source object and a target object.
 
-The objects are written as glb files into a temporary folder, the program meshmatch runs on them as a process of its own, and
-what it writes is imported beside the target.
+The objects are exported as glb or ply files to a temporary folder, the program meshmatch runs on them in a separate
+process, and its result is imported next to the target.
 """
 
 import contextlib
@@ -15,33 +15,31 @@ import bpy
 import mathutils
 import numpy as np
 
-JOBS = {  # verb, what the button says, what it does, and the file that comes back
+JOBS = {  # verb: button label, tooltip, and file name of the result
     "transfer-texture": ("Texture", "The target with the colors, or all material maps, of the source", "result.glb"),
     "transfer-rig": ("Rig", "The target with the armature, weights and actions of the source", "result.glb"),
     "transfer-weights": ("Weights", "Vertex groups of the source, on the target itself", "result.npz"),
     "transfer-shapes": ("Shape keys", "The target with the shape keys of the source", "result.glb"),
-    "transfer-garment": ("Garment", "A garment that sits on the source, as it sits on the target", "result.glb"),
-    "wrap": ("Wrap", "The mesh of the source, laid onto the surface of the target", "result.glb"),
-    "match": ("Match", "On the source, the vertex of the target that each of its own corresponds to", "result.npz"),
+    "transfer-garment": ("Garment", "The garment of the source, fitted to the target", "result.glb"),
+    "wrap": ("Wrap", "The mesh of the source, fitted to the surface of the target", "result.glb"),
+    "match": ("Match", "An attribute of the source: the matching target vertex for each vertex", "result.npz"),
 }
-IN_ORDER = (
-    "match",
-    "transfer-weights",
-)  # whose results are by vertex: the target's are written in order, without seams
+# Verbs with one result per vertex: the target is exported as ply, which keeps the order of vertices and splits no seams.
+IN_ORDER = ("match", "transfer-weights")
 SECONDS_TO_END = 5
 
 
 class Trouble(Exception):
-    """What the user can put right."""
+    """An error that the user can correct."""
 
 
 def environment():
-    """Without what Blender's own Python is told."""
+    """Environment variables without those that Blender sets for its own Python."""
     return {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
 
 
 class Process:
-    """meshmatch at work in a folder."""
+    """A meshmatch process that works in a folder."""
 
     def __init__(self, command, words, folder):
         program = shutil.which(bpy.path.abspath(command) if command.startswith("//") else os.path.expanduser(command))
@@ -60,13 +58,13 @@ class Process:
             return [line.strip() for line in file if line.strip()]
 
     def progress(self):
-        """The last line, and the share in it (0..1) if there is one."""
+        """The last line of output, and the share (0..1) that it contains, else 0."""
         line = (self.lines() or [""])[-1]
         share = re.search(r"(\d+) %", line)
         return line, int(share[1]) / 100 if share else 0.0
 
     def cancel(self):
-        self.running.terminate()  # meshmatch then leaves nothing half-written
+        self.running.terminate()  # on this signal meshmatch removes incomplete files
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.running.wait(SECONDS_TO_END)
         self.running.kill()
@@ -74,7 +72,7 @@ class Process:
         self.log.close()
 
     def finish(self):
-        """What it said; `Trouble` if it failed."""
+        """Wait for the process; return the lines of its output, or raise `Trouble` if it failed."""
         status = self.running.wait()
         self.log.close()
         lines = self.lines()
@@ -86,14 +84,14 @@ class Process:
 
 
 @contextlib.contextmanager
-def selected(thing):
-    """Only an object, what it hangs from and what hangs from it selected; as it was, afterwards."""
+def selected(item):
+    """Select only an object, its armature and the children of that; restore the selection afterwards."""
     layer = bpy.context.view_layer
     before, active = [each for each in layer.objects if each.select_get()], layer.objects.active
-    top = thing.find_armature() or thing
+    armature = item.find_armature() or item
     for each in layer.objects:
-        each.select_set(each in (thing, top) or (thing.type == "ARMATURE" and each in thing.children_recursive))
-    layer.objects.active = thing
+        each.select_set(each in (item, armature) or (item.type == "ARMATURE" and each in item.children_recursive))
+    layer.objects.active = item
     try:
         yield
     finally:
@@ -102,8 +100,8 @@ def selected(thing):
         layer.objects.active = active
 
 
-def write(thing, path):
-    with selected(thing):
+def write(item, path):
+    with selected(item):
         if path.endswith(".ply"):
             bpy.ops.wm.ply_export(
                 filepath=path, export_selected_objects=True, apply_modifiers=False, export_uv=False,
@@ -114,7 +112,7 @@ def write(thing, path):
 
 
 class Job:
-    """One verb on the chosen objects, from their files to what comes back."""
+    """One verb applied to the chosen objects, from export to import."""
 
     def __init__(self, verb, source, target, garment, command):
         if source is None or target is None or source == target:
@@ -126,13 +124,13 @@ class Job:
         self.verb, self.source, self.target, self.result = verb, source, target, JOBS[verb][2]
         self.folder = tempfile.mkdtemp(prefix="meshmatch-")
         try:
-            plain = verb in IN_ORDER
+            in_order = verb in IN_ORDER
             files = {"source.ply" if verb == "match" else "source.glb": source}
-            files["target.ply" if plain else "target.glb"] = target
+            files["target.ply" if in_order else "target.glb"] = target
             if verb == "transfer-garment":
                 files = {"garment.glb": garment} | files
-            for name, thing in files.items():
-                write(thing, os.path.join(self.folder, name))
+            for name, item in files.items():
+                write(item, os.path.join(self.folder, name))
             self.process = Process(command, [verb, *files, "-o", self.result], self.folder)
         except BaseException:
             self.remove()
@@ -146,7 +144,7 @@ class Job:
         self.remove()
 
     def finish(self):
-        """Bring the result into the scene; what meshmatch said last."""
+        """Import the result into the scene, and return the last line of meshmatch's output."""
         try:
             lines = self.process.finish()
             path = os.path.join(self.folder, self.result)
@@ -160,19 +158,19 @@ class Job:
         finally:
             self.remove()
 
-    def store_match(self, found):
+    def store_match(self, arrays):
         for name, kind, values in (
-            ("meshmatch_vertex", "INT", found["index"].astype(np.int32)),
-            ("meshmatch_confidence", "FLOAT", found["confidence"].astype(np.float32)),
+            ("meshmatch_vertex", "INT", arrays["index"].astype(np.int32)),
+            ("meshmatch_confidence", "FLOAT", arrays["confidence"].astype(np.float32)),
         ):
-            kept = self.source.data.attributes
-            if name in kept:
-                kept.remove(kept[name])
-            kept.new(name, kind, "POINT").data.foreach_set("value", values)
+            attributes = self.source.data.attributes
+            if name in attributes:
+                attributes.remove(attributes[name])
+            attributes.new(name, kind, "POINT").data.foreach_set("value", values)
 
-    def store_weights(self, found):
-        joints, weights = found["joints"], found["weights"]
-        for number, name in enumerate(found["names"].tolist()):
+    def store_weights(self, arrays):
+        joints, weights = arrays["joints"], arrays["weights"]
+        for number, name in enumerate(arrays["names"].tolist()):
             rows, columns = np.nonzero((joints == number) & (weights > 0))
             if len(rows):
                 groups = self.target.vertex_groups
@@ -181,23 +179,23 @@ class Job:
                     group.add([row], weight, "REPLACE")
 
     def place(self, path):
-        """Import the result, and move it beside the target, or the result before, by the target's width and a little."""
+        """Import the result next to the target, or to the previous result, shifted by 1.2 times the target's width."""
         before = set(bpy.data.objects)
-        place = 1 + sum(each.get("meshmatch_of") == self.target.name for each in before)
+        number = 1 + sum(each.get("meshmatch_of") == self.target.name for each in before)
         known = bpy.ops.import_scene.gltf.get_rna_type().properties.keys()
         options = {"disable_bone_shape": True} if "disable_bone_shape" in known else {}
         bpy.ops.import_scene.gltf(filepath=path, **options)
-        made = [each for each in bpy.data.objects if each not in before]
+        imported = [each for each in bpy.data.objects if each not in before]
         corners = [self.target.matrix_world @ mathutils.Vector(corner) for corner in self.target.bound_box]
         width = max(each.x for each in corners) - min(each.x for each in corners)
-        for each in made:
+        for each in imported:
             if each.parent is None:
-                each.location.x += 1.2 * width * place
+                each.location.x += 1.2 * width * number
                 each["meshmatch_of"] = self.target.name
 
 
 class MeshmatchRun(bpy.types.Operator):
-    """Let meshmatch work on the chosen objects; Esc stops it"""
+    """Run meshmatch on the chosen objects; Esc stops it"""
 
     bl_idname = "meshmatch.run"
     bl_label = "Run meshmatch"
@@ -215,7 +213,7 @@ class MeshmatchRun(bpy.types.Operator):
         return Job(self.verb, chosen.source, chosen.target, chosen.garment, command)
 
     def execute(self, context):
-        """Without a window, or from a script: wait."""
+        """Run and wait, in scripts and without a window."""
         try:
             self.report({"INFO"}, self.begin(context).finish())
         except Trouble as trouble:
@@ -277,8 +275,8 @@ class MeshmatchStop(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def is_mesh_or_armature(_, thing):
-    return thing.type in ("MESH", "ARMATURE")
+def is_mesh_or_armature(_, item):
+    return item.type in ("MESH", "ARMATURE")
 
 
 class MeshmatchChoice(bpy.types.PropertyGroup):
