@@ -1,4 +1,4 @@
-"""Blendshapes in files: a glTF scene, one mesh for each shape, or arrays (.npz)."""
+"""Files of blendshapes: a glTF scene, one mesh per shape, or arrays (.npz)."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import write_npz
 
 _FORMAT = "meshmatch blendshapes 1"
-_LARGEST = 1e18
+_MAX_DISPLACEMENT = 1e18
 _HINT = (
     "a .glb with morph targets, an .npz that meshmatch wrote, or a mesh for each shape with the source's own vertices"
 )
 
 
 def load_blend_shapes(given: str | Path | Sequence[str | Path], neutral: Shape) -> BlendShapes:
-    """Blendshapes of a mesh.
+    """Read the blendshapes of a mesh.
 
     Parameters
     ----------
     given
-        A glTF scene with morph targets; an .npz; or meshes with the vertices of ``neutral``, each named as its shape is:
-        their files, or a folder of them. One that is ``neutral`` itself is no shape.
+        A glTF scene with morph targets; an .npz; or meshes with the vertices of ``neutral``, each named like its shape:
+        their files, or a folder of them. Meshes equal to ``neutral`` are skipped.
     neutral
-        The mesh.
+        The mesh without expression.
 
     Returns
     -------
@@ -43,7 +43,7 @@ def load_blend_shapes(given: str | Path | Sequence[str | Path], neutral: Shape) 
     Raises
     ------
     InputError
-        A file cannot be read, holds no blendshapes, or those of another mesh; two have one name.
+        A file cannot be read, has no blendshapes, or those of another mesh; or two shapes have the same name.
     """
     files = [as_path(given)] if isinstance(given, str | Path) else [as_path(each) for each in given]
     if len(files) == 1 and files[0].is_dir():
@@ -53,10 +53,10 @@ def load_blend_shapes(given: str | Path | Sequence[str | Path], neutral: Shape) 
             raise InputError(f"there are no shapes in {folder}", _HINT)
     elif len(files) == 1 and files[0].suffix.lower() in (".npz", *gltf.SUFFIXES):
         path = existing(files[0])
-        found = _from_arrays(path) if path.suffix.lower() == ".npz" else read_morphs(path, read_bytes(path))
-        if found.moves.shape[1] != neutral.V:
-            raise _other_mesh(path.name, found.moves.shape[1], neutral)
-        return found
+        shapes = _from_arrays(path) if path.suffix.lower() == ".npz" else read_morphs(path, read_bytes(path))
+        if shapes.moves.shape[1] != neutral.V:
+            raise _other_mesh(path.name, shapes.moves.shape[1], neutral)
+        return shapes
     moves: dict[str, np.ndarray] = {}
     for file in files:
         shape = load_shape(file)
@@ -75,7 +75,7 @@ def load_blend_shapes(given: str | Path | Sequence[str | Path], neutral: Shape) 
 
 
 def save_blend_shapes(path: Path, shapes: BlendShapes) -> None:
-    """Write names and moves as arrays (.npz)."""
+    """Write names and displacements as arrays (.npz)."""
     write_npz(path, {"format": _FORMAT, "names": np.array(shapes.names, np.str_), "moves": shapes.moves})
 
 
@@ -86,7 +86,7 @@ def _from_arrays(path: Path) -> BlendShapes:
         raise InputError(f"{path.name} does not hold 'moves', an array (K, V, 3) of numbers", _HINT)
     if not len(moves) or len(set(names)) != len(moves):
         raise InputError(f"{path.name} has {len(moves)} shapes, and {len(set(names))} different names", _HINT)
-    if not (np.abs(moves) < _LARGEST).all():
+    if not (np.abs(moves) < _MAX_DISPLACEMENT).all():
         raise InputError(f"{path.name}: a move is no number, or too large", "is it the right file?")
     return BlendShapes(names, moves.astype(np.float32), np.zeros(len(names)))
 

@@ -1,4 +1,4 @@
-"""Blendshapes: named displacements of a mesh's vertices, as expressions of a face are."""
+"""Blendshapes: named displacements of a mesh's vertices, such as facial expressions."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from meshmatch.shapes.shape import Shape
 
 @dataclass(frozen=True, eq=False, repr=False)
 class WeightClip(Brief):
-    """A clip that animates blendshapes: the weights of all of them at each time.
+    """An animation clip of blendshapes: the weights of all of them at each time.
 
-    Of a cubic spline there are three rows for each time: the slopes before it, the weights and the slopes after it.
+    Cubic splines have three rows for each time: the incoming slopes, the weights and the outgoing slopes.
     """
 
     name: str
@@ -31,16 +31,15 @@ class BlendShapes(Brief):
     Attributes
     ----------
     names
-        Of the K shapes, none twice.
+        Unique names of the K shapes.
     moves
-        (K, V, 3) float32: where each vertex goes when a shape is fully on, minus where it is; in the frame and unit of
-        the mesh's file.
+        (K, V, 3) float32: displacement of each vertex when a shape is fully on, in the frame and unit of the mesh's file.
     weights
-        (K,) how much of each shape is on when the file is opened.
+        (K,) weight of each shape when the file is opened.
     normals
-        Whether the file has the directions of normals for each shape as well.
+        Whether the file has normals for each shape as well.
     clips
-        Clips that animate them.
+        Animation clips of the weights.
     """
 
     names: tuple[str, ...]
@@ -51,7 +50,7 @@ class BlendShapes(Brief):
 
 
 def shape_normals(shape: Shape, moves: Float[Floats32, "K V 3"]) -> Float[Floats32, "N V 3"]:
-    """Smooth normals at rest, and with each of the K shapes on; vertices at one place share theirs."""
+    """Smooth normals of the mesh at rest and with each of the K shapes fully on; vertices at one position share theirs."""
     twin = same_rows(shape.verts)
     faces = twin[shape.faces]
     places = (shape.verts, *(shape.verts + move for move in moves))

@@ -1,5 +1,5 @@
-"""Fewer triangles, nearly the same surface. The one door to pymeshlab, which is under the GPL and optional: nothing on
-the main path comes to it.
+"""Mesh simplification. The only module that imports pymeshlab, which is optional and under the GPL; no main code path
+uses it.
 """
 
 from __future__ import annotations
@@ -16,22 +16,23 @@ from meshmatch.shapes.shape import Shape
 
 Quality = Literal["fast", "meshlab"]
 _AGGRESSIVENESS = (3.0, 4.0, 2.5, 5.0)
-"""To try in turn. On closed bodies 3 kept the mesh closed with the least error where 7, the library's own choice, did
-not; but it can stop short of the target, which higher ones reach."""
-_one_at_a_time = threading.Lock()  # fast_simplification keeps its mesh in global variables
+"""Values to try, in order. On closed bodies 3 kept the mesh closed with the least error, and 7, the library's default,
+did not; but 3 can stop short of the target, which higher values reach.
+"""
+_lock = threading.Lock()  # fast_simplification keeps its mesh in global variables
 _COLLAPSE = "meshing_decimation_quadric_edge_collapse"
 
 
 def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
-    """The surface with about `faces` triangles, by quadric edge collapse (Garland and Heckbert 1997).
+    """Simplify a mesh to about `faces` triangles by quadric edge collapse (Garland and Heckbert 1997).
 
-    A mesh that has no more is returned as it is. A closed mesh comes out closed, if need be with more triangles than
-    asked for; if no way to do that is found, with as few open and non-manifold edges as possible. Non-manifold input is
-    taken as it is. Vertices that no face uses are dropped; colors are those of the nearest original vertex.
+    A mesh with no more faces is returned unchanged. A closed mesh stays closed, if need be with more triangles than
+    requested; if that fails, the result has as few open and non-manifold edges as possible. Non-manifold input is
+    accepted. Vertices without faces are dropped; colors are those of the nearest original vertex.
 
-    `faces` is at least 4; borders and closedness can keep it from getting there. Quality "meshlab" (by pymeshlab) takes
-    ten times as long, and makes well-shaped triangles where the surface is flat. `InputError`: the shape is a cloud.
-    `OptionError`: unknown quality, fewer than 4 faces, or pymeshlab is not there or lacks its filters.
+    `faces` is at least 4; borders and closedness can prevent the target. Quality "meshlab" (by pymeshlab) takes ten
+    times as long, and makes well-shaped triangles in flat regions. `InputError`: the shape is a cloud. `OptionError`:
+    unknown quality, fewer than 4 faces, or pymeshlab is missing or lacks its filters.
     """
     if quality not in ("fast", "meshlab"):
         raise OptionError(f"unknown decimation quality {quality!r}", "choose fast or meshlab")
@@ -41,7 +42,7 @@ def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
         raise InputError(f"{shape.name or 'the shape'} is a point cloud: it has no faces to decimate")
     if faces >= shape.F:
         return shape
-    # centered and of size 1: the library compares with fixed tolerances
+    # normalized, because the library compares with absolute tolerances
     center, size = shape.bounds.mean(axis=0), shape.diagonal or 1.0
     collapse = _by_pymeshlab if quality == "meshlab" else _fast
     verts, corners = collapse((shape.verts - center) / size, shape.faces, faces)
@@ -61,23 +62,28 @@ def _fast(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Ints]:
     closed = is_watertight(faces)
     best: tuple[tuple[int, int], Floats, Ints] | None = None
     for aggressiveness in _AGGRESSIVENESS:
-        with _one_at_a_time:
-            small = fast_simplification.simplify(verts, faces.astype(np.int32), target_count=target, agg=aggressiveness)
-        new_faces = np.asarray(small[1], np.int64)
-        new_faces = new_faces[(new_faces != np.roll(new_faces, 1, axis=1)).all(axis=1)]  # no vertex is named twice
+        with _lock:
+            simplified = fast_simplification.simplify(
+                verts, faces.astype(np.int32), target_count=target, agg=aggressiveness
+            )
+        new_faces = np.asarray(simplified[1], np.int64)
+        # drops faces that repeat a vertex
+        new_faces = new_faces[(new_faces != np.roll(new_faces, 1, axis=1)).all(axis=1)]
         if len(new_faces) == 0:
             continue
         faults = sum(edges_of(new_faces).counts) if closed else 0
-        badness = faults, max(len(new_faces) - int(1.02 * target) - 2, 0)
-        if best is None or badness < best[0]:
-            best = badness, np.asarray(small[0], np.float64), new_faces
-        if badness == (0, 0):
+        penalty = faults, max(len(new_faces) - int(1.02 * target) - 2, 0)
+        if best is None or penalty < best[0]:
+            best = penalty, np.asarray(simplified[0], np.float64), new_faces
+        if penalty == (0, 0):
             break
     return (verts, faces) if best is None else best[1:]
 
 
 def _by_pymeshlab(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Ints]:
-    """Well-shaped triangles, topology kept. Without Debian's libopengl0 some filters are silently missing."""
+    """Well-shaped triangles with the same topology. Without Debian's libopengl0 some filters are missing without an
+    error.
+    """
     try:
         import pymeshlab
     except ModuleNotFoundError as error:

@@ -195,7 +195,7 @@ def _bases(shape: Shape, corners: Int[Ints, "F 3"], area: Float[Floats, " F"], p
         if plane is None:
             continue
         centers = shape.verts[corners[own]].mean(axis=1)
-        low = plane.below(centers)
+        low = plane.is_base(centers)
         base, rest = own[low], own[~low]
         if len(base) and len(rest) and _plain(shape.verts[np.unique(corners[base])], centers[low], area[base]):
             pieces = np.bincount(triangles.face_parts(corners[rest], shape.V), area[rest])
@@ -210,7 +210,7 @@ def _of_cloud(cls: type[Parts], shape: Shape) -> Parts:
 
     number, faces = np.zeros(shape.V, np.int64), np.empty(0, np.int64)
     plane = base_plane(Shape(shape.verts[shape.valid], shape.faces))
-    low = shape.valid & plane.below(shape.verts) if plane is not None else number > 0
+    low = shape.valid & plane.is_base(shape.verts) if plane is not None else number > 0
     if not low.any() or not _plain(shape.verts[low], shape.verts[low], shape.vertex_areas[low]):
         return cls(shape, number, faces, np.empty(0))
     number = np.where(shape.valid, 1 + low, 0)

@@ -16,7 +16,7 @@ from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
 from meshmatch.shapes.copies import counterparts
-from meshmatch.shapes.denoise import without_noise
+from meshmatch.shapes.denoise import remove_noise
 from meshmatch.shapes.faces import collapsed, duplicate_faces, find_parts, flat_faces, seams, spikes, turn_faces
 from meshmatch.shapes.shape import Shape
 
@@ -160,7 +160,7 @@ def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     _note(notes, border, "open edge", "(the surface has holes or a border)")
     _note(notes, crowded, "non-manifold edge", "(more than two faces meet there), left as they are")
     found = _result(shape, kept, twin, faces, which, valid, notes, far)
-    smooth, passes = without_noise(found.shape, parts)
+    smooth, passes = remove_noise(found.shape, parts)
     if not passes:
         return found
     return replace(found, shape=smooth, notes=(*found.notes, f"smoothed {passes} times, because noise hid the surface"))

@@ -38,7 +38,7 @@ def test_the_plane_that_a_hill_stands_on_is_found_however_it_lies(noise: float) 
     verts = 100 * (shape.verts + noise * rng.standard_normal(shape.verts.shape)) @ turn.T + [7.0, 8.0, 9.0]
     found = base_plane(Shape(verts, shape.faces))
     assert found is not None and found.normal @ turn[:, 2] > 0.999
-    below = found.below(verts)
+    below = found.is_base(verts)
     assert below[shape.verts[:, 2] < 1e-3].mean() > 0.95 and not below[shape.verts[:, 2] > 0.1].any()
 
 

@@ -186,8 +186,8 @@ def test_bodies_keep_their_size_as_clouds(bench: Path, noise: float) -> None:
 def test_points_that_lie_on_each_other_are_judged_once() -> None:
     """A search among many at one place looks at all of them: it would take hours."""
     crowd = np.concatenate([np.tile([[0.0, 1.0, 2.0]], (3000, 1)), np.random.default_rng(0).normal(size=(2000, 3))])
-    assert len(cloud._part(crowd)) == 2001
-    assert cloud._part(crowd[2000:]) is not crowd and len(cloud._part(crowd[2000:])) == 3000
+    assert len(cloud._subset(crowd)) == 2001
+    assert cloud._subset(crowd[2000:]) is not crowd and len(cloud._subset(crowd[2000:])) == 3000
     equal = np.ones((300, 3))
     assert (local_areas(equal) == 0).all() and (estimate_normals(equal) == 0).all() and roughness(equal) == 0
     assert local_areas(crowd).shape == (5000,)

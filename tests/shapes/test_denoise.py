@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from meshmatch.shapes.denoise import coherence, without_noise
+from meshmatch.shapes.denoise import coherence, remove_noise
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 
@@ -26,7 +26,7 @@ def test_coherence() -> None:
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_what_shows_the_surface_is_left(noise: float) -> None:
     shape = ball(noise)
-    assert without_noise(shape) == (shape, 0)
+    assert remove_noise(shape) == (shape, 0)
     assert repair(shape).shape is shape
 
 

@@ -181,7 +181,7 @@ class Job:
     def place(self, path):
         """Import the result next to the target, or to the previous result, shifted by 1.2 times the target's width."""
         before = set(bpy.data.objects)
-        number = 1 + sum(each.get("meshmatch_of") == self.target.name for each in before)
+        place = 1 + sum(each.get("meshmatch_of") == self.target.name for each in before)
         known = bpy.ops.import_scene.gltf.get_rna_type().properties.keys()
         options = {"disable_bone_shape": True} if "disable_bone_shape" in known else {}
         bpy.ops.import_scene.gltf(filepath=path, **options)
@@ -190,7 +190,7 @@ class Job:
         width = max(each.x for each in corners) - min(each.x for each in corners)
         for each in imported:
             if each.parent is None:
-                each.location.x += 1.2 * width * number
+                each.location.x += 1.2 * width * place
                 each["meshmatch_of"] = self.target.name
 
 
