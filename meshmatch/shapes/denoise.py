@@ -11,11 +11,8 @@ from meshmatch.shapes.shape import Shape
 # above 0.89; noise as large as the triangles gives 0.3 to 0.64, two to ten times the area, and meaningless normals.
 _MIN_COHERENCE, _TARGET_COHERENCE = 0.75, 0.94
 _MAX_PASSES = 60
-_TAUBIN_PASS = {
-    "lamb": 0.5,
-    "nu": 0.53,
-    "iterations": 2,
-}  # one step inwards and one outwards, which preserve the volume
+# one step inwards and one outwards, which preserve the volume
+_TAUBIN_PASS = {"lamb": 0.5, "nu": 0.53, "iterations": 2}
 # Minimum triangles per part: parts of simple solids have few triangles, and corners that are not noise.
 _MIN_TRIANGLES = 100
 _MAX_WEIGHT = 20.0  # maximum weight of a vertex, in units of the median area around a vertex

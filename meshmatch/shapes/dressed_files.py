@@ -1,4 +1,4 @@
-"""Meshes that wear a baked material, in files: a glb or an obj stays what it was, but for what is laid on it."""
+"""Write meshes with a baked material: a glb or obj keeps everything in its file except the materials."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from meshmatch.shapes.textured_files import check_textured, files_of, image_file
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Dressed(Brief):
-    """A mesh that wears a baked material.
+    """A mesh with a baked material.
 
-    ``file`` is what it was read from, None where it came from arrays; ``uv`` are texture coordinates of each corner, v down,
-    ``own`` if they are those of the file; ``turn`` is what turns a file without axes upright in a format that has them.
-    ``tiles`` are materials that differ only in their images, by the tile (UDIM, 1001 to 1100) of the coordinates that they
-    are for; without, one image holds all.
+    ``file`` is the file it was read from, None for a mesh from arrays; ``uv`` are texture coordinates of each corner, v
+    down, ``own`` if they are those of the file. ``turn`` rotates a file without defined axes upright in formats that
+    define them. ``tiles`` are materials that differ only in their images, by the tile (UDIM, 1001 to 1100) of the
+    coordinates they are for; if empty, one image covers all coordinates.
     """
 
     shape: Shape
@@ -46,13 +46,13 @@ class Dressed(Brief):
 
     @property
     def turned(self) -> bool:
-        """Whether the file stands along another axis than y."""
+        """Whether the shape stands along another axis than y."""
         return not np.array_equal(self.turn, np.eye(3))
 
     def save(self, path: Path) -> None:
-        """Write a glb, or an obj with its material files; all of them, or none.
+        """Write a glb, or an obj with its material files; all files or none.
 
-        `OptionError` if the suffix is neither .glb nor .obj, nor .vrm of a character, or the format has no tiles;
+        `OptionError` if the suffix is neither .glb nor .obj, nor .vrm for a character, or the format has no tiles;
         `OutputError` if a file cannot be written.
         """
         check_textured(path)
@@ -63,7 +63,7 @@ class Dressed(Brief):
             self.write(path, places)
 
     def write(self, path: Path, places: Sequence[Path]) -> None:
-        """Write the `files_of` an output where they wait to get their names. What it does not hold is told."""
+        """Write the contents of `files_of` to temporary ``places``; issue a warning for what the format cannot hold."""
         if len(places) == 1:
             places[0].write_bytes(self._glb())
         else:
@@ -71,39 +71,39 @@ class Dressed(Brief):
         tell_lost(self.file, path)
 
     def _glb(self) -> bytes:
-        path, data, kept = glb_base(self.file, self.shape)
-        if kept:
+        path, data, is_original = glb_base(self.file, self.shape)
+        if is_original:
             uv, own, turn = self.uv, self.own, np.eye(3)
         else:
             uv, own, turn = self.uv[self.shape.valid_faces], False, self.turn
-        made = gltf.understood(
+        glb = gltf.understood(
             path, data, "scene makes", lambda document: dressed(document, uv, own, self.material, turn)
         )
-        return remembering(made, self.shape)
+        return remembering(glb, self.shape)
 
     def _write_obj(self, path: Path, places: Sequence[Path]) -> None:
-        made, name = self.material, "_".join((self.material.name or path.stem).split()) or "texture"
-        files = files_of(path, made.layers, self.tiles)
+        shared, name = self.material, "_".join((self.material.name or path.stem).split()) or "texture"
+        files = files_of(path, shared.layers, self.tiles)
         if self.file is not None and self.file.suffix.lower() == ".obj":
-            text, names = self._kept_text(self.file, files[1].name, name)
+            text, names = self._edited_text(self.file, files[1].name, name)
             places[0].write_bytes(text)
         else:
             real = self.shape.valid_faces
             mesh = Textured(self.shape.verts, self.shape.faces[real], self.uv[real])
             obj.write_textured(places[0], mesh, files[1].name, name)
             names = [name]
-        where, named = dict(zip(files, places, strict=True)), {}
-        for tile, material in (self.tiles or {0: made}).items():
+        place_of, image_names = dict(zip(files, places, strict=True)), {}
+        for tile, material in (self.tiles or {0: shared}).items():
             for word, image in _images_of(material).items():
-                own = image_file(path, word)
-                named[word] = tile_file(own, "<UDIM>" if self.tiles else "").name
-                where[tile_file(own, tile)].write_bytes(png_bytes(image))
-        obj.write_materials(places[1], names, made, named)
-        if made.occluded or made.unlit:
-            lost = " and ".join(["an occlusion map"] * made.occluded + ["materials without light"] * made.unlit)
+                image_path = image_file(path, word)
+                image_names[word] = tile_file(image_path, "<UDIM>" if self.tiles else "").name
+                place_of[tile_file(image_path, tile)].write_bytes(png_bytes(image))
+        obj.write_materials(places[1], names, shared, image_names)
+        if shared.occluded or shared.unlit:
+            lost = " and ".join(["an occlusion map"] * shared.occluded + ["materials without light"] * shared.unlit)
             warn(f"{path.name} does not have {lost}: an mtl holds none")
 
-    def _kept_text(self, file: Path, library: str, name: str) -> tuple[bytes, list[str]]:
+    def _edited_text(self, file: Path, library: str, name: str) -> tuple[bytes, list[str]]:
         data = read_bytes(file)
         if self.own:
             return obj_text.with_material(data, library, name, None)
@@ -115,7 +115,7 @@ class Dressed(Brief):
 
 
 def _images_of(material: BakedMaterial) -> dict[str, Pixels]:
-    """Images of an mtl, by the words of `image_file`."""
+    """The images of an mtl, keyed as in `image_file`."""
     images = {"color": material.color}
     if material.normal is not None:
         images["normal"] = material.normal
@@ -128,15 +128,16 @@ def _images_of(material: BakedMaterial) -> dict[str, Pixels]:
 
 
 def check_tiles(path: Path) -> None:
-    """Refuse to write tiles (UDIM) in a format that has none (`OptionError`)."""
+    """`OptionError` if the format cannot hold tiles (UDIM)."""
     if path.suffix.lower() != ".obj":
         problem = f"{path.name}: {path.suffix} has no tiles (UDIM), in which the texture coordinates of the target lie"
         raise OptionError(problem, "end the name in .obj, or bring them into one (BakeOptions.tiles=False)")
 
 
 def save_textured(path: str | Path, mesh: Textured, image: Pixels) -> None:
-    """Write a mesh that wears `image` (H, W, 4) as glb, or as obj with an mtl and a png of the same name; errors as
-    `Dressed.save`.
+    """Write a mesh with the texture `image` (H, W, 4) as glb, or as obj with an mtl and a png of the same name.
+
+    Errors are those of `Dressed.save`.
     """
     path = Path(path)
     material = BakedMaterial(image, mesh.alpha, mesh.cutoff, path.stem)
@@ -144,16 +145,18 @@ def save_textured(path: str | Path, mesh: Textured, image: Pixels) -> None:
 
 
 def save_colored(path: Path, shape: Shape, file: Path | None, turn: Float[Floats, "3 3"]) -> bool:
-    """Write a shape with its colors. A glb, obj, ply or vtp that it was read from stays what it was, but for the colors; a
-    file without axes is turned upright in a glb. Returns whether a file of this format stays what it was.
+    """Write a shape with its vertex colors.
+
+    If the shape was read from a glb, obj, ply or vtp and the output has the same format, everything else in the file is
+    kept. A glb of a shape without defined axes is rotated upright. Returns whether the rest of the file was kept.
     """
     suffix, colors = path.suffix.lower(), shape.colors
     assert colors is not None
     if suffix in (".glb", ".vrm"):
-        name, data, as_it_is = glb_base(file, shape)
-        turned = np.eye(3) if as_it_is else turn
-        made = gltf.understood(name, data, "scene makes", lambda doc: colored(doc, colors, turned))
-        path.write_bytes(remembering(made, shape))
+        name, data, is_original = glb_base(file, shape)
+        turned = np.eye(3) if is_original else turn
+        glb = gltf.understood(name, data, "scene makes", lambda doc: colored(doc, colors, turned))
+        path.write_bytes(remembering(glb, shape))
     elif suffix == ".obj" and file is not None and file.suffix.lower() == ".obj":
         path.write_bytes(obj_text.with_colors(file.name, read_bytes(file), colors))
     elif suffix == ".ply" and (as_ply := PlyFile.of(file, shape)) is not None:
@@ -167,23 +170,25 @@ def save_colored(path: Path, shape: Shape, file: Path | None, turn: Float[Floats
 
 
 def glb_base(file: Path | None, shape: Shape) -> tuple[Path, bytes, bool]:
-    """The glb or gltf that something is added to: name and bytes, and whether it is the file, not one made of the shape."""
+    """The glTF file that data is added to: its name and content, and whether it is the original rather than made of the
+    shape.
+    """
     if file is not None and file.suffix.lower() in gltf.SUFFIXES:
         data = read_bytes(file)
         if not gltf.understood(file, data, "scene makes", Document.draws_copies):
             return file, data, True
         warn(f"{file.name} draws copies of one mesh, which would have to differ: all becomes one mesh")
     name = Path(shape.name or "target").stem
-    bare = Shape(shape.verts, shape.faces[shape.valid_faces], name)
-    return Path(f"{name}.glb"), gltf_out.glb_of(bare), False
+    bare_shape = Shape(shape.verts, shape.faces[shape.valid_faces], name)
+    return Path(f"{name}.glb"), gltf_out.glb_of(bare_shape), False
 
 
 def tell_lost(file: Path | None, path: Path, kept: bool = True) -> None:
-    """Say what an output does not have of the file that it was made of: nothing, if it is of the same format and all of that
-    was ``kept``.
+    """Warn about what an output lacks of its original file; nothing if both have the same format and all of it was
+    ``kept``.
     """
     before, after = ("" if each is None else each.suffix.lower() for each in (file, path))
-    after = ".glb" if blender.is_converted(path) else after  # by way of which it is written
+    after = ".glb" if blender.is_converted(path) else after  # Blender writes these through a glb
     if (
         file is None
         or not file.is_file()
@@ -198,17 +203,17 @@ def tell_lost(file: Path | None, path: Path, kept: bool = True) -> None:
     else:
         lost = beyond_triangles(file)
     if lost:
-        several = f"{', '.join(lost[:-1])} and {lost[-1]}" if lost[1:] else lost[0]
-        warn(f"{path.name} does not have the {several} of {file.name}")
+        listed = f"{', '.join(lost[:-1])} and {lost[-1]}" if lost[1:] else lost[0]
+        warn(f"{path.name} does not have the {listed} of {file.name}")
 
 
 def beyond_triangles(file: Path) -> list[str]:
-    """What a file has besides the triangles of one mesh and its material or colors, in words."""
+    """What a file contains besides the triangles of one mesh and its material or colors, in words."""
     suffix = file.suffix.lower()
     if suffix in gltf.SUFFIXES:
         return gltf.understood(file, read_bytes(file), "scene makes", Document.beyond_triangles)
     readers: dict[str, type[PlyFile | VtpFile]] = {".ply": PlyFile, ".vtp": VtpFile}
     if suffix in readers:
         return readers[suffix].parsed(file.name, read_bytes(file)).beyond_triangles
-    told = {".obj": obj_text.beyond_triangles, ".off": off.beyond_triangles, ".vtk": vtk.beyond_triangles}
-    return told[suffix](file.name, read_bytes(file)) if suffix in told else []
+    describe = {".obj": obj_text.beyond_triangles, ".off": off.beyond_triangles, ".vtk": vtk.beyond_triangles}
+    return describe[suffix](file.name, read_bytes(file)) if suffix in describe else []

@@ -1,7 +1,8 @@
-"""Shapes from what users hold (files, arrays, meshes of other libraries), and to files; the format by suffix.
+"""Read shapes from files, arrays and meshes of other libraries, and write them to files; the suffix determines the
+format.
 
-Every vertex that a file lists stays, in the file's order, because a map has to answer for each of them: nothing is
-merged, split or dropped here (see `meshmatch.shapes.repair` for that). Polygons become triangles.
+All vertices of a file are kept, in the file's order, because a map must answer for each of them: nothing is merged,
+split or dropped here (`meshmatch.shapes.repair` does that). Polygons are triangulated.
 """
 
 from __future__ import annotations
@@ -46,35 +47,35 @@ _FORMATS: dict[str, tuple[Callable[[Path, bytes], Raw], Callable[[Path, Shape], 
 }
 _WRITERS = {suffix: write for suffix, (_, write) in _FORMATS.items() if write is not None}
 SUFFIXES = tuple(_FORMATS)
-"""The suffixes that `load_shape` knows."""
+"""Suffixes that `load_shape` reads."""
 PLAIN_SUFFIXES = tuple(suffix for suffix in SUFFIXES if suffix not in blender.SUFFIXES)
-"""Those that need no Blender: what is looked for in a folder."""
+"""Suffixes that need no Blender: those that are looked for in folders."""
 check_suffix = partial(tables.check_suffix, suffixes=_WRITERS, what="shapes")
-_CLOUDS = (".xyz", ".npy")  # of which no file holds faces
+_CLOUD_SUFFIXES = (".xyz", ".npy")  # formats without faces
 
-_NAMED = 10  # labels in one line
+_MAX_LISTED = 10  # maximum number of labels in a message
 
 Choice: TypeAlias = str | int | Sequence[str | int]
 """Meshes of a scene by name, or parts of a mesh by number: one or several."""
 
 
 def load_shape(path: str | Path, *, only: Choice = (), without: Choice = ()) -> Shape:
-    """Read a mesh or a point cloud as it is: all vertices, in file order.
+    """Read a mesh or a point cloud without changes: all vertices, in file order.
 
-    A vertex whose position is not a number is kept in its place and marked in `Shape.invalid`. The scene of a glb or
-    gltf is one shape: its meshes one after the other, each where the scene puts it. An stl has no shared vertices:
-    every corner of every triangle is a vertex, 3 F of them.
+    A vertex whose position is not finite keeps its place and is marked in `Shape.invalid`. The scene of a glb or gltf
+    is one shape: its meshes one after the other, each where the scene places it. An stl has no shared vertices: every
+    corner of every triangle is a vertex, 3 F of them.
 
     Parameters
     ----------
     path
-        Its suffix names the format.
+        Its suffix determines the format.
     only
-        Parts or, of a scene, meshes to trust; the vertices of all others get weight 0, so that no fit looks at them,
-        and keep their places. A name is that of a mesh or its node and may hold ``*`` and ``?``; upper and lower case
-        count the same. A number is that of a part, see `meshmatch info`.
+        Parts or, of a scene, meshes to fit; the vertices of all others get weight 0, so that fits ignore them, but they
+        keep their places. A name is that of a mesh or its node and may contain ``*`` and ``?``; case is ignored. A
+        number is that of a part, see `meshmatch info`.
     without
-        The opposite: not to be trusted.
+        The opposite: parts or meshes to ignore.
 
     Returns
     -------
@@ -84,8 +85,8 @@ def load_shape(path: str | Path, *, only: Choice = (), without: Choice = ()) -> 
     Raises
     ------
     InputError
-        The file is missing, empty, cut short, of an unknown kind, or holds no usable vertex; or none of its meshes has
-        a name that is given.
+        The file is missing, empty, truncated, of an unknown format, or has no usable vertex; or none of its meshes has
+        a given name.
 
     Examples
     --------
@@ -97,31 +98,31 @@ def load_shape(path: str | Path, *, only: Choice = (), without: Choice = ()) -> 
 
 
 def load_shapes(paths: Sequence[str | Path], *, only: Choice = (), without: Choice = ()) -> list[Shape]:
-    """Read shapes as `load_shape` does. A shape that lacks a name or number is not asked for it, but one must have it.
+    """Read shapes as `load_shape` does; each name and number must occur in at least one of them.
 
-    Errors are those of `load_shape`.
+    A shape that lacks a name or number ignores it. Errors are those of `load_shape`.
     """
     names = [[each] if isinstance(each, str | int) else list(each) for each in (only, without)]
     chosen, left_out = ([str(name) for name in each] for each in names)
-    found = [_read(path) for path in paths]
+    loaded = [_read(path) for path in paths]
     if not (chosen or left_out):
-        for shape, raw in found:
+        for shape, raw in loaded:
             if len(raw.meshes) > 1 and _is_label_map(shape):
-                labels = ", ".join(" or ".join(names) for names, _ in raw.meshes[:_NAMED])
-                more = f" and {len(raw.meshes) - _NAMED} more" if len(raw.meshes) > _NAMED else ""
+                labels = ", ".join(" or ".join(names) for names, _ in raw.meshes[:_MAX_LISTED])
+                suffix = f" and {len(raw.meshes) - _MAX_LISTED} more" if len(raw.meshes) > _MAX_LISTED else ""
                 warn(
-                    f"{shape.name} holds {len(raw.meshes)} labels, and all are read: {labels}{more}; choose with --only"
+                    f"{shape.name} holds {len(raw.meshes)} labels, and all are read: {labels}{suffix}; choose with --only"
                 )
-        return [shape for shape, _ in found]
-    known = [_Named(shape, raw.meshes) for shape, raw in found]
+        return [shape for shape, _ in loaded]
+    named_shapes = [_NamedShape(shape, raw.meshes) for shape, raw in loaded]
     for pattern in (*chosen, *left_out):
-        if all(each.of(pattern) is None for each in known):
-            raise _nothing_called(pattern, known)
-    return [each.weighted(chosen, left_out) for each in known]
+        if all(each.select(pattern) is None for each in named_shapes):
+            raise _unknown_name(pattern, named_shapes)
+    return [each.weighted(chosen, left_out) for each in named_shapes]
 
 
 @dataclass(frozen=True, eq=False)
-class _Named:
+class _NamedShape:
     """A shape, and the names of its scene's meshes."""
 
     shape: Shape
@@ -129,56 +130,59 @@ class _Named:
 
     @cached_property
     def parts(self) -> Parts:
-        return Parts.of(self.shape, bases=True)
+        return Parts.select(self.shape, bases=True)
 
     @cached_property
-    def _connected(self) -> Parts:
-        """The same with what they are fused with."""
-        return Parts.of(self.shape) if self.parts.bases else self.parts
+    def _connected_parts(self) -> Parts:
+        """The connected parts, with the bases that they are fused with."""
+        return Parts.select(self.shape) if self.parts.bases else self.parts
 
-    def of(self, pattern: str) -> Bool[Bools, " V"] | None:
-        """The vertices of the meshes of a name, or of the part of a number; None if there is none. Numbers of a label map
-        are those of labels alone.
+    def select(self, pattern: str) -> Bool[Bools, " V"] | None:
+        """The vertices of the meshes that match a name, or of the part with a number; None if there is none.
+
+        Numbers of a label map are labels only.
         """
-        called = [any(fnmatchcase(each.lower(), pattern.lower()) for each in names) for names, _ in self.meshes]
-        if any(called):
-            return np.repeat(np.array(called), [count for _, count in self.meshes])
+        is_match = [any(fnmatchcase(each.lower(), pattern.lower()) for each in names) for names, _ in self.meshes]
+        if any(is_match):
+            return np.repeat(np.array(is_match), [count for _, count in self.meshes])
         if _is_label_map(self.shape):
             return None
         if pattern.isdecimal() and len(pattern) < 10 and 0 < int(pattern) <= len(self.parts):
-            parts = self._connected if int(pattern) <= len(self._connected) else self.parts
+            parts = self._connected_parts if int(pattern) <= len(self._connected_parts) else self.parts
             return np.asarray(parts.number == int(pattern))
         return None
 
     def weighted(self, only: Sequence[str], without: Sequence[str]) -> Shape:
-        """The shape with weight 1 at the vertices that are to be trusted, and 0 at all others."""
-        asked, refused = ([own for each in names if (own := self.of(each)) is not None] for names in (only, without))
-        if not asked and not refused:
+        """The shape with weight 1 at selected vertices, and 0 at all others."""
+        selected, excluded = (
+            [own for each in names if (own := self.select(each)) is not None] for names in (only, without)
+        )
+        if not selected and not excluded:
             return self.shape
-        kept = np.any(asked, axis=0) if asked else np.ones(self.shape.V, bool)
-        if refused:
-            kept = kept & ~np.any(refused, axis=0)
-        if not (kept if self.shape.is_cloud else kept[self.shape.faces]).any():
-            what, more = ("mesh", "meshes") if self.meshes else ("part", "parts")
-            raise InputError(f"no {what} of {self.shape.name} is left", f"choose fewer {more} to leave out")
-        return replace(self.shape, weights=kept.astype(float))
+        is_fitted = np.any(selected, axis=0) if selected else np.ones(self.shape.V, bool)
+        if excluded:
+            is_fitted = is_fitted & ~np.any(excluded, axis=0)
+        if not (is_fitted if self.shape.is_cloud else is_fitted[self.shape.faces]).any():
+            noun, nouns = ("mesh", "meshes") if self.meshes else ("part", "parts")
+            raise InputError(f"no {noun} of {self.shape.name} is left", f"choose fewer {nouns} to leave out")
+        return replace(self.shape, weights=is_fitted.astype(float))
 
 
 def _is_label_map(shape: Shape) -> bool:
     return suffix_of(Path(shape.name)) in LABEL_MAP_SUFFIXES
 
 
-def _nothing_called(pattern: str, known: Sequence[_Named]) -> InputError:
-    files = " or ".join(each.shape.name for each in known)
-    what = "label" if any(_is_label_map(each.shape) for each in known) else "mesh"
-    if pattern.isdecimal() and what == "mesh":
-        last = ", ".join(f"{each.shape.name}: {len(each.parts)}" for each in known)
+def _unknown_name(pattern: str, named_shapes: Sequence[_NamedShape]) -> InputError:
+    files = " or ".join(each.shape.name for each in named_shapes)
+    noun = "label" if any(_is_label_map(each.shape) for each in named_shapes) else "mesh"
+    if pattern.isdecimal() and noun == "mesh":
+        last = ", ".join(f"{each.shape.name}: {len(each.parts)}" for each in named_shapes)
         return InputError(f"{files} has no part {pattern[:20]}", f"number of parts: {last}; see `meshmatch info`")
-    names = ", ".join(dict.fromkeys(names[0] for each in known for names, _ in each.meshes if names))
-    if not any(each.meshes for each in known):
+    names = ", ".join(dict.fromkeys(names[0] for each in named_shapes for names, _ in each.meshes if names))
+    if not any(each.meshes for each in named_shapes):
         hint = "meshes of .glb and .gltf files have names; of others choose parts by number, see `meshmatch info`"
         return InputError(f"{files} names no meshes to choose from", hint)
-    return InputError(f"no {what} of {files} is called {pattern[:80]!r}", f"there are: {names[:200] or 'none'}")
+    return InputError(f"no {noun} of {files} is called {pattern[:80]!r}", f"there are: {names[:200] or 'none'}")
 
 
 def _read(path: str | Path) -> tuple[Shape, Raw]:
@@ -188,7 +192,7 @@ def _read(path: str | Path) -> tuple[Shape, Raw]:
         unknown = f"{path.name}: unsupported file format {suffix or '(no suffix)'}"
         raise InputError(unknown, f"meshmatch reads {', '.join(SUFFIXES)}")
     data = read_bytes(path)
-    with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are judged below
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are handled below
         raw = _FORMATS[suffix][0](path, data)
     name = plain_text(path.name)
     shape = Shape.with_invalid(raw.verts, raw.faces, name, _visible(name, raw.colors))
@@ -200,7 +204,7 @@ def _read(path: str | Path) -> tuple[Shape, Raw]:
 
 
 def _visible(name: str, colors: Floats | None) -> Floats | None:
-    """Colors of vertices; opaque where they are all transparent, which is never meant."""
+    """Vertex colors; made opaque if all of them are transparent, which is never intended."""
     if colors is None or len(colors) == 0 or colors[:, 3].max() >= INVISIBLE:
         return colors
     warn(f"the colors of {name} are transparent at every vertex; they are read as opaque")
@@ -208,8 +212,10 @@ def _visible(name: str, colors: Floats | None) -> Floats | None:
 
 
 def mesh_list(path: str | Path) -> list[tuple[str, int]]:
-    """The names of a scene's meshes or a label map's labels, as ``only`` and ``without`` of `load_shape` know them, and how
-    many vertices each has, in the order of the vertices; none for formats without names. Errors are those of `load_shape`.
+    """Names and numbers of vertices of a scene's meshes or a label map's labels, in the order of the vertices.
+
+    The names are those that ``only`` and ``without`` of `load_shape` accept; formats without names give an empty list.
+    Errors are those of `load_shape`.
     """
     path = existing(as_path(path), suffixes=SUFFIXES)
     suffix = suffix_of(path)
@@ -220,34 +226,34 @@ def mesh_list(path: str | Path) -> list[tuple[str, int]]:
 
 
 def check_mesh_suffix(path: str | Path) -> str:
-    """As `check_suffix`; `OptionError` also for a format that holds no faces."""
+    """As `check_suffix`; `OptionError` also for a format without faces."""
     suffix = check_suffix(path)
-    if suffix in _CLOUDS:
-        hint = f"choose one of {' '.join(each for each in _WRITERS if each not in _CLOUDS)}"
+    if suffix in _CLOUD_SUFFIXES:
+        hint = f"choose one of {' '.join(each for each in _WRITERS if each not in _CLOUD_SUFFIXES)}"
         raise OptionError(f"a {suffix} file cannot hold faces", hint)
     return suffix
 
 
 def save_shape(path: str | Path, shape: ShapeLike) -> None:
-    """Write a shape, in the format that the suffix names. The file appears whole or not at all.
+    """Write a shape in the format of the suffix. The file appears completely or not at all.
 
-    All but stl and glb keep every bit of the positions; these hold 32-bit floats, and stl no shared vertices. Colors go
-    into all but stl, xyz and npy. An invalid vertex is written as nan where the format allows (all but
-    stl and glb, which take its stand-in).
+    All formats but stl and glb keep every bit of the positions; these have 32-bit floats, and stl no shared vertices.
+    Colors are written except in stl, xyz and npy. An invalid vertex is written as nan where the format allows it (all
+    but stl and glb, which get its stand-in position).
 
     Parameters
     ----------
     path
-        Where to.
+        The output.
     shape
         As in `match`.
 
     Raises
     ------
     OptionError
-        The suffix cannot be written, or holds no clouds (stl) or no faces (xyz, npy).
+        The suffix cannot be written, or cannot hold clouds (stl) or faces (xyz, npy).
     InputError
-        It is no shape.
+        It is not a shape.
     OutputError
         The folder is missing or cannot be written.
 
@@ -266,7 +272,9 @@ def save_shape(path: str | Path, shape: ShapeLike) -> None:
 
 
 def save_upright(path: Path, shape: Shape, turn: Float[Floats, "3 3"] | None) -> bool:
-    """`save_shape`; in a glb a node makes the turn, which lets the shape stand along y. Returns whether there is one."""
+    """As `save_shape`, but a glb gets a node with the rotation ``turn``, which makes y the up axis. Returns whether it
+    has one.
+    """
     turned = path.suffix.lower() == ".glb" and turn is not None and not np.array_equal(turn, np.eye(3))
     if turned:
         with replace_on_success(path) as temporary:
@@ -277,8 +285,8 @@ def save_upright(path: Path, shape: Shape, turn: Float[Floats, "3 3"] | None) ->
 
 
 def as_scene(source: ShapeLike, shape: Shape) -> tuple[Path, bytes, bool]:
-    """A shape as a glTF scene that can be edited: the path and the bytes of its file, and True, if it came from such a file;
-    else those of a glb with one mesh.
+    """A shape as an editable glTF scene: path and content of its file, and True, if it is a glTF file; else those of a
+    new glb.
     """
     file = as_path(source) if isinstance(source, str | Path) else None
     if file is not None and file.suffix.lower() in gltf.SUFFIXES:
@@ -288,7 +296,7 @@ def as_scene(source: ShapeLike, shape: Shape) -> tuple[Path, bytes, bool]:
 
 @runtime_checkable
 class HasVertices(Protocol):
-    """A mesh or a point cloud of another library: ``vertices`` (V, 3) and, for a mesh, ``faces`` (F, 3)."""
+    """A mesh or point cloud of another library: ``vertices`` (V, 3) and, for a mesh, ``faces`` (F, 3)."""
 
     @property
     def vertices(self) -> ArrayLike: ...
@@ -296,7 +304,7 @@ class HasVertices(Protocol):
 
 @runtime_checkable
 class HasPoints(Protocol):
-    """A mesh or a point cloud of a library that calls its vertices ``points``."""
+    """A mesh or point cloud of a library that calls its vertices ``points``."""
 
     @property
     def points(self) -> ArrayLike: ...
@@ -311,14 +319,14 @@ ShapeLike: TypeAlias = (
 
 
 def as_shape(source: ShapeLike, name: str = "") -> Shape:
-    """The shape that is meant: a `Shape` as it is, a file read, everything else copied.
+    """Convert to a `Shape`: a `Shape` is returned as it is, a file is read, everything else is copied.
 
-    Read are meshes and clouds of trimesh (its scenes as one shape, each mesh where its node puts it), Open3D, vedo,
-    PyVista, meshio, PyMeshLab and PyTorch3D (one at a time), and other objects with ``vertices`` or ``points`` and
-    ``faces`` or ``triangles``; with vertex colors of trimesh and Open3D. Polygons become triangles, as those of files do.
-    Tensors of torch are copied from whatever device they are on, without their gradient; masked values are invalid
-    positions. Faces may be floats if they are whole numbers. What connects its points in another way (volumes, lines,
-    strips) is refused, and never taken for a cloud. `name` is for messages, where the source has none of its own.
+    Supported are meshes and clouds of trimesh (a scene becomes one shape, each mesh where its node places it), Open3D,
+    vedo, PyVista, meshio, PyMeshLab and PyTorch3D (one at a time), and other objects with ``vertices`` or ``points``
+    and ``faces`` or ``triangles``; with vertex colors for trimesh and Open3D. Polygons are triangulated, as those of
+    files are. Torch tensors are copied from any device, without their gradient; masked values are invalid positions.
+    Faces may be floats if they are whole numbers. Objects that connect their points in other ways (volumes, lines,
+    strips) are refused rather than read as clouds. `name` is for messages if the source has no name.
 
     `InputError`: the file cannot be read, or the source is none of these.
     """
@@ -326,11 +334,11 @@ def as_shape(source: ShapeLike, name: str = "") -> Shape:
         return source
     if isinstance(source, str | os.PathLike):
         return load_shape(os.fspath(source))
-    if isinstance(held := getattr(source, "shape", None), Shape):  # a fit has points, but in a frame of its own
-        raise InputError(f"cannot make a shape of {type(source).__name__}", f"pass its .shape, {held.V} vertices")
-    found = None if isinstance(source, np.ndarray | tuple | list) else arrays_of(source, name)
-    if found is not None:
-        return _from_arrays(found.verts, found.faces, name, found.colors)
+    if isinstance(own := getattr(source, "shape", None), Shape):  # a fit has points, but in its own frame
+        raise InputError(f"cannot make a shape of {type(source).__name__}", f"pass its .shape, {own.V} vertices")
+    arrays = None if isinstance(source, np.ndarray | tuple | list) else arrays_of(source, name)
+    if arrays is not None:
+        return _from_arrays(arrays.verts, arrays.faces, name, arrays.colors)
     if isinstance(source, tuple | list) and len(source) == 2 and _array(source[0]).ndim in (2, 3):
         return _from_arrays(source[0], as_faces(source[1], source[0], name or "the shape"), name)
     if hasattr(source, "__array__") or isinstance(source, tuple | list):
@@ -339,13 +347,13 @@ def as_shape(source: ShapeLike, name: str = "") -> Shape:
 
 
 def as_shapes(sources: Sequence[ShapeLike]) -> list[Shape]:
-    """The shapes that are meant, see `as_shape`; `InputError` also for a single shape instead of a list."""
+    """Convert a list with `as_shape`; `InputError` also for a single shape instead of a list."""
     check_list(sources)
     return [as_shape(source) for source in sources]
 
 
 def check_list(sources: object) -> None:
-    """Refuse a single shape, or something else, in place of a list (`InputError`)."""
+    """`InputError` for a single shape, or anything else that is not a list."""
     single = isinstance(sources, str | os.PathLike | Shape | HasVertices | HasPoints)
     if single or not isinstance(sources, Iterable):
         raise InputError(f"expected a list of shapes, not {type(sources).__name__}", "write [shape]")
@@ -354,7 +362,7 @@ def check_list(sources: object) -> None:
 
 
 def _array(values: Any) -> NDArray[Any]:
-    """The values as an array; an empty one where they are none, such as rows of different lengths."""
+    """The values as an array; an empty one if they do not form one, such as rows of different lengths."""
     try:
         return np.asarray(off_torch(values))
     except (TypeError, ValueError):

@@ -1,5 +1,6 @@
-"""Files to be read: are they there, are they where a mesh may ask for them, and the arrays in npy and npz files, which
-can promise more than they hold. Nothing is unpickled.
+"""Checks and reading of input files, and of the arrays in npy and npz files.
+
+Files may claim more data than they contain, or try to escape their folder; nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -23,37 +24,40 @@ from meshmatch import blender
 from meshmatch.errors import InputError, warn
 
 LARGEST_FILE = 1 << 32
-"""Bytes: a hundred million vertices, more than anything here can work on. Larger files are refused unread."""
+"""Maximum size of a file in bytes: a hundred million vertices, more than can be processed. Larger files are refused
+unread.
+"""
 LARGEST_TEXT = 1 << 29
-"""Bytes of a file of text."""
+"""Maximum size of a text file in bytes."""
 LARGEST = 1 << 30
-"""Uncompressed bytes of one array in an npz file; a million vertices with 120 dense weights fit."""
+"""Maximum uncompressed size of an array in an npz file, in bytes; a million vertices with 120 dense weights fit."""
 ROOM = 800_000_000
-"""Bytes that a file may take besides four times its size; the rest of a gigabyte is the program's."""
+"""Bytes of memory that a file may need beyond four times its size; the rest of a gigabyte is the program's own."""
 LABEL_MAP_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
-"""Of volumes of labels, whose surfaces are shapes (`meshmatch.shapes.formats.label_maps`)."""
+"""Volumes of labels, whose surfaces are shapes (`meshmatch.shapes.formats.label_maps`)."""
 _MAYBE_TEXT = (".ply", ".obj", ".mtl", ".off", ".stl", ".gltf", ".xyz", ".pcd")  # tables are read by `read_text`
-_COPIES = 24  # bytes for each number of an array: it becomes one of 64 bits, and is compared and copied
+_BYTES_PER_NUMBER = 24  # bytes of memory per number of an array, which becomes 64-bit and is compared and copied
 _LAST_CHARACTER = 0x10FFFF
-_NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1f\x7f]")  # what no editor puts into a text
-_LINE_ENDS = b"\n\r\x0b\x0c\x1c\x1d\x1e\x85"  # where `str.splitlines` splits
+_NOT_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1f\x7f]")  # control characters that do not occur in text
+_LINE_ENDS = b"\n\r\x0b\x0c\x1c\x1d\x1e\x85"  # characters at which `str.splitlines` splits
 
 
 def suffix_of(path: PurePath) -> str:
-    """The suffix that tells the format, in small letters; that of a.nii.gz is .nii.gz."""
+    """The suffix that determines the format, in lower case; that of a.nii.gz is .nii.gz."""
     suffix = path.suffix.lower()
     return ".nii.gz" if suffix == ".gz" and path.stem.lower().endswith(".nii") else suffix
 
 
 def stem_of(path: PurePath) -> str:
-    """The name of a file without the suffix that tells its format."""
+    """The name of a file without the suffix that determines its format."""
     return path.name[: len(path.name) - len(suffix_of(path))]
 
 
 def existing(path: Path, hint: str = "", suffixes: tuple[str, ...] = ()) -> Path:
-    """The path; `InputError` if no ordinary file is there, or one that is empty or larger than `LARGEST_FILE`.
+    """The path; `InputError` unless it is a regular file that can be read, is not empty and at most `LARGEST_FILE`
+    large.
 
-    Without a `hint` for the error one is made up, with the most similar name of a file with one of ``suffixes``.
+    The error's hint is `hint`, or suggests the most similar name of a file with one of ``suffixes``.
     """
     try:
         if path.is_dir():
@@ -61,16 +65,16 @@ def existing(path: Path, hint: str = "", suffixes: tuple[str, ...] = ()) -> Path
         if not path.exists():
             if path.is_symlink():
                 raise InputError(f"{path} is a link to a file that is not there", "repair the link, or name the file")
-            raise InputError(f"there is no file {path}", hint or _similar(path, suffixes))
+            raise InputError(f"there is no file {path}", hint or _suggest_name(path, suffixes))
         if not path.is_file():
-            odd = f"{path} is not a regular file (it is a pipe or a device)"
-            raise InputError(odd, "write its data to a file first")
+            problem = f"{path} is not a regular file (it is a pipe or a device)"
+            raise InputError(problem, "write its data to a file first")
         size = path.stat().st_size
-        with path.open("rb"):  # may it be read?
+        with path.open("rb"):  # checks that it can be read
             pass
     except OSError as error:
-        usual = "may you read it?" if isinstance(error, PermissionError) else "check the name"
-        raise InputError(f"cannot read {path}: {error.strerror}", hint or usual) from error
+        default_hint = "may you read it?" if isinstance(error, PermissionError) else "check the name"
+        raise InputError(f"cannot read {path}: {error.strerror}", hint or default_hint) from error
     if size == 0:
         raise InputError(f"{path.name} is empty (0 bytes)", hint or "was the download or the export cut short?")
     if size > LARGEST_FILE:
@@ -79,7 +83,7 @@ def existing(path: Path, hint: str = "", suffixes: tuple[str, ...] = ()) -> Path
     return path
 
 
-def _similar(path: Path, suffixes: tuple[str, ...]) -> str:
+def _suggest_name(path: Path, suffixes: tuple[str, ...]) -> str:
     if not path.parent.is_dir():
         return f"there is no folder {path.parent} either"
     names = [entry.name for entry in path.parent.iterdir() if entry.suffix.lower() in suffixes]
@@ -88,51 +92,50 @@ def _similar(path: Path, suffixes: tuple[str, ...]) -> str:
 
 
 def read_bytes(path: Path, largest: int = LARGEST_FILE) -> bytes:
-    """All of a file, of text without the mark of its encoding (`_unmarked`); `InputError` as `existing`, for one of text
-    that is larger than that, or if reading fails. Of a file that Blender reads (`meshmatch.blender`) it is the glb that
-    it becomes.
+    """The content of a file; text without its byte order mark (`_strip_bom`), and formats read by Blender as glb.
+
+    `InputError` as for `existing`, for a file larger than ``largest``, and if reading fails.
     """
     try:
         if existing(path).stat().st_size > largest:
-            raise _much_text(path.name, path.stat().st_size, largest)
+            raise _text_too_large(path.name, path.stat().st_size, largest)
         if blender.is_converted(path):
             return blender.glb_of(path)
         data = path.read_bytes()
-        return _unmarked(path.name, data) if path.suffix.lower() in _MAYBE_TEXT else data
+        return _strip_bom(path.name, data) if path.suffix.lower() in _MAYBE_TEXT else data
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}", "check the disk") from error
 
 
-def _unmarked(name: str, data: bytes) -> bytes:
-    """Text without a byte order mark, and in UTF-8 where the mark is that of UTF-16."""
+def _strip_bom(name: str, data: bytes) -> bytes:
+    """Text without a byte order mark; UTF-16 with a mark is converted to UTF-8."""
     if name.lower().endswith(".stl") and b"solid" not in data[:16].replace(b"\0", b"").lower():
-        return data  # binary, with a header that may hold anything
-    if data.startswith(codecs.BOM_UTF8):  # sometimes two: a program wrote one before what had one
+        return data  # binary, with an arbitrary header
+    if data.startswith(codecs.BOM_UTF8):  # may occur twice: a program prepended one to text that had one
         return data.removeprefix(codecs.BOM_UTF8).removeprefix(codecs.BOM_UTF8)
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         if len(data) > LARGEST_TEXT:
-            raise _much_text(name, len(data), LARGEST_TEXT)
+            raise _text_too_large(name, len(data), LARGEST_TEXT)
         return data.decode("utf-16", "replace").encode("utf-8", "replace")
     return data
 
 
 def read_text(path: Path, line: int, cell: int = 0) -> str:
-    """A file's text, where a line takes so many bytes of memory, and each further cell; `InputError` if that
-    would be too much (`check_memory`), or the file is too large.
+    """The text of a file; `InputError` if the file is too large, or would need too much memory (`check_memory`).
+
+    ``line`` and ``cell`` are the bytes of memory that each line, and each further cell of it, takes.
     """
     data = read_bytes(path, largest=LARGEST_TEXT // 2)
     check_memory(path.name, len(data), line * sum(map(data.count, _LINE_ENDS)) + cell * sum(map(data.count, b",;")))
-    return _decoded(path.name, data)
+    return _decode(path.name, data)
 
 
-def _decoded(name: str, data: bytes) -> str:
-    """Text in UTF-8, UTF-16 with a byte order mark, or else, which is said, in Windows' Latin letters; `ValueError` for what
-    is no text.
-    """
+def _decode(name: str, data: bytes) -> str:
+    """Decode UTF-8, UTF-16 with a byte order mark, or else cp1252, with a warning; `ValueError` if it is not text."""
     try:
         return data.decode("utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig")
     except UnicodeDecodeError:
-        if _NO_TEXT.search(data):
+        if _NOT_TEXT.search(data):
             raise
         text = data.decode("cp1252")
         warn(f"{name} is not in UTF-8; it is read as Windows' Latin letters (cp1252)")
@@ -140,25 +143,25 @@ def _decoded(name: str, data: bytes) -> str:
 
 
 def check_text(name: str, data: bytes) -> None:
-    """Refuse a text that is too large, or has more lines or gaps between words than it may have (`InputError`)."""
+    """`InputError` for a text that is too large, or has too many lines or words for the memory."""
     if len(data) > LARGEST_TEXT:
-        raise _much_text(name, len(data), LARGEST_TEXT)
-    lines, gaps = (sum(map(data.count, each)) for each in (b"\r\n", b" \t"))
-    check_memory(name, len(data), 40 * lines + 20 * gaps)
+        raise _text_too_large(name, len(data), LARGEST_TEXT)
+    lines, spaces = (sum(map(data.count, each)) for each in (b"\r\n", b" \t"))
+    check_memory(name, len(data), 40 * lines + 20 * spaces)
 
 
-def _much_text(name: str, size: int, largest: int) -> InputError:
+def _text_too_large(name: str, size: int, largest: int) -> InputError:
     large = f"{name} is too large for a file of text: {size >> 20} MiB, of {largest >> 20} at most"
     return InputError(large, "save it in a binary format, such as .ply, .glb or .npz")
 
 
 def read_json(path: Path) -> Any:
-    """The value of a JSON file; `InputError` if that would take too much memory (`check_memory`)."""
+    """The value of a JSON file; `InputError` if it would take too much memory (`check_memory`)."""
     return json_of(path.name, read_bytes(path, largest=LARGEST_TEXT // 2))
 
 
 def json_of(name: str, data: bytes) -> Any:
-    """The value of a JSON text, if it does not take too much memory; `ValueError` if it is none."""
+    """The value of a JSON text; `ValueError` if it is not JSON, `InputError` if it would take too much memory."""
     check_memory(name, len(data), 100 * sum(map(data.count, b",[")) + 250 * data.count(b"{"))
     try:
         return json.loads(data.decode("utf-8-sig"))
@@ -167,14 +170,14 @@ def json_of(name: str, data: bytes) -> Any:
 
 
 def check_memory(name: str, size: int, need: int) -> None:
-    """Refuse a file of so many bytes that would need more memory than four times that and a gigabyte (`InputError`)."""
+    """`InputError` if a file of ``size`` bytes would ``need`` more memory than four times its size plus a gigabyte."""
     if need > 4 * size + ROOM:
         large = f"{name} promises too much: of {size / 1e6:,.0f} MB it would make {need / 1e9:.1f} GB"
         raise InputError(large, "make it smaller, or save it uncompressed in a binary format")
 
 
 def read_npy(path: Path) -> NDArray[Any]:
-    """The array of an npy file; `InputError` if it is damaged or holds objects."""
+    """The array of an npy file; `InputError` if it is damaged or contains objects."""
     try:
         with path.open("rb") as file:
             start = file.read(2)
@@ -184,66 +187,70 @@ def read_npy(path: Path) -> NDArray[Any]:
                 raise InputError(f"{path.name} is not an npy file", "does the suffix fit the content?")
             file.seek(0)
             size = path.stat().st_size
-            return _array(file, path.name, size, size)
+            return _read_array(file, path.name, size, size)
     except InputError:
         raise
-    except Exception as error:  # a damaged header can break Python's parser and NumPy in a dozen ways
-        raise _not_arrays(path, error) from error
+    except Exception as error:  # a damaged header can raise a dozen exceptions in Python's parser and NumPy
+        raise _unreadable_arrays(path, error) from error
 
 
 def read_npz(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """Those of the named arrays that an npz file holds; `InputError` if it is damaged, holds objects, or an array of
-    more than `LARGEST` bytes.
+    """The arrays of an npz file that are among ``names``.
+
+    `InputError` if the file is damaged, or if one of them contains objects or has more than `LARGEST` bytes.
     """
-    found: dict[str, NDArray[Any]] = {}
+    arrays: dict[str, NDArray[Any]] = {}
     try:
         with zipfile.ZipFile(path) as archive:
-            there = set(archive.namelist())
-            members = {name: archive.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in there}
+            present = set(archive.namelist())
+            members = {name: archive.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in present}
             size = path.stat().st_size
             check_memory(path.name, size, sum(member.file_size for member in members.values()))
             for name, member in members.items():
                 with archive.open(member) as file:
-                    found[name] = _array(file, member.filename, min(member.file_size, LARGEST), size)
+                    arrays[name] = _read_array(file, member.filename, min(member.file_size, LARGEST), size)
     except InputError:
         raise
-    except Exception as error:  # as above, and the zip around it
-        raise _not_arrays(path, error) from error
-    return found
+    except Exception as error:  # as above, and in the zip reader
+        raise _unreadable_arrays(path, error) from error
+    return arrays
 
 
-def _array(file: IO[bytes], name: str, most: int, size: int) -> NDArray[Any]:
-    """The array of an open npy file, if it promises no more than `most` bytes, nor too much for a file of a size."""
+def _read_array(file: IO[bytes], name: str, max_bytes: int, size: int) -> NDArray[Any]:
+    """The array of an open npy file; `ValueError` if it claims more than ``max_bytes``.
+
+    `InputError` if it claims too much for a file of ``size`` bytes.
+    """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of headers as Python 2 wrote them
+        warnings.simplefilter("ignore")  # headers written by Python 2
         version = npy_format.read_magic(file)
         if version not in ((1, 0), (2, 0), (3, 0)):
             raise ValueError(f"{name} has an unknown format version")
         read = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
-        shape, _, kind = read(file)
-        if kind.hasobject:
+        shape, _, dtype = read(file)
+        if dtype.hasobject:
             raise ValueError("it holds Python objects")
-        # An item counts, also one of no bytes: so many of them would fill a list.
-        promised = math.prod((max(int(kind.itemsize), 1), *(int(axis) for axis in shape)))
-        if min(shape, default=0) < 0 or promised > most:
-            raise ValueError(f"{name} promises {promised} bytes")
-        check_memory(name, size, _COPIES * math.prod(int(axis) for axis in shape))
+        # Items of no bytes count as well: a claimed number of them would fill a list.
+        claimed = math.prod((max(int(dtype.itemsize), 1), *(int(axis) for axis in shape)))
+        if min(shape, default=0) < 0 or claimed > max_bytes:
+            raise ValueError(f"{name} promises {claimed} bytes")
+        check_memory(name, size, _BYTES_PER_NUMBER * math.prod(int(axis) for axis in shape))
         file.seek(0)
         array = np.asarray(npy_format.read_array(file, allow_pickle=False))
     if array.dtype.kind == "U" and array.size:
         characters = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("=")).reshape(-1)
         codes = characters.view(np.uint32)
-        if ((codes > _LAST_CHARACTER) | ((codes >= 0xD800) & (codes < 0xE000))).any():  # the latter are halves
+        if ((codes > _LAST_CHARACTER) | ((codes >= 0xD800) & (codes < 0xE000))).any():  # the latter are surrogates
             raise ValueError(f"{name} holds invalid characters")
     if array.dtype.kind in "fc" and np.isnan(array).any():
         with np.errstate(invalid="ignore"):
-            array = np.asarray(array * array.dtype.type(1))  # no nan signals later
+            array = np.asarray(array * array.dtype.type(1))  # turns signaling nan into quiet nan
     return array
 
 
-def _not_arrays(path: Path, error: Exception) -> InputError:
+def _unreadable_arrays(path: Path, error: Exception) -> InputError:
     if "pickle" in str(error) or "Object arrays" in str(error):
         return InputError(f"{path.name} holds Python objects, which are not read", "save plain arrays in it")
-    what = str(error).partition(": <ast.")[0]  # not where Python's parser has its node
+    what = str(error).partition(": <ast.")[0]  # without the address of a node of Python's parser
     unreadable = f"{path.name} does not hold arrays that can be read: {what}"
     return InputError(unreadable, "is it damaged, or of another format?")

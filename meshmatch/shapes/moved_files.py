@@ -1,5 +1,5 @@
-"""Meshes whose vertices have moved, in files: a glb or a ply stays what it was but for the positions, and an obj keeps its
-text and takes its materials along.
+"""Write meshes with moved vertices: a glb or ply keeps everything in its file but the positions, and an obj keeps its
+text and its materials.
 """
 
 from __future__ import annotations
@@ -39,10 +39,11 @@ _WHITE = (1.0, 1.0, 1.0, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class MovedFile:
-    """An output that is like an original file, but for where its vertices are: what is written, and copied beside it.
+    """An output that equals an original file except for the vertex positions: what is written, and copied next to it.
 
-    ``original`` is None where the mesh came from no file; ``copies`` are pairs of a new file and what it is a copy of.
-    What the output does not hold is told, unless it is one of several (``told``) for the first of which it was.
+    ``original`` is None if the mesh came from no file; ``copies`` are pairs of a new file and its source. What the
+    output cannot hold is reported by a warning, unless ``told``: it is then one of several outputs, and the first one
+    reports it.
     """
 
     output: Path
@@ -52,13 +53,14 @@ class MovedFile:
 
     @classmethod
     def planned_all(cls, outputs: Sequence[Path], original: Path | None) -> list[MovedFile]:
-        """Several outputs of one folder, which need the materials of an .obj beside them once; errors as `planned`."""
+        """Plan several outputs in one folder, which share the material files of an .obj; errors as for `planned`."""
         plans = [cls.planned(output, None if number else original) for number, output in enumerate(outputs)]
         return [replace(plan, original=original, told=number > 0) for number, plan in enumerate(plans)]
 
     @classmethod
     def planned(cls, output: Path, original: Path | None, into: Path | None = None) -> MovedFile:
-        """What will be written, or put ``into`` another file. Materials and images that are named and not there are told.
+        """Plan an output, or data to put ``into`` another file. Warns about materials and images that are named but
+        missing.
 
         `OptionError`: the suffix cannot be written, or a copy would replace another file. `InputError`: a material file
         cannot be read.
@@ -72,11 +74,11 @@ class MovedFile:
         here, there = original.parent.resolve(), output.parent.resolve()
         if here == there:
             return cls(output, original)
-        found, missing = obj_look.companions(original, read_bytes(original))
-        if missing:
-            warn(f"{original.name} names {', '.join(missing)[:200]}, which is not there: not copied")
+        companions, missing_names = obj_look.companions(original, read_bytes(original))
+        if missing_names:
+            warn(f"{original.name} names {', '.join(missing_names)[:200]}, which is not there: not copied")
         copies = []
-        for file in found:
+        for file in companions:
             copy = output.parent / file.resolve().relative_to(here)
             if not copy.exists():
                 copies.append((copy, file))
@@ -87,17 +89,17 @@ class MovedFile:
 
     @property
     def turns_normals(self) -> bool:
-        """Whether directions at vertices of the original are turned, rather than made anew."""
+        """Whether vertex normals of the original are rotated, rather than recomputed."""
         before, after = "" if self.original is None else self.original.suffix.lower(), self.output.suffix.lower()
         return before == after in (".obj", ".ply") or (before in gltf.SUFFIXES and after == ".glb")
 
     @property
     def files(self) -> list[Path]:
-        """What is written, the output first."""
+        """The files that are written, the output first."""
         return [self.output, *(copy for copy, _ in self.copies)]
 
     def make_folders(self) -> None:
-        """Make the folders of copies that lie below the output's; `OutputError` if that cannot be."""
+        """Create the folders of copies below that of the output; `OutputError` on failure."""
         for copy, _ in self.copies:
             if copy.parent != self.output.parent:
                 make_folder(copy.parent)
@@ -111,11 +113,12 @@ class MovedFile:
         turn: Float[Floats, "3 3"] | None = None,
         into: Path | None = None,
     ) -> None:
-        """Write the moved mesh and the copies where they wait to get the names of `files`.
+        """Write the moved mesh and the copies to temporary ``places``, one for each of `files`.
 
-        The shape has the original's vertices in its order; ``turns`` is the rotation around each of them. A skeleton moves
-        them in a glb, if there is a ``binding``; the glb may be put ``into`` another one, whose joints these are. Without
-        either, a node makes the ``turn`` that lets a glb stand upright. What the format does not hold is told.
+        The shape has the original's vertices in its order; ``turns`` is the local rotation at each of them. With a
+        ``binding``, a glb gets a skeleton that moves them; it may be put ``into`` another glb, which has these joints.
+        Without either, a node with the rotation ``turn`` makes a glb upright. What the format cannot hold is reported
+        by a warning.
         """
         place = places[0]
         if place.suffix.lower() == SUFFIX:
@@ -128,16 +131,16 @@ class MovedFile:
             return
         self._write_mesh(places, shape, turns, still=binding is None)
         if place.suffix.lower() == ".glb" and (binding is not None or into is not None):
-            add = partial(_added, shape=shape, binding=binding, into=into)
+            add = partial(_add_skeleton, shape=shape, binding=binding, into=into)
             place.write_bytes(gltf.understood(self.output, place.read_bytes(), "scene makes", add))
         elif self.is_turned(binding, turn):
             assert turn is not None
             place.write_bytes(
-                gltf.understood(self.output, place.read_bytes(), "scene makes", partial(_turned, turn=turn))
+                gltf.understood(self.output, place.read_bytes(), "scene makes", partial(_turn_scene, turn=turn))
             )
 
     def is_turned(self, binding: Binding | None, turn: Float[Floats, "3 3"] | None) -> bool:
-        """Whether a node turns the mesh upright in this output: not where a skeleton does."""
+        """Whether a node makes the mesh upright in this output: not if it has a skeleton."""
         has_nodes = self.output.suffix.lower() == ".glb" or blender.is_converted(self.output)
         return has_nodes and binding is None and turn is not None and not np.array_equal(turn, np.eye(3))
 
@@ -150,26 +153,26 @@ class MovedFile:
             places[0].write_bytes(text)
             return
         ply = PlyFile.of(original, shape, moved=True) if suffix == ".ply" else None
-        as_it_came = None if ply is None else ply.with_positions(shape.verts_or_nan, turns)
+        edited = None if ply is None else ply.with_positions(shape.verts_or_nan, turns)
         if original is not None and suffix == ".glb" and original.suffix.lower() in gltf.SUFFIXES:
-            as_it_came = _scene(self.output, original, shape, turns, still and not self.told)
-        if as_it_came is not None:
-            places[0].write_bytes(as_it_came)
+            edited = _move_scene(self.output, original, shape, turns, still and not self.told)
+        if edited is not None:
+            places[0].write_bytes(edited)
             if not self.told:
-                tell_left(self.output, original, _polygons(original))
+                tell_left(self.output, original, _lost_polygons(original))
             return
-        read = _as_read(original, shape) if suffix == ".glb" else shape
-        look = _look_of(original, read, suffix == ".glb" and not self.told)
-        uv = _coordinates_of(original, read) if suffix == ".glb" else None
-        worn = _one_image(shape, look, uv) if suffix == ".glb" and look is not None else None
-        if worn is not None:
-            worn.write(self.output, places[:1])
+        as_read = _as_read(original, shape) if suffix == ".glb" else shape
+        look = _find_look(original, as_read, suffix == ".glb" and not self.told)
+        uv = _find_coordinates(original, as_read) if suffix == ".glb" else None
+        textured = _as_textured(shape, look, uv) if suffix == ".glb" and look is not None else None
+        if textured is not None:
+            textured.write(self.output, places[:1])
         else:
             save_shape(places[0], shape)
             if uv is not None:
-                places[0].write_bytes(_laid(self.output, places[0].read_bytes(), shape, uv))
+                places[0].write_bytes(_add_coordinates(self.output, places[0].read_bytes(), shape, uv))
         if not self.told:
-            tell_left(self.output, original, _lost(original, look, worn is not None, uv is not None))
+            tell_left(self.output, original, _describe_lost(original, look, textured is not None, uv is not None))
 
 
 def save_moved(
@@ -181,8 +184,9 @@ def save_moved(
     turn: Float[Floats, "3 3"] | None = None,
     into: Path | None = None,
 ) -> None:
-    """Write a mesh that was read from a file and has moved; all files appear, or none. Errors as `MovedFile.planned`, and
-    `OutputError` if a file cannot be written.
+    """Write a moved mesh that was read from a file; all files or none.
+
+    Errors as for `MovedFile.planned`, and `OutputError` if a file cannot be written.
     """
     plan = MovedFile.planned(Path(path), original, into)
     plan.make_folders()
@@ -191,7 +195,7 @@ def save_moved(
 
 
 def check_into(file: Path | None, output: Path) -> None:
-    """Refuse a file that nothing can be put into, or an output that is no glb, nor .vrm of a character (`OptionError`)."""
+    """`OptionError` if nothing can be put into a file, or the output is not a glb, nor a .vrm of a character."""
     if file is None or file.suffix.lower() not in gltf.SUFFIXES:
         name = "the target" if file is None else file.name
         raise OptionError(f"nothing can be put into {name}", f"the target must be one of {', '.join(gltf.SUFFIXES)}")
@@ -201,40 +205,45 @@ def check_into(file: Path | None, output: Path) -> None:
 
 
 def with_look(glb: bytes, original: Path | None, shape: Shape) -> tuple[bytes, str]:
-    """A glb that was made of a shape, with the texture coordinates, and the texture or the one color that the shape's file
-    gives it; and what else of its file a glb does not have, for `tell_left`.
+    """A glb of a shape with the texture coordinates, and the texture or single color, of the shape's file.
+
+    Also returns what a glb cannot hold of that file, for `tell_left`.
     """
     if original is None or original.suffix.lower() in gltf.SUFFIXES:
-        return glb, _polygons(original)
-    look, uv = _look_of(original, shape), _coordinates_of(original, shape)
-    worn = None if look is None else _one_image(shape, look, uv)
-    if worn is not None:
-        adding = partial(dressed, uv=worn.uv, own=False, material=worn.material, turn=worn.turn)
-        glb = gltf.understood(original, glb, "scene makes", adding)
+        return glb, _lost_polygons(original)
+    look, uv = _find_look(original, shape), _find_coordinates(original, shape)
+    textured = None if look is None else _as_textured(shape, look, uv)
+    if textured is not None:
+        edit = partial(dressed, uv=textured.uv, own=False, material=textured.material, turn=textured.turn)
+        glb = gltf.understood(original, glb, "scene makes", edit)
     elif uv is not None:
-        glb = _laid(original, glb, shape, uv)
-    return glb, _lost(original, look, worn is not None, uv is not None)
+        glb = _add_coordinates(original, glb, shape, uv)
+    return glb, _describe_lost(original, look, textured is not None, uv is not None)
 
 
 def tell_left(output: Path, original: Path | None, lost: str) -> None:
-    """Say what an output does not have of the file that it was made of, if there is anything."""
+    """Warn about what an output lacks of the file that it was made of, if anything."""
     if original is not None and lost:
         warn(f"{output.name} does not have {lost} of {original.name}")
 
 
-def _polygons(original: Path | None) -> str:
-    """The polygons of a file that becomes a glb by way of Blender, in words."""
-    there = original is not None and blender.is_converted(original) and blender.has_polygons(original)
-    return "the polygons" if there else ""
+def _lost_polygons(original: Path | None) -> str:
+    """ "the polygons", if the file has some that it loses when Blender converts it to glb; else ""."""
+    has_polygons = original is not None and blender.is_converted(original) and blender.has_polygons(original)
+    return "the polygons" if has_polygons else ""
 
 
 def _as_read(original: Path | None, shape: Shape) -> Shape:
-    """The mesh as its file has it: where its vertices are says how polygons were split, whose corners have coordinates."""
+    """The mesh with the positions of its file, on which the triangulation of polygons depends, and so the texture
+    coordinates.
+    """
     return load_shape(original) if original is not None and original.suffix.lower() in (".obj", ".ply") else shape
 
 
-def _look_of(original: Path | None, shape: Shape, wanted: bool = True) -> Appearance | None:
-    """The look of a mesh in its file; an image that is not there is told if it is ``wanted``; the mesh is not lost."""
+def _find_look(original: Path | None, shape: Shape, wanted: bool = True) -> Appearance | None:
+    """The appearance of a mesh in its file; None, with a warning if it is ``wanted``, if an image is missing or
+    unreadable.
+    """
     if original is None or shape.is_cloud:
         return None
     try:
@@ -245,33 +254,33 @@ def _look_of(original: Path | None, shape: Shape, wanted: bool = True) -> Appear
         return None
 
 
-def _coordinates_of(original: Path | None, shape: Shape) -> Floats | None:
-    """The texture coordinates of each corner in its file, whatever its materials are; None where a face has none."""
+def _find_coordinates(original: Path | None, shape: Shape) -> Floats | None:
+    """Texture coordinates of each corner, regardless of materials; None if any face has none."""
     with suppress(InputError):
         return None if original is None or shape.is_cloud else load_coordinates(original, shape)
     return None
 
 
-def _laid(name: Path, glb: bytes, shape: Shape, uv: Floats) -> bytes:
-    """A glb that was made of a shape, maybe of its valid faces alone, with texture coordinates."""
+def _add_coordinates(name: Path, glb: bytes, shape: Shape, uv: Floats) -> bytes:
+    """Add texture coordinates to a glb that was made of a shape, maybe of its valid faces only."""
 
-    def adding(document: gltf.Document) -> bytes:
+    def edit(document: gltf.Document) -> bytes:
         return laid(document, uv if len(document.faces()) == len(uv) else uv[shape.valid_faces])
 
-    return gltf.understood(name, glb, "scene makes", adding)
+    return gltf.understood(name, glb, "scene makes", edit)
 
 
-def _turned(document: gltf.Document, turn: Float[Floats, "3 3"]) -> bytes:
+def _turn_scene(document: gltf.Document, turn: Float[Floats, "3 3"]) -> bytes:
     editor = Editor(document)
     editor.turn(document, turn)
     return editor.to_bytes()
 
 
-def _added(document: gltf.Document, shape: Shape, binding: Binding | None, into: Path | None) -> bytes:
-    """The glb of a mesh with its skeleton, or in another one."""
+def _add_skeleton(document: gltf.Document, shape: Shape, binding: Binding | None, into: Path | None) -> bytes:
+    """The glb of a mesh with its skeleton, or the other glb with the mesh put into it."""
     if binding is not None:
         verts = document.scene().verts
-        # where a texture has seams there are copies of vertices
+        # vertices are duplicated at seams of the texture
         rows = np.arange(shape.V) if len(verts) == shape.V else cKDTree(shape.verts).query(verts)[1]
         binding = binding.of(rows)
     if into is not None:
@@ -281,38 +290,44 @@ def _added(document: gltf.Document, shape: Shape, binding: Binding | None, into:
     return rigged(document, binding)[0]
 
 
-def _scene(output: Path, original: Path, shape: Shape, turns: Float[Floats, "V 3 3"], still: bool) -> bytes | None:
-    """The original's scene with its vertices moved; None where it draws copies of a mesh, which cannot move apart. That
-    joints stay ``still`` is told.
+def _move_scene(output: Path, original: Path, shape: Shape, turns: Float[Floats, "V 3 3"], still: bool) -> bytes | None:
+    """The original scene with its vertices moved; None if it draws instances of a mesh, which cannot be moved
+    separately.
+
+    Warns that joints stay where they are, if ``still``.
     """
 
-    def made(document: gltf.Document) -> tuple[bytes, bool] | None:
+    def edit(document: gltf.Document) -> tuple[bytes, bool] | None:
         if gltf.INSTANCES in document.json.get("extensionsUsed", []):
             return None
         return moved(document, shape.verts_or_nan, turns), bool(document.json.get("skins"))
 
-    found = gltf.understood(original, read_bytes(original), "scene makes", made)
-    if found is not None and found[1] and still:
+    result = gltf.understood(original, read_bytes(original), "scene makes", edit)
+    if result is not None and result[1] and still:
         where = f"the joints of {original.name} stay where they are in {output.name}"
         warn(f"{where}: `meshmatch transfer-rig {original.name} {output.name}` moves them")
-    return None if found is None else found[0]
+    return None if result is None else result[0]
 
 
-def _one_image(shape: Shape, look: Appearance, coordinates: Floats | None) -> Dressed | None:
-    """The mesh with its texture, or its one color on the coordinates that it has, if that is all that its look says."""
-    made = look.materials[0]
-    if len(look.materials) != 1 or look.colors is not None or (made.image is None and made.factor == _WHITE):
+def _as_textured(shape: Shape, look: Appearance, coordinates: Floats | None) -> Dressed | None:
+    """The mesh with its texture, or with its single color on its texture coordinates; None if its appearance has more
+    than that.
+    """
+    material = look.materials[0]
+    if len(look.materials) != 1 or look.colors is not None or (material.image is None and material.factor == _WHITE):
         return None
-    image, uv = made.image, look.uv
+    image, uv = material.image, look.uv
     if image is None:
-        color = np.append(bytes_of(np.array(made.factor[:3], np.float32)), np.uint8(round(255 * made.factor[3])))
+        color = np.append(
+            bytes_of(np.array(material.factor[:3], np.float32)), np.uint8(round(255 * material.factor[3]))
+        )
         image = np.tile(color.astype(np.uint8), (4, 4, 1))
         uv = np.full_like(look.uv, 0.5) if coordinates is None else coordinates
-    return Dressed(shape, None, uv, False, BakedMaterial(image, made.alpha, made.cutoff, made.name))
+    return Dressed(shape, None, uv, False, BakedMaterial(image, material.alpha, material.cutoff, material.name))
 
 
-def _lost(original: Path | None, look: Appearance | None, textured: bool, laid_out: bool) -> str:
-    """What an output in this format does not have of the original, in words."""
+def _describe_lost(original: Path | None, look: Appearance | None, textured: bool, laid_out: bool) -> str:
+    """What an output lacks of the original, in words; for formats other than the original's."""
     if original is None:
         return ""
     suffix = original.suffix.lower()
