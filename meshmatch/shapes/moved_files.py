@@ -228,22 +228,21 @@ def tell_left(output: Path, original: Path | None, lost: str) -> None:
 
 
 def _lost_polygons(original: Path | None) -> str:
-    """ "the polygons", if the file has some that it loses when Blender converts it to glb; else ""."""
+    """Words for the polygons of a file, if Blender converts it to glb and it has any; else an empty string."""
     has_polygons = original is not None and blender.is_converted(original) and blender.has_polygons(original)
     return "the polygons" if has_polygons else ""
 
 
 def _as_read(original: Path | None, shape: Shape) -> Shape:
-    """The mesh with the positions of its file, on which the triangulation of polygons depends, and so the texture
-    coordinates.
+    """The mesh with the positions of its file, which determine how polygons are triangulated.
+
+    Texture coordinates belong to the corners of these triangles.
     """
     return load_shape(original) if original is not None and original.suffix.lower() in (".obj", ".ply") else shape
 
 
 def _find_look(original: Path | None, shape: Shape, wanted: bool = True) -> Appearance | None:
-    """The appearance of a mesh in its file; None, with a warning if it is ``wanted``, if an image is missing or
-    unreadable.
-    """
+    """The appearance of a mesh in its file; None if it cannot be read, with a warning if it is ``wanted``."""
     if original is None or shape.is_cloud:
         return None
     try:
@@ -291,10 +290,9 @@ def _add_skeleton(document: gltf.Document, shape: Shape, binding: Binding | None
 
 
 def _move_scene(output: Path, original: Path, shape: Shape, turns: Float[Floats, "V 3 3"], still: bool) -> bytes | None:
-    """The original scene with its vertices moved; None if it draws instances of a mesh, which cannot be moved
-    separately.
+    """The original scene with its vertices moved; None if it draws instances of a mesh.
 
-    Warns that joints stay where they are, if ``still``.
+    These cannot be moved separately. Warns that joints stay where they are, if ``still``.
     """
 
     def edit(document: gltf.Document) -> tuple[bytes, bool] | None:
@@ -310,9 +308,7 @@ def _move_scene(output: Path, original: Path, shape: Shape, turns: Float[Floats,
 
 
 def _as_textured(shape: Shape, look: Appearance, coordinates: Floats | None) -> Dressed | None:
-    """The mesh with its texture, or with its single color on its texture coordinates; None if its appearance has more
-    than that.
-    """
+    """The mesh with its texture, or with its single color on its texture coordinates; None for any other appearance."""
     material = look.materials[0]
     if len(look.materials) != 1 or look.colors is not None or (material.image is None and material.factor == _WHITE):
         return None

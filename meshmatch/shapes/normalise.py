@@ -1,9 +1,9 @@
-"""Position, size, unit and orientation: frames that bring every shape to one size, guesses at what its file does not
-say, and rigid alignment of one sampled shape to another: from the orientation that is given, or from any.
+"""Position, size, unit and orientation: normalizing frames, guesses at what files do not specify, and rigid alignment.
 
-The alignment is by iterative closest points (Besl and McKay 1992) with normals, both ways and with robust weights. It
-finds the nearest minimum, so a search begins from many turns: the axes of both files, and the principal axes of both
-shapes, in all 24 ways. Where several fit nearly as well, the orientation that the file has is believed.
+Alignment of sampled shapes is by iterative closest points (Besl and McKay 1992) with normals, in both directions and
+with robust weights. It finds the nearest minimum, so a search starts from many rotations: the 24 rotations of a cube
+about the axes of the files, and about the principal axes of both shapes. If several fit nearly as well, the orientation
+of the file is preferred.
 """
 
 from __future__ import annotations
@@ -26,23 +26,24 @@ from meshmatch.shapes.shape import Shape
 Align = Literal["none", "near", "rigid"]
 ALIGNS: tuple[Align, ...] = get_args(Align)
 Mirroring = Literal["auto", "no"]
-"""Whether the mirror image of a shape is tried too."""
+"""Whether to try the mirror image of a shape as well."""
 
 # Set by hand.
-_CLEARLY = 0.9  # a turn must fit better than the given orientation by this factor
-_CLOSE = 15.0  # degrees: two alignments nearer than that are one
-# Standing people are 1.2 to 2.2 m tall; a unit fits if it makes that of the longest extent.
-_SMALL, _TALL = 1.2, 2.2
-_SLENDER = 1.0  # longest extent in roots of the area; of people 1.1 to 1.7, however they stand
-_FINE = 1e-6  # of the diagonal: what rounding may move
+# maximum residual of a rotation that replaces the given orientation, relative to the latter's
+_MAX_RESIDUAL_RATIO = 0.9
+_MIN_ANGLE = 15.0  # alignments closer than this, in degrees, are treated as one
+# Height of standing people in meters; a unit is plausible if it brings the longest extent into this range.
+_MIN_HEIGHT, _MAX_HEIGHT = 1.2, 2.2
+_MIN_SLENDERNESS = 1.0  # minimum longest extent of a person in sqrt(area): 1.1 to 1.7 in any pose
+_MAX_ROUNDING = 1e-6  # maximum effect of rounding, as a fraction of the diagonal
 _UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "feet": 0.3048}
 
 
 def sqrt_area_frame(shape: Shape) -> Frame:
     """The frame with the area-weighted centroid at 0 and a surface area of 1, without rotation.
 
-    Area hardly changes with pose, where a bounding sphere does. `InputError` if the shape has no area: all its
-    vertices lie in a point or on a line.
+    Area hardly changes with pose, unlike a bounding sphere. `InputError` if the shape has no area: all its vertices lie
+    in a point or on a line.
     """
     area = shape.area
     if not area > (1e-9 * shape.diagonal) ** 2:
@@ -52,7 +53,7 @@ def sqrt_area_frame(shape: Shape) -> Frame:
 
 
 def unit_sphere_frame(shape: Shape) -> Frame:
-    """The frame with the area-weighted centroid at 0 and the furthest vertex at distance 1, without rotation.
+    """The frame with the area-weighted centroid at 0 and the farthest vertex at distance 1, without rotation.
 
     `InputError` if all vertices lie in one point.
     """
@@ -65,24 +66,27 @@ def unit_sphere_frame(shape: Shape) -> Frame:
 
 @derived
 def in_single_precision(shape: Shape) -> Shape:
-    """A shape as formats of single precision hold it: two interpretations of a pose may fit so nearly alike that less
-    decides between them, and a shape is to be fitted the same from any file. One far from the origin stays as it is.
+    """The shape rounded to single precision, as many formats store it, so that it is fitted in the same way from any
+    file.
+
+    Two interpretations of a pose may fit so nearly alike that rounding decides between them. Shapes far from the
+    origin, which rounding would change noticeably, are returned unchanged.
     """
-    with np.errstate(over="ignore"):  # what is larger than single precision holds moves without end
+    with np.errstate(over="ignore"):  # values beyond single precision become infinite
         verts = shape.verts.astype(np.float32).astype(np.float64)
     moved = float(np.abs(verts - shape.verts).max())
-    return replace(shape, verts=verts) if 0 < moved < _FINE * shape.diagonal else shape
+    return replace(shape, verts=verts) if 0 < moved < _MAX_ROUNDING * shape.diagonal else shape
 
 
 def _centroid(shape: Shape) -> Floats:
-    """(3,) area-weighted centroid; exact for a mesh: around a vertex lies a third of each of its faces."""
+    """(3,) area-weighted centroid; exact for a mesh, where each vertex has a third of the area of its faces."""
     return np.asarray(shape.vertex_areas @ shape.verts / shape.vertex_areas.sum())
 
 
 def long_axis(shape: Shape) -> str | None:
-    """The axis along which the shape is clearly longest, "x", "y" or "z"; None if none is.
+    """The axis along which the shape is clearly longest, "x", "y" or "z"; None if there is none.
 
-    Whatever stands or lies is longest along its up axis or its back; the sign cannot be told from extents.
+    Shapes are usually longest along their up axis or their back; extents do not determine its sign.
     """
     extents = shape.bounds[1] - shape.bounds[0]
     order = extents.argsort()
@@ -90,46 +94,48 @@ def long_axis(shape: Shape) -> str | None:
 
 
 def guess_unit(shape: Shape) -> str | None:
-    """The unit in which the shape would be as long as a standing person; None if there is none, or its surface is too
-    large for one.
+    """The unit in which the shape is as long as a standing person; None if there is none, or its area is too large for
+    a person.
     """
     length = float((shape.bounds[1] - shape.bounds[0]).max())
-    if not shape.is_cloud and length < _SLENDER * np.sqrt(shape.area):
+    if not shape.is_cloud and length < _MIN_SLENDERNESS * np.sqrt(shape.area):
         return None
-    return next((name for name, metres in _UNITS.items() if _SMALL <= length * metres <= _TALL), None)
+    return next((name for name, metres in _UNITS.items() if _MIN_HEIGHT <= length * metres <= _MAX_HEIGHT), None)
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """shape = pose.to_world(target), as in a core frame; residual: mean capped distance both ways, normals included."""
+    """An alignment: shape = pose.to_world(target), as in a core frame; and its mean capped distance both ways, normals
+    included.
+    """
 
     pose: RigidPose
     residual: float
 
 
 def align(shape: OrientedPoints, target: OrientedPoints, how: Align, keep: int = 1) -> list[Alignment]:
-    """Rigid motions that bring a target onto a shape, the best one first; at most `keep`, and one but for "rigid".
+    """Rigid motions that align a target with a shape, the best first: at most `keep` for "rigid", one otherwise.
 
-    Both are centered, of one scale, their points in random order. "none" takes the orientation as it is, "near"
-    improves it, "rigid" searches all orientations.
+    Both are centered and have one scale, and their points are in random order. "none" keeps the orientation, "near"
+    refines it, "rigid" searches all orientations.
     """
     coarse = ClosestPoints(shape.thinned(200), target.thinned(300))
     fine = ClosestPoints(shape.thinned(1200), target.thinned(1200))
-    as_it_is = RigidPose.identity()
+    unrotated = RigidPose.identity()
     if how != "rigid":
-        return _nearer(fine, [as_it_is], 25 if how == "near" else 0)
-    # the 24 turns of a cube in the files' own axes, and in the principal axes of both
-    turns = Rotation.create_group("O").as_matrix()
+        return _refine(fine, [unrotated], 25 if how == "near" else 0)
+    # the 24 rotations of a cube, about the files' axes and about the principal axes of both
+    rotations = Rotation.create_group("O").as_matrix()
     own, theirs = _principal_axes(shape.points), _principal_axes(target.points)
-    starts = [RigidPose(start, np.zeros(3)) for start in (*turns, *(own @ turn @ theirs.T for turn in turns))]
-    chosen = _distinct(_best_first(_nearer(coarse, starts, 6)))[: max(keep, 4)]
-    given, *found = _nearer(fine, [as_it_is, *(each.pose for each in chosen)], 25)
+    starts = [RigidPose(start, np.zeros(3)) for start in (*rotations, *(own @ turn @ theirs.T for turn in rotations))]
+    chosen = _distinct(_best_first(_refine(coarse, starts, 6)))[: max(keep, 4)]
+    given, *found = _refine(fine, [unrotated, *(each.pose for each in chosen)], 25)
     found = _best_first(found)
-    found.insert(0 if found[0].residual > _CLEARLY * given.residual else len(found), given)
+    found.insert(0 if found[0].residual > _MAX_RESIDUAL_RATIO * given.residual else len(found), given)
     return _distinct(found)[:keep]
 
 
-def _nearer(points: ClosestPoints, poses: list[RigidPose], steps: int) -> list[Alignment]:
+def _refine(points: ClosestPoints, poses: list[RigidPose], steps: int) -> list[Alignment]:
     nearer = points.nearer(poses, steps)
     return [Alignment(*each) for each in zip(nearer, points.residuals(nearer).tolist(), strict=True)]
 
@@ -139,16 +145,16 @@ def _best_first(found: list[Alignment]) -> list[Alignment]:
 
 
 def _distinct(found: list[Alignment]) -> list[Alignment]:
-    """Those that are not near an earlier one."""
+    """The alignments that are not close to an earlier one."""
     distinct: list[Alignment] = []
     for each in found:
-        if all(each.pose.angle_to(other.pose) > _CLOSE for other in distinct):
+        if all(each.pose.angle_to(other.pose) > _MIN_ANGLE for other in distinct):
             distinct.append(each)
     return distinct
 
 
 def residual(shape: OrientedPoints, target: OrientedPoints) -> float:
-    """Mean of the capped six-dimensional nearest distances, one way and back; of where both lie."""
+    """Mean capped six-dimensional nearest distance in both directions, for the current positions."""
     return float(ClosestPoints(shape, target).residuals([RigidPose.identity()])[0])
 
 

@@ -1,8 +1,8 @@
-"""Meshes and clouds of other libraries as arrays, known by their attributes: none of the libraries is imported.
+"""Meshes and clouds of other libraries as arrays, recognized by their attributes: none of the libraries is imported.
 
-Read are trimesh (also its scenes), Open3D, vedo, PyVista, meshio, PyMeshLab, PyTorch3D, and whatever has vertices and
-faces by the usual names. An object that connects its points in a way that is not known here is refused: it must never
-become a cloud without a word.
+Supported are trimesh (also its scenes), Open3D, vedo, PyVista, meshio, PyMeshLab, PyTorch3D, and any object with
+vertices and faces under the usual names. Objects that connect their points in an unknown way are refused: they must not
+silently become clouds.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from meshmatch.shapes.formats.polygons import triangles_of
 
 HINT = "pass a path, a Shape, (vertices, faces), an (N, 3) array, or an object with .vertices and .faces"
 _SURFACE = "pass its surface, such as (points, triangles)"
-_VTK_FACES, _VTK_LOOSE = (5, 7, 9), (0, 1, 2, 3, 4)  # triangles, polygons, quads; nothing, points and lines
+_VTK_FACES, _VTK_IGNORED = (5, 7, 9), (0, 1, 2, 3, 4)  # triangles, polygons, quads; empty cells, points and lines
 _MESHIO_FACES = re.compile("triangle|quad|polygon[0-9]*")
-_MESHIO_LOOSE = "vertex|line[0-9]*"
-_OTHER_LINKS = (
+_MESHIO_IGNORED = "vertex|line[0-9]*"
+_UNSUPPORTED_LINKS = (
     "strips",
     "lines",
     "polygons",
@@ -41,18 +41,18 @@ _OTHER_LINKS = (
     "elements",
     "regions",
 )
-"""Attributes by which libraries connect vertices in ways that are not read."""
+"""Attributes with which libraries connect vertices in ways that are not supported."""
 
 
 class _Polygons(NamedTuple):
-    """Corners of polygons, one after the other, and how many each has."""
+    """Corners of polygons in one array, and the number of corners of each."""
 
     corners: Ints
     sizes: Ints
 
 
 class Arrays(NamedTuple):
-    """What an object holds, unchecked."""
+    """Arrays of an object, unchecked."""
 
     verts: Any
     faces: Any = None
@@ -60,9 +60,9 @@ class Arrays(NamedTuple):
 
 
 def arrays_of(source: Any, name: str) -> Arrays | None:
-    """Vertices, faces and colors of a mesh or cloud of another library; None if it is no such object.
+    """Vertices, faces and colors of a mesh or cloud of another library; None for any other object.
 
-    `InputError` where it is one that is not read: volumes, lines, several meshes at once.
+    `InputError` for unsupported geometry: volumes, lines, several meshes at once.
     """
     label = name or f"the {type(source).__name__}"
     if callable(getattr(source, "to_legacy", None)):  # Open3D's tensor geometry
@@ -74,31 +74,31 @@ def arrays_of(source: Any, name: str) -> Arrays | None:
     if callable(getattr(source, "vertex_matrix", None)) and callable(getattr(source, "face_matrix", None)):
         points = source.vertex_matrix()
         return Arrays(points, _triangles(points, _rows(source.face_matrix(), label), label))
-    points = _value(source, "vertices", "points")
+    points = _get_value(source, "vertices", "points")
     if points is None:
         return None
     return Arrays(points, _triangles(points, _faces(source, label), label), _colors(source, label))
 
 
 def as_faces(values: Any, points: Any, label: str) -> Any:
-    """Faces of vertices as an array (F, 3) where that can be: polygons in lists are split into triangles, whole numbers are
-    taken for integers.
+    """Faces as an array (F, 3) if possible: lists of polygons are triangulated, whole numbers become integers.
 
-    `InputError` for faces of four corners, which may be quads or tetrahedra, and for anything else that is no array.
+    `InputError` for faces with four corners, which may be quads or tetrahedra, and for anything else that is not an
+    array.
     """
     if values is None:
         return None
-    if _ragged(values):
+    if _is_ragged(values):
         return _triangles(points, _polygons(values, label), label)
     found = _array(values, label)
     if found.ndim == 2 and found.shape[1] == 4:
         hint = f"split quads into triangles, or pass them as lists; of tetrahedra, {_SURFACE}"
         raise InputError(f"{label}: faces have four corners, which may be quads or tetrahedra", hint)
-    return _whole(found, label)
+    return _as_indices(found, label)
 
 
 def _triangles(points: Any, faces: Any, label: str) -> Any:
-    """Faces, those that are polygons split into triangles: as files are, where their vertices are points in space."""
+    """Faces as triangles; polygons are triangulated as in files if their vertices are points in space."""
     if not isinstance(faces, _Polygons):
         return faces
     verts = _array(points, label)
@@ -107,14 +107,14 @@ def _triangles(points: Any, faces: Any, label: str) -> Any:
     return faces.corners[triangles_of(label, verts.astype(np.float64), faces.corners, faces.sizes)]
 
 
-def _value(source: Any, *names: str) -> Any:
-    """The first attribute of these names that an object has; what older libraries have as methods is called."""
+def _get_value(source: Any, *names: str) -> Any:
+    """The first of these attributes that an object has; methods, as in older libraries, are called."""
     for name in names:
         found = getattr(source, name, None)
         if callable(found):
             try:
                 found = found()
-            except TypeError:  # it wants arguments
+            except TypeError:  # it needs arguments
                 found = None
         if found is not None:
             return found
@@ -128,8 +128,8 @@ def _array(values: Any, label: str) -> np.ndarray:
         raise InputError(f"{label}: not an array of numbers ({error})", HINT) from error
 
 
-def _whole(values: np.ndarray, label: str) -> np.ndarray:
-    """Numbers of vertices as integers; `InputError` for fractions, and words."""
+def _as_indices(values: np.ndarray, label: str) -> np.ndarray:
+    """Vertex indices as integers; `InputError` for fractions and text."""
     if values.dtype.kind == "f" and np.array_equal(values, np.round(values)) and (np.abs(values) < 2**53).all():
         return values.astype(np.int64)
     if values.size and values.dtype.kind not in "iu":
@@ -137,12 +137,12 @@ def _whole(values: np.ndarray, label: str) -> np.ndarray:
     return values
 
 
-def _some(values: Any) -> bool:
-    """Whether an attribute holds anything."""
+def _is_filled(values: Any) -> bool:
+    """Whether an attribute is not empty."""
     return hasattr(values, "__len__") and len(values) > 0
 
 
-def _ragged(values: Any) -> bool:
+def _is_ragged(values: Any) -> bool:
     """Whether these are lists of different lengths."""
     if not isinstance(values, list | tuple) or not values or not all(hasattr(each, "__len__") for each in values):
         return False
@@ -150,7 +150,7 @@ def _ragged(values: Any) -> bool:
 
 
 def _polygons(values: Any, label: str) -> _Polygons:
-    """Polygons of lists of corners, or of rows with the same number of corners."""
+    """Polygons from lists of corners, or from rows with the same number of corners."""
     if isinstance(values, np.ndarray) and values.ndim == 2:
         sizes, corners = np.full(len(values), values.shape[1]), values.reshape(-1)
     else:
@@ -160,25 +160,25 @@ def _polygons(values: Any, label: str) -> _Polygons:
         if any(isinstance(each, list | tuple | np.ndarray) for each in flat):
             raise InputError(f"{label}: each face must be a list of vertices", HINT)
         corners = _array(flat, label)
-    return _Polygons(_whole(corners, label).astype(np.int64), sizes)
+    return _Polygons(_as_indices(corners, label).astype(np.int64), sizes)
 
 
-def _counted(values: np.ndarray, label: str) -> tuple[Ints, Ints]:
-    """Where the corners of each cell begin, and how many there are, in VTK's flat lists: a count, then so many corners."""
-    starts, at = [], 0
+def _split_flat(values: np.ndarray, label: str) -> tuple[Ints, Ints]:
+    """Start and number of the corners of each cell in a flat VTK list: a count, then as many corners, for each cell."""
+    starts, position = [], 0
     flat = values.tolist()
-    while at < len(flat):
-        starts.append(at + 1)
-        if flat[at] < 0 or at + flat[at] >= len(flat):
+    while position < len(flat):
+        starts.append(position + 1)
+        if flat[position] < 0 or position + flat[position] >= len(flat):
             raise InputError(f"{label}: its flat list of faces does not consist of counts and corners", HINT)
-        at += flat[at] + 1
+        position += flat[position] + 1
     begins = np.array(starts, np.int64)
     return begins, values[begins - 1].astype(np.int64)
 
 
 def _flat_polygons(values: np.ndarray, label: str, chosen: Bools | None = None) -> _Polygons:
-    """Polygons of VTK's flat list, or of the chosen cells of it."""
-    starts, sizes = _counted(_whole(values, label), label)
+    """Polygons from a flat VTK list, or from the chosen cells of it."""
+    starts, sizes = _split_flat(_as_indices(values, label), label)
     if chosen is not None:
         if len(chosen) != len(starts):
             raise InputError(f"{label} has {len(starts)} cells and {len(chosen)} types of cells", HINT)
@@ -187,19 +187,19 @@ def _flat_polygons(values: np.ndarray, label: str, chosen: Bools | None = None) 
 
 
 def _faces(source: Any, label: str) -> Any:
-    """The faces of an object, triangles or polygons, None if it is a cloud."""
-    types = _value(source, "celltypes", "cell_types_array")
-    cells = _value(source, "cells")
+    """The faces of an object, triangles or polygons; None if it is a cloud."""
+    types = _get_value(source, "celltypes", "cell_types_array")
+    cells = _get_value(source, "cells")
     if types is not None:
         return _grid(cells, np.asarray(types), label)
-    faces = _value(source, "faces", "triangles")
-    if _some(faces):
+    faces = _get_value(source, "faces", "triangles")
+    if _is_filled(faces):
         return _rows(faces, label)
-    if _some(cells):
+    if _is_filled(cells):
         return _cells(source, cells, label)
-    for name in _OTHER_LINKS:
+    for name in _UNSUPPORTED_LINKS:
         links = getattr(source, name, None)
-        if not callable(links) and _some(links):
+        if not callable(links) and _is_filled(links):
             hint = "pass its .triangulate()" if name == "strips" else _SURFACE
             raise InputError(f"{label} connects its points by .{name}, which is not read", hint)
     vtk = type(getattr(source, "dataset", None)).__name__  # of vedo
@@ -209,20 +209,20 @@ def _faces(source: Any, label: str) -> Any:
 
 
 def _rows(faces: Any, label: str) -> Any:
-    """Faces by that name: triangles, quads, lists of polygons, or VTK's flat list."""
-    if _ragged(faces):
+    """Faces from an attribute of that name: triangles, quads, lists of polygons, or a flat VTK list."""
+    if _is_ragged(faces):
         return _polygons(faces, label)
     found = _array(faces, label)
     if found.ndim == 1:
         return _flat_polygons(found, label)
     if found.ndim == 2 and found.shape[1] > 3:
         return _polygons(found, label)
-    return _whole(found, label)
+    return _as_indices(found, label)
 
 
 def _grid(cells: Any, types: Ints, label: str) -> _Polygons | None:
-    """The faces of a VTK grid, if it has no volumes."""
-    if not np.isin(types, _VTK_FACES + _VTK_LOOSE).all():
+    """The faces of a VTK grid; `InputError` if it has volumes."""
+    if not np.isin(types, _VTK_FACES + _VTK_IGNORED).all():
         raise InputError(f"{label} is made of volumes or of curved cells", "pass its surface, .extract_surface()")
     chosen = np.isin(types, _VTK_FACES)
     if not chosen.any():
@@ -235,16 +235,16 @@ def _grid(cells: Any, types: Ints, label: str) -> _Polygons | None:
 def _cells(source: Any, cells: Any, label: str) -> Any:
     """The faces among cells: blocks of one type each (meshio), or lists of corners (vedo)."""
     blocks = cells.items() if isinstance(cells, dict) else cells
-    pairs = [pair for pair in map(_block, blocks) if pair is not None]
+    pairs = [pair for pair in map(_as_block, blocks) if pair is not None]
     if pairs and len(pairs) == len(blocks):
         parts = [_polygons(data, label) for kind, data in pairs if _MESHIO_FACES.fullmatch(kind) and len(data)]
-        loose = "vertex" if not parts else _MESHIO_LOOSE  # beside faces, lines are their features
-        wrong = [kind for kind, _ in pairs if not (_MESHIO_FACES.fullmatch(kind) or re.fullmatch(loose, kind))]
-        if wrong:
+        ignored = "vertex" if not parts else _MESHIO_IGNORED  # next to faces, lines are feature edges
+        unsupported = [kind for kind, _ in pairs if not (_MESHIO_FACES.fullmatch(kind) or re.fullmatch(ignored, kind))]
+        if unsupported:
             hint = "pass its surface, such as (mesh.points, mesh.cells_dict['triangle'])"
-            raise InputError(f"{label} has cells of type {wrong[0]}, of which no surface is made", hint)
+            raise InputError(f"{label} has cells of type {unsupported[0]}, of which no surface is made", hint)
         return _Polygons(*(np.concatenate(each) for each in zip(*parts, strict=True))) if parts else None
-    if not _ragged(cells):
+    if not _is_ragged(cells):
         found = _array(cells, label)
         surface = type(getattr(source, "dataset", None)).__name__ == "vtkPolyData"  # vedo: these are faces
         if found.ndim == 1:
@@ -255,8 +255,8 @@ def _cells(source: Any, cells: Any, label: str) -> Any:
     return _polygons(cells, label)
 
 
-def _block(block: Any) -> tuple[str, Any] | None:
-    """Type and corners of a block of cells of one type; None if it is something else."""
+def _as_block(block: Any) -> tuple[str, Any] | None:
+    """Type and corners of a block of cells of one type; None for anything else."""
     if isinstance(block, tuple) and len(block) == 2 and isinstance(block[0], str):
         return block
     kind = getattr(block, "type", None)
@@ -264,7 +264,7 @@ def _block(block: Any) -> tuple[str, Any] | None:
 
 
 def _scene(scene: Any, label: str) -> Arrays:
-    """The meshes of a trimesh scene, one after the other, each where its node puts it."""
+    """The meshes of a trimesh scene, one after the other, each where its node places it."""
     verts: list[Floats] = []
     faces: list[Int[Ints, "F 3"]] = []
     colors: list[Float[Floats, "V 4"] | None] = []
@@ -288,7 +288,7 @@ def _scene(scene: Any, label: str) -> Arrays:
 
 
 def _batch(source: Any, label: str) -> Arrays:
-    """The one mesh or cloud of PyTorch3D's batches."""
+    """The single mesh or cloud of a PyTorch3D batch."""
     if len(source) != 1:
         raise InputError(f"{label} is a batch of {len(source)} shapes", "pass one of them: shapes[0]")
     if callable(getattr(source, "verts_packed", None)):
@@ -298,13 +298,13 @@ def _batch(source: Any, label: str) -> Arrays:
 
 
 def _colors(source: Any, label: str) -> Float[Floats, "V 4"] | None:
-    """Colors of the vertices, as trimesh and Open3D have them; the mean of those around where trimesh has them of faces."""
+    """Vertex colors of trimesh and Open3D; means of the surrounding face colors if trimesh has these."""
     visual: Any = getattr(source, "visual", None)
     if getattr(visual, "kind", None) == "face":
         warn(f"{label} has colors of faces: each vertex gets the mean of those around it")
         own = np.repeat(np.asarray(visual.face_colors, np.float64) / 255.0, 3, axis=0)
         return colors_of_faces(len(source.vertices), np.asarray(source.faces).ravel(), own)
-    if getattr(visual, "kind", None) == "vertex" and len(visual.vertex_colors):  # a cloud of trimesh has none
+    if getattr(visual, "kind", None) == "vertex" and len(visual.vertex_colors):  # trimesh clouds have none
         return np.asarray(visual.vertex_colors, np.float64) / 255.0
     for has, name in (("has_vertex_colors", "vertex_colors"), ("has_colors", "colors")):
         if callable(getattr(source, has, None)) and getattr(source, has)():

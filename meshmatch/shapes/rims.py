@@ -1,4 +1,4 @@
-"""Open boundaries of a mesh: where a bust, a half shell or a broken bone ends."""
+"""Open boundaries of a mesh (rims): the ends of a bust, a half shell or a broken bone."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.triangles import edge_lengths
 from meshmatch.shapes.shape import Shape
 
-RIM = 0.3  # length of the boundary of a part at least, in units of sqrt(area); cracks of a mesh are shorter
-SHEET = 3.5  # length of all rims of a sheet: a flat disc has 3.54, and nothing flat has less; a broken bone has 2.6
+RIM = 0.3  # minimum length of a rim, in units of sqrt(area); cracks of a mesh are shorter
+SHEET = 3.5  # minimum length of all rims of a sheet: no flat shape has less than a disk's 3.54; a broken bone has 2.6
 
 
 def rim_lengths(shape: Shape) -> Float[Floats, " V"]:
-    """Length of the connected boundary that each vertex lies at, in units of sqrt(area); 0 for a vertex at none."""
+    """Length of the connected boundary at each vertex, in units of sqrt(area); 0 for vertices that are not on a
+    boundary.
+    """
     edges = shape.edges.open
     graph = coo_matrix((np.ones(len(edges)), edges.T), (shape.V, shape.V))
     rim = connected_components(graph, directed=False)[1]
@@ -27,7 +29,7 @@ def rim_lengths(shape: Shape) -> Float[Floats, " V"]:
 
 
 def is_sheet(shape: Shape) -> bool:
-    """Whether a shape is an open sheet, such as a leaf, which ends where others of its kind do; a cut one need not."""
+    """Whether a shape is an open sheet, such as a leaf: its rims are natural ends, unlike those of a cut shape."""
     if shape.is_cloud:
         return False
     ends = shape.edges.open[rim_lengths(shape)[shape.edges.open[:, 0]] > RIM]
@@ -35,7 +37,9 @@ def is_sheet(shape: Shape) -> bool:
 
 
 def rim_corners(shape: Shape) -> Int[Ints, "E 3"]:
-    """Both ends of each edge of the rims of a mesh, and the third corner of its triangle; cracks are no rims."""
+    """Both ends of each edge of a rim, and the third corner of its triangle; shorter boundaries, such as cracks, are
+    ignored.
+    """
     faces = np.asarray(shape.faces)
     corners = np.concatenate([faces, faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]])
     corners = corners[(rim_lengths(shape) > RIM)[corners[:, :2]].all(axis=1)]
@@ -47,7 +51,7 @@ def rim_corners(shape: Shape) -> Int[Ints, "E 3"]:
 def at_rim(
     verts: Float[Floats, "V 3"], corners: Int[Ints, "E 3"]
 ) -> tuple[Float[Floats, " E"], Float[Floats, "E 3"], Float[Floats, "E 3"]]:
-    """Length of each edge of a rim, and unit vectors that lead out of the surface there, and along the edge."""
+    """Length of each rim edge, and unit vectors that point out of the surface there, and along the edge."""
     a, b, c = verts[corners.T]
     length = np.linalg.norm(b - a, axis=1)
     along = (b - a) / np.maximum(length, 1e-300)[:, None]
@@ -57,7 +61,7 @@ def at_rim(
 
 @dataclass(frozen=True, eq=False)
 class RimPoints:
-    """Points along the rims of a mesh, with unit vectors that lead out of the surface there, and along the rim."""
+    """Points along the rims of a mesh, with unit vectors that point out of the surface, and along the rim."""
 
     points: Float[Floats, "P 3"]
     outward: Float[Floats, "P 3"]
@@ -65,7 +69,7 @@ class RimPoints:
 
     @classmethod
     def of(cls, shape: Shape, step: float) -> RimPoints:
-        """Points at most a ``step`` apart (units of sqrt(area)); none of a shape without a rim."""
+        """Points at most ``step`` apart (in units of sqrt(area)); none for a shape without a rim."""
         corners = rim_corners(shape)
         length, outward, along = at_rim(shape.verts, corners)
         count = np.ceil(np.maximum(length / (step * np.sqrt(shape.area)), 1.0)).astype(np.int64)
@@ -75,5 +79,5 @@ class RimPoints:
         return cls(a + share[:, None] * (b - a), outward[edge], along[edge])
 
     def in_frame(self, frame: Frame) -> RimPoints:
-        """The same through a frame."""
+        """The points and vectors in another frame."""
         return RimPoints(frame.apply(self.points), self.outward @ frame.rotation.T, self.along @ frame.rotation.T)

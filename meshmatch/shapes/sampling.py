@@ -1,4 +1,4 @@
-"""From a surface to points spread evenly over it, and from the points of a cloud to triangles."""
+"""Even sampling of surfaces, and triangulation of point clouds."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import dot, interpolate, triangle_vectors, unit
 from meshmatch.shapes.shape import Shape
 
-_NEIGHBOURS = 16
-_ENOUGH = 30  # points of which one is chosen are as good to choose from as many more
-_LONGEST = 3.0  # of an edge, against the usual reach of a point's sixth neighbour
+_N_NEIGHBORS = 16
+_CANDIDATES_PER_POINT = 30  # candidates per chosen point: more would not improve the choice
+_MAX_EDGE = 3.0  # maximum edge length, relative to the median distance of the sixth neighbor
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Samples(OrientedPoints):
-    """Points on a shape in its own frame, with the normals of their faces; a cloud's are estimated, not signed.
+    """Points on a shape in its own frame, with the normals of their faces; those of a cloud are estimated, without
+    reliable signs.
 
-    Each lies on a `face` (-1 for a cloud), whose corners have weights that sum to 1 (`barycentric`; for a cloud
-    (1, 0, 0)); `vertex` is the corner of the largest weight, or the very point of the cloud that was drawn.
+    `face` is the face of each point (-1 for a cloud), and `barycentric` its weights there, which sum to 1 ((1, 0, 0)
+    for a cloud); `vertex` is the corner with the largest weight, or the drawn point of the cloud.
     """
 
     face: Int[Ints, " P"]
@@ -34,10 +35,10 @@ class Samples(OrientedPoints):
 
 
 def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
-    """Draw `P` points with equal probability per area; the same `rng` state gives the same points.
+    """Draw `P` points with uniform probability per area; the same state of `rng` gives the same points.
 
-    From a cloud, its own points are drawn with probability proportional to the area that each stands for
-    (so a dense patch is not favoured), without repetition while there are enough. `InputError` if there is no area.
+    From a cloud, its own points are drawn with probability proportional to the area that each represents (so dense
+    regions are not favored), without repetition while there are enough. `InputError` if there is no area.
     """
     areas = shape.vertex_areas if shape.is_cloud else shape.face_areas
     total = np.cumsum(areas)
@@ -49,7 +50,7 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
         normals = shape.vertex_normals[chosen]
         trust = None if shape.weights is None else shape.weights[chosen]
         return Samples(shape.verts[chosen], normals, False, trust, face=face, barycentric=weights, vertex=chosen)
-    # side="right" steps over faces without area
+    # side="right" skips faces without area
     face = np.searchsorted(total, rng.random(P) * total[-1], side="right").astype(np.int64)
     face = np.minimum(face, np.flatnonzero(areas)[-1])
     root = np.sqrt(rng.random(P))
@@ -63,10 +64,11 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
 
 
 def farthest_points(points: Float[Floats, "N D"], K: int) -> Int[Ints, " K"]:
-    """Indices of points that are each as far as possible from all before them, beginning with the first.
+    """Farthest point sampling: indices of points that are each as far as possible from all previous ones, starting with
+    the first.
 
-    Takes K passes over the points. With fewer distinct points than `K` the last ones repeat positions, never
-    indices. `InputError` if there are fewer points.
+    Takes K passes over the points. With fewer distinct points than `K` the last ones repeat positions, never indices.
+    `InputError` if there are fewer points.
     """
     points = np.asarray(points, np.float64)
     if not 0 < K <= len(points):
@@ -81,7 +83,7 @@ def farthest_points(points: Float[Floats, "N D"], K: int) -> Int[Ints, " K"]:
         for axis in others:
             squared += (axis - axis[current]) ** 2
         np.minimum(nearest, squared, out=nearest)
-        nearest[current] = -1.0  # never again
+        nearest[current] = -1.0  # do not choose it again
         current = int(nearest.argmax())
     return chosen
 
@@ -100,25 +102,26 @@ def _draw_points(areas: Floats, P: int, rng: np.random.Generator) -> Ints:
 
 
 def triangulate_cloud(cloud: Shape, most: int) -> tuple[Int[Ints, " V"], Int[Ints, "F 3"]]:
-    """A mesh over some points of a cloud: each point's Delaunay star in its tangent plane, and the triangles that agree.
+    """Triangulate some points of a cloud: triangles of each point's Delaunay star in its tangent plane on which stars
+    agree.
 
-    After the localised Delaunay triangulation of Gopi, Krishnan and Silva (*Surface Reconstruction based on Lower
-    Dimensional Localized Delaunay Triangulation*, 2000): a triangle is kept where the stars of all three corners have
-    it. Where points are noisy stars disagree and a small hole stays; nothing is moved or invented.
+    After the localized Delaunay triangulation of Gopi, Krishnan and Silva (*Surface Reconstruction based on Lower
+    Dimensional Localized Delaunay Triangulation*, 2000): a triangle is kept if it is in the stars of all three corners.
+    Where noisy points make stars disagree a small hole remains; no point is moved or added.
 
-    There are about `most` triangles at most: half as many points are taken, evenly spread. Returns those that are
-    corners, and faces over them, counter-clockwise seen from where the cloud's estimated normals point. `InputError` if
-    hardly any two stars agree: the points lie on no surface.
+    There are at most about `most` triangles: half as many points are used, evenly distributed. Returns the points that
+    are corners, and faces over them, counter-clockwise seen from where the cloud's estimated normals point.
+    `InputError` if hardly any two stars agree: the points do not lie on a surface.
     """
     chosen = np.arange(cloud.V)
-    if cloud.V > _ENOUGH * (most // 2):  # every pass looks at all points
-        chosen = np.sort(np.random.default_rng(0).choice(cloud.V, _ENOUGH * (most // 2), replace=False))
+    if cloud.V > _CANDIDATES_PER_POINT * (most // 2):  # farthest point sampling is linear in the points
+        chosen = np.sort(np.random.default_rng(0).choice(cloud.V, _CANDIDATES_PER_POINT * (most // 2), replace=False))
     if len(chosen) > most // 2:
         chosen = np.sort(chosen[farthest_points(cloud.verts[chosen], most // 2)])
     points, normals = cloud.verts[chosen], cloud.vertex_normals[chosen]
-    k = min(_NEIGHBOURS, len(points) - 1)
+    k = min(_N_NEIGHBORS, len(points) - 1)
     distance, index = cKDTree(points).query(points, k + 1)
-    reach = _LONGEST * np.median(distance[:, min(6, k)])
+    reach = _MAX_EDGE * np.median(distance[:, min(6, k)])
     votes: Counter[tuple[int, ...]] = Counter()
     for own, near in enumerate(index):
         stars = _star(points[near], normals[own], reach)
@@ -129,18 +132,18 @@ def triangulate_cloud(cloud: Shape, most: int) -> tuple[Int[Ints, " V"], Int[Int
         raise InputError(rough, "give a cleaner or denser cloud, or a mesh, with --template")
     outwards = dot(triangle_vectors(points, faces), normals[faces].sum(1))
     faces[outwards < 0] = faces[outwards < 0][:, ::-1]
-    used, renumbered = np.unique(faces, return_inverse=True)
-    return chosen[used], renumbered.reshape(-1, 3)
+    used, corners = np.unique(faces, return_inverse=True)
+    return chosen[used], corners.reshape(-1, 3)
 
 
 def _star(points: Floats, normal: Floats, reach: float) -> list[tuple[int, int]]:
-    """Triangles around the first of some points, as pairs of the others, in the plane across a normal."""
+    """Triangles of the Delaunay star of the first point in the plane of a normal, as pairs of the other two corners."""
     across = np.linalg.svd(normal[None])[2][1:]
     flat = (points - points[0]) @ across.T
     try:
         triangles = Delaunay(flat).simplices
     except QhullError:
-        return []  # all on a line
+        return []  # all points are collinear
     found = []
     for corners in triangles[(triangles == 0).any(axis=1)]:
         b, c = (int(i) for i in corners if i != 0)

@@ -1,4 +1,4 @@
-"""A shape: a triangle mesh or a point cloud, with what is derived from it."""
+"""Shapes: triangle meshes and point clouds, with derived quantities."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
 LARGEST = 1e60
-"""Positions from here on are invalid: squared areas must not overflow."""
+"""Positions from this size on are invalid: squared areas must not overflow."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shape(Pickled):
-    """A triangle mesh, or a point cloud if it has no faces. Valid once built; its arrays are read-only.
+    """A triangle mesh, or a point cloud if it has no faces. It is validated on construction; its arrays are read-only.
 
     Attributes
     ----------
@@ -34,28 +34,28 @@ class Shape(Pickled):
     faces
         (F, 3) corners of each triangle; (0, 3) for a cloud.
     name
-        For people: usually the file's name without its folder.
+        For messages: usually the file's name without its folder.
     colors
         (V, 4) red, green, blue (sRGB) and alpha in 0..1, whatever the file stores.
     invalid
-        (V,) True for a vertex whose position in the file was not a number. It keeps its place in the order (the map
-        answers for it too), but its ``verts`` row is only a stand-in, and faces that touch it have no area.
+        (V,) True for a vertex whose position in the file was not finite. It keeps its place in the order (maps answer
+        for it too), but its ``verts`` row is a stand-in, and faces that touch it have no area.
     weights
-        (V,) how far a fit trusts each vertex, from 0 (not at all) to 1; fully where not given.
+        (V,) how far a fit trusts each vertex, from 0 (not at all) to 1; fully by default.
     skinned
-        (V,) True for a vertex that joints of its file move: no part with one is ever dropped as dirt.
+        (V,) True for a vertex that joints of its file move: parts with such a vertex are never dropped as outliers.
     upright
-        Whether the format of its file says that y is up and z the front, as glTF does. A fit tries that first.
+        Whether its file format defines y as up and z as front, as glTF does. A fit tries that orientation first.
     made_of
-        Hashes of meshes whose vertices are the first ones of this one, in their order, with the same triangles: of a file
-        that a transfer made of them. Maps to one of these are maps to this shape too.
+        Hashes of meshes whose vertices are the first ones of this shape, in their order, with the same triangles, for a
+        file that a transfer made of them. Maps to one of these are maps to this shape too.
     meshes
-        The meshes of its scene, or labels of its label map: the name of each, and how many vertices, in their order.
+        Name and number of vertices of each mesh of its scene, or label of its label map, in the order of the vertices.
 
     Raises
     ------
     InputError
-        Wrong array shapes, no vertices, a position that is not finite, or a face that names no vertex.
+        Wrong array shapes, no vertices, a position that is not finite, or a face with an invalid vertex index.
 
     Examples
     --------
@@ -91,19 +91,19 @@ class Shape(Pickled):
         if V == 0:
             raise InputError(f"{label} has no vertices")
         if not np.isfinite(verts).all():
-            what = f"{label}: some vertex positions are not finite"
-            raise InputError(what, "load it with load_shape, which marks them invalid")
+            problem = f"{label}: some vertex positions are not finite"
+            raise InputError(problem, "load it with load_shape, which marks them invalid")
         if len(faces) and (faces.min() < 0 or faces.max() >= V):
-            worst = int(faces.min()) if faces.min() < 0 else int(faces.max())
-            what = f"{label}: a face refers to vertex {worst}, but there are only {V} vertices"
-            raise InputError(what, "the file is damaged, or was cut short")
+            invalid_index = int(faces.min()) if faces.min() < 0 else int(faces.max())
+            problem = f"{label}: a face refers to vertex {invalid_index}, but there are only {V} vertices"
+            raise InputError(problem, "the file is damaged, or was cut short")
         object.__setattr__(self, "verts", verts)
         object.__setattr__(self, "faces", faces)
-        kinds = {"colors": (np.float64, (V, 4)), "invalid": (np.bool_, (V,)), "weights": (np.float64, (V,))}
-        kinds["skinned"] = (np.bool_, (V,))
-        for name, (kind, shape) in kinds.items():
+        specifications = {"colors": (np.float64, (V, 4)), "invalid": (np.bool_, (V,)), "weights": (np.float64, (V,))}
+        specifications["skinned"] = (np.bool_, (V,))
+        for name, (dtype, shape) in specifications.items():
             if (values := getattr(self, name)) is not None:
-                array = read_only(values, kind, label)
+                array = read_only(values, dtype, label)
                 if array.shape != shape:
                     raise InputError(f"{label}: {name} must be an array of {shape}, not {array.shape}")
                 object.__setattr__(self, name, array)
@@ -116,7 +116,7 @@ class Shape(Pickled):
     def with_invalid(
         cls, verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], name: str, colors: Float[Floats, "V 4"] | None = None
     ) -> Shape:
-        """A shape some of whose positions may be NaN or infinite: these are marked in ``invalid``, and moved to the
+        """A shape from positions that may be NaN or infinite: these are marked in ``invalid``, and moved to the
         centroid of the others.
 
         Parameters
@@ -126,7 +126,7 @@ class Shape(Pickled):
         faces
             (F, 3).
         name
-            For people.
+            For messages.
         colors
             (V, 4), sRGB and alpha in 0..1.
 
@@ -156,7 +156,7 @@ class Shape(Pickled):
 
     @property
     def verts_or_nan(self) -> Float[Floats, "V 3"]:
-        """Positions as a file should have them: NaN where a vertex is invalid."""
+        """Positions for writing to a file: NaN where a vertex is invalid."""
         return self.verts if self.invalid is None else np.where(self.invalid[:, None], np.nan, self.verts)
 
     @property
@@ -171,30 +171,28 @@ class Shape(Pickled):
 
     @property
     def is_cloud(self) -> bool:
-        """True if there are no faces."""
+        """Whether there are no faces."""
         return len(self.faces) == 0
 
     @property
     def valid(self) -> Bool[Bools, " V"]:
-        """True for a vertex that has a position."""
+        """(V,) whether each vertex has a position."""
         return np.ones(self.V, bool) if self.invalid is None else ~self.invalid
 
     @property
     def valid_faces(self) -> Bool[Bools, " F"]:
-        """True for a face whose corners all have a position."""
+        """(F,) whether all corners of a face have a position."""
         return np.asarray(self.valid[self.faces].all(axis=1))
 
     @cached_property
     def on_surface(self) -> Bool[Bools, " V"]:
-        """True for a vertex of a face whose corners all have a position; where there is no such face, as in a cloud, for one
-        with a position.
-        """
+        """(V,) whether a vertex belongs to a valid face; without such faces, as in a cloud, whether it has a position."""
         used = np.bincount(self.faces[self.valid_faces].ravel(), minlength=self.V) > 0
         return frozen(used if used.any() else self.valid)
 
     @cached_property
     def face_vectors(self) -> Floats:
-        """(F, 3) normal of each face, twice its area long; 0 where a corner is invalid."""
+        """(F, 3) normal of each face, with a length of twice its area; 0 if a corner is invalid."""
         vectors = triangle_vectors(self.verts, self.faces)
         if self.invalid is not None:
             vectors[~self.valid_faces] = 0.0
@@ -202,37 +200,37 @@ class Shape(Pickled):
 
     @cached_property
     def face_areas(self) -> Floats:
-        """(F,) areas, squared units of the file."""
+        """(F,) areas, in squared units of the file."""
         return frozen(0.5 * np.sqrt(squared_lengths(self.face_vectors)))
 
     @property
-    def _valid(self) -> Floats:
+    def _valid_verts(self) -> Floats:
         return self.verts if self.invalid is None else self.verts[~self.invalid]
 
-    def _estimated(self, estimate: Callable[[Floats], Floats]) -> Floats:
-        """What is estimated of a cloud's points; zeros for invalid ones."""
+    def _estimate(self, estimate: Callable[[Floats], Floats]) -> Floats:
+        """Estimates for the points of a cloud; zeros for invalid ones."""
         if self.invalid is None:
             return frozen(estimate(self.verts))
-        found = estimate(self._valid)
-        every = np.zeros((self.V, *found.shape[1:]))
-        every[~self.invalid] = found
-        return frozen(every)
+        estimates = estimate(self._valid_verts)
+        result = np.zeros((self.V, *estimates.shape[1:]))
+        result[~self.invalid] = estimates
+        return frozen(result)
 
     @cached_property
     def vertex_areas(self) -> Floats:
-        """(V,) share of the surface around each vertex: a third of its faces; a cloud's are estimated."""
+        """(V,) area of each vertex: a third of that of its faces; estimated for a cloud."""
         if self.is_cloud:
-            return self._estimated(local_areas)
+            return self._estimate(local_areas)
         return frozen(share_areas(self.face_areas, self.faces, self.V))
 
     @cached_property
     def vertex_normals(self) -> Floats:
-        """(V, 3) unit normals, the area-weighted mean of the faces around; zeros where there is none.
+        """(V, 3) unit normals, area-weighted means of the surrounding faces' normals; zeros where there are none.
 
-        A cloud's are estimated from its neighbourhoods and turned outwards as far as that can be told.
+        Those of a cloud are estimated from neighborhoods and oriented outwards as far as possible.
         """
         if self.is_cloud:
-            return self._estimated(estimate_normals)
+            return self._estimate(estimate_normals)
         return frozen(average_normals(self.face_vectors, self.faces, self.V))
 
     @cached_property
@@ -242,46 +240,46 @@ class Shape(Pickled):
 
     @cached_property
     def face_parts(self) -> Ints:
-        """(F,) number of the connected part that each face is in; faces that share a vertex are connected."""
+        """(F,) number of the connected part of each face; faces that share a vertex are connected."""
         return frozen(triangles.face_parts(self.faces, self.V))
 
     @cached_property
     def vertex_parts(self) -> Ints:
-        """(V,) number of the connected part that each vertex is in; -1 without a face."""
+        """(V,) number of the connected part of each vertex; -1 without a face."""
         part = np.full(self.V, -1, np.int64)
         part[self.faces] = self.face_parts[:, None]
         return frozen(part)
 
     @cached_property
     def area(self) -> float:
-        """Surface area, squared units of the file; a cloud's is estimated from its density."""
+        """Surface area, in squared units of the file; estimated from the density of a cloud."""
         return float(self.vertex_areas.sum() if self.is_cloud else self.face_areas.sum())
 
     @cached_property
     def roughness(self) -> float:
-        """How noisy a cloud is, 0..1 (see `cloud.roughness`); 0 for a mesh, whose faces say what lies where."""
-        return roughness(self._valid) if self.is_cloud else 0.0
+        """Noise of a cloud, 0..1 (see `cloud.roughness`); 0 for a mesh."""
+        return roughness(self._valid_verts) if self.is_cloud else 0.0
 
     @cached_property
     def bounds(self) -> Floats:
-        """(2, 3) lowest and highest corner of the box around the surface, or the points of a cloud."""
+        """(2, 3) lowest and highest corner of the bounding box of the surface, or of a cloud's points."""
         verts = self.verts[self.on_surface] if self.on_surface.any() else self.verts
         return frozen(np.stack([verts.min(axis=0), verts.max(axis=0)]))
 
     @property
     def diagonal(self) -> float:
-        """Length of the bounding box's diagonal, units of the file."""
+        """Length of the bounding box's diagonal, in units of the file."""
         return float(np.linalg.norm(self.bounds[1] - self.bounds[0]))
 
     @cached_property
     def hash(self) -> str:
-        """16 hexadecimal digits that name this geometry (sha256 of the bytes of verts, then of faces)."""
+        """16 hexadecimal digits that identify the geometry (sha256 of the bytes of verts, then of faces)."""
         digest = hashlib.sha256(self.verts.data)
         digest.update(self.faces.data if len(self.faces) else b"")
         return digest.hexdigest()[:16]
 
     def to_trimesh(self) -> Trimesh:
-        """The shape as a mesh of trimesh, vertices and faces in the same order; a cloud as one without faces.
+        """Convert to a trimesh mesh with vertices and faces in the same order; a cloud becomes a mesh without faces.
 
         Invalid vertices keep their stand-in positions; colors become 8-bit vertex colors.
 
@@ -301,7 +299,7 @@ class Shape(Pickled):
 
 
 def checked_shape(shape: object, whose: str) -> Shape:
-    """A shape that somebody handed in; `InputError` for anything else, such as a file's name."""
+    """Check an argument: return it if it is a `Shape`; `InputError` for anything else, such as a file's name."""
     if not isinstance(shape, Shape):
         raise InputError(f"{whose} must be a Shape, not {type(shape).__name__}", "read a file with load_shape")
     return shape

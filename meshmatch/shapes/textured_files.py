@@ -1,4 +1,4 @@
-"""Appearances from files: materials and images of glb, gltf, obj and ply, vertex colors of all others."""
+"""Read the appearance of files: materials and images of glb, gltf, obj and ply, vertex colors of all other formats."""
 
 from __future__ import annotations
 
@@ -19,8 +19,12 @@ from meshmatch.shapes.shape import Shape
 
 TEXTURED_SUFFIXES = (".glb", ".obj", ".vrm")
 _FINISHES = dict.fromkeys(gltf.SUFFIXES, gltf_finish.read_finish) | {".obj": obj_look.read_finish}
-_SHOWN: dict[Layer, tuple[str, ...]] = {"normal": ("normal",), "surface": ("roughness", "metal"), "glow": ("emission",)}
-_READERS = {  # of the look, and of texture coordinates alone
+_LAYER_IMAGES: dict[Layer, tuple[str, ...]] = {
+    "normal": ("normal",),
+    "surface": ("roughness", "metal"),
+    "glow": ("emission",),
+}
+_READERS = {  # readers of appearances, and of texture coordinates alone
     **dict.fromkeys(gltf.SUFFIXES, (gltf_attributes.read_look, gltf_attributes.read_coordinates)),
     ".obj": (obj_look.read_look, obj_look.read_coordinates),
     ".ply": (ply_look.read_look, ply_look.read_coordinates),
@@ -28,15 +32,15 @@ _READERS = {  # of the look, and of texture coordinates alone
 
 
 def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = None) -> Appearance:
-    """What a file says about the look of its surface.
+    """Read the appearance of a file.
 
-    glb and gltf: materials with their images and factors, samplers, texture transforms, vertex colors.
-    obj: its mtl with Kd, map_Kd, d and map_d, beside it. ply: the images that its comments name, beside it, or else vertex
-    colors. Everything else: vertex colors.
+    glb and gltf: materials with their images and factors, samplers, texture transforms, vertex colors. obj: Kd, map_Kd,
+    d and map_d of its mtl, which is in the same folder. ply: images named in comments, in the same folder, or else
+    vertex colors. Other formats: vertex colors.
 
-    `shape` is what `load_shape` made of the same file; `image` a picture that takes the place of those that the file
-    names, or that it fails to name. `InputError`: an image or material file is missing, damaged, too large, or outside
-    the file's folder; there are no texture coordinates for `image`; or the file has no look at all.
+    `shape` is the result of `load_shape` for the same file; `image` is a picture that replaces the images of the file,
+    or is used if the file names none. `InputError`: an image or material file is missing, damaged, too large, or
+    outside the file's folder; there are no texture coordinates for `image`; or the file has no appearance.
     """
     found = find_appearance(path, shape, image, finished=True)
     if found is None:
@@ -49,8 +53,9 @@ def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
 def find_appearance(
     path: str | Path, shape: Shape, image: str | Path | None = None, finished: bool = False, plain: bool = False
 ) -> Appearance | None:
-    """As `load_appearance`, but None where the file has no look at all, unless ``plain`` looks of one color are wanted too;
-    and with a finish only if that is asked for.
+    """As `load_appearance`, but None if the file has no appearance.
+
+    ``finished`` also reads the `Finish`; ``plain`` also returns appearances of a single color.
     """
     path = Path(path)
     suffix, reader = path.suffix.lower(), ImageReader()
@@ -70,9 +75,9 @@ def find_appearance(
 
 
 def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] | None:
-    """Texture coordinates of every corner, v down, whatever the materials say; None where a face has none.
+    """Texture coordinates of every corner, v down, regardless of materials; None if any face has none.
 
-    `shape` is what `load_shape` made of the same file; `InputError` if that is damaged.
+    `shape` is the result of `load_shape` for the same file; `InputError` if that is damaged.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -83,12 +88,12 @@ def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] |
 
 
 def files_of(path: Path, layers: Collection[Layer] = (), tiles: Iterable[int | str] = ()) -> list[Path]:
-    """What will be written for an output: an obj has companions, more of them with images of these layers, and one of each
-    for every tile (UDIM).
+    """The files that an output consists of: an obj has an mtl and images, one for each map of these layers and each
+    tile (UDIM).
     """
     if path.suffix.lower() != ".obj":
         return [path]
-    shown = [word for layer in layers for word in _SHOWN.get(layer, ())]
+    shown = [word for layer in layers for word in _LAYER_IMAGES.get(layer, ())]
     images = [image_file(path, word) for word in ("color", *shown)]
     return [
         path,
@@ -98,17 +103,17 @@ def files_of(path: Path, layers: Collection[Layer] = (), tiles: Iterable[int | s
 
 
 def image_file(path: Path, word: str) -> Path:
-    """The image beside an output that shows what a word says."""
+    """The image of an output for one map: "color", "normal", "roughness", "metal" or "emission"."""
     return path.with_suffix(".png") if word == "color" else path.with_name(f"{path.stem}-{word}.png")
 
 
 def tile_file(image: Path, tile: int | str) -> Path:
-    """The name of an image of one tile; without a tile, its own."""
+    """The file name for one tile of an image; the image itself without a tile."""
     return image.with_name(f"{image.stem}.{tile}{image.suffix}") if tile else image
 
 
 def check_textured(path: Path, colored: tuple[str, ...] = ()) -> None:
-    """Refuse a suffix that holds no texture (`OptionError`), nor is one of those `colored` by vertex."""
+    """`OptionError` for a suffix that can hold neither textures nor, if it is in `colored`, vertex colors."""
     if blender.is_converted(path):
         blender.check_written(path)
     elif path.suffix.lower() not in (*TEXTURED_SUFFIXES, *colored):

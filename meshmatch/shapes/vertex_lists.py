@@ -1,7 +1,8 @@
-"""Lists of known vertices: pairs of two shapes (landmarks, a truth), or points of one.
+"""Lists of vertex indices: pairs of corresponding vertices of two shapes (landmarks, ground truth), or vertices of one
+shape.
 
-The text has one pair, or one vertex, a line: numbers separated by spaces, tabs, commas or semicolons; ``#`` begins a
-comment; a first line of words is taken for a header. ``.npy`` files hold the same as an array of whole numbers. Vertices are
+Text files have one pair, or one vertex, per line: numbers separated by spaces, tabs, commas or semicolons; ``#`` begins
+a comment; a first line of words is a header. ``.npy`` files contain the same as an array of whole numbers. Vertices are
 counted from 0, in the order of the shape's file.
 """
 
@@ -22,23 +23,23 @@ _TRUTH = f"{_PAIRS}; or for each vertex of the source the target's alone"
 
 
 def load_pairs(path: str | Path) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
-    """Read pairs: vertices of the source, and the same N points on the target; `InputError` as `load_points`."""
-    first, second = _vertices(Path(path), (2,), _PAIRS).T.copy()
+    """Read pairs: N vertices of the source, and of the target; `InputError` as for `load_points`."""
+    first, second = _read_vertices(Path(path), (2,), _PAIRS).T.copy()
     return first, second
 
 
 def load_points(path: str | Path) -> Int[Ints, " N"]:
-    """Read a list of vertices of one shape; `InputError` if the file is missing or empty, or is none."""
-    return _vertices(Path(path), (1,), _POINTS)[:, 0].copy()
+    """Read a list of vertices of one shape; `InputError` if the file is missing, empty, or not such a list."""
+    return _read_vertices(Path(path), (1,), _POINTS)[:, 0].copy()
 
 
 def load_truth(path: str | Path) -> Int[Ints, "N columns"]:
-    """Read pairs as `load_pairs`, in two columns, or for each vertex of the source its partner, in one; -1 for none."""
-    return _vertices(Path(path), (1, 2), _TRUTH, missing=True)
+    """Read pairs as `load_pairs`, in two columns, or one column with each source vertex's target vertex; -1 for none."""
+    return _read_vertices(Path(path), (1, 2), _TRUTH, missing=True)
 
 
-def _vertices(path: Path, columns: tuple[int, ...], hint: str, missing: bool = False) -> Ints:
-    """(N, columns) numbers of vertices; some may be ``missing``, in the file -1 or nan."""
+def _read_vertices(path: Path, columns: tuple[int, ...], hint: str, missing: bool = False) -> Ints:
+    """(N, columns) vertex indices; if ``missing`` is allowed, -1 or nan in the file are missing vertices."""
     suffix = path.suffix.lower()
     read = read_npy if suffix == ".npy" else lambda path: read_table(path, comments="ends", whole=True).numbers()[1]
 
