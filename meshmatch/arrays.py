@@ -77,8 +77,9 @@ def frozen(array: NDArray[Any]) -> NDArray[Any]:
 
 
 class Pickled:
-    """Mixin for frozen dataclasses: pickle the fields without cached values, and restore arrays that were read-only as
-    such.
+    """Mixin for frozen dataclasses that pickles their fields alone, without cached values.
+
+    Arrays that were read-only are read-only again.
     """
 
     def __getstate__(self) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -116,8 +117,7 @@ def table_html(title: str, rows: Mapping[str, str]) -> str:
 
 
 def off_torch(values: Any) -> Any:
-    """Convert a torch tensor, or a list of them, to NumPy: detached from its gradient, in CPU memory. Return anything
-    else as is.
+    """Convert a torch tensor, or a list of them, to NumPy, detached and in CPU memory; return anything else as is.
 
     `TypeError` for a tensor that is not dense or not of numbers, such as a sparse one.
     """
@@ -161,9 +161,7 @@ def whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
 
 
 def as_numbers(values: ArrayLike | TensorLike, name: str, finite: bool = False) -> Floats:
-    """Convert values to float64; `InputError` if they are not numbers, or rows differ in length, or, if ``finite``, any
-    is not.
-    """
+    """Convert values to float64; `InputError` if they are not numbers, rows differ in length, or ``finite`` fails."""
     try:
         array = np.asarray(off_torch(values))
         if array.dtype.kind == "c":

@@ -53,8 +53,9 @@ def is_converted(path: Path) -> bool:
 
 
 def command(name: str) -> list[str]:
-    """The command that runs a script in Blender; `OptionError`, which names the file that needs it, if Blender is not
-    found.
+    """The command that runs a script in Blender.
+
+    `OptionError` if Blender is not found; ``name`` is the file that needs it.
     """
     configured = os.environ.get(ENVIRONMENT_VARIABLE, "")
     program = shutil.which(configured) if configured else shutil.which("blender") or shutil.which(_MAC_PROGRAM)
@@ -118,8 +119,7 @@ def check_written(path: Path) -> None:
 
 
 def from_glb(glb: Path, place: Path, path: Path) -> dict[Path, bytes]:
-    """Convert a glb to the format of ``path``, and write it to ``place``; return the images of a dae that do not exist
-    yet.
+    """Convert a glb to the format of ``path`` and write it to ``place``; return images of a dae that do not exist yet.
 
     Their keys are paths next to ``path``, whose stem their names begin with. `OutputError` if Blender fails,
     `OptionError` if there is no Blender or an image would replace another file.
@@ -147,8 +147,9 @@ def _is_new(copy: Path, file: Path, path: Path) -> bool:
 
 
 def _run(source: Path, output: Path) -> _Failure | list[str]:
-    """Convert a file with Blender. Return the lines of its output, or a failure; issue a warning for each note among
-    them.
+    """Convert a file with Blender; return the lines of its output, or a failure.
+
+    A warning is issued for each note among the lines.
     """
     script = SCRIPTS / "convert.py"
     name = (source if output.suffix == ".glb" else output).name  # of the user's file; the other one is temporary

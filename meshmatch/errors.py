@@ -82,8 +82,9 @@ class PoorFit(MeshmatchError):
 
 
 def visible(text: str) -> str:
-    """Text that cannot control a terminal: control characters and bidirectional overrides become U+FFFD; tabs and new
-    lines stay.
+    """Text that cannot control a terminal: control characters, but for tabs and new lines, become U+FFFD.
+
+    So do those that change the direction of text.
     """
     return text.translate(_REPLACEMENTS)
 

@@ -110,8 +110,9 @@ class Gathering:
 
 
 def gathered(answer: Callable[[Sequence[Question]], Sequence[Answer]], question: Question) -> Answer:
-    """The answer to one question, from a function that answers several: batched inside `Gathering.together`, alone
-    outside.
+    """The answer to one question, from a function that answers several.
+
+    Calls are batched inside `Gathering.together`, and made alone outside.
     """
     gathering: Gathering | None = getattr(_thread_state, "gathering", None)
     return answer([question])[0] if gathering is None else gathering.ask(answer, question)

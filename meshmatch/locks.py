@@ -1,5 +1,6 @@
-"""Locks between processes. The system releases them when their owner ends, even if it is killed, so none has to be
-removed.
+"""Locks between processes.
+
+The system releases them when their owner ends, even if it is killed, so that none has to be removed.
 """
 
 from collections.abc import Iterator

@@ -61,10 +61,9 @@ def home_folder(kind: Literal["data", "cache"]) -> Path:
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder if it does not exist. Call it before long work, so that a folder that cannot be created is
-    reported at once.
+    """Create a folder if it does not exist; `OutputError` if it cannot be created, or is a file.
 
-    `OutputError` if it cannot be created, or is a file.
+    Call it before long work, so that a folder that cannot be created is reported at once.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -157,8 +156,9 @@ def _replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def replace_all_on_success(paths: Sequence[str | Path]) -> Iterator[list[Path]]:
-    """As `replace_on_success` for several files that belong together; the first, which refers to the others, is renamed
-    last.
+    """As `replace_on_success`, for several files that belong together.
+
+    The first file, which refers to the others, is renamed last.
     """
     with ExitStack() as claims:
         yield [claims.enter_context(replace_on_success(path)) for path in paths]
@@ -209,8 +209,9 @@ def folder_on_success(path: str | Path, replaces: Collection[str] = ()) -> Itera
 
 
 def check_new_folder(path: str | Path, replaces: Collection[str] = ()) -> Path:
-    """The path at which `folder_on_success` would create a folder; `OutputError` if it could not. Call it before long
-    work.
+    """The path where `folder_on_success` would create a folder; `OutputError` if it could not.
+
+    Call it before long work.
     """
     path = _resolve_link(Path(path))
     folder = path.parent

@@ -50,9 +50,7 @@ class ClosestPoints:
     def _correspondences(
         self, here: Float[Floats, "N P 6"], there: Float[Floats, "N Q 6"]
     ) -> tuple[Int[Ints, "N P"], Int[Ints, "N Q"]]:
-        """Indices of the closest target point for each shape query, and of the closest shape point for each target
-        query.
-        """
+        """Indices of the target points closest to the shape's queries, and of the shape points closest to the target's."""
         to_target = nearest(self._features[1], here.reshape(-1, 6)).reshape(here.shape[:2])
         return to_target, nearest(self._features[0], there.reshape(-1, 6)).reshape(there.shape[:2])
 

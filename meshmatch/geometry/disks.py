@@ -65,8 +65,7 @@ class Disk:
     def laid_flat(
         self, verts: Float[Floats, "V 3"], rim: Float[Floats, "R 2"] | None = None, side: float = 1.0
     ) -> Float[Floats, "M 2"] | None:
-        """Positions of the vertices in the plane: one to one if the border is convex, otherwise with as little stretch
-        as found.
+        """Map the vertices to the plane: one to one if the border is convex, otherwise with as little stretch as found.
 
         Parameters
         ----------
@@ -124,8 +123,9 @@ class _Springs:
         self.order = row_of[self.column[self.inner]]
 
     def equilibrium(self, scales: Float[Floats, " M"], places: Float[Floats, "R 2"]) -> Float[Floats, "M 2"]:
-        """Positions (M, 2) where each free vertex is the weighted mean of its neighbors; weights are multiplied by the
-        ``scales`` of the neighbors.
+        """Positions (M, 2) where each free vertex is the weighted mean of its neighbors.
+
+        Weights are multiplied by the ``scales`` of the neighbors.
         """
         N, result = len(self.free), np.zeros((len(scales), 2))
         result[self.fixed] = places

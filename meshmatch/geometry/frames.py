@@ -13,8 +13,9 @@ from meshmatch.errors import InputError
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Frame(Brief, Pickled):
-    """A similarity between a file's coordinates and a model's; with a reflection for a shape that matches in mirror
-    image.
+    """A similarity between a file's coordinates and a model's.
+
+    It contains a reflection for a shape that is fitted in mirror image.
 
     Attributes
     ----------

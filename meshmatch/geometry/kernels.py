@@ -1,8 +1,7 @@
-"""Kernels of moving least squares: a node's weight by distance, up to its support radius, and whether a point has
-enough nodes.
+"""Kernels of moving least squares, and which points have enough nodes in reach.
 
-To add a kernel, add its name to `Kernel` and its functions to `KERNELS` and `CURVATURES`. The functions take NumPy
-arrays and torch tensors alike.
+A kernel is a node's weight by distance, up to its support radius. To add one, add its name to `Kernel` and its
+functions to `KERNELS` and `CURVATURES`. The functions take NumPy arrays and torch tensors alike.
 """
 
 from __future__ import annotations
@@ -91,8 +90,9 @@ def poorly_supported(
     kernel: Kernel = "smooth",
     margin: float = 30.0,
 ) -> Int[Ints, " N"]:
-    """Indices of the points without four clearly non-coplanar nodes in reach; ``margin`` multiplies
-    `MINIMUM_EIGENVALUE`.
+    """Indices of the points without four clearly non-coplanar nodes in reach.
+
+    A node set is accepted if its smallest eigenvalue is at least ``margin`` times `MINIMUM_EIGENVALUE`.
     """
     radii = np.broadcast_to(np.asarray(radius, np.float64), (len(nodes),))
     row, column = support_pairs(points, nodes, radii)

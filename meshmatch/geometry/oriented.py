@@ -71,9 +71,7 @@ class OrientedPoints:
         return self if step <= 1 else self.rows(slice(None, None, step))
 
     def drawn(self, count: int, rng: np.random.Generator) -> Float[Floats, "N 3"]:
-        """At most ``count`` distinct points, drawn with probability proportional to the weights, or uniformly without
-        them.
-        """
+        """At most ``count`` distinct points, drawn uniformly, or with probability proportional to the weights."""
         share = None if self.weights is None else self.weights / self.weights.sum()
         available = len(self.points) if share is None else np.count_nonzero(share)
         return self.points[rng.choice(len(self.points), min(count, available), replace=False, p=share)]

@@ -77,9 +77,7 @@ def _multigrid(matrix: csr_array) -> Callable[[Floats], Floats]:
 
 
 def _is_cheap(first: csr_array, second: csr_array, entries: int = 0) -> bool:
-    """Whether a sparse product takes at most `_MAX_WORK` multiplications per entry; ``entries`` defaults to those of
-    ``first``.
-    """
+    """Whether a sparse product takes at most `_MAX_WORK` multiplications per entry (by default entries of ``first``)."""
     return int(np.diff(second.indptr)[first.indices].sum(dtype=np.int64)) <= _MAX_WORK * (entries or first.nnz)
 
 

@@ -1,9 +1,9 @@
-"""Matrix logarithms and exponentials of many symmetric 3 x 3 matrices, stored as six rows of entries: xx xy xz yy yz
-zz.
+"""Matrix logarithms and exponentials of many symmetric 3 x 3 matrices.
 
-A matrix function is evaluated as Newton's interpolation polynomial at the eigenvalues, which have a closed form in
-cosines. Nearly equal eigenvalues are harmless: divided differences are computed without cancellation, and the error of
-the second one is multiplied by nearly zero. This takes a seventh of the time of eigenvectors.
+Matrices are stored as six rows of entries: xx xy xz yy yz zz. A matrix function is evaluated as Newton's interpolation
+polynomial at the eigenvalues, which have a closed form in cosines. Nearly equal eigenvalues are harmless: divided
+differences are computed without cancellation, and the error of the second one is multiplied by nearly zero. This takes
+a seventh of the time of eigenvectors.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ def logarithm(S: Float[Floats, "6 G"], least: float) -> Float[Floats, "6 G"]:
     def slope(a: Floats, b: Floats) -> Floats:
         return _divided(np.log1p, (a - b) / b) / b
 
-    singular = low <= 10 * least
-    if singular.any():
-        high, middle, low = (np.where(singular, 1.0, each) for each in (high, middle, low))
+    nearly_singular = low <= 10 * least
+    if nearly_singular.any():
+        high, middle, low = (np.where(nearly_singular, 1.0, each) for each in (high, middle, low))
     result = _newton_polynomial(S, (high, middle, low), np.log(high), slope(high, middle), slope(middle, low))
-    if singular.any():
-        values, axes = np.linalg.eigh(matrices_of(S[:, singular]))
+    if nearly_singular.any():
+        values, axes = np.linalg.eigh(matrices_of(S[:, nearly_singular]))
         logs = np.log(np.maximum(values, least))
-        result[:, singular] = entries_of((axes * logs[:, None, :]) @ axes.transpose(0, 2, 1))
+        result[:, nearly_singular] = entries_of((axes * logs[:, None, :]) @ axes.transpose(0, 2, 1))
     return result
 
 
@@ -81,9 +81,7 @@ def _newton_polynomial(
     first: Float[Floats, " G"],
     second: Float[Floats, " G"],
 ) -> Float[Floats, "6 G"]:
-    """Evaluate Newton's polynomial at S: a value at the first node and divided differences to the second and to the
-    third.
-    """
+    """Evaluate Newton's polynomial at S, from a value at the first node and two divided differences between nodes."""
     high, middle, low = nodes
     gap = high - low
     curve = np.divide(first - second, gap, out=np.zeros_like(gap), where=gap > 0)

@@ -157,8 +157,7 @@ def closest_on_triangles(
 def covering_balls(
     triangles: Float[Floats, "N 3 3"],
 ) -> tuple[Int[Ints, " M"], Float[Floats, "M 3"], Float[Floats, " M"]]:
-    """Balls that together cover triangles; large triangles get several along their longest side, so that balls stay
-    small.
+    """Balls that together cover triangles; large triangles get several small ones along their longest side.
 
     There are at most three times as many balls as triangles.
 
@@ -303,7 +302,7 @@ class FacesAround:
 
 
 def directed_edges(faces: Int[Ints, "F 3"]) -> Int[Ints, " F_times_3"]:
-    """(3 F,) twice the key of each edge of each face (`edge_keys`), plus 1 if the face traverses it from the smaller
+    """(3 F,) twice the key of each face's edges (`edge_keys`), plus 1 if traversed from the smaller to the larger
     vertex.
     """
     keys = edge_keys(faces, _stride(faces))

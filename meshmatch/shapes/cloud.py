@@ -72,8 +72,8 @@ def roughness(points: Float[Floats, "V 3"]) -> float:
 
 
 def outlier_points(points: Float[Floats, "V 3"], far: float = 3.0) -> Bool[Bools, " V"]:
-    """Whether a point is ``far`` times farther from its neighbors than they are from theirs, and than is usual in the
-    cloud.
+    """Whether each point is an outlier: ``far`` times farther from its neighbors than they are from theirs, and than
+    usual.
     """
     from meshmatch.geometry.trees import cKDTree
 
@@ -112,9 +112,7 @@ def _subset(points: Floats) -> Floats:
 
 
 def _neighbourhoods(points: Floats) -> tuple[Floats, Floats, Ints, int, float]:
-    """The subset of points; distance and index (P, k + 1) of their neighbors, themselves first; k; and the noise in
-    0..1.
-    """
+    """A subset of the points; distance and index (P, k + 1) of their neighbors, themselves first; k; the noise in 0..1."""
     part = np.ascontiguousarray(_subset(points), float)
     return part, *_neighbours(part.tobytes())
 

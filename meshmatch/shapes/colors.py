@@ -1,8 +1,7 @@
-"""Color conversions between sRGB, as files store colors, and linear light, in which averages are taken; and colors of
-labels.
+"""Color conversions between sRGB and linear light, and colors of labels.
 
-sRGB is IEC 61966-2-1. An even mix of black and white is 188 of 255 in sRGB, not 128: colors must be mixed as linear
-light.
+Files store colors as sRGB (IEC 61966-2-1), but averages must be taken of linear light: an even mix of black and white
+is 188 of 255 in sRGB, not 128.
 """
 
 from __future__ import annotations

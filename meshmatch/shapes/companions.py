@@ -76,9 +76,7 @@ def _spellings(name: str, uri: bool) -> Iterator[str]:
 
 
 def _parts(name: str) -> list[str]:
-    """The folders and the file name of a path, without its drive and parent references; at most `_MAX_DEPTH` of the
-    last ones.
-    """
+    """The folders and file name of a path, at most `_MAX_DEPTH`, without its drive; parent references are resolved."""
     parts: list[str] = []
     for part in _DRIVE.sub("", name, count=1).replace("\\", "/").split("/"):
         if part == "..":

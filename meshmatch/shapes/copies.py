@@ -14,12 +14,12 @@ _TOLERANCE = 1e-4  # maximum deviation of a copy's vertices from the affine imag
 
 
 def counterparts(shape: Shape, lost: Bool[Bools, " V"]) -> Int[Ints, " V"]:
-    """Match dropped meshes of a scene with kept meshes that they are copies of, such as the same figure at another
-    node.
+    """Match dropped meshes of a scene with kept meshes that they are copies of.
 
-    Returns, for each vertex of a mesh that is ``lost`` as a whole, the corresponding vertex of the kept mesh; -1 for
-    all other vertices. All are -1 unless every kept mesh has a lost copy, because single meshes, such as shoes, are
-    often copies of one another. Among identical meshes the first lost one corresponds to the first kept one, and so on.
+    Such copies are the same figure at another node, for example. Returns, for each vertex of a mesh that is ``lost`` as
+    a whole, the corresponding vertex of the kept mesh; -1 for all other vertices. All are -1 unless every kept mesh has
+    a lost copy, because single meshes, such as shoes, are often copies of one another. Among identical meshes the first
+    lost one corresponds to the first kept one, and so on.
     """
     found, none = np.full(shape.V, -1), np.full(shape.V, -1)
     counts = [count for _, count in shape.meshes]

@@ -1,5 +1,6 @@
-"""Mesh simplification. The only module that imports pymeshlab, which is optional and under the GPL; no main code path
-uses it.
+"""Mesh simplification.
+
+The only module that imports pymeshlab, which is optional and under the GPL; the other modules do not need it.
 """
 
 from __future__ import annotations
@@ -81,8 +82,9 @@ def _fast(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Ints]:
 
 
 def _by_pymeshlab(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Ints]:
-    """Well-shaped triangles with the same topology. Without Debian's libopengl0 some filters are missing without an
-    error.
+    """Well-shaped triangles with the same topology.
+
+    Without Debian's libopengl0 pymeshlab silently lacks some filters.
     """
     try:
         import pymeshlab

@@ -37,10 +37,10 @@ def coherence(shape: Shape) -> float:
 
 
 def remove_noise(shape: Shape, parts: int = 1) -> tuple[Shape, int]:
-    """A mesh with ``parts`` parts, smoothed if its noise is as large as its triangles; and the number of passes, 0 if
-    unchanged.
+    """Smooth a mesh with ``parts`` parts if its noise is as large as its triangles.
 
-    Smoothing follows Taubin, *A signal processing approach to fair surface design* (SIGGRAPH 1995).
+    Returns the mesh, and the number of passes, 0 if it is unchanged. Smoothing follows Taubin, *A signal processing
+    approach to fair surface design* (SIGGRAPH 1995).
     """
     if shape.F < _MIN_TRIANGLES * parts or coherence(shape) >= _MIN_COHERENCE:
         return shape, 0

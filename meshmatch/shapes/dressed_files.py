@@ -170,8 +170,9 @@ def save_colored(path: Path, shape: Shape, file: Path | None, turn: Float[Floats
 
 
 def glb_base(file: Path | None, shape: Shape) -> tuple[Path, bytes, bool]:
-    """The glTF file that data is added to: its name and content, and whether it is the original rather than made of the
-    shape.
+    """The glTF file that data is added to, as a name and its content, and whether it is the original file.
+
+    Otherwise it is a new glb of the shape.
     """
     if file is not None and file.suffix.lower() in gltf.SUFFIXES:
         data = read_bytes(file)
@@ -184,8 +185,9 @@ def glb_base(file: Path | None, shape: Shape) -> tuple[Path, bytes, bool]:
 
 
 def tell_lost(file: Path | None, path: Path, kept: bool = True) -> None:
-    """Warn about what an output lacks of its original file; nothing if both have the same format and all of it was
-    ``kept``.
+    """Warn about what an output lacks of its original file.
+
+    Nothing is missing if both have the same format and all of it was ``kept``.
     """
     before, after = ("" if each is None else each.suffix.lower() for each in (file, path))
     after = ".glb" if blender.is_converted(path) else after  # Blender writes these through a glb

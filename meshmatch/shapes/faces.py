@@ -228,9 +228,7 @@ def _find_hull(verts: Floats, faces: Ints, part: Ints) -> int | None:
 
 
 def _find_ground(verts: Floats, faces: Ints, part: Ints, cross: Floats) -> int | None:
-    """The part with the largest area, if it is simple and flat, extends far beyond all others, and has them on one
-    side.
-    """
+    """The largest part, if it is simple and flat, extends far beyond all others, and has them on one side."""
     areas = np.bincount(part, np.sqrt(squared_lengths(cross)))
     largest = int(areas.argmax())
     in_largest = part == largest
@@ -251,8 +249,9 @@ def _find_ground(verts: Floats, faces: Ints, part: Ints, cross: Floats) -> int |
 
 
 def _gaps(verts: Floats, faces: Ints, face_areas: Floats, part: Ints, body: Ints, others: Ints) -> tuple[Floats, float]:
-    """Distance (parts,) of each of the `others` to the parts in `body`, infinite beyond `_MIN_FAR_GAP`, 0 for the rest;
-    and the diagonal of the body.
+    """Distance (parts,) of each of the `others` to the parts in `body`, and the diagonal of the body.
+
+    Distances are infinite beyond `_MIN_FAR_GAP`, and 0 for parts that are not among the others.
     """
     from meshmatch.geometry.trees import cKDTree
 

@@ -1,8 +1,7 @@
-"""Read shapes from files, arrays and meshes of other libraries, and write them to files; the suffix determines the
-format.
+"""Read shapes from files, arrays and meshes of other libraries, and write them to files.
 
-All vertices of a file are kept, in the file's order, because a map must answer for each of them: nothing is merged,
-split or dropped here (`meshmatch.shapes.repair` does that). Polygons are triangulated.
+The suffix determines the format. All vertices of a file are kept, in the file's order, because a map must answer for
+each of them: nothing is merged, split or dropped here (`meshmatch.shapes.repair` does that). Polygons are triangulated.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ _WRITERS = {suffix: write for suffix, (_, write) in _FORMATS.items() if write is
 SUFFIXES = tuple(_FORMATS)
 """Suffixes that `load_shape` reads."""
 PLAIN_SUFFIXES = tuple(suffix for suffix in SUFFIXES if suffix not in blender.SUFFIXES)
-"""Suffixes that need no Blender: those that are looked for in folders."""
+"""Suffixes that need no Blender; only these are searched for in folders."""
 check_suffix = partial(tables.check_suffix, suffixes=_WRITERS, what="shapes")
 _CLOUD_SUFFIXES = (".xyz", ".npy")  # formats without faces
 
@@ -130,12 +129,12 @@ class _NamedShape:
 
     @cached_property
     def parts(self) -> Parts:
-        return Parts.select(self.shape, bases=True)
+        return Parts.of(self.shape, bases=True)
 
     @cached_property
     def _connected_parts(self) -> Parts:
         """The connected parts, with the bases that they are fused with."""
-        return Parts.select(self.shape) if self.parts.bases else self.parts
+        return Parts.of(self.shape) if self.parts.bases else self.parts
 
     def select(self, pattern: str) -> Bool[Bools, " V"] | None:
         """The vertices of the meshes that match a name, or of the part with a number; None if there is none.
@@ -272,9 +271,7 @@ def save_shape(path: str | Path, shape: ShapeLike) -> None:
 
 
 def save_upright(path: Path, shape: Shape, turn: Float[Floats, "3 3"] | None) -> bool:
-    """As `save_shape`, but a glb gets a node with the rotation ``turn``, which makes y the up axis. Returns whether it
-    has one.
-    """
+    """As `save_shape`, but in a glb a node with the rotation ``turn`` makes y the up axis; return whether there is one."""
     turned = path.suffix.lower() == ".glb" and turn is not None and not np.array_equal(turn, np.eye(3))
     if turned:
         with replace_on_success(path) as temporary:
@@ -285,8 +282,9 @@ def save_upright(path: Path, shape: Shape, turn: Float[Floats, "3 3"] | None) ->
 
 
 def as_scene(source: ShapeLike, shape: Shape) -> tuple[Path, bytes, bool]:
-    """A shape as an editable glTF scene: path and content of its file, and True, if it is a glTF file; else those of a
-    new glb.
+    """A shape as an editable glTF scene: a path, its content, and whether it is the shape's own glTF file.
+
+    Otherwise it is a new glb with one mesh.
     """
     file = as_path(source) if isinstance(source, str | Path) else None
     if file is not None and file.suffix.lower() in gltf.SUFFIXES:

@@ -54,10 +54,9 @@ def stem_of(path: PurePath) -> str:
 
 
 def existing(path: Path, hint: str = "", suffixes: tuple[str, ...] = ()) -> Path:
-    """The path; `InputError` unless it is a regular file that can be read, is not empty and at most `LARGEST_FILE`
-    large.
+    """Check that a path is a regular, readable, nonempty file of at most `LARGEST_FILE` bytes, and return it.
 
-    The error's hint is `hint`, or suggests the most similar name of a file with one of ``suffixes``.
+    Otherwise `InputError`. Its hint is `hint`, or suggests the most similar name of a file with one of ``suffixes``.
     """
     try:
         if path.is_dir():

@@ -1,8 +1,8 @@
 """Landmark files: tables of vertices or positions, JSON, MeshLab's picked points, 3D Slicer's markups, the .pts and
 .tps files of landmark editors, the text formats of Amira and Morphologika.
 
-Files are parsed here; `meshmatch.transfer.landmarks` places the landmarks on a shape. 3D Slicer writes points and
-meshes in one of two frames, LPS or RAS, which differ in the signs of x and y, and names it in the file.
+Files are parsed here; `meshmatch.transfer.landmarks` places the landmarks on a shape. 3D Slicer names the frame of
+points and meshes in their files: LPS or RAS, which differ in the signs of x and y.
 """
 
 from __future__ import annotations
@@ -72,9 +72,7 @@ class LandmarkFile:
 
 
 def mesh_space(path: str | Path) -> Space:
-    """The frame that 3D Slicer wrote into the header of a mesh file, "" if none; LPS for label maps, which are read in
-    that frame.
-    """
+    """The frame in the header of a mesh file that 3D Slicer wrote, else ""; label maps are read in LPS."""
     if suffix_of(Path(path)) in LABEL_MAP_SUFFIXES:
         return "LPS"
     try:
@@ -176,7 +174,7 @@ def _read_npy(path: Path) -> list[Record]:
 
 
 def _read_table(path: Path, shape: str) -> list[Record]:
-    """Landmarks of a table: one row each with a vertex or three coordinates, optionally after a name; or named columns.
+    """Landmarks of a table: rows of a vertex or three coordinates, with or without a name; or named columns.
 
     One of the named columns may name the specimen.
     """
@@ -197,12 +195,11 @@ def _read_table(path: Path, shape: str) -> list[Record]:
         head = _default_columns(rows[0])
         numbers = [k for k, name in enumerate(head) if name != "name"]
         if len(rows) > 1 and not any(is_number(rows[0][k]) for k in numbers):
-            # the first row has unknown column names
-            rows = rows[1:] if all(is_number(rows[1][k]) for k in numbers) else rows
+            rows = rows[1:] if all(is_number(rows[1][k]) for k in numbers) else rows  # unknown column names
     if "specimen" in head:
         specimen_column = head.index("specimen")
         specimens = list(dict.fromkeys(row[specimen_column] for row in rows))
-        chosen = specimens[_find_specimen([{each} for each in specimens], shape)]
+        chosen = specimens[_find_index([{each} for each in specimens], shape)]
         rows = [row for row in rows if row[specimen_column] == chosen]
     name_column = next((name for name in _NAME_COLUMNS if name in head), "")
     numeric = [k for k, name in enumerate(head) if name in ("x", "y", "z", "w0", "w1", "w2")]
@@ -329,9 +326,7 @@ def _read_pts(path: Path) -> list[Record]:
 
 
 def _read_tps(path: Path, shape: str) -> list[Record]:
-    """Landmarks of one specimen (LM3=), then the points of its curves; of several specimens, the one with the shape's
-    name.
-    """
+    """Landmarks of one specimen (LM3=), then the points of its curves; of several, those of the shape's name."""
     specimens: list[tuple[list[list[float]], dict[str, str]]] = []
     for line in read_text(path, _RECORD_BYTES).splitlines():
         key, has_value, value = (part.strip() for part in line.partition("="))
@@ -351,17 +346,13 @@ def _read_tps(path: Path, shape: str) -> list[Record]:
             specimens[-1][0].append(_parse_three(words, str(len(specimens[-1][0]))))
     if not specimens:
         return []
-    points, fields = specimens[
-        _find_specimen([{fields.get("ID", ""), fields.get("IMAGE", "")} for _, fields in specimens], shape)
-    ]
-    scale = number(fields.get("SCALE", "1"))
+    points, meta = specimens[_find_index([{meta.get("ID", ""), meta.get("IMAGE", "")} for _, meta in specimens], shape)]
+    scale = number(meta.get("SCALE", "1"))
     return [{"position": [scale * each for each in point]} for point in points]
 
 
 def _morphologika_records(text: str, shape: str) -> list[Record]:
-    """Landmarks of one specimen of a Morphologika file, whose sections have names in brackets; one section has all
-    points.
-    """
+    """Landmarks of one specimen of a Morphologika file: sections with names in brackets, one with all points."""
     sections: dict[str, list[str]] = {}
     for line in filter(None, map(str.strip, text.splitlines())):
         if line.startswith("["):
@@ -378,12 +369,12 @@ def _morphologika_records(text: str, shape: str) -> list[Record]:
     if S == 0 or len(points) != S * L:
         raise InputError(f"it has {len(points)} points, not {L} landmarks of {S} individuals")
     names = sections.get("names", [])
-    first = L * _find_specimen([{name} for name in names] if len(names) == S else [set()] * S, shape)
+    first = L * _find_index([{name} for name in names] if len(names) == S else [set()] * S, shape)
     return [{"position": _parse_three(words, str(k))} for k, words in enumerate(points[first : first + L])]
 
 
-def _find_specimen(ids: Sequence[Collection[str]], shape: str) -> int:
-    """Index of the specimen that a shape is, by its names: those of the shape, or of its file with a suffix."""
+def _find_index(ids: Sequence[Collection[str]], shape: str) -> int:
+    """Index of the specimen whose names include that of the shape, or of its file with a suffix."""
     matches = [0] if len(ids) == 1 else []
     for part in ("name", "stem"):
         labels = [{getattr(PureWindowsPath(name), part) for name in names} for names in ids]
@@ -490,10 +481,9 @@ def _description(confidence: float) -> str:
 def markups_record(
     points: Iterable[tuple[str, Sequence[float], float]], space: Space, lists: Sequence[Markup] = ()
 ) -> dict[str, Any]:
-    """3D Slicer markups (.mrk.json), from names, positions and confidences, in a frame; in the lists that they come
-    from.
+    """3D Slicer markups (.mrk.json), from names, positions and confidences, in a frame, in one list or in ``lists``.
 
-    Such lists are curves, for example. A position that is nan is undefined.
+    A position that is nan is undefined.
     """
     controls: list[dict[str, Any]] = []
     for k, (name, position, confidence) in enumerate(points, 1):

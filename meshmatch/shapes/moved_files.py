@@ -1,5 +1,6 @@
-"""Write meshes with moved vertices: a glb or ply keeps everything in its file but the positions, and an obj keeps its
-text and its materials.
+"""Write meshes with moved vertices.
+
+A glb or ply keeps everything in its file but the positions, and an obj keeps its text and its materials.
 """
 
 from __future__ import annotations
@@ -59,8 +60,7 @@ class MovedFile:
 
     @classmethod
     def planned(cls, output: Path, original: Path | None, into: Path | None = None) -> MovedFile:
-        """Plan an output, or data to put ``into`` another file. Warns about materials and images that are named but
-        missing.
+        """Plan an output, or data to put ``into`` another file; warn about materials and images that are missing.
 
         `OptionError`: the suffix cannot be written, or a copy would replace another file. `InputError`: a material file
         cannot be read.

@@ -66,11 +66,10 @@ def unit_sphere_frame(shape: Shape) -> Frame:
 
 @derived
 def in_single_precision(shape: Shape) -> Shape:
-    """The shape rounded to single precision, as many formats store it, so that it is fitted in the same way from any
-    file.
+    """The shape rounded to single precision, as many formats store it.
 
-    Two interpretations of a pose may fit so nearly alike that rounding decides between them. Shapes far from the
-    origin, which rounding would change noticeably, are returned unchanged.
+    It is then fitted in the same way from any file: two interpretations of a pose may fit so nearly alike that rounding
+    decides between them. Shapes far from the origin, which rounding would change noticeably, are returned unchanged.
     """
     with np.errstate(over="ignore"):  # values beyond single precision become infinite
         verts = shape.verts.astype(np.float32).astype(np.float64)
@@ -94,9 +93,7 @@ def long_axis(shape: Shape) -> str | None:
 
 
 def guess_unit(shape: Shape) -> str | None:
-    """The unit in which the shape is as long as a standing person; None if there is none, or its area is too large for
-    a person.
-    """
+    """The unit in which the shape is as long as a standing person; None if there is none, or its area is too large."""
     length = float((shape.bounds[1] - shape.bounds[0]).max())
     if not shape.is_cloud and length < _MIN_SLENDERNESS * np.sqrt(shape.area):
         return None
@@ -105,8 +102,9 @@ def guess_unit(shape: Shape) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """An alignment: shape = pose.to_world(target), as in a core frame; and its mean capped distance both ways, normals
-    included.
+    """An alignment: shape = pose.to_world(target), as in a core frame.
+
+    Its residual is the mean capped distance in both directions, normals included.
     """
 
     pose: RigidPose

@@ -32,12 +32,11 @@ _MIN_VISIBLE_SHARE = 0.2  # minimum share of the area that must be visible
 
 @derived
 def without_hidden(shape: Shape) -> Shape:
-    """A mesh of several connected parts without the faces that are invisible from outside; other shapes are returned
-    unchanged.
+    """Remove the faces that are invisible from outside from a mesh of several connected parts.
 
-    All vertices are kept. A shape is also unchanged if few or nearly all faces are hidden, as of foliage; if it is so
-    large that depth maps would be too coarse; or if its weights vary, because vertices of weight 0 must not hide
-    others.
+    All vertices are kept. Other shapes are returned unchanged, and so is a shape of which little or nearly everything
+    is hidden, as of foliage; one so large that depth maps would show too little; and one whose weights vary, because
+    vertices of weight 0 must not hide others.
     """
     if shape.is_cloud or (shape.weights is not None and np.ptp(shape.weights[shape.faces]) > 0):
         return shape

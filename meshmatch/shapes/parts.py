@@ -254,9 +254,7 @@ def _is_simple(verts: Float[Floats, "V 3"], centers: Float[Floats, "F 3"], area:
 
 
 def _sample_parts(parts: Parts, unit: float) -> tuple[Float[Floats, "S 3"], Int[Ints, " S"]]:
-    """About `_SAMPLES` points, evenly distributed on each part, a few on every one; and the number of each point's
-    part.
-    """
+    """About `_SAMPLES` points, evenly distributed on each part, a few on every one; and the part of each point."""
     shape = parts.shape
     order = np.argsort(parts.faces, kind="stable")
     order = order[np.count_nonzero(parts.faces == 0) :]

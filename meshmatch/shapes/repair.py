@@ -98,8 +98,9 @@ def repair(shape: Shape) -> Repaired:
 
 
 def turned_outwards(shape: Shape) -> Shape:
-    """The shape with faces oriented as by `repair`, and no other change: nodes of negative scale and some scans are
-    inside out.
+    """The shape with faces oriented as by `repair`, and no other change.
+
+    Nodes of negative scale, and some scans, are inside out.
     """
     has_area = np.flatnonzero(shape.face_areas > 0)
     if not len(has_area):

@@ -18,9 +18,7 @@ SHEET = 3.5  # minimum length of all rims of a sheet: no flat shape has less tha
 
 
 def rim_lengths(shape: Shape) -> Float[Floats, " V"]:
-    """Length of the connected boundary at each vertex, in units of sqrt(area); 0 for vertices that are not on a
-    boundary.
-    """
+    """Length of the connected boundary at each vertex, in units of sqrt(area); 0 for vertices that are on none."""
     edges = shape.edges.open
     graph = coo_matrix((np.ones(len(edges)), edges.T), (shape.V, shape.V))
     rim = connected_components(graph, directed=False)[1]
@@ -37,9 +35,7 @@ def is_sheet(shape: Shape) -> bool:
 
 
 def rim_corners(shape: Shape) -> Int[Ints, "E 3"]:
-    """Both ends of each edge of a rim, and the third corner of its triangle; shorter boundaries, such as cracks, are
-    ignored.
-    """
+    """Both ends of each edge of a rim, and the third corner of its triangle; shorter boundaries (cracks) are ignored."""
     faces = np.asarray(shape.faces)
     corners = np.concatenate([faces, faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]])
     corners = corners[(rim_lengths(shape) > RIM)[corners[:, :2]].all(axis=1)]

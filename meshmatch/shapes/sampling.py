@@ -22,11 +22,11 @@ _MAX_EDGE = 3.0  # maximum edge length, relative to the median distance of the s
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Samples(OrientedPoints):
-    """Points on a shape in its own frame, with the normals of their faces; those of a cloud are estimated, without
-    reliable signs.
+    """Points on a shape in its own frame, with the normals of their faces.
 
-    `face` is the face of each point (-1 for a cloud), and `barycentric` its weights there, which sum to 1 ((1, 0, 0)
-    for a cloud); `vertex` is the corner with the largest weight, or the drawn point of the cloud.
+    Normals of a cloud are estimated, without reliable signs. `face` is the face of each point (-1 for a cloud), and
+    `barycentric` its weights there, which sum to 1 ((1, 0, 0) for a cloud); `vertex` is the corner with the largest
+    weight, or the drawn point of the cloud.
     """
 
     face: Int[Ints, " P"]
@@ -64,11 +64,10 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
 
 
 def farthest_points(points: Float[Floats, "N D"], K: int) -> Int[Ints, " K"]:
-    """Farthest point sampling: indices of points that are each as far as possible from all previous ones, starting with
-    the first.
+    """Farthest point sampling: indices of points that are each as far as possible from all previous ones.
 
-    Takes K passes over the points. With fewer distinct points than `K` the last ones repeat positions, never indices.
-    `InputError` if there are fewer points.
+    The first point is the start. Takes K passes over the points. With fewer distinct points than `K` the last ones
+    repeat positions, never indices. `InputError` if there are fewer points.
     """
     points = np.asarray(points, np.float64)
     if not 0 < K <= len(points):
@@ -102,8 +101,7 @@ def _draw_points(areas: Floats, P: int, rng: np.random.Generator) -> Ints:
 
 
 def triangulate_cloud(cloud: Shape, most: int) -> tuple[Int[Ints, " V"], Int[Ints, "F 3"]]:
-    """Triangulate some points of a cloud: triangles of each point's Delaunay star in its tangent plane on which stars
-    agree.
+    """Triangulate some points of a cloud by the triangles on which their Delaunay stars in the tangent planes agree.
 
     After the localized Delaunay triangulation of Gopi, Krishnan and Silva (*Surface Reconstruction based on Lower
     Dimensional Localized Delaunay Triangulation*, 2000): a triangle is kept if it is in the stars of all three corners.

@@ -116,8 +116,9 @@ class Shape(Pickled):
     def with_invalid(
         cls, verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], name: str, colors: Float[Floats, "V 4"] | None = None
     ) -> Shape:
-        """A shape from positions that may be NaN or infinite: these are marked in ``invalid``, and moved to the
-        centroid of the others.
+        """A shape from positions that may be NaN or infinite.
+
+        Such positions are marked in ``invalid``, and moved to the centroid of the others.
 
         Parameters
         ----------

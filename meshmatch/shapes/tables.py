@@ -347,15 +347,14 @@ def _has_decimal_commas(row: list[str]) -> bool:
 
 
 def _is_number_row(words: list[str]) -> bool:
-    """Whether all words but the first are numbers without a leading or trailing comma, and the first does not end in
-    one.
-    """
+    """Whether all words but the first are numbers without a comma at either end, and the first does not end in one."""
     return all(is_number(word) and not word.startswith(",") for word in words[1:]) and not words[0].endswith(",")
 
 
 def _is_single_column(text: str, whole: bool) -> bool | None:
-    """Whether lines such as 0,5 are a column with decimal commas: False for columns of whole numbers, None if
-    ambiguous.
+    """Whether lines such as 0,5 are a column with decimal commas; None if ambiguous.
+
+    False means that they are columns of whole numbers.
     """
     head = next((line for line in _lines(text) if line.strip()), "")
     header = head if not all(map(is_number, next(_split([head], ",")))) else ""
@@ -396,11 +395,10 @@ def check_suffix(path: str | Path, suffixes: Iterable[str], what: str) -> str:
 
 
 def read_by_suffix(path: str | Path, readers: Mapping[str, Callable[[Path], T]], what: str, hint: str) -> T:
-    """Read a file with the reader for its suffix; `InputError` if there is none, or the file is missing, empty or
-    damaged.
+    """Read a file with the reader for its suffix.
 
-    Messages begin with the file's name. Errors of a reader keep their class and message, and get `hint` if they have
-    none.
+    `InputError` if there is none, or the file is missing, empty or damaged. Messages begin with the file's name. Errors
+    of a reader keep their class and message, and get `hint` if they have none.
     """
     path = existing(as_path(path), hint)
     suffix = path.suffix.lower()
@@ -460,9 +458,7 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
 
 
 def short_floats(values: np.ndarray) -> list[Any]:
-    """Convert float32 numbers to the floats with the fewest digits that read back as the same float32; nan becomes
-    None.
-    """
+    """Convert float32 to the floats with the fewest digits that read back as the same float32; nan becomes None."""
     floats = values.astype(np.float32).astype(np.str_).astype(np.float64)
     found = floats.astype(object)
     found[np.isnan(floats)] = None

@@ -88,9 +88,7 @@ def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] |
 
 
 def files_of(path: Path, layers: Collection[Layer] = (), tiles: Iterable[int | str] = ()) -> list[Path]:
-    """The files that an output consists of: an obj has an mtl and images, one for each map of these layers and each
-    tile (UDIM).
-    """
+    """The files of an output: an obj has an mtl, and images for each map of these layers and each tile (UDIM)."""
     if path.suffix.lower() != ".obj":
         return [path]
     shown = [word for layer in layers for word in _LAYER_IMAGES.get(layer, ())]

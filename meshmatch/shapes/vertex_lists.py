@@ -1,5 +1,4 @@
-"""Lists of vertex indices: pairs of corresponding vertices of two shapes (landmarks, ground truth), or vertices of one
-shape.
+"""Lists of vertex indices of one shape, and of pairs of vertices of two shapes (landmarks, ground truth).
 
 Text files have one pair, or one vertex, per line: numbers separated by spaces, tabs, commas or semicolons; ``#`` begins
 a comment; a first line of words is a header. ``.npy`` files contain the same as an array of whole numbers. Vertices are
