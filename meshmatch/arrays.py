@@ -51,7 +51,7 @@ class TensorLike(Protocol):
 SomeTensor = TypeVar("SomeTensor", bound=TensorLike)
 
 
-def read_only(values: Any, dtype: type, label: str) -> NDArray[Any]:
+def as_read_only(values: Any, dtype: type, label: str) -> NDArray[Any]:
     """The values as a contiguous, read-only array; copied unless they are one already that owns its data.
 
     `InputError` if the values are not numbers, or rows differ in length; ``label`` names them in the message.
@@ -111,8 +111,8 @@ class Brief:
 
 def table_html(title: str, rows: Mapping[str, str]) -> str:
     """A heading and a table as HTML for a notebook; rows with empty values are left out."""
-    left = '<td style="text-align:left">'
-    lines = [f"<tr>{left}{escape(name)}</td>{left}{escape(value)}</td></tr>" for name, value in rows.items() if value]
+    cell = '<td style="text-align:left">'
+    lines = [f"<tr>{cell}{escape(name)}</td>{cell}{escape(value)}</td></tr>" for name, value in rows.items() if value]
     return f"<b>{escape(title)}</b><table>{''.join(lines)}</table>"
 
 

@@ -31,22 +31,22 @@ def thread_limit(count: int) -> Iterator[None]:
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(count, user_api="blas"):
-        here = _torch_threads()
+        torch_threads = _torch_threads()
         with _lock:
             if _open_blocks == 0:
-                _torch_before = here
+                _torch_before = torch_threads
             _open_blocks += 1
         _set_torch_threads(count)
-        nested = getattr(_thread_state, "depth", 0)
-        _thread_state.depth = nested + 1
+        depth = getattr(_thread_state, "depth", 0)
+        _thread_state.depth = depth + 1
         try:
             yield
         finally:
-            _thread_state.depth = nested
+            _thread_state.depth = depth
             with _lock:
                 _open_blocks -= 1
                 # torch gives a new thread the count that was set last: it must not be that of a block elsewhere
-                _set_torch_threads(here if nested else _torch_before)
+                _set_torch_threads(torch_threads if depth else _torch_before)
 
 
 @contextmanager

@@ -43,24 +43,28 @@ class ClosestPoints:
 
         The queries are transformed rather than the sets they search, so that the search structures stay valid.
         """
-        (shape_queries, target_queries), back = (self._shape_queries, self._target_queries), turns.transpose(0, 2, 1)
-        here = with_normals((shape_queries.points - centers[:, None]) @ turns, shape_queries.normals @ turns)
-        return here, with_normals(target_queries.points @ back + centers[:, None], target_queries.normals @ back)
+        (shape_queries, target_queries), inverse = (self._shape_queries, self._target_queries), turns.transpose(0, 2, 1)
+        shape_local = with_normals((shape_queries.points - centers[:, None]) @ turns, shape_queries.normals @ turns)
+        return shape_local, with_normals(
+            target_queries.points @ inverse + centers[:, None], target_queries.normals @ inverse
+        )
 
     def _correspondences(
-        self, here: Float[Floats, "N P 6"], there: Float[Floats, "N Q 6"]
+        self, shape_local: Float[Floats, "N P 6"], target_world: Float[Floats, "N Q 6"]
     ) -> tuple[Int[Ints, "N P"], Int[Ints, "N Q"]]:
         """Indices of the target points closest to the shape's queries, and of the shape points closest to the target's."""
-        to_target = nearest(self._features[1], here.reshape(-1, 6)).reshape(here.shape[:2])
-        return to_target, nearest(self._features[0], there.reshape(-1, 6)).reshape(there.shape[:2])
+        to_target = nearest(self._features[1], shape_local.reshape(-1, 6)).reshape(shape_local.shape[:2])
+        return to_target, nearest(self._features[0], target_world.reshape(-1, 6)).reshape(target_world.shape[:2])
 
     def residuals(self, poses: list[RigidPose]) -> Float[Floats, " N"]:
         """Mean capped distance both ways for each pose, normals included."""
-        here, there = self._transformed_queries(*_stack_poses(poses))
-        to_target, to_shape = self._correspondences(here, there)
-        far = np.linalg.norm(here - self._features[1][to_target], axis=2)
-        back = np.linalg.norm(there - self._features[0][to_shape], axis=2)
-        return np.asarray(0.5 * np.minimum(far, _MAX_DISTANCE).mean(1) + 0.5 * np.minimum(back, _MAX_DISTANCE).mean(1))
+        shape_local, target_world = self._transformed_queries(*_stack_poses(poses))
+        to_target, to_shape = self._correspondences(shape_local, target_world)
+        forward = np.linalg.norm(shape_local - self._features[1][to_target], axis=2)
+        backward = np.linalg.norm(target_world - self._features[0][to_shape], axis=2)
+        return np.asarray(
+            0.5 * np.minimum(forward, _MAX_DISTANCE).mean(1) + 0.5 * np.minimum(backward, _MAX_DISTANCE).mean(1)
+        )
 
     def nearer(self, poses: list[RigidPose], steps: int) -> list[RigidPose]:
         """Poses after at most ``steps`` iterations from the given ones; converged poses stop early."""
@@ -73,11 +77,11 @@ class ClosestPoints:
         for _ in range(steps):
             R, c = turns[active], centers[active]
             to_target, to_shape = self._correspondences(*self._transformed_queries(R, c))
-            here, there = (
+            shape_points, target_points = (
                 np.broadcast_to(each.points, (len(R), *each.points.shape)) for each in (shape_queries, target_queries)
             )
-            source = np.concatenate([self._target.points[to_target], there], 1)
-            destination = (np.concatenate([here, self._shape.points[to_shape]], 1) - c[:, None]) @ R
+            source = np.concatenate([self._target.points[to_target], target_points], 1)
+            destination = (np.concatenate([shape_points, self._shape.points[to_shape]], 1) - c[:, None]) @ R
             squared = np.square(source - destination).sum(2)
             turn, shift = _kabsch_batch(source, destination, weight / np.square(1.0 + squared / _ROBUST_SCALE**2))
             turns[active], centers[active] = R @ turn, (R @ shift[..., None])[..., 0] + c

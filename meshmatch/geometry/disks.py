@@ -51,16 +51,16 @@ class Disk:
         """The disk that ``faces`` of ``surface`` form; None if they do not form one."""
         vertices, corners = np.unique(surface[faces], return_inverse=True)
         corners, M = corners.reshape(-1, 3), len(vertices)
-        keys, first, count = np.unique(edge_keys(corners, M), return_index=True, return_counts=True)
-        face, side = first[count == 1] % len(faces), first[count == 1] // len(faces)
-        start, end = corners[face, side], corners[face, (side + 1) % 3]
-        after = dict(zip(start.tolist(), end.tolist(), strict=True))
-        if count.max() > 2 or M - len(keys) + len(faces) != 1 or not len(start):
+        keys, first_index, count = np.unique(edge_keys(corners, M), return_index=True, return_counts=True)
+        face, side = first_index[count == 1] % len(faces), first_index[count == 1] // len(faces)
+        tail, head = corners[face, side], corners[face, (side + 1) % 3]
+        successor = dict(zip(tail.tolist(), head.tolist(), strict=True))
+        if count.max() > 2 or M - len(keys) + len(faces) != 1 or not len(tail):
             return None
-        rim = [int(start[0])]
-        while (following := after.get(rim[-1])) is not None and following != rim[0] and len(rim) <= len(start):
+        rim = [int(tail[0])]
+        while (following := successor.get(rim[-1])) is not None and following != rim[0] and len(rim) <= len(tail):
             rim.append(following)
-        return cls(faces, vertices, corners, np.array(rim)) if len(rim) == len(start) else None
+        return cls(faces, vertices, corners, np.array(rim)) if len(rim) == len(tail) else None
 
     def laid_flat(
         self, verts: Float[Floats, "V 3"], rim: Float[Floats, "R 2"] | None = None, side: float = 1.0
@@ -117,8 +117,12 @@ class _Springs:
         row_of = np.full(M, -1)
         row_of[self.free] = np.arange(len(self.free))
         edges = weights.tocoo()
-        own = moves[edges.row]
-        self.row, self.column, self.weight = row_of[edges.row[own]], edges.col[own], edges.data[own]
+        is_free_row = moves[edges.row]
+        self.row, self.column, self.weight = (
+            row_of[edges.row[is_free_row]],
+            edges.col[is_free_row],
+            edges.data[is_free_row],
+        )
         self.inner = moves[self.column]
         self.order = row_of[self.column[self.inner]]
 
@@ -178,19 +182,19 @@ def found_in(
     inside
         (N,) whether the point lies in its triangle.
     """
-    near = (
+    candidates = (
         cKDTree(places[corners].mean(axis=1)).query(points, min(_CANDIDATES, len(corners)))[1].reshape(len(points), -1)
     )
-    a, b, c = (places[corners[near, k]] for k in range(3))
-    own = points[:, None] - a
+    a, b, c = (places[corners[candidates, k]] for k in range(3))
+    offsets = points[:, None] - a
     area = _cross(b - a, c - a)
     area = np.where(np.abs(area) < 1e-300, 1e-300, area)
-    second, third = _cross(own, c - a) / area, _cross(b - a, own) / area
+    second, third = _cross(offsets, c - a) / area, _cross(b - a, offsets) / area
     weights = np.stack([1 - second - third, second, third], axis=2)
     best = np.arange(len(points)), weights.min(axis=2).argmax(axis=1)
     inside = weights[best].min(axis=1) >= -_INSIDE_TOLERANCE
     clipped = np.maximum(weights[best], 0.0)
-    return near[best], clipped / clipped.sum(axis=1, keepdims=True), inside
+    return candidates[best], clipped / clipped.sum(axis=1, keepdims=True), inside
 
 
 def mean_values(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> csr_array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Brief, Float, Floats, Pickled, as_numbers, off_torch, read_only
+from meshmatch.arrays import Brief, Float, Floats, Pickled, as_numbers, as_read_only, off_torch
 from meshmatch.errors import InputError
 
 
@@ -38,8 +38,8 @@ class Frame(Brief, Pickled):
     center: Float[Floats, " 3"]  # file point that becomes the origin
 
     def __post_init__(self) -> None:
-        rotation = read_only(self.rotation, np.float64, "a frame's rotation")
-        center = read_only(self.center, np.float64, "a frame's center")
+        rotation = as_read_only(self.rotation, np.float64, "a frame's rotation")
+        center = as_read_only(self.center, np.float64, "a frame's center")
         scale = as_numbers(self.scale, "a frame's scale")
         if rotation.shape != (3, 3) or center.shape != (3,):
             raise InputError(f"a frame needs a (3, 3) rotation and a (3,) center, not {rotation.shape}, {center.shape}")

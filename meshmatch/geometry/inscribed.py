@@ -24,11 +24,11 @@ def inscribed_diameters(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) ->
     nan where no surface lies opposite, as on a sheet, and at vertices without a triangle.
     """
     normals = vertex_normals(verts, faces)
-    known = np.flatnonzero(np.linalg.norm(normals, axis=1) > 0)
-    points, inwards = verts[known], -normals[known]
-    tree, largest = cKDTree(points), float(np.linalg.norm(np.ptp(points, axis=0))) / 2 if len(known) else 0.0
-    radius = np.full(len(known), largest)
-    active = np.arange(len(known))
+    used = np.flatnonzero(np.linalg.norm(normals, axis=1) > 0)
+    points, inwards = verts[used], -normals[used]
+    tree, largest = cKDTree(points), float(np.linalg.norm(np.ptp(points, axis=0))) / 2 if len(used) else 0.0
+    radius = np.full(len(used), largest)
+    active = np.arange(len(used))
     for _ in range(_MAX_ROUNDS):
         if not len(active):
             break
@@ -46,5 +46,5 @@ def inscribed_diameters(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) ->
         active = active[shrinks]
         radius[active] = smaller[shrinks]
     diameters = np.full(len(verts), np.nan)
-    diameters[known] = np.where(radius < largest, 2 * radius, np.nan)
+    diameters[used] = np.where(radius < largest, 2 * radius, np.nan)
     return diameters

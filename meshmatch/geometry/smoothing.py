@@ -73,7 +73,7 @@ def _multigrid(matrix: csr_array) -> Callable[[Floats], Floats]:
         prolongation = members
     restriction = prolongation.T.tocsr()
     coarser = _multigrid(csr_array(restriction @ matrix @ prolongation))
-    return lambda rest: inverse * rest + prolongation @ coarser(restriction @ rest)
+    return lambda vector: inverse * vector + prolongation @ coarser(restriction @ vector)
 
 
 def _is_cheap(first: csr_array, second: csr_array, entries: int = 0) -> bool:

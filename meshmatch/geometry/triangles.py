@@ -136,10 +136,10 @@ def closest_on_triangles(
     w = (d00 * d21 - d01 * d20) / scale
     result = np.empty((len(points), 3))
     result[:, 0], result[:, 1], result[:, 2] = 1 - v - w, v, w
-    flat = ~(area > 1e-14 * d00 * d11)
+    is_degenerate = ~(area > 1e-14 * d00 * d11)
     best = np.full(len(points), np.inf)
     for i, j, beyond in ((0, 1, w < 0), (1, 2, v + w > 1), (2, 0, v < 0)):
-        rows = np.flatnonzero(beyond | flat)
+        rows = np.flatnonzero(beyond | is_degenerate)
         start, queries = (a, b, c)[i].take(rows, 0), points.take(rows, 0)
         along = (a, b, c)[j].take(rows, 0) - start
         t = dot(queries - start, along) / np.maximum(dot(along, along), 1e-300)
@@ -205,15 +205,15 @@ def together(count: int, start: Int[Ints, " N"], end: Int[Ints, " N"]) -> Int[In
 
 def same_rows(rows: Float[Floats, "N D"] | Int[Ints, "N D"]) -> Int[Ints, " N"]:
     """(N,) index of the first row equal to each row: its own index if it is the first. 0.0 equals -0.0."""
-    own = np.arange(len(rows))
+    indices = np.arange(len(rows))
     if len(rows) < 2:
-        return own
+        return indices
     hashed = _hash(rows)
     ordered = np.sort(hashed)
     if not (ordered[1:] == ordered[:-1]).any():
-        return own
+        return indices
     begins = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
-    del ordered, own  # saves memory for millions of rows
+    del ordered, indices  # saves memory for millions of rows
     order = np.argsort(hashed)
     del hashed
     first = np.empty(len(rows), np.int64)
@@ -271,8 +271,8 @@ def edges_of(faces: Int[Ints, "F 3"]) -> Edges:
     first[1:] = (ordered[1:] ^ ordered[:-1]) > 1  # all bits but the last are the edge's key
     begins = np.flatnonzero(first).astype(np.int32)
     sizes = np.diff(np.append(begins, np.int32(len(ordered)))).astype(np.int32)
-    two = begins[sizes == 2]
-    disagreeing = ordered[two] == ordered[two + 1]
+    interior = begins[sizes == 2]
+    disagreeing = ordered[interior] == ordered[interior + 1]
     vertices = np.empty((len(begins), 2), np.int32)
     for low in range(0, len(begins), _CHUNK):
         keys = ordered[begins[low : low + _CHUNK]] >> 1

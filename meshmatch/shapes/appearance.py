@@ -192,7 +192,7 @@ class Appearance(Brief):
         return is_one_color and not any(layer.textured for layer in layers)
 
 
-def visible(look: Appearance, name: str) -> Appearance:
+def make_visible(look: Appearance, name: str) -> Appearance:
     """The appearance, with wholly transparent materials made opaque; issues a `MeshmatchWarning` that names them.
 
     Such materials are never intended: many programs write the opacity as transparency, or 0 where they support neither.

@@ -62,8 +62,8 @@ def load_blend_shapes(given: str | Path | Sequence[str | Path], neutral: Shape) 
         shape = load_shape(file)
         if shape.V != neutral.V:
             raise _other_mesh(file.name, shape.V, neutral)
-        known = shape.valid & neutral.valid
-        move = np.where(known[:, None], shape.verts - neutral.verts, 0.0).astype(np.float32)
+        is_valid = shape.valid & neutral.valid
+        move = np.where(is_valid[:, None], shape.verts - neutral.verts, 0.0).astype(np.float32)
         name = plain_text(file.stem)
         if name in moves:
             raise InputError(f"two shapes are called {name}", "rename one of the files")

@@ -21,7 +21,7 @@ def counterparts(shape: Shape, lost: Bool[Bools, " V"]) -> Int[Ints, " V"]:
     a lost copy, because single meshes, such as shoes, are often copies of one another. Among identical meshes the first
     lost one corresponds to the first kept one, and so on.
     """
-    found, none = np.full(shape.V, -1), np.full(shape.V, -1)
+    result, none = np.full(shape.V, -1), np.full(shape.V, -1)
     counts = [count for _, count in shape.meshes]
     if len(counts) < 2 or sum(counts) != shape.V or not lost.any():
         return none
@@ -40,17 +40,17 @@ def counterparts(shape: Shape, lost: Bool[Bools, " V"]) -> Int[Ints, " V"]:
         for number, copy in enumerate(copies if kept else ()):
             match = kept[number % len(kept)]
             if _is_affine_image(shape.verts[starts[match] : ends[match]], shape.verts[starts[copy] : ends[copy]]):
-                found[starts[copy] : ends[copy]] = np.arange(starts[match], ends[match])
+                result[starts[copy] : ends[copy]] = np.arange(starts[match], ends[match])
                 unmatched.discard(match)
         if unmatched:
             return none
-    return found
+    return result
 
 
-def _is_affine_image(here: Floats, there: Floats) -> bool:
+def _is_affine_image(source: Floats, target: Floats) -> bool:
     """Whether an affine map takes all points to the others."""
-    if not (np.isfinite(here).all() and np.isfinite(there).all()):
+    if not (np.isfinite(source).all() and np.isfinite(target).all()):
         return False
-    rows = np.column_stack([here - here.mean(axis=0), np.ones(len(here))])
-    deviation = np.abs(rows @ np.linalg.lstsq(rows, there, rcond=None)[0] - there)
-    return bool(deviation.max() <= _TOLERANCE * np.ptp(there, axis=0).max())
+    rows = np.column_stack([source - source.mean(axis=0), np.ones(len(source))])
+    deviation = np.abs(rows @ np.linalg.lstsq(rows, target, rcond=None)[0] - target)
+    return bool(deviation.max() <= _TOLERANCE * np.ptp(target, axis=0).max())

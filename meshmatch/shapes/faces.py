@@ -48,7 +48,7 @@ def seams(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, " V
     return representative
 
 
-def spikes(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Bool[Bools, " V"]:
+def find_spikes(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Bool[Bools, " V"]:
     """Single vertices far from all others, at the tip of a needle of faces, as scanners produce by error."""
     is_spike = np.zeros(len(verts), bool)
     used = np.flatnonzero(np.bincount(faces.ravel(), minlength=len(verts)))
@@ -77,7 +77,7 @@ def spikes(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Bool[Bools, 
     return is_spike
 
 
-def collapsed(
+def collapse_short_edges(
     verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], cross: Float[Floats, "F 3"], diagonal: float
 ) -> Int[Ints, " V"]:
     """The vertex that represents each vertex: the first of all vertices connected by edges without length.
@@ -95,7 +95,7 @@ def collapsed(
     return together(len(verts), start, end)
 
 
-def flat_faces(
+def degenerate_faces(
     verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], cross: Float[Floats, "F 3"], diagonal: float
 ) -> Bool[Bools, " F"]:
     """Whether each face is degenerate: it repeats a vertex, or its height is within rounding of its longest edge.
@@ -145,14 +145,14 @@ def _orientation(faces: Ints) -> Bools:
     return np.asarray(rotated[:, 1] < rotated[:, 2])
 
 
-def find_parts(
+def find_outlier_parts(
     verts: Float[Floats, "V 3"],
     faces: Int[Ints, "F 3"],
     cross: Float[Floats, "F 3"],
     spared: Bool[Bools, " V"] | None = None,
     around: int = _MAX_NESTED,
 ) -> tuple[Bool[Bools, " F"], int, int, int, float]:
-    """Classify the connected parts of a mesh; `cross` as in `flat_faces`.
+    """Classify the connected parts of a mesh; `cross` as in `degenerate_faces`.
 
     A part with a `spared` vertex is never an outlier. A simple hull of all other parts is an outlier, and so is a flat
     ground that extends far beyond them, up to ``around`` of these, one around another.
@@ -170,7 +170,7 @@ def find_parts(
     if outer is not None:
         inside = part != outer
         dropped = np.ones(len(faces), bool)
-        dropped[inside], n_outliers, kept, apart, share = find_parts(
+        dropped[inside], n_outliers, kept, apart, share = find_outlier_parts(
             verts, faces[inside], cross[inside], None, around - 1
         )
         return dropped, n_outliers + 1, kept, apart, share

@@ -106,20 +106,20 @@ def read_landmark_file(path: Path, shape: str = "", space: Space = "") -> Landma
         raise InputError(f"{path.name} holds no landmark")
     if len(spaces := {_SPACES.get(str(record.get("space")), "") for record in records}) > 1:
         raise InputError("its markups are in several coordinate systems", "save each list in a file of its own")
-    (own,), turned = spaces, ""
-    if own and space and own != space:
-        turned = f"{path.name} is in {own}, {shape} is in {space}: x and y change their signs"
+    (file_space,), turned = spaces, ""
+    if file_space and space and file_space != space:
+        turned = f"{path.name} is in {file_space}, {shape} is in {space}: x and y change their signs"
     has_name = [not is_missing(str(record.get("name") or "")) for record in records]
     places = tuple(
         replace(_parse_place(record, k, bool(turned)), markup=record.get("markup", (0, _POINT_LIST)))
         for k, record in enumerate(records)
     )
-    return LandmarkFile(places, all(has_name), own, turned)
+    return LandmarkFile(places, all(has_name), file_space, turned)
 
 
 def _parse_place(record: Record, number: int, turned: bool) -> Place:
-    given = record.get("name")
-    name = one_line(str(number if given in (None, "") else given))
+    raw_name = record.get("name")
+    name = one_line(str(number if raw_name in (None, "") else raw_name))
     face, weights, vertex = record.get("face"), record.get("barycentric"), record.get("vertex")
     if face is not None and face != -1 and weights is not None:
         return Place(name, "face", (_parse_index(face, name), _parse_three(weights, name)))
@@ -237,17 +237,17 @@ def _default_columns(row: Sequence[str]) -> list[str]:
 
 
 def _read_json(path: Path) -> list[Record]:
-    found = read_json(path)
-    if isinstance(found, dict) and isinstance(found.get("markups"), list):
-        return _markup_records(path, found["markups"])
-    if isinstance(found, dict) and isinstance(found.get("landmarks"), list | dict):
-        found = found["landmarks"]
-    if isinstance(found, dict | list):
-        check_memory(path.name, path.stat().st_size, _RECORD_BYTES * len(found))
-    if isinstance(found, dict):
-        return [{"name": name, **_json_record(value)} for name, value in found.items()]
-    if isinstance(found, list):
-        return [_json_record(value) for value in found]
+    content = read_json(path)
+    if isinstance(content, dict) and isinstance(content.get("markups"), list):
+        return _markup_records(path, content["markups"])
+    if isinstance(content, dict) and isinstance(content.get("landmarks"), list | dict):
+        content = content["landmarks"]
+    if isinstance(content, dict | list):
+        check_memory(path.name, path.stat().st_size, _RECORD_BYTES * len(content))
+    if isinstance(content, dict):
+        return [{"name": name, **_json_record(value)} for name, value in content.items()]
+    if isinstance(content, list):
+        return [_json_record(value) for value in content]
     raise InputError("it holds no list of landmarks")
 
 
@@ -356,9 +356,9 @@ def _morphologika_records(text: str, shape: str) -> list[Record]:
     sections: dict[str, list[str]] = {}
     for line in filter(None, map(str.strip, text.splitlines())):
         if line.startswith("["):
-            found = sections.setdefault(line.strip("[]").lower(), [])
+            section = sections.setdefault(line.strip("[]").lower(), [])
         else:
-            found.append(line)
+            section.append(line)
     sizes = [sections.get(name, [""])[:1] for name in ("individuals", "landmarks", "dimensions")]
     if not all(each and each[0].isdecimal() for each in sizes):
         raise InputError("it does not say how many individuals, landmarks and dimensions it has")
@@ -494,7 +494,7 @@ def markups_record(
     schema = "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
     pairs = zip(lists or [(0, _POINT_LIST)] * len(controls), controls, strict=True)
     markups = [
-        {"type": kind, "coordinateSystem": space, "controlPoints": [control for _, control in own]}
-        for (_, kind), own in groupby(pairs, key=lambda pair: pair[0])
+        {"type": kind, "coordinateSystem": space, "controlPoints": [control for _, control in members]}
+        for (_, kind), members in groupby(pairs, key=lambda pair: pair[0])
     ]
     return {"@schema": f"{schema}markups-schema-v1.0.3.json#", "markups": markups}

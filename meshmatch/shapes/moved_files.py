@@ -71,15 +71,15 @@ class MovedFile:
             check_into(into, output)
         if original is None or not (output.suffix.lower() == original.suffix.lower() == ".obj"):
             return cls(output, original)
-        here, there = original.parent.resolve(), output.parent.resolve()
-        if here == there:
+        source_folder, output_folder = original.parent.resolve(), output.parent.resolve()
+        if source_folder == output_folder:
             return cls(output, original)
         companions, missing_names = obj_look.companions(original, read_bytes(original))
         if missing_names:
             warn(f"{original.name} names {', '.join(missing_names)[:200]}, which is not there: not copied")
         copies = []
         for file in companions:
-            copy = output.parent / file.resolve().relative_to(here)
+            copy = output.parent / file.resolve().relative_to(source_folder)
             if not copy.exists():
                 copies.append((copy, file))
             elif copy.read_bytes() != file.read_bytes():

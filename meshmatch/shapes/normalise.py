@@ -124,13 +124,18 @@ def align(shape: OrientedPoints, target: OrientedPoints, how: Align, keep: int =
         return _refine(fine, [unrotated], 25 if how == "near" else 0)
     # the 24 rotations of a cube, about the files' axes and about the principal axes of both
     rotations = Rotation.create_group("O").as_matrix()
-    own, theirs = _principal_axes(shape.points), _principal_axes(target.points)
-    starts = [RigidPose(start, np.zeros(3)) for start in (*rotations, *(own @ turn @ theirs.T for turn in rotations))]
+    shape_axes, target_axes = _principal_axes(shape.points), _principal_axes(target.points)
+    starts = [
+        RigidPose(start, np.zeros(3))
+        for start in (*rotations, *(shape_axes @ turn @ target_axes.T for turn in rotations))
+    ]
     chosen = _distinct(_best_first(_refine(coarse, starts, 6)))[: max(keep, 4)]
-    given, *found = _refine(fine, [unrotated, *(each.pose for each in chosen)], 25)
-    found = _best_first(found)
-    found.insert(0 if found[0].residual > _MAX_RESIDUAL_RATIO * given.residual else len(found), given)
-    return _distinct(found)[:keep]
+    unrotated_fit, *candidates = _refine(fine, [unrotated, *(each.pose for each in chosen)], 25)
+    candidates = _best_first(candidates)
+    candidates.insert(
+        0 if candidates[0].residual > _MAX_RESIDUAL_RATIO * unrotated_fit.residual else len(candidates), unrotated_fit
+    )
+    return _distinct(candidates)[:keep]
 
 
 def _refine(points: ClosestPoints, poses: list[RigidPose], steps: int) -> list[Alignment]:
@@ -138,14 +143,14 @@ def _refine(points: ClosestPoints, poses: list[RigidPose], steps: int) -> list[A
     return [Alignment(*each) for each in zip(nearer, points.residuals(nearer).tolist(), strict=True)]
 
 
-def _best_first(found: list[Alignment]) -> list[Alignment]:
-    return sorted(found, key=attrgetter("residual"))
+def _best_first(alignments: list[Alignment]) -> list[Alignment]:
+    return sorted(alignments, key=attrgetter("residual"))
 
 
-def _distinct(found: list[Alignment]) -> list[Alignment]:
+def _distinct(alignments: list[Alignment]) -> list[Alignment]:
     """The alignments that are not close to an earlier one."""
     distinct: list[Alignment] = []
-    for each in found:
+    for each in alignments:
         if all(each.pose.angle_to(other.pose) > _MIN_ANGLE for other in distinct):
             distinct.append(each)
     return distinct

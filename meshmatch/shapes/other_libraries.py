@@ -90,11 +90,11 @@ def as_faces(values: Any, points: Any, label: str) -> Any:
         return None
     if _is_ragged(values):
         return _triangles(points, _polygons(values, label), label)
-    found = _array(values, label)
-    if found.ndim == 2 and found.shape[1] == 4:
+    array = _array(values, label)
+    if array.ndim == 2 and array.shape[1] == 4:
         hint = f"split quads into triangles, or pass them as lists; of tetrahedra, {_SURFACE}"
         raise InputError(f"{label}: faces have four corners, which may be quads or tetrahedra", hint)
-    return _as_indices(found, label)
+    return _as_indices(array, label)
 
 
 def _triangles(points: Any, faces: Any, label: str) -> Any:
@@ -110,14 +110,14 @@ def _triangles(points: Any, faces: Any, label: str) -> Any:
 def _get_value(source: Any, *names: str) -> Any:
     """The first of these attributes that an object has; methods, as in older libraries, are called."""
     for name in names:
-        found = getattr(source, name, None)
-        if callable(found):
+        value = getattr(source, name, None)
+        if callable(value):
             try:
-                found = found()
+                value = value()
             except TypeError:  # it needs arguments
-                found = None
-        if found is not None:
-            return found
+                value = None
+        if value is not None:
+            return value
     return None
 
 
@@ -212,12 +212,12 @@ def _rows(faces: Any, label: str) -> Any:
     """Faces from an attribute of that name: triangles, quads, lists of polygons, or a flat VTK list."""
     if _is_ragged(faces):
         return _polygons(faces, label)
-    found = _array(faces, label)
-    if found.ndim == 1:
-        return _flat_polygons(found, label)
-    if found.ndim == 2 and found.shape[1] > 3:
-        return _polygons(found, label)
-    return _as_indices(found, label)
+    array = _array(faces, label)
+    if array.ndim == 1:
+        return _flat_polygons(array, label)
+    if array.ndim == 2 and array.shape[1] > 3:
+        return _polygons(array, label)
+    return _as_indices(array, label)
 
 
 def _grid(cells: Any, types: Ints, label: str) -> _Polygons | None:
@@ -245,13 +245,13 @@ def _cells(source: Any, cells: Any, label: str) -> Any:
             raise InputError(f"{label} has cells of type {unsupported[0]}, of which no surface is made", hint)
         return _Polygons(*(np.concatenate(each) for each in zip(*parts, strict=True))) if parts else None
     if not _is_ragged(cells):
-        found = _array(cells, label)
+        array = _array(cells, label)
         surface = type(getattr(source, "dataset", None)).__name__ == "vtkPolyData"  # vedo: these are faces
-        if found.ndim == 1:
+        if array.ndim == 1:
             raise InputError(f"{label} connects its points by .cells without their types", _SURFACE)
-        if found.ndim == 2 and found.shape[1] > 3 and not surface:
+        if array.ndim == 2 and array.shape[1] > 3 and not surface:
             raise InputError(f"{label}: its cells may be faces or volumes", _SURFACE)
-        return _rows(found, label)
+        return _rows(array, label)
     return _polygons(cells, label)
 
 
@@ -302,8 +302,8 @@ def _colors(source: Any, label: str) -> Float[Floats, "V 4"] | None:
     visual: Any = getattr(source, "visual", None)
     if getattr(visual, "kind", None) == "face":
         warn(f"{label} has colors of faces: each vertex gets the mean of those around it")
-        own = np.repeat(np.asarray(visual.face_colors, np.float64) / 255.0, 3, axis=0)
-        return colors_of_faces(len(source.vertices), np.asarray(source.faces).ravel(), own)
+        corner_colors = np.repeat(np.asarray(visual.face_colors, np.float64) / 255.0, 3, axis=0)
+        return colors_of_faces(len(source.vertices), np.asarray(source.faces).ravel(), corner_colors)
     if getattr(visual, "kind", None) == "vertex" and len(visual.vertex_colors):  # trimesh clouds have none
         return np.asarray(visual.vertex_colors, np.float64) / 255.0
     for has, name in (("has_vertex_colors", "vertex_colors"), ("has_colors", "colors")):

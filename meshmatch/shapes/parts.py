@@ -14,7 +14,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry import triangles
-from meshmatch.shapes.faces import flat_faces, seams
+from meshmatch.shapes.faces import degenerate_faces, seams
 from meshmatch.shapes.shape import Shape
 
 # All constants were set by hand; lengths are in units of sqrt(area) of the reference part, see `_reference_part`.
@@ -69,7 +69,7 @@ class Parts:
         corners = shape.faces[usable]
         twin = seams(shape.verts, corners)
         vectors = shape.face_vectors[usable]
-        has_area = ~flat_faces(shape.verts, twin[corners], vectors, shape.diagonal)
+        has_area = ~degenerate_faces(shape.verts, twin[corners], vectors, shape.diagonal)
         usable, corners = usable[has_area], corners[has_area]
         number, of_face = np.zeros(shape.V, np.int64), np.zeros(shape.F, np.int64)
         if not len(usable):
@@ -114,11 +114,11 @@ class Parts:
     @cached_property
     def bounds(self) -> Float[Floats, "P 2 3"]:
         """Lowest and highest corner of each part's bounding box, in the frame of the file."""
-        found = np.full((len(self) + 1, 2, 3), np.inf)
-        np.minimum.at(found[:, 0], self.number, self.shape.verts)
-        np.minimum.at(found[:, 1], self.number, -self.shape.verts)
-        found[:, 1] *= -1
-        return found[1:]
+        boxes = np.full((len(self) + 1, 2, 3), np.inf)
+        np.minimum.at(boxes[:, 0], self.number, self.shape.verts)
+        np.minimum.at(boxes[:, 1], self.number, -self.shape.verts)
+        boxes[:, 1] *= -1
+        return boxes[1:]
 
     def share(self, numbers: Iterable[int]) -> float:
         """Share (0..1) of these parts together in the area."""
@@ -167,10 +167,10 @@ def tries(parts: Parts) -> list[frozenset[int]]:
         ]
         groups.append(sorted(large_groups, key=lambda group: -parts.share(group)))
     singles = [n for n in large[:_MAX_LARGE] if n not in simple][:3] + simple[:2]
-    found = [group for each in groups for group in each[:1]]
-    found += [_with_belongings(parts, n, points, owner) for n in singles]
-    found += [group for each in groups for group in each[1:2]]
-    return [each for each in dict.fromkeys(found) if each != everything][:_MAX_TRIES]
+    candidates = [group for each in groups for group in each[:1]]
+    candidates += [_with_belongings(parts, n, points, owner) for n in singles]
+    candidates += [group for each in groups for group in each[1:2]]
+    return [each for each in dict.fromkeys(candidates) if each != everything][:_MAX_TRIES]
 
 
 def apart(parts: Parts, one: frozenset[int], other: frozenset[int]) -> bool:
@@ -198,7 +198,7 @@ def _find_bases(
     """For each flat base, which faces belong to it."""
     from meshmatch.shapes.bases import base_plane
 
-    found = []
+    bases = []
     for number in range(1, min(_MAX_BASES, int(part.max())) + 1):
         in_part = np.flatnonzero(part == number)
         plane = base_plane(Shape(shape.verts, corners[in_part]))
@@ -214,8 +214,8 @@ def _find_bases(
         ):
             pieces = np.bincount(triangles.face_parts(corners[standing], shape.V), area[standing])
             if pieces.max() >= _MIN_STANDING_SHARE * pieces.sum():
-                found.append(base)
-    return found
+                bases.append(base)
+    return bases
 
 
 def _parts_of_cloud(cls: type[Parts], shape: Shape) -> Parts:
@@ -273,24 +273,24 @@ def _sample_parts(parts: Parts, unit: float) -> tuple[Float[Floats, "S 3"], Int[
 
 
 def _touching_groups(
-    points: Float[Floats, "S 3"], owner: Int[Ints, " S"], numbers: frozenset[int], count: int, near: float
+    points: Float[Floats, "S 3"], owner: Int[Ints, " S"], numbers: frozenset[int], count: int, max_gap: float
 ) -> list[frozenset[int]]:
     """Groups of parts that are connected by near pairs: by grid cells that have points of both in their neighborhood."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     in_group = np.isin(owner, np.array(sorted(numbers), np.int64))
-    cell = np.floor(points[in_group] / near - 0.5).astype(np.int64)
+    cell = np.floor(points[in_group] / max_gap - 0.5).astype(np.int64)
     cell = cell[:, None] + np.stack(np.meshgrid(*[(0, 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
     cells = triangles.same_rows(cell.reshape(-1, 3))
     ends = np.repeat(owner[in_group], 8), count + 1 + cells
     size = count + 1 + len(cells)
     graph = coo_array((np.ones(len(cells), np.int8), ends), shape=(size, size))
     group = connected_components(graph, directed=False)[1]
-    found: dict[int, list[int]] = {}
+    members: dict[int, list[int]] = {}
     for number in sorted(numbers):
-        found.setdefault(int(group[number]), []).append(number)
-    return [frozenset(each) for each in found.values()]
+        members.setdefault(int(group[number]), []).append(number)
+    return [frozenset(each) for each in members.values()]
 
 
 def _with_belongings(parts: Parts, number: int, points: Float[Floats, "S 3"], owner: Int[Ints, " S"]) -> frozenset[int]:

@@ -17,7 +17,15 @@ from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
 from meshmatch.shapes.copies import counterparts
 from meshmatch.shapes.denoise import remove_noise
-from meshmatch.shapes.faces import collapsed, duplicate_faces, find_parts, flat_faces, seams, spikes, turn_faces
+from meshmatch.shapes.faces import (
+    collapse_short_edges,
+    degenerate_faces,
+    duplicate_faces,
+    find_outlier_parts,
+    find_spikes,
+    seams,
+    turn_faces,
+)
 from meshmatch.shapes.shape import Shape
 
 _MAX_LISTED = 5  # maximum number of meshes in a note
@@ -70,7 +78,7 @@ class Repaired(Brief):
 def repair(shape: Shape) -> Repaired:
     """Drop invalid parts of a shape and merge duplicates, and report it.
 
-    In this order: vertices without a position, single vertices far from all others (`meshmatch.shapes.faces.spikes`),
+    In this order: vertices without a position, single vertices far from all others (`meshmatch.shapes.faces.find_spikes`),
     and the faces that touch them; faces, or points, of weight 0; vertices at exactly the same position are merged if
     they lie on an open edge (texture seams of obj and glTF files, every corner of an stl; two layers that merely touch
     stay separate); edges without length are collapsed; faces without area; duplicate faces (both of them, where they
@@ -89,7 +97,7 @@ def repair(shape: Shape) -> Repaired:
         hint = "all are NaN, infinite or huge: export it again"
         raise InputError(f"{shape.name or 'the shape'}: no vertex has a usable position", hint)
     _add_note(notes, shape.V - int(valid.sum()), "vertex", "without a usable position dropped")
-    far = spikes(shape.verts, shape.faces[shape.valid_faces])
+    far = find_spikes(shape.verts, shape.faces[shape.valid_faces])
     if far.any():
         _add_note(notes, int(far.sum()), "vertex", "far from all others dropped, as a spike is")
         valid = valid & ~far
@@ -142,13 +150,13 @@ def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     if n_doubles:
         _add_note(notes, n_doubles, "vertex", "merged with another at the same position")
         faces = twin[faces]
-    representative = collapsed(shape.verts, faces, cross, shape.diagonal)
+    representative = collapse_short_edges(shape.verts, faces, cross, shape.diagonal)
     n_collapsed = int((representative != np.arange(shape.V)).sum())
     if n_collapsed:
         _add_note(notes, n_collapsed, "edge", "without length collapsed")
         faces, twin = representative[faces], representative[twin]
         cross = np.where((faces == faces[:, [1, 2, 0]]).any(axis=1)[:, None], 0.0, cross)
-    flat = flat_faces(shape.verts, faces, cross, shape.diagonal)
+    flat = degenerate_faces(shape.verts, faces, cross, shape.diagonal)
     _add_note(notes, int(flat.sum()), "face", "without area dropped")
     faces, cross, original_face = _drop(flat, faces, cross, original_face)
     double = duplicate_faces(faces)
@@ -156,7 +164,7 @@ def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     faces, cross, original_face = _drop(double, faces, cross, original_face)
     if len(faces) == 0:
         raise InputError(f"{shape.name or 'the shape'} has no face with any area", "is it a mesh at all?")
-    outlier, outlier_parts, parts, far, far_share = find_parts(shape.verts, faces, cross, shape.skinned)
+    outlier, outlier_parts, parts, far, far_share = find_outlier_parts(shape.verts, faces, cross, shape.skinned)
     text = (
         f"dropped ({outlier.sum():,} {'face' if outlier.sum() == 1 else 'faces'}"
         f"{_describe_meshes(shape, faces[outlier])})"

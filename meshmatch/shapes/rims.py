@@ -14,7 +14,8 @@ from meshmatch.geometry.triangles import edge_lengths
 from meshmatch.shapes.shape import Shape
 
 RIM = 0.3  # minimum length of a rim, in units of sqrt(area); cracks of a mesh are shorter
-SHEET = 3.5  # minimum length of all rims of a sheet: no flat shape has less than a disk's 3.54; a broken bone has 2.6
+# minimum length of all rims of a sheet: no flat shape has less than a disk's 3.54; a broken bone has 2.6
+MIN_SHEET_RIMS = 3.5
 
 
 def rim_lengths(shape: Shape) -> Float[Floats, " V"]:
@@ -31,7 +32,7 @@ def is_sheet(shape: Shape) -> bool:
     if shape.is_cloud:
         return False
     ends = shape.edges.open[rim_lengths(shape)[shape.edges.open[:, 0]] > RIM]
-    return bool(edge_lengths(shape.verts, ends).sum() > SHEET * np.sqrt(shape.area))
+    return bool(edge_lengths(shape.verts, ends).sum() > MIN_SHEET_RIMS * np.sqrt(shape.area))
 
 
 def rim_corners(shape: Shape) -> Int[Ints, "E 3"]:

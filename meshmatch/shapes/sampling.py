@@ -121,9 +121,9 @@ def triangulate_cloud(cloud: Shape, most: int) -> tuple[Int[Ints, " V"], Int[Int
     distance, index = cKDTree(points).query(points, k + 1)
     reach = _MAX_EDGE * np.median(distance[:, min(6, k)])
     votes: Counter[tuple[int, ...]] = Counter()
-    for own, near in enumerate(index):
-        stars = _star(points[near], normals[own], reach)
-        votes.update(tuple(sorted((own, int(near[second]), int(near[third])))) for second, third in stars)
+    for center, neighbors in enumerate(index):
+        stars = _star(points[neighbors], normals[center], reach)
+        votes.update(tuple(sorted((center, int(neighbors[second]), int(neighbors[third])))) for second, third in stars)
     faces = np.array([key for key, count in votes.items() if count == 3], np.int64).reshape(-1, 3)
     if 3 * len(faces) < len(points):
         rough = f"{cloud.name or 'the cloud'} is too rough for a template: its points lie on no surface"
@@ -137,15 +137,15 @@ def triangulate_cloud(cloud: Shape, most: int) -> tuple[Int[Ints, " V"], Int[Int
 def _star(points: Floats, normal: Floats, reach: float) -> list[tuple[int, int]]:
     """Triangles of the Delaunay star of the first point in the plane of a normal, as pairs of the other two corners."""
     across = np.linalg.svd(normal[None])[2][1:]
-    flat = (points - points[0]) @ across.T
+    planar = (points - points[0]) @ across.T
     try:
-        triangles = Delaunay(flat).simplices
+        triangles = Delaunay(planar).simplices
     except QhullError:
         return []  # all points are collinear
-    found = []
+    pairs = []
     for corners in triangles[(triangles == 0).any(axis=1)]:
         b, c = (int(i) for i in corners if i != 0)
         edges = (points[b] - points[0], points[c] - points[0], points[b] - points[c])
         if max(float(edge @ edge) for edge in edges) < reach**2:
-            found.append((b, c))
-    return found
+            pairs.append((b, c))
+    return pairs

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Pickled, frozen, off_torch, read_only
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Pickled, as_read_only, frozen, off_torch
 from meshmatch.errors import InputError
 from meshmatch.geometry import triangles
 from meshmatch.geometry.triangles import average_normals, share_areas, squared_lengths, triangle_vectors
@@ -77,11 +77,11 @@ class Shape(Pickled):
 
     def __post_init__(self) -> None:
         label = self.name or "the shape"
-        verts = read_only(self.verts, np.float64, label)
+        verts = as_read_only(self.verts, np.float64, label)
         given = np.asarray([] if self.faces is None else off_torch(self.faces))
         if given.size and given.dtype.kind not in "iu":
             raise InputError(f"{label}: faces must be integers, not {given.dtype}")
-        faces = read_only(given if given.size else np.empty((0, 3)), np.int64, label)
+        faces = as_read_only(given if given.size else np.empty((0, 3)), np.int64, label)
         if verts.ndim != 2 or verts.shape[1] != 3:
             raise InputError(f"{label}: vertices must be an array of (V, 3), not {verts.shape}")
         if faces.ndim != 2 or faces.shape[1] != 3:
@@ -103,7 +103,7 @@ class Shape(Pickled):
         specifications["skinned"] = (np.bool_, (V,))
         for name, (dtype, shape) in specifications.items():
             if (values := getattr(self, name)) is not None:
-                array = read_only(values, dtype, label)
+                array = as_read_only(values, dtype, label)
                 if array.shape != shape:
                     raise InputError(f"{label}: {name} must be an array of {shape}, not {array.shape}")
                 object.__setattr__(self, name, array)

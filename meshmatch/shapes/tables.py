@@ -388,8 +388,8 @@ def check_suffix(path: str | Path, suffixes: Iterable[str], what: str) -> str:
         blender.check_written(path)
         return ".glb"
     if suffix not in suffixes:
-        given = f"'{suffix}'" if suffix else "a name without a suffix"
-        unknown = f"{path.name or path}: {given} is not a format for {what}"
+        described = f"'{suffix}'" if suffix else "a name without a suffix"
+        unknown = f"{path.name or path}: {described} is not a format for {what}"
         raise OptionError(unknown, f"end the name in one of {' '.join(suffixes)}")
     return suffix
 
@@ -460,6 +460,6 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
 def short_floats(values: np.ndarray) -> list[Any]:
     """Convert float32 to the floats with the fewest digits that read back as the same float32; nan becomes None."""
     floats = values.astype(np.float32).astype(np.str_).astype(np.float64)
-    found = floats.astype(object)
-    found[np.isnan(floats)] = None
-    return list(found.tolist())
+    result = floats.astype(object)
+    result[np.isnan(floats)] = None
+    return list(result.tolist())

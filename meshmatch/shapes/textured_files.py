@@ -42,12 +42,12 @@ def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
     or is used if the file names none. `InputError`: an image or material file is missing, damaged, too large, or
     outside the file's folder; there are no texture coordinates for `image`; or the file has no appearance.
     """
-    found = find_appearance(path, shape, image, finished=True)
-    if found is None:
+    look = find_appearance(path, shape, image, finished=True)
+    if look is None:
         nothing = f"{Path(path).name} has no texture and no vertex colors: there is nothing to transfer"
         hint = "name a picture for its texture coordinates with --image, or export it with its materials"
         raise InputError(nothing, hint)
-    return found
+    return look
 
 
 def find_appearance(
@@ -62,16 +62,16 @@ def find_appearance(
     picture = None if image is None else reader.read(Path(image))
     if suffix in _READERS:
         with np.errstate(invalid="ignore", over="ignore"):  # coordinates are judged by the appearance
-            found = _READERS[suffix][0](path, read_bytes(path), shape, reader, picture)
+            look = _READERS[suffix][0](path, read_bytes(path), shape, reader, picture)
     elif picture is not None:
         raise appearance.no_coordinates(path.name)
     else:
-        found = appearance.vertex_colors_alone(shape)
-    if len(found.material) != shape.F or (found.colors is not None and len(found.colors) != shape.V):
+        look = appearance.vertex_colors_alone(shape)
+    if len(look.material) != shape.F or (look.colors is not None and len(look.colors) != shape.V):
         raise InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
     if finished and suffix in _FINISHES:
-        found = replace(found, finish=_FINISHES[suffix](path, read_bytes(path), shape, reader))
-    return None if found.plain and not plain else appearance.visible(found, path.name)
+        look = replace(look, finish=_FINISHES[suffix](path, read_bytes(path), shape, reader))
+    return None if look.plain and not plain else appearance.make_visible(look, path.name)
 
 
 def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] | None:
@@ -81,10 +81,10 @@ def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] |
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    found = _READERS[suffix][1](path, read_bytes(path), shape) if suffix in _READERS else None
-    if found is not None and len(found) != shape.F:
+    coordinates = _READERS[suffix][1](path, read_bytes(path), shape) if suffix in _READERS else None
+    if coordinates is not None and len(coordinates) != shape.F:
         raise InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
-    return found if shape.F else None
+    return coordinates if shape.F else None
 
 
 def files_of(path: Path, layers: Collection[Layer] = (), tiles: Iterable[int | str] = ()) -> list[Path]:

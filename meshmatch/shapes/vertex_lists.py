@@ -43,8 +43,8 @@ def _read_vertices(path: Path, columns: tuple[int, ...], hint: str, missing: boo
     read = read_npy if suffix == ".npy" else lambda path: read_table(path, comments="ends", whole=True).numbers()[1]
 
     def numbers(path: Path) -> Ints:
-        found = read(path)
-        return whole(np.nan_to_num(found, nan=-1.0) if missing and found.dtype.kind == "f" else found)
+        values = read(path)
+        return whole(np.nan_to_num(values, nan=-1.0) if missing and values.dtype.kind == "f" else values)
 
     rows = read_by_suffix(path, {suffix: numbers}, "vertices", hint)
     if rows.ndim == 1 and 1 in columns:
@@ -54,8 +54,8 @@ def _read_vertices(path: Path, columns: tuple[int, ...], hint: str, missing: boo
     if rows.ndim != 2 or rows.shape[1] not in columns:
         shape = " x ".join(str(n) for n in rows.shape)
         comma = f"; {DECIMAL_COMMA}" if columns == (1,) and rows.shape[1:] == (2,) else ""
-        asked = " or ".join(str(n) for n in columns)
-        raise InputError(f"{path.name} has {shape} numbers, not {asked} a line", hint + comma)
+        expected = " or ".join(str(n) for n in columns)
+        raise InputError(f"{path.name} has {shape} numbers, not {expected} a line", hint + comma)
     if rows.min() < (-1 if missing else 0):
         raise InputError(f"{path.name} names vertex {int(rows.min())}", hint)
     return rows
