@@ -52,7 +52,7 @@ SomeTensor = TypeVar("SomeTensor", bound=TensorLike)
 
 
 def as_read_only(values: Any, dtype: type, label: str) -> NDArray[Any]:
-    """The values as a contiguous, read-only array; copied unless they are one already that owns its data.
+    """The values as a contiguous, read-only array: a copy, unless they already are such an array that owns its data.
 
     `InputError` if the values are not numbers, or rows differ in length; ``label`` names them in the message.
     """
@@ -63,7 +63,7 @@ def as_read_only(values: Any, dtype: type, label: str) -> NDArray[Any]:
     try:
         values = off_torch(values)
         if np.iscomplexobj(values):
-            raise TypeError("complex ones have two parts")
+            raise TypeError("complex numbers are not supported")
         array: NDArray[Any] = np.array(values, dtype=dtype, order="C")
     except (TypeError, ValueError) as error:
         raise InputError(f"{label}: not an array of numbers ({error})") from error
@@ -165,7 +165,7 @@ def as_numbers(values: ArrayLike | TensorLike, name: str, finite: bool = False) 
     try:
         array = np.asarray(off_torch(values))
         if array.dtype.kind == "c":
-            raise TypeError("complex ones have two parts")
+            raise TypeError("complex numbers are not supported")
         array = array.astype(np.float64, copy=False)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} must be numbers ({error})", "pass an array, one row for each vertex") from error

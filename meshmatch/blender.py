@@ -142,7 +142,7 @@ def _is_new(copy: Path, file: Path, path: Path) -> bool:
         return True
     if not copy.is_file() or copy.read_bytes() != file.read_bytes():
         hint = "choose another folder for the output, or remove the file"
-        raise OptionError(f"cannot write {file.name} beside {path.name}: another {copy} is there", hint)
+        raise OptionError(f"cannot write {file.name} next to {path.name}: another {copy} is there", hint)
     return False
 
 

@@ -19,7 +19,7 @@ from meshmatch.threads import released_slot, worker_slot
 
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")
-_MAX_WAIT = 0.5  # maximum wait for a full batch, in seconds: another task may be busy with something else for long
+_MAX_WAIT = 0.5  # maximum wait for a full batch, in seconds: another task may be busy with something else
 
 _thread_state = threading.local()
 

@@ -44,7 +44,9 @@ class Frame(Brief, Pickled):
         if rotation.shape != (3, 3) or center.shape != (3,):
             raise InputError(f"a frame needs a (3, 3) rotation and a (3,) center, not {rotation.shape}, {center.shape}")
         if not (scale.ndim == 0 and np.isfinite(scale) and scale > 0 and np.isfinite(center).all()):
-            raise InputError(f"a frame's scale must be positive and finite, not {self.scale}", "has it any size?")
+            raise InputError(
+                f"a frame's scale must be positive and finite, not {self.scale}", "does the shape have a size?"
+            )
         is_bounded = (np.abs(rotation) < 2).all()  # larger entries could overflow in the product
         if not (is_bounded and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)):
             raise InputError("a frame's rotation must be orthonormal")

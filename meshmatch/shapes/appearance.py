@@ -238,7 +238,7 @@ def vertex_colors_alone(shape: Shape) -> Appearance:
 
 def no_coordinates(name: str) -> InputError:
     """The error for an image without texture coordinates."""
-    what = f"{name} has no texture coordinates: an image cannot be laid on it"
+    what = f"{name} has no texture coordinates: no image can be mapped onto it"
     return InputError(what, "unwrap it, or leave out --image and use its vertex colors")
 
 

@@ -148,7 +148,8 @@ def save_colored(path: Path, shape: Shape, file: Path | None, turn: Float[Floats
     """Write a shape with its vertex colors.
 
     If the shape was read from a glb, obj, ply or vtp and the output has the same format, everything else in the file is
-    kept. A glb of a shape without defined axes is rotated upright. Returns whether the rest of the file was kept.
+    kept. A glb of a shape without defined axes is rotated upright. Returns whether an original of the output's format
+    would be kept.
     """
     suffix, colors = path.suffix.lower(), shape.colors
     assert colors is not None

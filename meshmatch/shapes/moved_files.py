@@ -84,7 +84,7 @@ class MovedFile:
                 copies.append((copy, file))
             elif copy.read_bytes() != file.read_bytes():
                 hint = "choose another folder for the output, or remove the file"
-                raise OptionError(f"cannot copy {file.name} beside {output.name}: another {copy} is there", hint)
+                raise OptionError(f"cannot copy {file.name} next to {output.name}: another {copy} is there", hint)
         return cls(output, original, tuple(copies))
 
     @property

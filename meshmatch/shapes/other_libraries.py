@@ -202,7 +202,7 @@ def _faces(source: Any, label: str) -> Any:
         if not callable(links) and _is_filled(links):
             hint = "pass its .triangulate()" if name == "strips" else _SURFACE
             raise InputError(f"{label} connects its points by .{name}, which is not read", hint)
-    vtk = type(getattr(source, "dataset", None)).__name__  # of vedo
+    vtk = type(getattr(source, "dataset", None)).__name__  # vedo meshes have a .dataset
     if (faces is None and getattr(source, "n_cells", None)) or vtk not in ("NoneType", "vtkPolyData"):
         raise InputError(f"{label} is a grid, not a surface", "pass its surface, such as .extract_surface()")
     return None

@@ -99,7 +99,7 @@ def repair(shape: Shape) -> Repaired:
     _add_note(notes, shape.V - int(valid.sum()), "vertex", "without a usable position dropped")
     far = find_spikes(shape.verts, shape.faces[shape.valid_faces])
     if far.any():
-        _add_note(notes, int(far.sum()), "vertex", "far from all others dropped, as a spike is")
+        _add_note(notes, int(far.sum()), "vertex", "far from all others dropped (spikes)")
         valid = valid & ~far
     _note_rigid(notes, shape)
     return (_repair_cloud if shape.is_cloud else _repair_mesh)(shape, valid, notes)
@@ -139,7 +139,7 @@ def _repair_cloud(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
 
 def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     drop = np.asarray((~valid)[shape.faces].any(axis=1))
-    _add_note(notes, int(drop.sum()), "face", "at such vertices dropped")
+    _add_note(notes, int(drop.sum()), "face", "at these vertices dropped")
     if shape.weights is not None:
         ignored = ~drop & ~(shape.weights > 0)[shape.faces].any(axis=1)
         _add_note(notes, int(ignored.sum()), "face", NOT_TRUSTED)
@@ -253,7 +253,7 @@ def _build_result(
         to_repaired[copied] = to_repaired[counterpart[copied]]
         if copied.any():
             _add_note(
-                notes, int(copied.sum()), "vertex", "of copies of the rest, elsewhere in the scene, matched as that is"
+                notes, int(copied.sum()), "vertex", "of copies elsewhere in the scene, matched like their originals"
             )
             return Repaired(repaired, to_repaired, chosen, tuple(notes), shape, which, far_parts, copied=copied)
     return Repaired(repaired, to_repaired, chosen, tuple(notes), shape, which, far_parts)

@@ -53,4 +53,4 @@ def test_counterparts_stand_for_what_was_left_out() -> None:
     clean, V = repair(chosen), tube().V
     assert clean.copied is not None and np.array_equal(clean.copied, lost(shape, 1))
     np.testing.assert_array_equal(clean.original_to_repaired[V:], clean.original_to_repaired[:V])
-    assert f"{V:,} vertices of copies of the rest, elsewhere in the scene, matched as that is" in clean.notes
+    assert f"{V:,} vertices of copies elsewhere in the scene, matched like their originals" in clean.notes

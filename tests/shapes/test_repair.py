@@ -242,8 +242,8 @@ def test_a_spike_is_dropped_and_answered_by_a_neighbour(sphere: Shape, length: f
     tip = int(spiked.verts[:, 2].argmax())
     done = repair(spiked)
     assert done.notes[:2] == (
-        "1 vertex far from all others dropped, as a spike is",
-        f"{(spiked.faces == tip).any(axis=1).sum()} faces at such vertices dropped",
+        "1 vertex far from all others dropped (spikes)",
+        f"{(spiked.faces == tip).any(axis=1).sum()} faces at these vertices dropped",
     )
     assert done.shape.V == sphere.V - 1 and done.shape.diagonal < 4
     answer = done.kept_vertex[done.original_to_repaired[tip]]
