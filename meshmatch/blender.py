@@ -28,7 +28,7 @@ ENVIRONMENT_VARIABLE = "MESHMATCH_BLENDER"
 SCRIPTS = Path(__file__).with_name("_blender")
 """Folder of the code that Blender's Python runs."""
 _MAX_BYTES = 1 << 30  # maximum size of an input file, in bytes
-_TIMEOUT = 300
+_TIMEOUT = 300  # seconds
 _CACHE_SIZE = 4  # converted files to keep in memory: a command reads each several times
 _MAC_PROGRAM = "/Applications/Blender.app/Contents/MacOS/Blender"
 _HINT = (
@@ -93,11 +93,11 @@ def _convert(path: Path) -> tuple[bytes, bool]:
                 raise InputError(f"{path.name} is larger than {_MAX_BYTES >> 30} GiB", "export it as .glb")
             with tempfile.TemporaryDirectory(prefix="meshmatch-") as folder:
                 glb = Path(folder, "converted.glb")
-                lines = _run(path, glb)
-                if isinstance(lines, _Failure):
-                    hint = lines.hint or _export_hint(path)
-                    raise InputError(f"{path.name} cannot be read: {lines.why}", hint)
-                _cache[key] = glb.read_bytes(), _POLYGONS_LINE in lines
+                outcome = _run(path, glb)
+                if isinstance(outcome, _Failure):
+                    hint = outcome.hint or _export_hint(path)
+                    raise InputError(f"{path.name} cannot be read: {outcome.why}", hint)
+                _cache[key] = glb.read_bytes(), _POLYGONS_LINE in outcome
         _cache.move_to_end(key)
         while len(_cache) > _CACHE_SIZE:
             _cache.popitem(last=False)
@@ -126,10 +126,10 @@ def from_glb(glb: Path, place: Path, path: Path) -> dict[Path, bytes]:
     """
     with tempfile.TemporaryDirectory(prefix="meshmatch-") as folder:
         output = Path(folder, path.name)
-        lines = _run(glb, output)
-        if isinstance(lines, _Failure):
-            hint = lines.hint or "write a .glb, and open that in the other program"
-            raise OutputError(f"cannot write {path}: {lines.why}", hint)
+        outcome = _run(glb, output)
+        if isinstance(outcome, _Failure):
+            hint = outcome.hint or "write a .glb, and open that in the other program"
+            raise OutputError(f"cannot write {path}: {outcome.why}", hint)
         images = [file for file in sorted(Path(folder).iterdir()) if file != output and file.is_file()]
         new = [file for file in images if not is_converted(file) and _is_new(path.parent / file.name, file, path)]
         shutil.copyfile(output, place)
