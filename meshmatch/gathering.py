@@ -95,6 +95,7 @@ class Gathering:
         return len(self._waiting) >= min(self._batch_size, self._n_left)
 
     def _run_batch(self, batch: Sequence[_Call]) -> None:
+        """Answer the calls of a batch, grouped by function, and wake their callers."""
         for answer in dict.fromkeys(each.answer for each in batch):
             calls = [each for each in batch if each.answer == answer]
             try:

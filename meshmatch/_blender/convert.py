@@ -92,7 +92,7 @@ def remove_external_files(folder):
 
 
 def rendered_meshes():
-    """The objects with a mesh that a render draws, also those of collections that others draw copies of."""
+    """Objects with a mesh that are rendered, including the members of instanced collections."""
     found = list(bpy.context.scene.objects)
     for each in found:  # the list grows in the loop
         if each.instance_type == "COLLECTION" and each.instance_collection is not None and not each.hide_render:

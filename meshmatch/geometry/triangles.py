@@ -333,6 +333,7 @@ def is_watertight(faces: Int[Ints, "F 3"]) -> bool:
 
 
 def _hash(rows: Floats | Ints) -> NDArray[np.uint64]:
+    """64-bit hash of each row; equal rows have equal hashes."""
     total = np.zeros(len(rows), np.uint64)
     for k, column in enumerate(rows.T):
         total ^= (column + 0 if rows.dtype.kind == "i" else column + 0.0).view(np.uint64)

@@ -256,7 +256,10 @@ class ImageReader:
         return self._known[file]
 
     def decode(self, data: bytes, label: str) -> Pixels:
-        """(H, W, 4) red, green, blue, alpha of a png, jpeg, webp, bmp, tga or tiff, top row first; or `InputError`."""
+        """Decode a png, jpeg, webp, bmp, tga or tiff to (H, W, 4) red, green, blue, alpha, top row first.
+
+        `InputError` if the image is damaged, too large, or of another format.
+        """
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # sizes are checked below; other warnings concern metadata
@@ -296,6 +299,7 @@ def _suppress_stderr() -> Iterator[None]:
 
 
 def _rgba(image: Image.Image) -> Pixels:
+    """(H, W, 4) 8-bit pixels of an image in any mode."""
     if image.mode.startswith("I") or image.mode == "F":  # 16-bit gray, which Pillow would clip
         gray = np.asarray(image).astype(np.float64)
         maximum = 65535.0 if image.mode.startswith("I") else 1.0

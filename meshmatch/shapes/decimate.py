@@ -58,6 +58,9 @@ def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
 
 
 def _fast(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Ints]:
+    """Simplify with fast_simplification, with increasing aggressiveness until the result is good, else take the best
+    one.
+    """
     import fast_simplification
 
     closed = is_watertight(faces)

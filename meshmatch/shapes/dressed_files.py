@@ -71,6 +71,7 @@ class Dressed(Brief):
         tell_lost(self.file, path)
 
     def _glb(self) -> bytes:
+        """The mesh with its material as glb: the edited original, or a new file."""
         path, data, is_original = glb_base(self.file, self.shape)
         if is_original:
             uv, own, turn = self.uv, self.own, np.eye(3)
@@ -104,6 +105,7 @@ class Dressed(Brief):
             warn(f"{path.name} does not have {lost}: an mtl holds none")
 
     def _edited_text(self, file: Path, library: str, name: str) -> tuple[bytes, list[str]]:
+        """The text of an original obj with the new material, and the names of its materials."""
         data = read_bytes(file)
         if self.own:
             return obj_text.with_material(data, library, name, None)

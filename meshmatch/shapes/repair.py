@@ -230,6 +230,7 @@ def _build_result(
     shape: Shape, kept: Bools, twin: Ints, faces: Ints, which: Ints, valid: Bools,
     notes: list[str], far_parts: int = 0,
 ) -> Repaired:  # fmt: skip
+    """The repaired shape of the kept vertices and faces, and its relation to the original."""
     chosen = np.flatnonzero(kept)
     if len(chosen) == 0:
         raise InputError(f"{shape.name or 'the shape'} has no usable vertex", "is it a mesh or a point cloud at all?")
