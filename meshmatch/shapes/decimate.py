@@ -58,9 +58,7 @@ def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
 
 
 def _fast(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Ints]:
-    """Simplify with fast_simplification, with increasing aggressiveness until the result is good, else take the best
-    one.
-    """
+    """Simplify with fast_simplification: the first of `_AGGRESSIVENESS` without faults, else the best."""
     import fast_simplification
 
     closed = is_watertight(faces)
