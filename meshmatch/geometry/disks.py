@@ -107,7 +107,7 @@ class Disk:
 
 
 class _Springs:
-    """A spring network with weights (M, M) between neighbors and some fixed vertices."""
+    """A spring network with weights (M, M) between neighbours and some fixed vertices."""
 
     def __init__(self, weights: csr_array, fixed: Int[Ints, " R"]) -> None:
         M = weights.shape[0]
@@ -127,9 +127,9 @@ class _Springs:
         self.order = row_of[self.column[self.inner]]
 
     def equilibrium(self, scales: Float[Floats, " M"], places: Float[Floats, "R 2"]) -> Float[Floats, "M 2"]:
-        """Positions (M, 2) where each free vertex is the weighted mean of its neighbors.
+        """Positions (M, 2) where each free vertex is the weighted mean of its neighbours.
 
-        Weights are multiplied by the ``scales`` of the neighbors.
+        Weights are multiplied by the ``scales`` of the neighbours.
         """
         N, result = len(self.free), np.zeros((len(scales), 2))
         result[self.fixed] = places
@@ -198,7 +198,7 @@ def found_in(
 
 
 def mean_values(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> csr_array:
-    """(V, V) mean value weights of each vertex's neighbors: positive, and reproducing a planar neighborhood exactly."""
+    """(V, V) mean value weights of each vertex's neighbours: positive, and reproducing a planar neighbourhood exactly."""
     entries, min_length = [], _MIN_EDGE * float(np.sqrt(triangle_areas(verts, faces).mean())) + 1e-300
     for k in range(3):
         corner, *others = (faces[:, (k + each) % 3] for each in range(3))

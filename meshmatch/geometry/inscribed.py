@@ -1,6 +1,6 @@
 """Local thickness of a closed surface by its largest inscribed balls.
 
-Shrinking balls after Ma, Bae and Choi, *3D medial axis point approximation using nearest neighbors and the normal
+Shrinking balls after Ma, Bae and Choi, *3D medial axis point approximation using nearest neighbours and the normal
 field* (The Visual Computer 28, 2012): a ball that touches a point from inside shrinks until it contains no other point.
 """
 
@@ -14,7 +14,7 @@ from meshmatch.geometry.triangles import vertex_normals
 
 _MAX_ROUNDS = 30
 _MIN_SHRINKAGE = 1e-3  # as a fraction of the radius; a ball that would shrink less has converged
-# Two points closer together than this angle, seen from the ball's center, are neighbors that only noise separates.
+# Two points closer together than this angle, seen from the ball's center, are neighbours that only noise separates.
 _MIN_ANGLE_COSINE = np.cos(np.radians(20.0))
 
 

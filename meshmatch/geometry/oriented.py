@@ -96,7 +96,7 @@ class OrientedPoints:
 def nearest_unsigned(
     tree: cKDTree, points: Float[Floats, "N 3"], normals: Float[Floats, "N 3"], reach: float
 ) -> tuple[Float[Floats, " N"], Int[Ints, " N"], Bool[Bools, " N"]]:
-    """Nearest neighbors in a feature tree, with each query's normal in whichever direction brings it nearer.
+    """Nearest neighbours in a feature tree, with each query's normal in whichever direction brings it nearer.
 
     The second search, with flipped normals, only looks for points nearer than the first found. Queries are searched in
     groups of similar distance, which share one bound.

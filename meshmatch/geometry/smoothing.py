@@ -15,7 +15,7 @@ _MIN_MULTIGRID = 20_000  # vertices; for smaller systems a diagonal precondition
 _MAX_COARSEST = 3_000  # vertices of the coarsest level, whose matrix is factorized
 _CLUSTER_SIZE = 10  # vertices per cluster, from one level to the next
 _DAMPING = 0.6
-_MAX_WORK = 10  # multiplications for each entry of a matrix: 2 to 6 on a surface, far more with thousands of neighbors
+_MAX_WORK = 10  # multiplications for each entry of a matrix: 2 to 6 on a surface, far more with thousands of neighbours
 
 
 def laplacian(edges: Int[Ints, "E 2"], weight: Float[Floats, " E"], V: int) -> csr_array:
@@ -53,7 +53,7 @@ def solved(matrix: csr_array, right: Float[Floats, "V D"], start: Float[Floats, 
 def _multigrid(matrix: csr_array) -> Callable[[Floats], Floats]:
     """Approximate inverse of a matrix: an additive multigrid preconditioner with smoothed aggregation.
 
-    Each level adds its inverse diagonal to the correction from clusters of neighbors. With it the number of conjugate
+    Each level adds its inverse diagonal to the correction from clusters of neighbours. With it the number of conjugate
     gradient steps hardly grows with the mesh.
     """
     V, inverse = matrix.shape[0], 1.0 / matrix.diagonal()

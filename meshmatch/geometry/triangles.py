@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Ints32
 
-# A map is discontinuous between neighbors if their images are farther apart than `_GAP` (in sqrt(area)) plus `_STRETCH`
-# times the neighbors' own distance. Set by hand.
+# A map is discontinuous between neighbours if their images are farther apart than `_GAP` (in sqrt(area)) plus `_STRETCH`
+# times the neighbours' own distance. Set by hand.
 _GAP, _STRETCH = 0.06, 3.0
 _CHUNK = 65_536  # rows per chunk
 _MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
@@ -353,8 +353,8 @@ def edge_lengths(points: Float[Floats, "V 3"], edges: Int[NDArray[Any], "E 2"]) 
 
 
 def is_discontinuous(apart: Float[Floats, " N"], length: Float[Floats, " N"]) -> Bool[Bools, " N"]:
-    """Whether the images of neighbors are so far ``apart`` that the map is torn between them.
+    """Whether the images of neighbours are so far ``apart`` that the map is torn between them.
 
-    ``length`` is the distance of the neighbors; both are in units of sqrt(area).
+    ``length`` is the distance of the neighbours; both are in units of sqrt(area).
     """
     return np.asarray(apart >= _GAP + _STRETCH * length)

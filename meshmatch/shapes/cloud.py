@@ -19,11 +19,11 @@ _CHUNK = 2**18
 def local_areas(points: Float[Floats, "V 3"]) -> Float[Floats, " V"]:
     """Surface area that each point represents, in squared units.
 
-    For points scattered with density n over a surface, the smallest disk with a point's k nearest neighbors has an area
+    For points scattered with density n over a surface, the smallest disk with a point's k nearest neighbours has an area
     of k / n on average; so pi (r_1^2 + ... + r_k^2) / (1 + ... + k) is an unbiased estimate of 1 / n, the area per
     point. (r_k alone would not do: around the vertices of an even mesh the distances come in steps.) Noise makes r
-    larger, by a nearly constant amount once r is well above it: where neighborhoods are not flat, k grows to half a per
-    cent of the points, and only the growth of r^2 from k / 3 to k counts. Where limbs are thinner than the neighborhood
+    larger, by a nearly constant amount once r is well above it: where neighbourhoods are not flat, k grows to half a per
+    cent of the points, and only the growth of r^2 from k / 3 to k counts. Where limbs are thinner than the neighbourhood
     the result is a few per cent too low (measured on bodies: -10 to +8 % of area).
     """
     if len(_subset(points)) < 4:
@@ -44,9 +44,9 @@ def local_areas(points: Float[Floats, "V 3"]) -> Float[Floats, " V"]:
 
 
 def estimate_normals(points: Float[Floats, "V 3"]) -> Float[Floats, "V 3"]:
-    """Unit normals: the direction in which each neighborhood is thinnest.
+    """Unit normals: the direction in which each neighbourhood is thinnest.
 
-    Signs are made consistent between neighbors (Hoppe et al. 1992, section 3.3), then each connected part is oriented
+    Signs are made consistent between neighbours (Hoppe et al. 1992, section 3.3), then each connected part is oriented
     away from its own center. For an open or very noisy cloud the signs can be wrong.
     """
     if len(_subset(points)) < 4:
@@ -72,7 +72,7 @@ def roughness(points: Float[Floats, "V 3"]) -> float:
 
 
 def outlier_points(points: Float[Floats, "V 3"], far: float = 3.0) -> Bool[Bools, " V"]:
-    """Whether each point is an outlier: ``far`` times farther from its neighbors than they are from theirs, and than
+    """Whether each point is an outlier: ``far`` times farther from its neighbours than they are from theirs, and than
     usual.
     """
     from meshmatch.geometry.trees import cKDTree
@@ -81,7 +81,7 @@ def outlier_points(points: Float[Floats, "V 3"], far: float = 3.0) -> Bool[Bools
     if len(subset) < 20:
         return np.zeros(len(points), bool)
     tree = cKDTree(subset)
-    own_reach = tree.query(subset, 9)[0][:, -1]  # the point itself and 8 neighbors
+    own_reach = tree.query(subset, 9)[0][:, -1]  # the point itself and 8 neighbours
     limit = far * np.median(own_reach)
     outlier = np.zeros(len(points), bool)
     for low in range(0, len(points), _CHUNK):  # in chunks: nine distances per point need much memory
@@ -112,14 +112,14 @@ def _subset(points: Floats) -> Floats:
 
 
 def _neighbourhoods(points: Floats) -> tuple[Floats, Floats, Ints, int, float]:
-    """A subset of the points; distance and index (P, k + 1) of their neighbors, themselves first; k; the noise in 0..1."""
+    """A subset of the points; distance and index (P, k + 1) of their neighbours, themselves first; k; the noise in 0..1."""
     part = np.ascontiguousarray(_subset(points), float)
     return part, *_neighbours(part.tobytes())
 
 
 @lru_cache(maxsize=8)
 def _neighbours(data: bytes) -> tuple[Floats, Ints, int, float]:
-    """Neighborhoods of points given as bytes, for the cache: areas, normals and roughness of a cloud share them.
+    """Neighbourhoods of points given as bytes, for the cache: areas, normals and roughness of a cloud share them.
 
     k is small without noise, and grows with it.
     """
@@ -140,7 +140,7 @@ def _neighbours(data: bytes) -> tuple[Floats, Ints, int, float]:
 
 
 def _scatter(points: Floats, index: Ints) -> Floats:
-    """(N, 3, 3) scatter matrix of each neighborhood."""
+    """(N, 3, 3) scatter matrix of each neighbourhood."""
     local = points[index]
     local = local - local.mean(axis=1, keepdims=True)
     return np.asarray(local.transpose(0, 2, 1) @ local)

@@ -1,6 +1,6 @@
 """Faces of a mesh: duplicate and degenerate ones, outlier parts, and consistent orientation.
 
-`agreeing_flips` makes orientations consistent between neighbors, of faces as well as of normals of a cloud.
+`agreeing_flips` makes orientations consistent between neighbours, of faces as well as of normals of a cloud.
 """
 
 from __future__ import annotations
@@ -277,9 +277,9 @@ def _gaps(verts: Floats, faces: Ints, face_areas: Floats, part: Ints, body: Ints
 def agreeing_flips(
     count: int, pairs: Int[Ints, "N 2"], differ: Bool[Bools, " N"], cost: Float[Floats, " N"]
 ) -> tuple[Bool[Bools, " count"], Int[Ints, " count"]]:
-    """Flip some of `count` items so that neighbors agree along a minimum spanning forest.
+    """Flip some of `count` items so that neighbours agree along a minimum spanning forest.
 
-    `differ` says which `pairs` of neighbors disagree now; `cost` is small where a pair is reliable. Returns which items
+    `differ` says which `pairs` of neighbours disagree now; `cost` is small where a pair is reliable. Returns which items
     to flip, relative to an arbitrary member of their component, and the component of each item.
     """
     from scipy.sparse import coo_array

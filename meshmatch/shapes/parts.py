@@ -275,7 +275,7 @@ def _sample_parts(parts: Parts, unit: float) -> tuple[Float[Floats, "S 3"], Int[
 def _touching_groups(
     points: Float[Floats, "S 3"], owner: Int[Ints, " S"], numbers: frozenset[int], count: int, max_gap: float
 ) -> list[frozenset[int]]:
-    """Groups of parts that are connected by near pairs: by grid cells that have points of both in their neighborhood."""
+    """Groups of parts that are connected by near pairs: by grid cells that have points of both in their neighbourhood."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

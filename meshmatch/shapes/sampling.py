@@ -15,9 +15,9 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import dot, interpolate, triangle_vectors, unit
 from meshmatch.shapes.shape import Shape
 
-_N_NEIGHBORS = 16
+_N_NEIGHBOURS = 16
 _CANDIDATES_PER_POINT = 30  # candidates per chosen point: more would not improve the choice
-_MAX_EDGE = 3.0  # maximum edge length, relative to the median distance of the sixth neighbor
+_MAX_EDGE = 3.0  # maximum edge length, relative to the median distance of the sixth neighbour
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -117,13 +117,15 @@ def triangulate_cloud(cloud: Shape, most: int) -> tuple[Int[Ints, " V"], Int[Int
     if len(chosen) > most // 2:
         chosen = np.sort(chosen[farthest_points(cloud.verts[chosen], most // 2)])
     points, normals = cloud.verts[chosen], cloud.vertex_normals[chosen]
-    k = min(_N_NEIGHBORS, len(points) - 1)
+    k = min(_N_NEIGHBOURS, len(points) - 1)
     distance, index = cKDTree(points).query(points, k + 1)
     reach = _MAX_EDGE * np.median(distance[:, min(6, k)])
     votes: Counter[tuple[int, ...]] = Counter()
-    for center, neighbors in enumerate(index):
-        stars = _star(points[neighbors], normals[center], reach)
-        votes.update(tuple(sorted((center, int(neighbors[second]), int(neighbors[third])))) for second, third in stars)
+    for center, neighbours in enumerate(index):
+        stars = _star(points[neighbours], normals[center], reach)
+        votes.update(
+            tuple(sorted((center, int(neighbours[second]), int(neighbours[third])))) for second, third in stars
+        )
     faces = np.array([key for key, count in votes.items() if count == 3], np.int64).reshape(-1, 3)
     if 3 * len(faces) < len(points):
         rough = f"{cloud.name or 'the cloud'} is too rough for a template: its points lie on no surface"

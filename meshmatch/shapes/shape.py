@@ -228,7 +228,7 @@ class Shape(Pickled):
     def vertex_normals(self) -> Floats:
         """(V, 3) unit normals, area-weighted means of the surrounding faces' normals; zeros where there are none.
 
-        Those of a cloud are estimated from neighborhoods and oriented outwards as far as possible.
+        Those of a cloud are estimated from neighbourhoods and oriented outwards as far as possible.
         """
         if self.is_cloud:
             return self._estimate(estimate_normals)
