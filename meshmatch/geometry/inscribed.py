@@ -1,6 +1,6 @@
 """Local thickness of a closed surface by its largest inscribed balls.
 
-Shrinking balls after Ma, Bae and Choi, *3D medial axis point approximation using nearest neighbours and the normal
+Shrinking balls after Ma, Bae and Choi, *3D medial axis point approximation using nearest neighbors and the normal
 field* (The Visual Computer 28, 2012): a ball that touches a point from inside shrinks until it contains no other point.
 """
 

@@ -72,9 +72,7 @@ def roughness(points: Float[Floats, "V 3"]) -> float:
 
 
 def outlier_points(points: Float[Floats, "V 3"], far: float = 3.0) -> Bool[Bools, " V"]:
-    """Whether each point is an outlier: ``far`` times farther from its neighbours than they are from theirs, and than
-    usual.
-    """
+    """Whether each point is ``far`` times farther from its neighbours than they are from theirs, and than is usual."""
     from meshmatch.geometry.trees import cKDTree
 
     subset = _subset(points)
