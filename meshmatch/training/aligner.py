@@ -1,6 +1,6 @@
-"""The aligner alone, before everything else learns: it sees a fixed set of scans, turned anew in every step.
+"""Train the aligner on its own, before the whole network: on a fixed set of scans, rotated anew in every step.
 
-A step costs a tenth of one of the whole network, and what it takes to know every orientation is steps.
+A step takes a tenth of the time of one of the whole network, and learning all orientations takes many steps.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from meshmatch.training import scans
 from meshmatch.training.batches import Draw, batches
 from meshmatch.training.datasets import BatchDataset, step_generator
 
-_SEED = 424_243  # of the scans, which no other step draws
+_SEED = 424_243  # seed offset of the scans, so that no other step draws the same ones
 _BATCH, _POINTS, _SHAPES = 64, 1024, 2048
 _RATE, _WARM_UP = 2e-3, 100
 
 
-class _Unread(torch.nn.Module):
-    """Stands for an aligner whose features are the points themselves."""
+class _PointFeatures(torch.nn.Module):
+    """Placeholder for an aligner, with the points themselves as features."""
 
     def features(self, points: Float[Tensor, "B P 3"]) -> Float[Tensor, "B P 3"]:
         return points[:, :_POINTS]
@@ -39,12 +39,15 @@ class _Unread(torch.nn.Module):
 
 @dataclass(frozen=True)
 class Aligned:
-    """What became of the aligner: whether all its steps are done, seconds of this run and of all, and the mean distance of
-    its last rotations."""
+    """Result of training the aligner.
+
+    ``done`` is whether all steps are done; ``seconds`` is the time of this run, ``total_seconds`` that of all runs;
+    ``error`` is a running mean of the Frobenius distance between predicted and correct rotations.
+    """
 
     done: bool = True
     seconds: float = 0.0
-    of_all: float = 0.0
+    total_seconds: float = 0.0
     error: float = math.nan
 
 
@@ -57,28 +60,31 @@ def train_aligner(
     minutes: float | None = None,
     checkpoint: Path | None = None,
 ) -> Aligned:
-    """Train the aligner of a model in place, where the model is: a function of the data's seed and the sort of device.
+    """Train the aligner of a model in place, on the model's device; the result depends on the data's seed and the kind of
+    device.
 
-    After so many ``minutes`` it stops, with a ``checkpoint`` that the next call goes on from (`ModelError` if that is of
+    After ``minutes`` it stops and writes ``checkpoint``, from which the next call resumes (`ModelError` if it belongs to
     another training).
     """
-    aligner, device, began = model.aligner, model.nodes.device, time.monotonic()
+    aligner, device, start = model.aligner, model.nodes.device, time.monotonic()
     assert aligner is not None
-    raw = replace(data, aligner=_Unread(), encoder=None, seed=data.seed + _SEED)  # type: ignore[arg-type]
-    drawn = list(batches(raw, range(-(-_SHAPES // data.shapes)), device, 0, draw))
+    raw = replace(data, aligner=_PointFeatures(), encoder=None, seed=data.seed + _SEED)  # type: ignore[arg-type]
+    scan_batches = list(batches(raw, range(-(-_SHAPES // data.shapes)), device, 0, draw))
     points, rotation, center = (
-        torch.cat([getattr(batch, name) for batch in drawn])
+        torch.cat([getattr(batch, name) for batch in scan_batches])
         for name in ("align_features", "align_rotation", "align_center")
     )
     optimiser = torch.optim.AdamW(aligner.parameters(), _RATE, betas=(0.9, 0.99), weight_decay=0.01)
-    first, before = 0, 0.0
+    first_step, seconds_before = 0, 0.0
     if checkpoint is not None and checkpoint.is_file():
-        first, before = _load(checkpoint, aligner, optimiser, {"seed": str(data.seed), "steps": str(steps)})
+        first_step, seconds_before = _load(
+            checkpoint, aligner, optimiser, {"seed": str(data.seed), "steps": str(steps)}
+        )
     aligner.train()
-    recent = torch.zeros((), device=device)
-    for step in range(first, steps):
+    recent_error = torch.zeros((), device=device)
+    for step in range(first_step, steps):
         generator = step_generator(data.seed + _SEED, step, device)
-        torch.manual_seed(step)  # of dropout
+        torch.manual_seed(step)  # for dropout
         for group in optimiser.param_groups:
             group["lr"] = _RATE * min(1.0, (step + 1) / _WARM_UP) * 0.5 * (1 + np.cos(np.pi * step / steps))
         with device:
@@ -89,23 +95,23 @@ def train_aligner(
         with torch.no_grad():
             features = aligner.features(turned - middle)
         R, t = model.align(features)
-        off = (R - turn @ rotation[rows]).square().sum((1, 2)).clamp_min(1e-12).sqrt().mean()
-        wanted = (turn @ center[rows][..., None])[..., 0] - middle[:, 0]
-        loss = off + 3 * (t - wanted).norm(dim=1).mean()
+        rotation_error = (R - turn @ rotation[rows]).square().sum((1, 2)).clamp_min(1e-12).sqrt().mean()
+        true_center = (turn @ center[rows][..., None])[..., 0] - middle[:, 0]
+        loss = rotation_error + 3 * (t - true_center).norm(dim=1).mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
-        recent = recent + (off.detach() - recent) / min(step - first + 1, 50)
+        recent_error = recent_error + (rotation_error.detach() - recent_error) / min(step - first_step + 1, 50)
         if progress is not None:
             progress((step + 1) / steps)
-        seconds = time.monotonic() - began
+        seconds = time.monotonic() - start
         if minutes is not None and seconds > 60 * minutes and step + 1 < steps:
             if checkpoint is not None:
-                words = {"step": str(step + 1), "seconds": f"{before + seconds:.1f}"}
+                words = {"step": str(step + 1), "seconds": f"{seconds_before + seconds:.1f}"}
                 _save(checkpoint, aligner, optimiser, words | {"seed": str(data.seed), "steps": str(steps)})
-            return Aligned(False, seconds, before + seconds, float(recent))
-    seconds = time.monotonic() - began
-    return Aligned(True, seconds, before + seconds, float(recent))
+            return Aligned(False, seconds, seconds_before + seconds, float(recent_error))
+    seconds = time.monotonic() - start
+    return Aligned(True, seconds, seconds_before + seconds, float(recent_error))
 
 
 def _save(path: Path, aligner: torch.nn.Module, optimiser: torch.optim.Optimizer, words: dict[str, str]) -> None:
@@ -117,21 +123,21 @@ def _save(path: Path, aligner: torch.nn.Module, optimiser: torch.optim.Optimizer
 
 
 def _load(
-    path: Path, aligner: torch.nn.Module, optimiser: torch.optim.Optimizer, same: dict[str, str]
+    path: Path, aligner: torch.nn.Module, optimiser: torch.optim.Optimizer, expected: dict[str, str]
 ) -> tuple[int, float]:
-    """Go on where `_save` was called: the next step, and seconds of all runs before."""
-    held: dict[str, dict[str, Tensor]] = {"aligner": {}}
+    """Restore the state that `_save` wrote; return the next step, and seconds of all previous runs."""
+    parts: dict[str, dict[str, Tensor]] = {"aligner": {}}
     try:
         with safe_open(str(path), framework="pt") as file:
             words = file.metadata() or {}
             step, seconds = int(words["step"]), float(words["seconds"])
             for name in file.keys():  # noqa: SIM118 (it is no dictionary)
                 part, _, key = name.rpartition(".") if name.startswith("optimiser.") else name.partition(".")
-                held.setdefault(part, {})[key] = file.get_tensor(name)
-        if any(words[name] != value for name, value in same.items()) or not 0 < step < int(same["steps"]):
+                parts.setdefault(part, {})[key] = file.get_tensor(name)
+        if any(words[name] != value for name, value in expected.items()) or not 0 < step < int(expected["steps"]):
             raise ValueError("of another training")
-        aligner.load_state_dict(held.pop("aligner"))
-        state = {int(part.removeprefix("optimiser.")): each for part, each in held.items()}
+        aligner.load_state_dict(parts.pop("aligner"))
+        state = {int(part.removeprefix("optimiser.")): each for part, each in parts.items()}
         optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
     except (SafetensorError, OSError, LookupError, ValueError, RuntimeError) as error:
         hint = "train into another folder, or start afresh"

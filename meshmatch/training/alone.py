@@ -1,4 +1,4 @@
-"""One training at a time writes to a folder."""
+"""Lock the output folder, so that only one training writes to it at a time."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ from typing import Any, TypeVar, cast
 from meshmatch.locks import locked
 from meshmatch.outputs import as_path, make_folder
 
-CHECKPOINT = Path("checkpoint", "last.safetensors")  # in the model folder
-ALIGNER = Path("checkpoint", "aligner.safetensors")  # of one that was stopped before all else could be learned
+CHECKPOINT = Path("checkpoint", "last.safetensors")  # relative to the model folder
+ALIGNER = Path("checkpoint", "aligner.safetensors")  # checkpoint of an interrupted training of the aligner
 Train = TypeVar("Train", bound=Callable[..., Any])
 
 
 def alone(train: Train) -> Train:
-    """Let a training make its output folder, and refuse a second one in it (`OutputError`) until the first ends or is
-    killed.
+    """Decorate a training function: make the output folder, its first argument, and lock it during the call.
+
+    `OutputError` if another process holds the lock. The lock is released even if that process is killed.
     """
 
     @wraps(train)
-    def only(output: str | Path, *args: Any, **kwargs: Any) -> Any:
+    def locked_train(output: str | Path, *args: Any, **kwargs: Any) -> Any:
         folder = (as_path(output) / CHECKPOINT).parent
         make_folder(folder)
-        if os.environ.get("RANK", "0") != "0":  # of several processes the first holds the lock for all
+        if os.environ.get("RANK", "0") != "0":  # the process with rank 0 holds the lock for all
             return train(output, *args, **kwargs)
         with locked(folder / "lock", f"another training writes to {output}", "let it end, or choose another folder"):
             return train(output, *args, **kwargs)
 
-    return cast(Train, only)
+    return cast(Train, locked_train)

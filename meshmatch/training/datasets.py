@@ -1,7 +1,7 @@
-"""Training batches, drawn statelessly: batch s is a function of (seed, s), which makes resuming exact.
+"""Training batches without state: batch s is a function of (seed, s), which makes resuming exact.
 
-Registered shapes are scanned (`BatchDataset`); shapes without correspondence are known by samples (`CloudDataset`), which
-are smoothly deformed, a little turned, scaled and roughened.
+`BatchDataset` simulates scans of registered shapes. `CloudDataset` has samples of shapes without correspondence, and
+augments them with smooth deformations, small rotations, scaling and noise.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from meshmatch.training import scans
 from meshmatch.training.scans import ScanConfig, small_rotations
 
 DEFORM = 0.08
-"""Standard deviation of the vectors of a coarse lattice, whose field deforms a shape smoothly, units of sqrt(area)."""
-_PLAIN = 0.25  # of the shapes are not deformed; this and `DEFORM` are set by hand
-_SIDE = 4  # nodes of the lattice along each axis; this and the reach are set by hand
-_REACH = 1.9  # of a lattice node, in spacings
-_BLOCK = 50  # shapes that are drawn at a time
-_MAX_POINTS = 400_000  # for which a lattice is kept ready; with more shapes there is no need to deform them
+"""Standard deviation of the node vectors of the coarse lattice that deforms shapes smoothly, units of sqrt(area)."""
+_UNDEFORMED_SHARE = 0.25  # share of shapes that are not deformed; this and `DEFORM` are set by hand
+_SIDE = 4  # nodes of the lattice along each axis; this and the radius are set by hand
+_NODE_RADIUS = 1.9  # radius of a lattice node, in spacings
+_BLOCK = 50  # shapes drawn at a time
+_MAX_POINTS = 400_000  # data sets with more points need no deformation, and get no lattice
 
 
 def registered_source(shapes: Float[Tensor, "N V 3"]) -> Source:
-    """A fixed set of registered shapes, drawn with replacement."""
+    """Source that draws from a fixed set of registered shapes with replacement."""
     return partial(any_of, shapes - shapes.mean(1, keepdim=True))
 
 
-def drawn_once(source: Source, count: int, seed: int, progress: Progress) -> Source:
-    """The first ``count`` shapes that a source draws, and no others."""
+def fixed_pool(source: Source, count: int, seed: int, progress: Progress) -> Source:
+    """Source that draws, with replacement, from the first ``count`` shapes of another source."""
     generator, blocks = torch.Generator().manual_seed(seed), []
     for start in range(0, count, _BLOCK):
         blocks.append(source(min(_BLOCK, count - start), generator))
@@ -49,15 +49,15 @@ def drawn_once(source: Source, count: int, seed: int, progress: Progress) -> Sou
 
 
 def step_generator(seed: int, step: int, device: torch.device | str = "cpu") -> torch.Generator:
-    """The random stream of one training step. A large odd multiplier keeps those of different seeds apart.
+    """Random generator of one training step. A large odd multiplier separates the streams of different seeds.
 
-    Every sort of device has streams of its own.
+    Different kinds of device give different random numbers.
     """
     return torch.Generator(device).manual_seed((seed * 2_654_435_761 + step) % (2**63))
 
 
 class OnDevice:
-    """Dataclasses of tensors."""
+    """Base of dataclasses of tensors that can be moved to a device."""
 
     def to(self, device: torch.device) -> Self:
         return type(self)(**{n: v if v is None else v.to(device) for n, v in vars(self).items()})
@@ -65,8 +65,12 @@ class OnDevice:
 
 @dataclass(frozen=True, eq=False)
 class Batch(OnDevice):
-    """Scans in a roughly right core frame, lengths in units of sqrt(surface area); where the template's loss points belong
-    in it; what the encoder reads of ``points``; and the aligner's input (any turn) and answer."""
+    """A batch of B scans with their supervision.
+
+    ``points`` are approximately in the core frame, in units of sqrt(surface area); ``targets`` are the correct places of the
+    template's loss points in the same frame; ``encode_features`` are the encoder's features of ``points``. The aligner's
+    input is the scan in a random orientation, and ``align_rotation`` and ``align_center`` are the expected answer.
+    """
 
     points: Float[Tensor, "B P 3"]
     targets: Float[Tensor, "B M 3"]
@@ -78,10 +82,10 @@ class Batch(OnDevice):
 
 @dataclass(frozen=True, eq=False)
 class BatchDataset(torch.utils.data.Dataset[Batch]):
-    """Item s is the batch of training step s, drawn on the CPU; see `training.batches` for other devices.
+    """Simulated scans of registered shapes. Item s is the batch of step s, drawn on the CPU; see `training.batches`.
 
-    ``template_core`` are the template's vertices of the core, ``core`` their indices; ``loss_points`` the indices of
-    supervised vertices. Each drawn shape is scanned ``scans_per_shape`` times, and scaled to ``radius`` or to area 1.
+    ``template_core`` are the template's core vertices, ``core`` their indices; ``loss_points`` are the indices of the
+    supervised vertices. Each drawn shape is scaled to ``radius``, or to area 1, and scanned ``scans_per_shape`` times.
     """
 
     source: Source
@@ -105,18 +109,23 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
         return self.batch(step_generator(self.seed, step))
 
     @torch.no_grad()
-    def drawn(self, generator: torch.Generator) -> Float[Tensor, "N V 3"]:
-        """Shapes of the source, which is ours if it draws on a GPU, and looked at nowhere else."""
+    def draw_shapes(self, generator: torch.Generator) -> Float[Tensor, "N V 3"]:
+        """Draw shapes from the source and check them.
+
+        They are not checked on a GPU, where only meshmatch's own sources draw.
+        """
         if not callable(self.source):
             hint = "docs/training.md has one of your own"
             raise InputError(f"a source is a function that draws shapes, not {type(self.source).__name__}", hint)
-        found = self.source(self.shapes, generator)
-        return found if self.faces.device.type != "cpu" else _checked(found, self.shapes, int(self.faces.max()) + 1)
+        shapes = self.source(self.shapes, generator)
+        return (
+            shapes if self.faces.device.type != "cpu" else _check_shapes(shapes, self.shapes, int(self.faces.max()) + 1)
+        )
 
     @torch.no_grad()
     def batch(self, generator: torch.Generator, verts: Float[Tensor, "N V 3"] | None = None) -> Batch:
-        """The batch of a random stream, of shapes that it draws or of given ones, where the tensors of this are."""
-        verts = self.drawn(generator) if verts is None else verts
+        """Batch for a random stream, on the dataset's device; shapes are drawn unless ``verts`` are given."""
+        verts = self.draw_shapes(generator) if verts is None else verts
         scale = verts.flatten(1).std(1)[:, None, None]
         verts = scans.bump(verts / scale * 0.3, self.scan.bumps, generator)
         verts, areas = scans.normalise(verts, self.faces)
@@ -125,14 +134,14 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
         verts, areas = (table.repeat_interleave(self.scans_per_shape, 0) for table in (verts, areas))
         B = len(verts)
         verts = verts * (1 + self.scan.scale * torch.randn(B, 1, 1, generator=generator).clamp(-2, 2))
-        areas, grown, foreign = self._clutter(verts, areas, generator)
-        verts = verts * grown
+        areas, factor, foreign = self._clutter(verts, areas, generator)
+        verts = verts * factor
         points = scans.sample_scan(verts, areas, self.faces, self.scan, generator)
         if self.scan.strays:
-            strange = torch.rand(points.shape[:2], generator=generator)[..., None] < foreign
-            points = torch.where(strange, scans.stray_points(verts, points.shape[1], generator), points)
+            is_foreign = torch.rand(points.shape[:2], generator=generator)[..., None] < foreign
+            points = torch.where(is_foreign, scans.stray_points(verts, points.shape[1], generator), points)
         R, t = scans.rigid_fit(self.template_core, verts[:, self.core])
-        # The roughly right frame in which the encoder works: x_core = S R^T (x - t) + shift.
+        # The approximate core frame in which the encoder works: x_core = S R^T (x - t) + shift.
         if self.scan.upright:
             t = points.mean(1)
             turn = scans.yaw_rotations(B, generator) if self.scan.yaw else torch.eye(3).expand(B, 3, 3)
@@ -145,26 +154,29 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
         features = torch.zeros(B, 0) if self.encoder is None else self.encoder.features(in_core)
         if self.aligner is None:
             return Batch(in_core, targets, features)
-        # The aligner sees the scan centred on its own points and turned anywhere.
+        # The aligner sees the scan centered on its own points, in a random orientation.
         middle = points.mean(1, keepdim=True)
-        anywhere = scans.random_rotations(B, generator)
-        turned = (points - middle) @ anywhere.transpose(1, 2)
-        center = (anywhere @ (t - middle[:, 0])[..., None])[..., 0]
-        return Batch(in_core, targets, features, self.aligner.features(turned), anywhere @ R, center)
+        orientation = scans.random_rotations(B, generator)
+        turned = (points - middle) @ orientation.transpose(1, 2)
+        center = (orientation @ (t - middle[:, 0])[..., None])[..., 0]
+        return Batch(in_core, targets, features, self.aligner.features(turned), orientation @ R, center)
 
     def _clutter(
         self, verts: Tensor, areas: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Float[Tensor, "B 1 1"]]:
-        """Areas of faces without those that scans do not show; the factor by which shapes then are larger, and with things
-        beside them smaller, at the same total area; and which share of each scan is such things."""
+        """Simulate hidden surfaces and foreign objects in scans that have a total area of 1.
+
+        Returns face areas, nearly 0 where a scan does not show the face; the factor that scales each shape to its share of
+        the total area; and the share of each scan that is foreign objects.
+        """
         B, scan = len(verts), self.scan
         foreign = torch.zeros(B, 1, 1)
         if scan.outside:
             chosen = torch.rand(B, generator=generator) < scan.outside
-            # a GPU sooner looks at all than that somebody waits until it knows which
+            # On a GPU it is faster to process all shapes than to wait for the indices of the chosen ones.
             at = torch.nonzero(chosen)[:, 0] if areas.device.type == "cpu" else torch.arange(B)
-            seen = scans.seen_from_outside(verts[at], self.faces, generator) | ~chosen[at, None]
-            areas = areas.index_copy(0, at, areas[at] * torch.where(seen, 1.0, 1e-3))
+            is_visible = scans.seen_from_outside(verts[at], self.faces, generator) | ~chosen[at, None]
+            areas = areas.index_copy(0, at, areas[at] * torch.where(is_visible, 1.0, 1e-3))
         if scan.strays:
             foreign = 0.3 * torch.rand(B, 1, 1, generator=generator)
             foreign = foreign * (torch.rand(B, 1, 1, generator=generator) < scan.strays)
@@ -172,12 +184,12 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
         return areas, ((1 - foreign) / shown).sqrt(), foreign
 
 
-def _checked(found: Any, count: int, V: int) -> Float[Tensor, "N V 3"]:
-    """What a source drew, in float32; `InputError` if these are not so many shapes of at least V vertices."""
+def _check_shapes(drawn: Any, count: int, V: int) -> Float[Tensor, "N V 3"]:
+    """Convert what a source returned to float32; `InputError` if it is not ``count`` shapes of at least V vertices."""
     try:
-        verts: Tensor = torch.as_tensor(found).float()
+        verts: Tensor = torch.as_tensor(drawn).float()
     except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"a source must give vertices, not {type(found).__name__}", "it returns a tensor") from error
+        raise InputError(f"a source must give vertices, not {type(drawn).__name__}", "it returns a tensor") from error
     if verts.ndim != 3 or len(verts) != count or verts.shape[1] < V or verts.shape[2] != 3:
         wanted = f"({count}, V, 3) with the template's vertices"
         raise InputError(
@@ -192,7 +204,7 @@ def _checked(found: Any, count: int, V: int) -> Float[Tensor, "N V 3"]:
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """A coarse field on every sample of N shapes, its gradient there, and the field on their landmarks."""
+    """Shape functions of a coarse lattice of L nodes at the P samples of N shapes, their gradients, and at M landmarks."""
 
     phi: Float[Tensor, "N P L"]
     gradient: Float[Tensor, "N P 3 L"]
@@ -201,7 +213,7 @@ class Lattice:
 
 @dataclass(frozen=True, eq=False)
 class CloudBatch(OnDevice):
-    """As `Batch`, roughly in the template's frame; landmarks that a shape lacks are NaN."""
+    """A batch of B shapes without correspondence, approximately in the template's frame; missing landmarks are NaN."""
 
     points: Float[Tensor, "B P 3"]
     normals: Float[Tensor, "B P 3"]
@@ -210,7 +222,7 @@ class CloudBatch(OnDevice):
 
 
 def build_lattice(samples: ShapeSamples) -> Lattice | None:
-    """A lattice around all shapes and its field on their samples; None where there are so many that none is needed."""
+    """Build a lattice around all shapes, with its field at their samples; None if there are more than `_MAX_POINTS`."""
     N, P, _ = samples.points.shape
     if N * P > _MAX_POINTS:
         return None
@@ -222,25 +234,25 @@ def build_lattice(samples: ShapeSamples) -> Lattice | None:
 
 
 def _lattice_field(points: Float[Floats, "N 3"]) -> Field:
-    """The field of a coarse lattice around all points, at them."""
+    """Field at the points, of a coarse lattice of nodes that encloses them."""
     low, high = points.min(0), points.max(0)
     middle, half = 0.5 * (low + high), 0.55 * float((high - low).max())
     ticks = np.linspace(-half, half, _SIDE)
     lattice = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3) + middle
-    return Field.of(build_field(points, lattice, _REACH * float(ticks[1] - ticks[0]), "smooth"))
+    return Field.of(build_field(points, lattice, _NODE_RADIUS * float(ticks[1] - ticks[0]), "smooth"))
 
 
 def lattice_vectors(deform: float, B: int, L: int, generator: torch.Generator) -> Float[Tensor, "B L 3"]:
-    """Vectors of a lattice's nodes for a batch of shapes; every shape draws how much of the deformation it gets."""
+    """Random node vectors of a lattice for a batch of shapes; their magnitude varies from shape to shape."""
     size = deform * torch.rand(B, 1, 1, generator=generator)
-    size = size * (torch.rand(B, 1, 1, generator=generator) >= _PLAIN)
+    size = size * (torch.rand(B, 1, 1, generator=generator) >= _UNDEFORMED_SHARE)
     return size * torch.randn(B, L, 3, generator=generator)
 
 
 def deformed_source(shapes: Float[Tensor, "N V 3"], deform: float = DEFORM) -> Source:
-    """Registered shapes, drawn with replacement and smoothly deformed; all stand alike, in any unit.
+    """Source that draws registered shapes with replacement and deforms them smoothly.
 
-    So many that no change is needed (see `build_lattice`) are drawn as they are.
+    All shapes have the same orientation, in any unit. Large sets (see `build_lattice`) are not deformed.
     """
     N, V, _ = shapes.shape
     if N * V > _MAX_POINTS or deform <= 0:
@@ -248,10 +260,10 @@ def deformed_source(shapes: Float[Tensor, "N V 3"], deform: float = DEFORM) -> S
     shapes = shapes - shapes.mean(1, keepdim=True)
     shapes = 0.3 * shapes / shapes.flatten(1).std(1)[:, None, None]  # about area 1
     phi = _lattice_field(shapes.reshape(-1, 3).double().numpy()).phi.to_dense().reshape(N, V, -1)
-    return partial(_deformed, shapes, phi, deform)
+    return partial(_draw_deformed, shapes, phi, deform)
 
 
-def _deformed(
+def _draw_deformed(
     shapes: Float[Tensor, "N V 3"], phi: Float[Tensor, "N V L"], deform: float, count: int, generator: torch.Generator
 ) -> Float[Tensor, "B V 3"]:
     which = torch.randint(len(shapes), (count,), generator=generator)
@@ -260,7 +272,7 @@ def _deformed(
 
 @dataclass(frozen=True, eq=False)
 class CloudDataset(torch.utils.data.Dataset[CloudBatch]):
-    """Item s is the batch of training step s, a function of the seed and s alone."""
+    """Augmented samples of shapes without correspondence. Item s is the batch of training step s."""
 
     points: Float[Tensor, "N P 3"]
     normals: Float[Tensor, "N P 3"]
@@ -281,9 +293,9 @@ class CloudDataset(torch.utils.data.Dataset[CloudBatch]):
 
     @torch.no_grad()
     def batch(self, generator: torch.Generator) -> CloudBatch:
-        """The batch of a random stream, where the tensors of this are."""
+        """Batch for a random stream, on the dataset's device."""
         N, total, _ = self.points.shape
-        # Every shape once before one comes again, as far as a batch goes.
+        # Within a batch every shape is drawn once before any is repeated.
         order = [torch.randperm(N, generator=generator) for _ in range(-(-self.shapes // N))]
         which = torch.cat(order)[: self.shapes]
         P = min(self.scan.points, total)
@@ -295,7 +307,7 @@ class CloudDataset(torch.utils.data.Dataset[CloudBatch]):
             vectors = lattice_vectors(self.deform, B, self.lattice.phi.shape[2], generator)
             points = points + self.lattice.phi[rows, pick] @ vectors
             known = known + self.lattice.landmark_phi[which] @ vectors
-            slopes = self.lattice.gradient[rows, pick] @ vectors[:, None]  # B P k a: d u_a / d x_k
+            slopes = self.lattice.gradient[rows, pick] @ vectors[:, None]  # (B, P, k, a): d u_a / d x_k
             normals = deformed_normals(slopes.transpose(-1, -2) + torch.eye(3), normals)
         turn = small_rotations(B, generator)
         size = 1 + self.scan.scale * torch.randn(B, 1, 1, generator=generator).clamp(-2, 2)
@@ -310,7 +322,7 @@ class CloudDataset(torch.utils.data.Dataset[CloudBatch]):
 
 
 def deformed_normals(F: Float[Tensor, "*B 3 3"], normals: Float[Tensor, "*#B 3"]) -> Float[Tensor, "*B 3"]:
-    """Unit normals after a deformation with gradient F: its cofactors on the normals."""
+    """Unit normals after a deformation with gradient F, by the cofactor matrix of F."""
     a, b, c = F.unbind(-1)  # columns
     cofactors = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -1)
     return torch.nn.functional.normalize((cofactors @ normals[..., None])[..., 0], dim=-1)

@@ -1,4 +1,4 @@
-"""What a training is told about its model, for the card."""
+"""Facts about a model that a training writes to its card."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from meshmatch.models.trained import TrainedModel
 
 @dataclass(frozen=True)
 class CardFacts:
-    """What a training is told about its model; goes onto the card, see `ModelCard`.
+    """Facts about a model for its card, see `ModelCard`; those left empty are filled in by the training.
 
-    Empty words are found out. The weights of ``start`` (a model of the same template, network and kernel, its name or
-    folder) begin the training.
+    ``start`` is a model (or its name or folder) with the same template, network and kernel, whose weights training starts
+    from.
     """
 
-    name: str = ""  # the output folder's
-    category: str = ""  # of a folder of shapes the model's name; "human" for bodies
+    name: str = ""  # by default the name of the output folder
+    category: str = ""  # by default the model's name for a folder of shapes; "human" for bodies
     data: str = ""  # a sentence about the shapes
     licence: str = "unstated"
-    stiffness: float = 1.0  # 0.05 suits what differs more from shape to shape than bodies do, such as organs
+    stiffness: float = 1.0  # 0.05 suits shapes that vary more than bodies do, such as organs
     start: TrainedModel | str | Path | None = None
-    mirror: str = ""  # "auto" for what comes in two sides, or "no"
-    frame: dict[str, str] | None = None  # as the training's shapes and network say
-    measured: str = ""  # what the validation error is of, unless it is of more of what is generated
+    mirror: str = ""  # "auto" if shapes come in left and right versions, or "no"
+    frame: dict[str, str] | None = None  # by default determined by the shapes and the network
+    measured: str = ""  # what the validation error was measured on; empty for newly generated shapes
 
 
-def inherited(facts: CardFacts, card: ModelCard) -> CardFacts:
-    """What is not said of a model is said of the one that it goes on from; `OptionError` if that may not teach."""
+def fill_from_card(facts: CardFacts, card: ModelCard) -> CardFacts:
+    """Fill unset fields from the start model's card; `OptionError` if that was trained without correspondence."""
     if not card.correspondence:
         raise OptionError(
             f"{card.name} was trained without correspondence", "fit with a model that was trained with correspondence"
         )
-    plain = CardFacts()
+    defaults = CardFacts()
     names = ("frame", "mirror", "category", "licence", "stiffness")
-    unsaid = {name: getattr(card, name) for name in names if getattr(facts, name) == getattr(plain, name)}
-    return replace(facts, **unsaid)
+    unset = {name: getattr(card, name) for name in names if getattr(facts, name) == getattr(defaults, name)}
+    return replace(facts, **unset)

@@ -1,4 +1,4 @@
-"""The training loop: time budget, exact resume, several GPUs, an average of the weights for use."""
+"""The training loop: time budget, exact resuming, several GPUs, and averaged weights for inference."""
 
 from __future__ import annotations
 
@@ -32,20 +32,24 @@ from meshmatch.training.batches import Draw, batches
 from meshmatch.training.losses import CorrespondenceLoss, Objective
 
 OF_THE_MACHINE = ("minutes", "checkpoint_minutes", "threads", "device", "draw", "compile")
-"""Settings of a training that a recipe does not pass on."""
-_OF_TEMPLATE = ("nodes", "anchors")  # what a checkpoint must share with the training that goes on from it
-_MOMENTS, _COUNT = ("exp_avg", "exp_avg_sq"), {"step": torch.Size()}  # of Adam: what it knows of each parameter
+"""Settings that depend on the machine; they are not read from a recipe."""
+_TEMPLATE_BUFFERS = (
+    "nodes",
+    "anchors",
+)  # buffers that must be equal in a checkpoint and the training that resumes from it
+_MOMENTS, _STEP_SHAPE = ("exp_avg", "exp_avg_sq"), {"step": torch.Size()}  # Adam's state of each parameter
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """How long and how fast to learn.
+    """Optimiser settings, schedule, batch sizes and hardware options of a training.
 
-    ``steps`` fixes the schedule: warm-up, a constant rate, then a cosine to zero over the last ``decay`` share.
-    ``minutes`` only stops the run (with a checkpoint to go on from). ``align_steps``: so many steps of the aligner alone
-    come first. ``device``: "auto" (a GPU of CUDA if there is one), "cpu", "cuda" or "mps"; ``draw``: where batches are
-    drawn: "cpu", "device", or "auto" (on a GPU of CUDA). ``bf16``, and on GPUs that have it ``tf32``, round the factors of
-    products; torch may ``compile`` the loss. `OptionError` if a number cannot be.
+    ``steps`` determines the learning rate schedule: linear warm-up, constant rate, then cosine decay to zero over the last
+    fraction ``decay`` of the steps. ``minutes`` only stops the run, with a checkpoint to resume from. ``align_steps`` is the
+    number of steps in which the aligner is first trained on its own. ``device`` is "auto" (CUDA if available), "cpu",
+    "cuda" or "mps". ``draw`` is where batches are drawn: "cpu", "device", or "auto" (on the device if that is CUDA).
+    ``bf16`` runs the loss in mixed precision, ``tf32`` lets GPUs multiply in TF32, ``compile`` applies torch.compile to the
+    loss. `OptionError` if a value is out of range.
     """
 
     steps: int = 20_000
@@ -55,9 +59,9 @@ class TrainConfig:
     warm_up: int = 200
     decay: float = 0.4
     weight_decay: float = 0.01
-    average: float = 0.999  # how much of the averaged weights a step keeps; 0: the last weights are the model's
-    momentum: float = 0.99  # of squared gradients: the second beta of Adam
-    clip: float | None = 1.0  # largest norm of a gradient
+    average: float = 0.999  # decay of the exponential moving average of the weights; 0 uses the last weights
+    momentum: float = 0.99  # decay of the squared gradients, Adam's beta2
+    clip: float | None = 1.0  # maximum norm of the gradient
     minutes: float | None = None
     checkpoint_minutes: float = 3.0
     workers: int = 1
@@ -90,7 +94,7 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class StepReport:
-    """What a caller may show after a step: step counts, rate, seconds of this run, means of the losses since the last."""
+    """Progress after a step: step counts, learning rate, seconds of this run, mean losses since the last report."""
 
     step: int
     steps: int
@@ -101,50 +105,52 @@ class StepReport:
 
     @property
     def words(self) -> str:
-        """One line for people."""
+        """One-line summary."""
         return f"step {self.step:,} of {self.steps:,}{self.losses}"
 
     @property
     def losses(self) -> str:
-        """What `words` say of them."""
+        """The part of `words` with the losses and the validation error."""
         words = ", ".join(f"{name} {value:.4g}" for name, value in self.terms.items())
         known = "" if self.validation is None else f", validation {self.validation:.4f}"
         return f": {words}{known}"
 
 
 def settings_of(record: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Numbers and words of a recipe, by dotted names, without what belongs to the machine."""
-    found: dict[str, Any] = {}
+    """Flatten a recipe's record to dotted names, without the settings that depend on the machine."""
+    flat: dict[str, Any] = {}
     for name, value in record.items():
         if isinstance(value, Mapping):
-            found |= settings_of(value, f"{prefix}{name}.")
+            flat |= settings_of(value, f"{prefix}{name}.")
         elif name not in (*OF_THE_MACHINE, "workers"):
-            found[prefix + name] = value
-    return found
+            flat[prefix + name] = value
+    return flat
 
 
 def learning_rate(step: int, config: TrainConfig) -> float:
-    """Rate of a step: linear warm-up, constant, cosine to zero."""
-    start = (1 - config.decay) * config.steps
-    faded = min(1.0, max(0.0, step - start) / max(config.steps - start, 1))
-    fade = 0.5 * (1 + math.cos(math.pi * faded))
-    return config.rate * min(1.0, (step + 1) / max(config.warm_up, 1)) * fade
+    """Learning rate of a step: linear warm-up, constant, cosine decay to zero."""
+    decay_start = (1 - config.decay) * config.steps
+    decayed = min(1.0, max(0.0, step - decay_start) / max(config.steps - decay_start, 1))
+    factor = 0.5 * (1 + math.cos(math.pi * decayed))
+    return config.rate * min(1.0, (step + 1) / max(config.warm_up, 1)) * factor
 
 
 def processes() -> int:
-    """How many learn together, each from batches of its own, as torchrun says."""
+    """Number of processes that train together, each on its own batches; set by torchrun."""
     return int(os.environ.get("WORLD_SIZE", 1))
 
 
 class Trainer:
-    """State of a run: weights, their average, the optimiser and the next step. All of it is in a checkpoint."""
+    """State of a training: weights, their moving average, the optimiser and the next step; a checkpoint contains it all."""
 
     def __init__(
         self, model: Any, points: Any, config: TrainConfig, digest: str = "", recipe: Mapping[str, Any] | None = None
     ) -> None:
-        self.config, self.digest = config, digest  # of the shapes, see `Lessons`; empty where it is not known
+        self.config, self.digest = config, digest  # digest of the shapes, see `TrainingData`; empty if unknown
         self.settings: dict[str, Any] = settings_of(recipe or asdict(config)) | {"processes": processes()}
-        self.earlier: list[dict[str, Any]] = []  # until which step other settings held, and which
+        self.earlier: list[
+            dict[str, Any]
+        ] = []  # earlier settings that differed, each with the step until which they applied
         self.rank = int(os.environ.get("RANK", 0))
         self.world = processes()
         self.device = training_device(int(os.environ.get("LOCAL_RANK", 0)), config.device)
@@ -157,12 +163,14 @@ class Trainer:
         self.optimiser = torch.optim.AdamW(model.parameters(), config.rate, **settings)
         self.loss: Any = torch.compile(config.loss) if config.compile else config.loss
         self.step, self.seconds = 0, 0.0
-        self._unchecked: tuple[dict[str, Tensor], int] | None = None  # terms of a step, which a GPU still computes
-        self._came: list[int] = []  # signals that are to end one of several processes
-        self._ends = False  # whether one came to any of them
+        self._unchecked: tuple[dict[str, Tensor], int] | None = (
+            None  # loss terms and step, not yet checked to be finite
+        )
+        self._signals: list[int] = []  # termination signals that this one of several processes received
+        self._stop_requested = False  # whether any process received one
 
     def save(self, path: Path) -> None:
-        """Write everything that the next step depends on (rank 0 only)."""
+        """Write a checkpoint with everything that the next step depends on (rank 0 only)."""
         self._check_last()
         if self.rank:
             return
@@ -177,12 +185,14 @@ class Trainer:
             save_file(arrays, temporary, words | {"digest": self.digest})
 
     def load(self, path: Path) -> None:
-        """Go on where `save` was called; `ModelError` if the file is none, or of another seed, network or template, or of
-        other shapes. Other settings than before are told, and kept for the card."""
+        """Restore the state that `save` wrote; warns of changed settings, which are recorded for the card.
+
+        `ModelError` if the file is not a checkpoint, or has another seed, network, template or other shapes.
+        """
         hint = "train into another folder, or start afresh"
-        here = self.model.state_dict()
-        of_parameters = {name: tensor.shape for name, tensor in self.average.items()}
-        expected = {"model": {name: tensor.shape for name, tensor in here.items()}, "average": of_parameters}
+        current = self.model.state_dict()
+        parameter_shapes = {name: tensor.shape for name, tensor in self.average.items()}
+        expected = {"model": {name: tensor.shape for name, tensor in current.items()}, "average": parameter_shapes}
         parts: dict[str, dict[str, Tensor]] = {"model": {}, "average": {}, "optimiser": {}}
         state: dict[int, dict[str, Tensor]] = {}
         try:
@@ -190,8 +200,11 @@ class Trainer:
                 words = file.metadata() or {}
                 step, seconds = int(words["step"]), float(words.get("seconds", 0.0))
                 seed, digest = int(words.get("seed", self.config.seed)), words.get("digest", "")
-                known, earlier = json.loads(words.get("settings", "{}")), json.loads(words.get("earlier", "[]"))
-                if not isinstance(known, dict) or not isinstance(earlier, list):
+                saved_settings, earlier = (
+                    json.loads(words.get("settings", "{}")),
+                    json.loads(words.get("earlier", "[]")),
+                )
+                if not isinstance(saved_settings, dict) or not isinstance(earlier, list):
                     raise ValueError("no such settings")
                 for name in file.keys():  # noqa: SIM118 (it is no dictionary)
                     part, _, key = name.partition(".")
@@ -207,11 +220,11 @@ class Trainer:
             raise ModelError(f"{path} is a checkpoint of a training with seed {seed}", hint)
         if any({name: t.shape for name, t in parts[part].items()} != expected[part] for part in expected):
             raise ModelError(f"{path} is a checkpoint of another network", hint)
-        moments = {n: dict.fromkeys(_MOMENTS, p.shape) | _COUNT for n, p in enumerate(self.model.parameters())}
+        moments = {n: dict.fromkeys(_MOMENTS, p.shape) | _STEP_SHAPE for n, p in enumerate(self.model.parameters())}
         if any({key: t.shape for key, t in state[n].items()} != moments.get(n) for n in state):
             raise ModelError(f"{path} is not a checkpoint of a training", hint)
         weights = parts["model"]
-        if not all(torch.equal(weights[n], here[n].cpu()) for n in here if n.endswith(_OF_TEMPLATE)):
+        if not all(torch.equal(weights[n], current[n].cpu()) for n in current if n.endswith(_TEMPLATE_BUFFERS)):
             raise ModelError(f"{path} is a checkpoint for another template", hint)
         if digest and self.digest and digest != self.digest:
             raise ModelError(
@@ -225,10 +238,10 @@ class Trainer:
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
         self.earlier = earlier
-        self._note_changes(known)
+        self._note_changes(saved_settings)
 
     def _note_changes(self, before: dict[str, Any]) -> None:
-        """Tell which settings of the training up to here were others."""
+        """Record settings that differ from those of the checkpoint, and warn of them."""
         now = json.loads(json.dumps(self.settings, default=str))
         changed = {name: value for name, value in before.items() if name in now and now[name] != value}
         if changed and self.step:
@@ -248,72 +261,77 @@ class Trainer:
         spent: float = 0.0,
         progress: Progress | None = None,
     ) -> None:
-        """Train until ``steps`` or ``minutes`` are over, of which so many seconds are ``spent``; writes ``checkpoint`` now
-        and then, at the end, and where Ctrl-C ends it; several processes end after the same step."""
+        """Train until ``steps`` are done or ``minutes`` have passed, counting ``spent`` seconds as used already.
+
+        Writes ``checkpoint`` periodically, at the end, and on Ctrl-C. Several processes stop after the same step.
+        ``report`` is called ``every`` so many steps, ``validate`` at every tenth report and at the last.
+        """
         config = self.config
         torch.set_num_threads(config.threads)
-        _keep_memory()
-        ours = range(self.rank, config.steps * self.world, self.world)[self.step : config.steps]
+        _keep_freed_memory()
+        step_numbers = range(self.rank, config.steps * self.world, self.world)[self.step : config.steps]
         saved = time.monotonic()
-        began, before = saved - spent, self.seconds - spent
+        start, seconds_before = saved - spent, self.seconds - spent
         sums: dict[str, Tensor | float] = {}
-        first, between, summed, lately = self.step, True, 0, ""
+        first_step, can_save, n_summed, last_losses = self.step, True, 0, ""
         self.model.train()
-        if self.world > 1:  # which begin with the same weights
-            for held in (*self.model.state_dict().values(), *self.average.values()):
-                dist.broadcast(held.detach(), 0)
+        if self.world > 1:  # all processes start with the weights of rank 0
+            for tensor in (*self.model.state_dict().values(), *self.average.values()):
+                dist.broadcast(tensor.detach(), 0)
         try:
-            with _noted(self.world > 1) as self._came:
-                for batch in batches(data, ours, self.device, config.workers, config.draw):
-                    with _whole() if self.world == 1 else nullcontext():
-                        between = False
+            with _recorded_signals(self.world > 1) as self._signals:
+                for batch in batches(data, step_numbers, self.device, config.workers, config.draw):
+                    with _delayed_signals() if self.world == 1 else nullcontext():
+                        can_save = False
                         terms = self.iterate(batch)
-                        between = True
+                        can_save = True
                     for name, value in terms.items():
                         sums[name] = (
                             sums.get(name, 0.0) + value.detach().float()
-                        )  # there: no step waits for a GPU's numbers
-                    summed += 1
+                        )  # stays on the device, so that no step waits for it
+                    n_summed += 1
                     now = time.monotonic()
-                    self.seconds = before + now - began
+                    self.seconds = seconds_before + now - start
                     if report is not None and (self.step % every == 0 or self.step == config.steps):
-                        asked = self.step % (10 * every) == 0 or self.step == config.steps
-                        score = validate(self.model) if validate and asked else None
-                        means = {name: float(value) / summed for name, value in sums.items()}
+                        validates = self.step % (10 * every) == 0 or self.step == config.steps
+                        score = validate(self.model) if validate and validates else None
+                        means = {name: float(value) / n_summed for name, value in sums.items()}
                         rate = learning_rate(self.step, config)
-                        reported = StepReport(self.step, config.steps, rate, now - began, means, score)
-                        report(reported)
-                        sums, summed, lately = {}, 0, reported.losses
-                    if progress is not None:  # at every step, for one may take seconds
-                        progress.named(f"step {self.step:,} of {config.steps:,}{lately}")(self.step / config.steps)
+                        step_report = StepReport(self.step, config.steps, rate, now - start, means, score)
+                        report(step_report)
+                        sums, n_summed, last_losses = {}, 0, step_report.losses
+                    if progress is not None:  # at every step, since one may take seconds
+                        progress.named(f"step {self.step:,} of {config.steps:,}{last_losses}")(self.step / config.steps)
                     if checkpoint is not None and now - saved > 60 * config.checkpoint_minutes:
                         self.save(checkpoint)
                         saved = now
-                    if self._ends or (config.minutes is not None and self.any_says(now - began > 60 * config.minutes)):
+                    if self._stop_requested or (
+                        config.minutes is not None and self.any_process(now - start > 60 * config.minutes)
+                    ):
                         break
         except KeyboardInterrupt:
-            if checkpoint is not None and self.world == 1 and between and self.step > first:
+            if checkpoint is not None and self.world == 1 and can_save and self.step > first_step:
                 self.save(checkpoint)
             raise
         if checkpoint is not None:
             self.save(checkpoint)
         self.model.eval()
-        if self._ends:
-            _obey(self._came)
-            raise KeyboardInterrupt  # another process was told to
+        if self._stop_requested:
+            _handle_first(self._signals)
+            raise KeyboardInterrupt  # the signal went to another process
 
     def iterate(self, batch: Any) -> dict[str, Tensor]:
-        """One step of training on a batch; returns its losses. The model must be in training mode."""
+        """Run one training step on a batch and return its losses. The model must be in training mode."""
         config = self.config
         seed = config.seed * 7919 + self.step * self.world + self.rank
         generator = torch.Generator().manual_seed(seed)
-        # Dropout draws from the global stream: a resumed run must meet the same.
+        # Dropout draws from the global stream, which must be the same after resuming.
         torch.manual_seed(seed + 1)
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.step, config)
-        with _products("high" if config.tf32 else torch.get_float32_matmul_precision()):
+        with _matmul_precision("high" if config.tf32 else torch.get_float32_matmul_precision()):
             with torch.autocast(self.device.type, torch.bfloat16) if config.bf16 else nullcontext():
-                # torch compiles draws from its global stream alone
+                # torch.compile supports random numbers from the global stream only
                 terms: dict[str, Tensor] = self.loss(
                     self.model, batch.to(self.device), self.points, None if config.compile else generator
                 )
@@ -334,45 +352,48 @@ class Trainer:
         return terms
 
     def _check_last(self) -> None:
-        """`ModelError` if the total of the last step is not finite. Where that waits for a GPU it is asked a step later."""
+        """Raise `ModelError` if the total of the last unchecked step is not finite.
+
+        On a GPU this is checked one step later, so that no step waits for the result.
+        """
         if self._unchecked is not None:
             _check_finite(*self._unchecked)
             self._unchecked = None
 
     def _exchange(self) -> None:
-        """Gradients become the means over all processes, and all know whether one is to end: all at once, for each exchange
-        takes time of its own.
+        """Average gradients over all processes, and share whether any received a signal; in one call to all_reduce, for
+        each has a fixed cost.
         """
-        held = [each.grad for each in self.model.parameters() if each.grad is not None]
-        ends = held[0].new_tensor([float(bool(self._came))])
-        flat = torch.cat([*(each.flatten() for each in held), ends])
+        gradients = [each.grad for each in self.model.parameters() if each.grad is not None]
+        stop_flag = gradients[0].new_tensor([float(bool(self._signals))])
+        flat = torch.cat([*(each.flatten() for each in gradients), stop_flag])
         dist.all_reduce(flat)
-        flat, self._ends = flat[:-1], bool(flat[-1])
-        for each, mean in zip(held, (flat / self.world).split([each.numel() for each in held]), strict=True):
+        flat, self._stop_requested = flat[:-1], bool(flat[-1])
+        for each, mean in zip(gradients, (flat / self.world).split([each.numel() for each in gradients]), strict=True):
             each.copy_(mean.view_as(each))
 
     def _update_average(self) -> None:
-        # A young average follows quickly, an old one slowly.
+        # In the first steps the average follows the weights faster.
         keep = min(self.config.average, (1 + self.step) / (10 + self.step))
         names, values = zip(*self.model.named_parameters(), strict=True)
         torch._foreach_lerp_([self.average[n] for n in names], [v.detach() for v in values], 1 - keep)
 
-    def any_says(self, stop: bool) -> bool:
-        """Whether any process says so: one that stopped alone would leave the others waiting for its gradients."""
+    def any_process(self, stop: bool) -> bool:
+        """Whether ``stop`` is true in any process: if only one stopped, the others would wait for its gradients forever."""
         if self.world == 1:
             return stop
-        said = torch.tensor(float(stop), device=self.device)
-        dist.all_reduce(said, dist.ReduceOp.MAX)
-        return bool(said)
+        flag = torch.tensor(float(stop), device=self.device)
+        dist.all_reduce(flag, dist.ReduceOp.MAX)
+        return bool(flag)
 
     def close(self) -> None:
-        """Part from the other processes, if there are any; nothing more can be trained."""
+        """Leave the process group, if there is one; no further training is possible."""
         if self.world > 1 and dist.is_initialized():
             dist.destroy_process_group()
 
     @contextmanager
     def averaged(self) -> Iterator[None]:
-        """The model with the averaged weights, within the block."""
+        """Context in which the model has the averaged weights."""
         before = {n: t.detach().clone() for n, t in self.model.state_dict().items()}
         self.model.load_state_dict(self.averaged_state())
         try:
@@ -387,8 +408,8 @@ class Trainer:
 
 
 @contextmanager
-def _products(precision: str) -> Iterator[None]:
-    """How exact products of float32 matrices are within the block: scans are always drawn with exact ones."""
+def _matmul_precision(precision: str) -> Iterator[None]:
+    """Context with another precision of float32 matrix products; scans are drawn outside it, with full precision."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision(precision)
     try:
@@ -398,62 +419,66 @@ def _products(precision: str) -> Iterator[None]:
 
 
 @contextmanager
-def _noted(wanted: bool = True) -> Iterator[list[int]]:
-    """Signals that end the program are noted alone within the block; one that comes again, a second later, ends it."""
-    came: list[int] = []
-    began = 0.0
-    named = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    ours = wanted and threading.current_thread() is threading.main_thread()
-    handlers: dict[int, Any] = {each: found for each in named if ours and callable(found := signal.getsignal(each))}
+def _recorded_signals(wanted: bool = True) -> Iterator[list[int]]:
+    """Context that only records termination signals; a further one, more than a second later, is handled at once."""
+    received: list[int] = []
+    last_time = 0.0
+    terminating = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    active = wanted and threading.current_thread() is threading.main_thread()
+    handlers: dict[int, Any] = {
+        each: found for each in terminating if active and callable(found := signal.getsignal(each))
+    }
 
-    def note(number: int, frame: Any) -> None:
-        nonlocal began
-        if came and time.monotonic() - began > 1:
+    def record(number: int, frame: Any) -> None:
+        nonlocal last_time
+        if received and time.monotonic() - last_time > 1:
             handlers[number](number, frame)
-        began = time.monotonic()
-        came.append(number)
+        last_time = time.monotonic()
+        received.append(number)
 
     for number in handlers:
-        signal.signal(number, note)
+        signal.signal(number, record)
     try:
-        yield came
+        yield received
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
 
 
 @contextmanager
-def _whole() -> Iterator[None]:
-    """Signals that end the program wait until the block is done, unless they come again."""
-    with _noted() as came:
+def _delayed_signals() -> Iterator[None]:
+    """Context that delays termination signals until its end, unless they are repeated."""
+    with _recorded_signals() as received:
         yield
-    _obey(came)
+    _handle_first(received)
 
 
-def _obey(came: list[int]) -> None:
-    """Let the first of some signals do what it does."""
-    handler: Any = signal.getsignal(came[0]) if came else None
+def _handle_first(received: list[int]) -> None:
+    """Call the handler of the first recorded signal, if there is one."""
+    handler: Any = signal.getsignal(received[0]) if received else None
     if callable(handler):
-        handler(came[0], None)
+        handler(received[0], None)
 
 
 def _check_terms(terms: Any) -> None:
-    """What a loss gave: `OptionError` if nothing can be learned from it."""
+    """Raise `OptionError` unless a loss returned a dictionary of scalars whose total has a gradient."""
     if not (isinstance(terms, dict) and all(isinstance(each, Tensor) and not each.shape for each in terms.values())):
-        raise OptionError("a loss must give a dictionary of tensors, each of one number", "Objective describes losses")
+        raise OptionError("a loss must return a dictionary of scalar tensors", "Objective describes losses")
     if "total" not in terms or not terms["total"].requires_grad:
-        raise OptionError("a loss must give a term 'total' that has a gradient", "Objective describes losses")
+        raise OptionError("a loss must return a term 'total' that has a gradient", "Objective describes losses")
 
 
 def _check_finite(terms: dict[str, Tensor], step: int) -> None:
     if not terms["total"].isfinite():
-        strange = ", ".join(sorted(name for name, each in terms.items() if not each.isfinite()))
-        raise ModelError(f"the training diverged: not finite at step {step + 1:,} are {strange}", "take a lower rate")
+        not_finite = ", ".join(sorted(name for name, each in terms.items() if not each.isfinite()))
+        raise ModelError(
+            f"the training diverged: not finite at step {step + 1:,} are {not_finite}", "take a lower rate"
+        )
 
 
-def _keep_memory() -> None:
-    """Let glibc keep what is freed: returning large tensors to the system and getting them again, page by page, costs the
-    paper's preset a third of its time."""
+def _keep_freed_memory() -> None:
+    """Make glibc keep freed memory: returning large tensors to the system and mapping them again, page by page, takes a
+    third of the time of the paper's preset."""
     if sys.platform == "linux" and hasattr(library := ctypes.CDLL(None), "mallopt"):
         for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
             library.mallopt(option, 2**30)

@@ -1,7 +1,7 @@
-"""What a training minimises: an `Objective` holds the weights of its terms and computes them for a batch.
+"""Training losses: an `Objective` holds the weights of its terms and computes them for a batch.
 
-A new loss is a subclass of `Objective` in a recipe. `CorrespondenceLoss` knows where every template point belongs;
-`ChamferLoss` does not: a robust Chamfer distance, the paper's regularisers, known points.
+A custom loss is a subclass of `Objective` in a recipe. `CorrespondenceLoss` needs the place of every template point on the
+shape. `ChamferLoss` does not: it has a robust Chamfer distance, the paper's regularisers and optional landmarks.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from meshmatch.training.datasets import Batch, CloudBatch, OnDevice, deformed_no
 
 Terms = dict[str, Tensor]
 NORMAL_WEIGHT = 0.15
-"""How far a normal that points the other way (2 units) pushes a neighbour away, units of sqrt(area); set by hand."""
-_ROBUST = 0.25  # distances far beyond it no longer pull harder, units of sqrt(area); set by hand
+"""Weight of normals in the search for nearest points: distance of two points for a unit difference of their normals, in
+units of sqrt(area); set by hand."""
+_ROBUST = 0.25  # scale of the robust loss, units of sqrt(area): it saturates at larger distances; set by hand
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,19 +34,19 @@ class LossPoints(OnDevice):
     field: PointField
 
     def moved(self, rows: Float[Tensor, "B R 3"]) -> Float[Tensor, "B M 3"]:
-        """Where what the decoder answers moves the points."""
+        """Deformed positions of the points, for the decoder's outputs of B shapes."""
         return self.positions + self.field.displacement(rows)
 
 
 @dataclass(frozen=True)
 class Objective(ABC):
-    """Weights l1..l4 of the paper (its defaults for registered bodies), and of the learned corrections.
+    """Base class of losses: the paper's weights l1 to l4 (with its defaults for registered bodies), and of the corrections.
 
-    ``blend`` (l4) is of volume and rigidity between two codes; corrections look at the first ``correct_points`` points
-    of a scan.
+    ``reconstruction``, ``volume``, ``arap`` and ``blend`` are l1 to l4; ``blend`` weights volume and rigidity of blends of
+    two codes. ``correct`` weights the learned corrections, which see the first ``correct_points`` points of a scan.
     """
 
-    needs_correspondence: ClassVar[bool] = True  # shapes must be registered
+    needs_correspondence: ClassVar[bool] = True  # whether shapes must be registered
     reconstruction: float = 1.0
     volume: float = 5e-3
     arap: float = 1e-2
@@ -55,7 +56,7 @@ class Objective(ABC):
 
     @abstractmethod
     def __call__(self, model: Deformer, batch: Any, points: Any, generator: torch.Generator | None) -> Terms:
-        """Weighted terms by name; their sum under ``total``. Errors without weight start with ``error``.
+        """Return weighted terms by name, and their sum as ``total``; unweighted errors have names that begin with ``error``.
 
         Random numbers come from the generator, or from torch's global stream if that is None.
         """
@@ -72,20 +73,20 @@ class Objective(ABC):
         points: LossPoints,
         generator: torch.Generator | None,
     ) -> Terms:
-        """The weighted energies of random blends of every code with the one ``shift`` places before it."""
+        """Weighted volume and rigidity energies of random blends of each code with the one ``shift`` rows before it."""
         if not self.blend:
             return {}
-        share = torch.rand(len(code), 1, generator=generator, device=_home(generator, code)).to(code.device)
+        share = torch.rand(len(code), 1, generator=generator, device=_device_for(generator, code)).to(code.device)
         F = points.field.deformation_gradient(model.decoder(share * code + (1 - share) * code.roll(shift, 0)))
         return {"blend": self.blend * (volume_energy(F).mean() + arap_energy(F).mean())}
 
 
 @dataclass(frozen=True)
 class CorrespondenceLoss(Objective):
-    """Every template point is pulled to its place on the shape, which is known.
+    """Distance of every template point to its known place on the shape.
 
-    ``align``: weight of the aligner's rotation and center. ``robust``: the mean distance instead of the paper's mean
-    squared distance.
+    ``align`` is the weight of the aligner's rotation and center. ``robust`` takes the mean distance instead of the paper's
+    mean squared distance.
     """
 
     align: float = 0.3
@@ -100,7 +101,7 @@ class CorrespondenceLoss(Objective):
         terms = {"reconstruction": self.reconstruction * (fit if self.robust else squared)}
         terms |= self._rigidity(points, rows)
         errors = {"error_code": fit.detach()}
-        # Half a batch apart: scans of one shape stand side by side, and between these there is nothing to learn.
+        # Blend scans half a batch apart: neighbors are scans of the same shape, whose blends have nothing to teach.
         terms |= self.between(model, code, max(1, len(code) // 2), points, generator)
         if model.corrector is not None:
             scan = batch.points[:, : self.correct_points]
@@ -125,11 +126,11 @@ class CorrespondenceLoss(Objective):
 
     def _rigidity(self, points: LossPoints, rows: Tensor) -> Terms:
         if not self.volume and not self.arap:
-            return {}  # the gradient is not computed for nothing
+            return {}  # do not compute the gradient if both weights are zero
         return self.rigidity(points.field.deformation_gradient(rows))
 
 
-def _home(generator: torch.Generator | None, like: Tensor) -> torch.device:
+def _device_for(generator: torch.Generator | None, like: Tensor) -> torch.device:
     return like.device if generator is None else generator.device
 
 
@@ -140,7 +141,7 @@ def distance(a: Float[Tensor, "*N 3"], b: Float[Tensor, "*N 3"]) -> Float[Tensor
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints(LossPoints):
-    """Template points with unit normals (M, 3), and the template's known points (L, 3) with the field there."""
+    """Supervised template points with unit normals (M, 3), and the template's landmarks (L, 3) with the field there."""
 
     normals: Float[Tensor, "M 3"]
     landmarks: Float[Tensor, "L 3"]
@@ -149,9 +150,11 @@ class SurfacePoints(LossPoints):
 
 @dataclass(frozen=True)
 class ChamferLoss(Objective):
-    """The template is pulled to the nearest points of a shape, and they to it; ``landmarks`` weighs known points.
+    """Symmetric Chamfer distance between template and shape.
 
-    Nearest in position and normal, and far ones pull less; ``plain``: in position, by squared distance, as in the paper.
+    Nearest points are found by position and normal, and the distance is robust, so that far points pull less. With ``plain``
+    they are found by position only, and the distance is squared, as in the paper. ``landmarks`` is the weight of the squared
+    distances of landmarks.
     """
 
     needs_correspondence: ClassVar[bool] = False
@@ -164,7 +167,7 @@ class ChamferLoss(Objective):
         code = model.encoder(batch.encode_features)
         rows = model.decoder(code)
         terms, fit = self._energies(rows, batch, points)
-        # Neighbours are of different shapes: each is drawn once before one comes again, and scanned once.
+        # Neighbors in a batch are different shapes: each is drawn once before any is repeated.
         terms |= self.between(model, code, 1, points, generator)
         if model.corrector is not None:
             current = rows.detach()
@@ -181,22 +184,22 @@ class ChamferLoss(Objective):
     def _energies(
         self, rows: Float[Tensor, "B R 3"], batch: CloudBatch, points: SurfacePoints
     ) -> tuple[Terms, Float[Tensor, ""]]:
-        """Weighted terms of node vectors, and the mean distance both ways."""
+        """Weighted terms for the decoder's outputs, and the mean distance in both directions."""
         moved = points.moved(rows)
         F = points.field.deformation_gradient(rows)
         normals = deformed_normals(F.detach(), points.normals)
         share = 0.0 if self.plain else 1.0
-        there, back = chamfer(moved, share * normals, batch.points, share * batch.normals)
-        pull = torch.Tensor.float if self.plain else robust
-        terms = {"reconstruction": self.reconstruction * (pull(there).mean() + pull(back).mean())}
+        to_shape, to_template = chamfer(moved, share * normals, batch.points, share * batch.normals)
+        penalty = torch.Tensor.float if self.plain else robust
+        terms = {"reconstruction": self.reconstruction * (penalty(to_shape).mean() + penalty(to_template).mean())}
         terms |= self.rigidity(F)
         known = ~batch.landmarks.isnan().any(-1)
         if self.landmarks and known.any():
             placed = points.landmarks + points.landmark_field.displacement(rows)
-            apart = (placed[known] - batch.landmarks[known]).square().sum(-1)
-            terms["landmarks"] = self.landmarks * apart.mean()
+            squared = (placed[known] - batch.landmarks[known]).square().sum(-1)
+            terms["landmarks"] = self.landmarks * squared.mean()
         with torch.no_grad():
-            fit = 0.5 * ((there + 1e-12).sqrt().mean() + (back + 1e-12).sqrt().mean())
+            fit = 0.5 * ((to_shape + 1e-12).sqrt().mean() + (to_template + 1e-12).sqrt().mean())
         return terms, fit
 
 
@@ -206,32 +209,36 @@ def chamfer(
     points: Float[Tensor, "B P 3"],
     point_normals: Float[Tensor, "B P 3"],
 ) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B P"]]:
-    """Squared distances of the moved points to the nearest of the others, and back.
+    """Squared distances of ``moved`` to the nearest of ``points``, and of ``points`` to the nearest of ``moved``.
 
-    Neighbours are nearest in position and a share of the normal; the distance is of positions alone, and gradients
-    flow through it into ``moved``.
+    Nearest points are found by position and weighted normal. The distances are those of positions only, and have gradients
+    with respect to ``moved``.
     """
     with torch.no_grad():
-        a = torch.cat([moved, NORMAL_WEIGHT * normals], -1).float()
-        b = torch.cat([points, NORMAL_WEIGHT * point_normals], -1).float()
-        forward, back = nearest_index(a, b), nearest_index(b, a)
-    nearest = torch.gather(points, 1, forward[..., None].expand(-1, -1, 3))
-    partner = torch.gather(moved, 1, back[..., None].expand(-1, -1, 3))
-    return (moved - nearest).square().sum(-1), (partner - points).square().sum(-1)
+        deformed_features = torch.cat([moved, NORMAL_WEIGHT * normals], -1).float()
+        point_features = torch.cat([points, NORMAL_WEIGHT * point_normals], -1).float()
+        nearest_point, nearest_moved = (
+            nearest_index(deformed_features, point_features),
+            nearest_index(point_features, deformed_features),
+        )
+    nearest_position = torch.gather(points, 1, nearest_point[..., None].expand(-1, -1, 3))
+    nearest_deformed = torch.gather(moved, 1, nearest_moved[..., None].expand(-1, -1, 3))
+    return (moved - nearest_position).square().sum(-1), (nearest_deformed - points).square().sum(-1)
 
 
 def robust(squared: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
-    """Geman and McClure's function of squared distances: d^2 / (1 + d^2 / s^2), near d^2 for small ones."""
+    """Geman-McClure loss of squared distances: d^2 / (1 + d^2 / s^2), which is close to d^2 for small d."""
     return squared / (1 + squared / _ROBUST**2)
 
 
 @torch.no_grad()
 def held_out_error(model: Deformer, batch: Batch | CloudBatch, points: LossPoints) -> float:
-    """Mean distance (units of sqrt(area)) on held-out shapes, learned corrections included.
+    """Mean distance on held-out shapes after the learned corrections, units of sqrt(area).
 
-    Of the template's points from their places; without correspondence both ways, between fitted template and shape.
+    With correspondence this is the distance of template points from their correct places, without it the mean distance of
+    nearest points in both directions.
     """
-    was = model.training
+    was_training = model.training
     model.eval()
     batch = batch.to(points.positions.device)
     if isinstance(batch, Batch):
@@ -239,5 +246,5 @@ def held_out_error(model: Deformer, batch: Batch | CloudBatch, points: LossPoint
     else:
         assert isinstance(points, SurfacePoints)
         error = ChamferLoss(blend=0.0)(model, batch, points, torch.Generator())["error"]
-    model.train(was)
+    model.train(was_training)
     return float(error)

@@ -1,4 +1,4 @@
-"""Recipes: everything that a training is a function of, besides its shapes; and which one a folder is learned by."""
+"""Recipes: all settings of a training; and the choice of a recipe for a folder of shapes."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from meshmatch.models.checkpoint import Storage
 from meshmatch.models.network import PAPER, NetworkConfig
 from meshmatch.models.trained import TrainedModel
 from meshmatch.templates.prepared_folder import check_prepared, frame_of, is_registered
-from meshmatch.training.limits import filled
+from meshmatch.training.limits import with_changes
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import ChamferLoss, CorrespondenceLoss
 from meshmatch.training.scans import ScanConfig
 
 Preset = Literal["default", "paper"]
-_OF_SCAN, _OF_LOSS = {"points"}, {"volume", "arap", "blend"}
+_SCAN_SETTINGS, _LOSS_SETTINGS = {"points"}, {"volume", "arap", "blend"}
 _PLAIN_ADAM: dict[str, Any] = {
     "warm_up": 0, "decay": 0.0, "weight_decay": 0.0, "average": 0.0, "momentum": 0.999, "clip": None,
 }  # fmt: skip
@@ -31,31 +31,31 @@ _CHAMFER = ChamferLoss(volume=1e-4, arap=1e-3, blend=1e-4)  # the paper's weight
 
 @dataclass(frozen=True)
 class Recipe:
-    """Everything that a training is a function of, besides its shapes.
+    """All settings of a training: together with the shapes they determine the result.
 
     Attributes
     ----------
     network
-        Sizes and choices of the network.
+        Architecture and sizes of the network.
     train
-        Steps, rates and minutes; its ``loss`` is what is minimised.
+        Steps, rates and minutes; its ``loss`` is minimised.
     scan
         How scans are simulated.
     kernel
-        Of the deformation field: "cubic" or "smooth".
+        Kernel of the deformation field: "cubic" or "smooth".
     deform
-        Registered shapes are smoothly deformed whenever they are drawn, and the card says how a fit finds the
-        orientation, as the network does not.
+        Deform registered shapes smoothly whenever they are drawn. The network then finds no orientation; the card records
+        how a fit finds it.
     storage
-        How compactly the weights are written.
+        Number format of the weights in the file.
     template
-        The bundled one that generated bodies have, unless they name another.
+        Name of the bundled template of generated bodies, unless `Bodies` names another.
     characters
-        The share (0..1) of generated bodies in clothes or of other proportions, unless they say otherwise.
+        Share (0..1) of generated bodies with clothes or other proportions, unless `Bodies` sets it.
     stylised
-        The share of these that have the proportions of cartoons, unless they say otherwise.
+        Share of these with the proportions of cartoons, unless `Bodies` sets it.
     bodies
-        How many generated bodies are drawn, once; 0 for ever new ones. Unless they say otherwise.
+        Number of generated bodies in a fixed pool; 0 generates new ones in every step. Unless `Bodies` sets it.
 
     Examples
     --------
@@ -75,18 +75,18 @@ class Recipe:
     stylised: float = STYLISED
 
     def changed(self, **settings: Any) -> Recipe:
-        """Another recipe.
+        """Return a copy with other settings.
 
         Parameters
         ----------
         settings
-            Fields of `TrainConfig`, ``field`` of the network, ``points`` of a scan, ``volume``, ``arap`` and ``blend`` of
-            the loss; None changes nothing.
+            Fields of `TrainConfig`, ``field`` of the network, ``points`` of the scans, ``volume``, ``arap`` and ``blend`` of
+            the loss. A value of None leaves the setting as it is.
 
         Returns
         -------
         Recipe
-            With these settings.
+            A recipe with these settings.
 
         Raises
         ------
@@ -96,33 +96,36 @@ class Recipe:
         given = {name: value for name, value in settings.items() if value is not None}
         wanted = {name: value.item() if isinstance(value, np.generic) else value for name, value in given.items()}
         network = replace(self.network, field=wanted.pop("field", self.network.field))
-        scan, weights = ({name: wanted.pop(name) for name in names & wanted.keys()} for names in (_OF_SCAN, _OF_LOSS))
+        scan, weights = (
+            {name: wanted.pop(name) for name in names & wanted.keys()} for names in (_SCAN_SETTINGS, _LOSS_SETTINGS)
+        )
         train = replace(self.train, loss=wanted.pop("loss", self.train.loss))
-        train = replace(train, loss=filled(train.loss, weights))
+        train = replace(train, loss=with_changes(train.loss, weights))
         known = {each.name for each in fields(TrainConfig)}
         if unknown := sorted(wanted.keys() - known):
             raise OptionError(f"unknown training setting {unknown[0]!r}", f"choose from {', '.join(sorted(known))}")
-        return replace(self, network=network, scan=filled(self.scan, scan), train=filled(train, wanted))
+        return replace(self, network=network, scan=with_changes(self.scan, scan), train=with_changes(train, wanted))
 
 
 def default() -> Recipe:
-    """For many registered shapes; chosen on generated bodies (docs/paper.md)."""
+    """Recipe for many registered shapes; selected on generated bodies (docs/paper.md)."""
     loss = CorrespondenceLoss(volume=2e-3, arap=2e-3, blend=1e-3, robust=True)
     return Recipe(NetworkConfig(), TrainConfig(steps=13_000, decay=0.65, loss=loss), ScanConfig(), "smooth")
 
 
 def people() -> Recipe:
-    """For generated people: half of them naked, half characters; things and hidden surfaces in the scans."""
+    """Recipe for generated people: half of them naked, half characters; some scans have foreign objects, some lack hidden
+    surfaces."""
     usual = default()
     return replace(usual, scan=replace(usual.scan, outside=0.2, strays=0.12), characters=0.5)
 
 
 def paper() -> Recipe:
-    """The NeurIPS 2022 paper's: point encoder, node decoder, squared loss with its weights, its kernel, batch and rate, and
-    Adam as it is.
+    """Recipe of the NeurIPS 2022 paper: point encoder, node decoder, squared loss, plain Adam, and the paper's loss weights,
+    kernel, batch size and learning rate.
 
     Scans are 3,000 clean points in the unit sphere, turned about the vertical axis; 75,000 steps are its 1,200 epochs of
-    1,000 shapes, which are drawn once. The template has its 300 nodes, each with a radius of a fifth of the diameter.
+    1,000 shapes, a fixed pool. The template has 300 nodes as in the paper, each with a radius of a fifth of the diameter.
     """
     train = TrainConfig(steps=75_000, shapes=16, scans_per_shape=1, **_PLAIN_ADAM)
     clean: dict[str, Any] = dict.fromkeys(("noise", "holes", "outliers", "partial", "density", "bumps", "scale"), 0.0)
@@ -131,8 +134,8 @@ def paper() -> Recipe:
 
 
 def small_data() -> Recipe:
-    """For fewer than a hundred registered shapes: a small network that finds no orientation; measured on
-    hearts and animals (docs/categories.md)."""
+    """Recipe for fewer than a hundred registered shapes: a small network that finds no orientation; evaluated on hearts and
+    animals (docs/categories.md)."""
     network = NetworkConfig(code=128, width=256, depth=1, basis=384, align_basis=0, corrections=2, correct_width=256)
     loss = CorrespondenceLoss(volume=1e-3, arap=1e-3, blend=1e-3, robust=True)
     speed: dict[str, Any] = {"decay": 0.5, "warm_up": 100, "average": 0.99}
@@ -141,15 +144,16 @@ def small_data() -> Recipe:
 
 
 def clouds() -> Recipe:
-    """For shapes without correspondence: the network for small data, the paper's weights for segmentation transfer."""
+    """Recipe for shapes without correspondence: the network for small data, with the paper's weights for segmentation
+    transfer."""
     small = small_data()
     return replace(small, train=replace(small.train, loss=_CHAMFER), storage="float16")
 
 
 def paper_clouds() -> Recipe:
-    """The paper's for shapes without correspondence: its network, its weights, and neighbours by squared distance alone.
+    """Recipe of the paper for shapes without correspondence: its network and weights, and a plain squared Chamfer distance.
 
-    Lengths of the loss are those of the unit sphere for shapes that `meshmatch prepare --scale sphere` made ready.
+    For folders from `meshmatch prepare --scale sphere` the loss is in units of the unit sphere, as in the paper.
     """
     loss = replace(_CHAMFER, plain=True)
     train = TrainConfig(steps=4000, shapes=8, scans_per_shape=1, loss=loss, workers=0, **_PLAIN_ADAM)
@@ -158,7 +162,8 @@ def paper_clouds() -> Recipe:
 
 
 def compact() -> Recipe:
-    """For generated hands and heads: a network of half the size, half as many shapes a step, and first the aligner alone."""
+    """Recipe for generated hands and heads: half the network size, half the shapes in a step, and the aligner is trained
+    first."""
     usual = people()
     network = NetworkConfig(code=384, width=512, basis=640, align_basis=384, align_width=384, correct_width=448)
     train = replace(usual.train, steps=4000, shapes=16, rate=8e-4, align_steps=3000)
@@ -166,7 +171,7 @@ def compact() -> Recipe:
 
 
 def going_on(start: TrainedModel) -> Recipe:
-    """For shapes that a trained model has fitted: its own network and kernel, at a small rate."""
+    """Recipe for continuing a model's training on shapes that it has fitted: its network and kernel, at a low rate."""
     usual = people()
     train = replace(usual.train, steps=1500, rate=1e-4, shapes=16, decay=0.5)
     kernel = next(name for name in KERNELS if name == start.card.field["kernel"])
@@ -179,26 +184,26 @@ def going_on(start: TrainedModel) -> Recipe:
 def recipe_for(
     shapes: str | Path | None = None, preset: Preset = "default", unsupervised: bool = False, kind: str | None = None
 ) -> Recipe:
-    """How shapes are learned, unless something else is asked for.
+    """Choose the recipe for a folder of shapes, or for generated shapes.
 
-    With correspondence where all shapes are registered; by the recipe for small data where they are few and stand at equal
-    areas. The paper's preset knows no small data.
+    Shapes are learned with correspondence if all of them are registered. A folder whose frame is known (few shapes, scaled
+    to equal areas) gets the recipe for small data; the paper's preset has no such recipe.
 
     Parameters
     ----------
     shapes
-        A folder that `prepare` made; None for generated shapes.
+        A prepared folder (see `prepare`); None for generated shapes.
     preset
-        "default", or "paper": that of the NeurIPS 2022 paper.
+        "default", or "paper" for the settings of the NeurIPS 2022 paper.
     unsupervised
         Ignore the correspondence of registered shapes.
     kind
-        Of generated shapes: "human" (the default), "quadruped", "hand" or "head".
+        Kind of generated shapes: "human" (the default), "quadruped", "hand" or "head".
 
     Returns
     -------
     Recipe
-        For `train`.
+        A recipe for `train`.
 
     Raises
     ------
@@ -217,7 +222,7 @@ def recipe_for(
     if shapes is None and unsupervised:
         raise OptionError("learning without correspondence needs a folder of shapes", "name it with --shapes")
     if kind not in (None, "human"):
-        Kind(kind)  # which knows the others
+        Kind(kind)  # raises if the kind is unknown
     if shapes is not None:
         if kind is not None:
             raise OptionError("generated shapes do not go with a folder of shapes", "leave out one of the two")

@@ -1,4 +1,4 @@
-"""What a training writes about itself while it runs: a line in metrics.jsonl for each report, and curves for TensorBoard."""
+"""Write a training's reports while it runs, to metrics.jsonl and as curves for TensorBoard."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ Report = Callable[[StepReport], None]
 
 
 class Metrics:
-    """Reports as lines of JSON: step, rate, seconds of all runs, terms of the loss, validation.
+    """Append reports to a file as lines of JSON: step, rate, seconds of all runs, loss terms, validation error.
 
-    Of a file from before, lines of steps that are done again are dropped. ``best`` is the lowest validation error in it.
-    `OutputError` if it cannot be written.
+    Lines of an existing file are kept up to the step that training resumes from. ``best`` is the lowest validation error
+    in the file. `OutputError` if it cannot be written.
     """
 
     def __init__(self, path: Path, trainer: Trainer) -> None:
         self.path, self.trainer, kept = path, trainer, []
-        known = []
+        scores = []
         with suppress(OSError, ValueError, KeyError, TypeError):
             for line in path.read_text(encoding="utf-8").splitlines() if trainer.step else []:
                 row = json.loads(line)
                 if row["step"] <= trainer.step:
                     kept.append(line)
-                    known += [float(row["validation"])] if "validation" in row else []
-        self.best = min(known, default=float("inf"))
+                    scores += [float(row["validation"])] if "validation" in row else []
+        self.best = min(scores, default=float("inf"))
         with replace_on_success(path) as temporary:
             temporary.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
 
@@ -48,41 +48,41 @@ class Metrics:
             raise OutputError(f"cannot write {self.path}: {error.strerror}", hint) from error
 
     def is_best(self, score: float) -> bool:
-        """Whether an error is the lowest so far, and remember it."""
+        """Whether a validation error is the lowest so far; it is then stored in ``best``."""
         lower = score < self.best
         self.best = min(score, self.best)
         return lower
 
 
 def curves(folder: Path, step: int) -> Report:
-    """A report that draws its numbers as TensorBoard's curves, from a step on; `OptionError` if that is not installed."""
+    """Report function that writes curves for TensorBoard after a step; `OptionError` if TensorBoard is not installed."""
     check_curves()
     from torch.utils.tensorboard import SummaryWriter
 
     writer: Any = SummaryWriter(folder, purge_step=step + 1)
 
-    def draw(now: StepReport) -> None:
-        numbers = {"rate": now.rate} | {f"loss/{name}": value for name, value in now.terms.items()}
-        numbers |= {} if now.validation is None else {"validation": now.validation}
-        for name, value in numbers.items():
+    def write_curves(now: StepReport) -> None:
+        values = {"rate": now.rate} | {f"loss/{name}": value for name, value in now.terms.items()}
+        values |= {} if now.validation is None else {"validation": now.validation}
+        for name, value in values.items():
             writer.add_scalar(name, value, now.step)
         writer.flush()
 
-    return draw
+    return write_curves
 
 
 def check_curves() -> None:
-    """`OptionError` if TensorBoard is not installed."""
+    """Raise `OptionError` if TensorBoard is not installed."""
     with needs("tensorboard", "tensorboard"):
         import tensorboard  # noqa: F401
 
 
-def in_turn(*reports: Report | None) -> Report:
-    """A report that makes several, in this order."""
+def combine_reports(*reports: Report | None) -> Report:
+    """Report function that calls several others in order, skipping None."""
 
-    def each(now: StepReport) -> None:
+    def combined(now: StepReport) -> None:
         for report in reports:
             if report is not None:
                 report(now)
 
-    return each
+    return combined

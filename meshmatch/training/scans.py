@@ -1,4 +1,4 @@
-"""Turn clean generated shapes into what a scanner or a modeller delivers: samples, noise, holes, any turn."""
+"""Simulate scans of clean shapes: samples of uneven density, noise, holes, outliers, arbitrary orientation."""
 
 from __future__ import annotations
 
@@ -10,20 +10,22 @@ from torch import Tensor
 from meshmatch.arrays import Bool, Float, Int
 from meshmatch.generators.rotations import DEGREE, rotation_from_vector
 
-_VIEWS, _CELLS = 10, 48  # of what is seen from outside: directions, and cells of a picture's side
+_VIEWS, _CELLS = 10, 48  # for visibility from outside: number of views, and cells along each side of a depth image
 
 
 @dataclass(frozen=True)
 class ScanConfig:
-    """How rough the simulated scans are; set by hand. Lengths in units of sqrt(surface area).
+    """Settings of simulated scans, set by hand; lengths are in units of sqrt(surface area).
 
-    ``holes``, ``outliers``, ``partial`` are shares of the scans: with holes; with up to 10 % outliers; seen
-    from one side or cut by a plane. ``upright``: scans stand in the category's own axes, centred, turned about
-    the vertical only (the paper), without ``yaw`` not at all; otherwise roughly in the core frame, where an aligner puts
-    them.
-    ``outside`` is the share of scans that show only what is seen from outside, not what lies inside clothes or between
-    parts; ``strays`` that of scans with something else in them: a thing that is held, a base, a sheet.
-    ``sphere``: shapes are scaled to the template's radius around its centroid (the paper) instead of to area 1.
+    ``points`` is the number of points of a scan; ``noise``, ``density``, ``bumps`` and ``scale`` are the strengths of noise,
+    uneven density, smooth bumps and random scaling. These are shares of the scans: ``holes`` of those with holes;
+    ``outliers`` of those with up to 10 % outliers; ``partial`` of those seen from one side or cut by a plane; ``outside`` of
+    those that show only what is visible from outside, not surfaces inside clothes or between parts; ``strays`` of those with
+    a foreign object, such as a held object, a base or a sheet.
+
+    With ``upright``, scans are in the category's own axes, centered, and rotated about the vertical axis only (as in the
+    paper), or not at all without ``yaw``; otherwise they are approximately in the core frame, as an aligner leaves them.
+    With ``sphere``, shapes are scaled to the template's radius around its centroid (as in the paper) instead of to area 1.
     """
 
     points: int = 2048
@@ -87,19 +89,19 @@ def rigid_fit(
 
 
 def small_rotations(B: int, generator: torch.Generator) -> Float[Tensor, "B 3 3"]:
-    """Mostly a few degrees, sometimes tens: what an aligner gets wrong."""
+    """Random rotations of the size of an aligner's errors: mostly a few degrees, sometimes tens."""
     size = torch.where(torch.rand(B, 1, generator=generator) < 0.75, 6.0, 18.0) * DEGREE
     return rotation_from_vector(size * torch.randn(B, 3, generator=generator))
 
 
 def yaw_rotations(B: int, generator: torch.Generator) -> Float[Tensor, "B 3 3"]:
-    """Rotations about the vertical axis y."""
+    """Uniformly random rotations about the vertical axis y."""
     angle = 2 * torch.pi * torch.rand(B, 1, generator=generator)
     return rotation_from_vector(angle * torch.tensor([0.0, 1.0, 0.0]))
 
 
 def bump(verts: Float[Tensor, "B V 3"], amplitude: float, generator: torch.Generator) -> Float[Tensor, "B V 3"]:
-    """Smooth random displacement (clothes, soft tissue, another modeller's hand), unit: sqrt(area)."""
+    """Add a smooth random displacement, such as from clothes, soft tissue or modeling style; amplitude in sqrt(area)."""
     B = len(verts)
     size = amplitude * torch.rand(B, 1, 1, generator=generator)
     for frequency in (8.0, 20.0):
@@ -112,15 +114,15 @@ def bump(verts: Float[Tensor, "B V 3"], amplitude: float, generator: torch.Gener
 def seen_share(
     normals: Float[Tensor, "B F 3"], centers: Float[Tensor, "B F 3"], share: float, generator: torch.Generator
 ) -> Float[Tensor, "B F"]:
-    """Factors for the chance of each face: nearly 0 where a partial scan does not see it, else 1.
+    """Factors for the sampling probability of each face: nearly 0 where a partial scan does not show it, else 1.
 
-    A ``share`` of the scans is partial. Half of those see what faces one direction, the others lose what lies
-    beyond a plane, at most half of the centers. Faces that hide each other are not told apart.
+    A ``share`` of the scans is partial. Half of those show the faces that point in one direction, the others lose the faces
+    beyond a plane, at most half of them. Occlusion is ignored.
     """
     B = len(centers)
     direction = torch.nn.functional.normalize(torch.randn(B, 3, 1, generator=generator), dim=1)
     facing = (normals @ direction)[..., 0] > 0
-    height = (centers @ direction)[..., 0]  # B F
+    height = (centers @ direction)[..., 0]  # (B, F)
     rank = (0.5 * torch.rand(B, generator=generator) * height.shape[1]).long()
     plane = height.sort(dim=1).values[torch.arange(B), rank]
     kind = torch.rand(B, 1, generator=generator) / max(share, 1e-9)
@@ -131,7 +133,7 @@ def seen_share(
 def seen_from_outside(
     verts: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"], generator: torch.Generator
 ) -> Bool[Tensor, "B F"]:
-    """Whether the middle of each face is among the foremost, as seen from one of many directions."""
+    """Whether each face is visible from outside: its center is close to the foremost in the depth image of some view."""
     B, cells = len(verts), _CELLS
     centers = verts[:, faces].mean(2)
     views = random_rotations(B * _VIEWS, generator).view(B, _VIEWS, 3, 3)
@@ -146,23 +148,23 @@ def seen_from_outside(
 
 
 def stray_points(verts: Float[Tensor, "B V 3"], P: int, generator: torch.Generator) -> Float[Tensor, "B P 3"]:
-    """Points of a box, a rod or a sheet near each body, or of a slab that it stands on (y is up)."""
+    """Points of a foreign object: a box, rod or sheet near each body, or a slab below it (y is up)."""
     B = len(verts)
-    rows = torch.arange(B)
-    base = torch.rand(B, 1, generator=generator) < 0.3
-    half = 0.015 * 30 ** torch.rand(B, 3, generator=generator)  # from a stick to a shield
+    shape_index = torch.arange(B)
+    is_slab = torch.rand(B, 1, generator=generator) < 0.3
+    half = 0.015 * 30 ** torch.rand(B, 3, generator=generator)  # half extents, from a stick to a shield
     slab = torch.cat([half[:, :1], half[:, 1:2] * 0.15, half[:, :1]], 1) + torch.tensor([0.12, 0.0, 0.12])
-    half = torch.where(base, slab, half)
+    half = torch.where(is_slab, slab, half)
     sides = torch.stack([half[:, 1] * half[:, 2], half[:, 0] * half[:, 2], half[:, 0] * half[:, 1]], 1)
     axis = torch.multinomial(sides, P, True, generator=generator)
     inside = 2 * torch.rand(B, P, 3, generator=generator) - 1
-    on = inside.scatter(2, axis[..., None], inside.gather(2, axis[..., None]).sign()) * half[:, None]
-    turn = torch.where(base[..., None], torch.eye(3), random_rotations(B, generator))
-    anchor = verts[rows, torch.randint(verts.shape[1], (B,), generator=generator)]
+    on_surface = inside.scatter(2, axis[..., None], inside.gather(2, axis[..., None]).sign()) * half[:, None]
+    rotation = torch.where(is_slab[..., None], torch.eye(3), random_rotations(B, generator))
+    anchor = verts[shape_index, torch.randint(verts.shape[1], (B,), generator=generator)]
     anchor = anchor + 0.5 * half.amin(1, keepdim=True) * torch.randn(B, 3, generator=generator)
     lowest, middle = verts[..., 1].amin(1), verts.mean(1)
-    under = torch.stack([middle[:, 0], lowest - half[:, 1], middle[:, 2]], 1)
-    return on @ turn.transpose(1, 2) + torch.where(base, under, anchor)[:, None]
+    below = torch.stack([middle[:, 0], lowest - half[:, 1], middle[:, 2]], 1)
+    return on_surface @ rotation.transpose(1, 2) + torch.where(is_slab, below, anchor)[:, None]
 
 
 def sample_scan(
@@ -172,26 +174,26 @@ def sample_scan(
     config: ScanConfig,
     generator: torch.Generator,
 ) -> Float[Tensor, "B P 3"]:
-    """Points on the surface, with uneven density, holes, noise and outliers."""
+    """Sample points on the surface, with uneven density, holes, noise and outliers."""
     B, P = len(verts), config.points
     a, b, c = (verts[:, faces[:, k]] for k in range(3))
     centers = (a + b + c) / 3  # B F 3
-    chance = areas.clone()
+    face_weight = areas.clone()
     if config.partial:
-        chance = chance * seen_share(torch.linalg.cross(b - a, c - a), centers, config.partial, generator)
+        face_weight = face_weight * seen_share(torch.linalg.cross(b - a, c - a), centers, config.partial, generator)
     waves = torch.randn(B, 3, 1, generator=generator) * 4
     strength = config.density * torch.rand(B, 1, generator=generator)
-    chance = chance * (strength * torch.sin((centers @ waves)[..., 0])).exp()
-    # A hole swallows everything within a ball around a random surface point.
+    face_weight = face_weight * (strength * torch.sin((centers @ waves)[..., 0])).exp()
+    # A hole removes everything within a ball around a random face center.
     for _ in range(2):
-        here = torch.randint(centers.shape[1], (B,), generator=generator)
-        middle = centers[torch.arange(B), here]
+        center_face = torch.randint(centers.shape[1], (B,), generator=generator)
+        middle = centers[torch.arange(B), center_face]
         radius = 0.16 * torch.rand(B, generator=generator)
         radius = radius * (torch.rand(B, generator=generator) < config.holes)
         inside = (centers - middle[:, None]).square().sum(-1) < radius[:, None] ** 2
-        chance = torch.where(inside, chance * 1e-4, chance)
-    pick = torch.multinomial(chance, P, True, generator=generator)  # B P
-    corner = faces[pick]  # B P 3
+        face_weight = torch.where(inside, face_weight * 1e-4, face_weight)
+    picked = torch.multinomial(face_weight, P, True, generator=generator)  # B P
+    corner = faces[picked]  # B P 3
     weight = torch.rand(B, P, 2, generator=generator)
     weight = torch.where(weight.sum(-1, keepdim=True) > 1, 1 - weight, weight)
     rows = torch.arange(B)[:, None]
@@ -199,6 +201,6 @@ def sample_scan(
     points = a + weight[..., :1] * (b - a) + weight[..., 1:] * (c - a)
     sigma = config.noise * torch.rand(B, 1, 1, generator=generator) ** 3
     points = points + sigma * torch.randn(B, P, 3, generator=generator)
-    lost = torch.rand(B, 1, generator=generator) < config.outliers
-    outlier = torch.rand(B, P, generator=generator) < 0.1 * torch.rand(B, 1, generator=generator) * lost
+    has_outliers = torch.rand(B, 1, generator=generator) < config.outliers
+    outlier = torch.rand(B, P, generator=generator) < 0.1 * torch.rand(B, 1, generator=generator) * has_outliers
     return torch.where(outlier[..., None], 0.5 * torch.randn(B, P, 3, generator=generator), points)

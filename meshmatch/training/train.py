@@ -1,6 +1,6 @@
-"""`meshmatch train` as a library: a folder of shapes, or generated bodies, becomes a model folder.
+"""Train a model on a folder of shapes or on generated shapes, and write it as a model folder.
 
-How a folder is learned is decided by `meshmatch.training.recipes.recipe_for`.
+`meshmatch.training.recipes.recipe_for` chooses the settings for a folder.
 """
 
 from __future__ import annotations
@@ -42,19 +42,26 @@ from meshmatch.training.alone import ALIGNER, alone
 from meshmatch.training.alone import CHECKPOINT as CHECKPOINT
 from meshmatch.training.datasets import BatchDataset, CloudDataset, build_lattice
 from meshmatch.training.facts import CardFacts as CardFacts
-from meshmatch.training.facts import inherited
-from meshmatch.training.lessons import Lessons, check_start, kind_named, lessons, measured_on, template_of
+from meshmatch.training.facts import fill_from_card
+from meshmatch.training.load_data import (
+    TrainingData,
+    check_start,
+    kind_named,
+    load_training_data,
+    template_of,
+    with_validation,
+)
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.losses import LossPoints, SurfacePoints, held_out_error
 from meshmatch.training.recipe_files import recipe_record
 from meshmatch.training.recipes import Recipe, going_on, recipe_for, small_data
-from meshmatch.training.records import CURVES, METRICS, Metrics, Report, check_curves, curves, in_turn
+from meshmatch.training.records import CURVES, METRICS, Metrics, Report, check_curves, combine_reports, curves
 from meshmatch.training.scans import ScanConfig
 
 BEST = "best"
-"""The folder of the model with the lowest validation error so far."""
+"""Subfolder for the model with the lowest validation error so far."""
 VALIDATION_SEED = 999_983
-"""Of the batch that no training sees and every training is measured on."""
+"""Seed of the validation batch, which no training step draws."""
 
 
 def train(
@@ -70,51 +77,52 @@ def train(
     progress: ProgressCallback | None = None,
     report: Callable[[StepReport], None] | None = None,
 ) -> Path:
-    """Train a model, or go on training it from the checkpoint in its folder, exactly.
+    """Train a model, or resume its training exactly from the checkpoint in its folder.
 
-    The folder receives ``checkpoint/last.safetensors`` and ``metrics.jsonl`` on the way and, at every stop,
-    ``template.safetensors``, ``weights.safetensors`` and last ``card.json``; and in ``best`` the same of the model with the
-    lowest validation error, which is measured every 500 steps and at the end.
+    During training the folder receives ``checkpoint/last.safetensors`` and ``metrics.jsonl``. Whenever training stops,
+    ``template.safetensors``, ``weights.safetensors`` and finally ``card.json`` are written. The subfolder ``best`` holds the
+    same files for the model with the lowest validation error, which is measured every 500 steps and at the end.
 
     Parameters
     ----------
     output
         The model's folder.
     shapes
-        A folder that `prepare` made, which also has the template; or fits (``Collection(FITS).to_learn()``): a
-        model that made them goes on learning from them, and what no model made is learned anew.
+        A prepared folder (see `prepare`), which also contains the template; or fits (``Collection(FITS).to_learn()``):
+        if a model made the fits, its training continues on them, otherwise a new model is trained.
     kind
-        Or generated shapes: "human" (the default), "quadruped", "hand" or "head"; or `Bodies` or a `Kind` with choices.
+        Generated shapes instead of ``shapes``: "human" (the default), "quadruped", "hand" or "head"; or `Bodies` or a
+        `Kind` with options.
     recipe
         Losses, sizes and steps, such as ``recipe_for(shapes, ...).changed(minutes=60)``; by default chosen for the
         shapes.
     facts
-        What the card says of the model: name, category, licence.
+        Facts about the model for its card: name, category, licence.
     resume
-        Go on from a checkpoint if there is one.
+        Resume from a checkpoint if there is one.
     validation
-        Registered shapes to measure on, which the training does not see: a folder that `prepare` made with the same
-        template, or fits as for ``shapes``. By default more of what is learned.
+        Registered shapes for validation, excluded from training: a folder prepared with the same template, or fits as
+        for ``shapes``. By default a batch drawn from the training shapes.
     tensorboard
         Also write curves for TensorBoard (the extra ``tensorboard``), into the folder ``tensorboard``.
     progress
         As in `match`.
     report
-        Called with losses and validation every 50 steps.
+        Called with losses and validation error every 50 steps.
 
     Returns
     -------
     Path
-        The folder.
+        The model's folder.
 
     Raises
     ------
     InputError
         A folder is not prepared, or has too few shapes.
     OptionError
-        Choices do not go together, or the extra ``train`` or ``tensorboard`` is not installed.
+        The options conflict, or the extra ``train`` or ``tensorboard`` is not installed.
     ModelError
-        The name cannot be one, or the checkpoint is of another training.
+        The name is invalid, or the checkpoint belongs to another training.
     TemplateError
         The template is missing or damaged.
     OutputError
@@ -128,46 +136,48 @@ def train(
     output, facts = Path(output), facts or CardFacts()
     facts = replace(facts, name=check_name(facts.name or output.resolve().name))
     kind = kind_named(kind) if isinstance(kind, str) else kind
-    of_model = shapes.model if isinstance(shapes, RegisteredShapes) and shapes.model != NO_MODEL else None
-    start = facts.start or of_model
+    source_model = shapes.model if isinstance(shapes, RegisteredShapes) and shapes.model != NO_MODEL else None
+    start = facts.start or source_model
     start = load_model(start) if isinstance(start, str | Path) else start
     facts = replace(facts, start=start)
     if not isinstance(shapes, RegisteredShapes):
         recipe = recipe or recipe_for(shapes, kind=None if kind is None else kind.name)
-    elif of_model is None:
+    elif source_model is None:
         recipe = recipe or small_data()
     else:
         assert start is not None
         if Path(shapes.model).resolve() == output.resolve():
             raise OptionError(f"{output} is the model that made the fits", "choose another folder")
-        facts, recipe = inherited(facts, start.card), recipe or going_on(start)
+        facts, recipe = fill_from_card(facts, start.card), recipe or going_on(start)
     if start is not None:
-        check_start(start, template_of(shapes, kind, recipe, start), recipe)  # shapes may take minutes to make
+        check_start(
+            start, template_of(shapes, kind, recipe, start), recipe
+        )  # before shapes are made, which takes minutes
 
     if tensorboard:
         check_curves()
 
-    making = Progress(progress, "shapes").stage("making shapes (once)")
+    shape_progress = Progress(progress, "shapes").stage("making shapes (once)")
 
-    def make() -> Lessons:
-        return measured_on(validation, lessons(shapes, kind, recipe, making))
+    def load_data() -> TrainingData:
+        return with_validation(validation, load_training_data(shapes, kind, recipe, shape_progress))
 
-    return _learn(output, facts, recipe, resume, report, tensorboard, make, Progress(progress, "training"))
+    return _train_locked(output, facts, recipe, resume, report, tensorboard, load_data, Progress(progress, "training"))
 
 
 @alone
-def _learn(
+def _train_locked(
     output: str | Path, facts: CardFacts, recipe: Recipe, resume: bool, report: Report | None, tensorboard: bool,
-    make: Callable[[], Lessons], progress: Progress,
+    load_data: Callable[[], TrainingData], progress: Progress,
 ) -> Path:  # fmt: skip
-    """What `train` does once its folder is its own."""
-    learned = make()
-    facts = replace(facts, category=facts.category or learned.category or facts.name, data=facts.data or learned.data)
-    facts = replace(facts, frame=facts.frame or learned.frame, mirror=facts.mirror or learned.mirror)
-    facts = replace(facts, measured=facts.measured or learned.measured)
+    """Train in ``output``, which this process has locked; see `train`."""
+    data = load_data()
+    facts = replace(facts, category=facts.category or data.category or facts.name, data=facts.data or data.data)
+    facts = replace(facts, frame=facts.frame or data.frame, mirror=facts.mirror or data.mirror)
+    facts = replace(facts, measured=facts.measured or data.measured)
     return train_model(
-        learned.template, learned.source, output, recipe, facts, resume, report, learned.unseen, tensorboard, progress,
-        learned.digest,
+        data.template, data.source, output, recipe, facts, resume, report, data.validation_source, tensorboard,
+        progress, data.digest,
     )  # fmt: skip
 
 
@@ -184,19 +194,23 @@ def train_model(
     progress: Progress | None = None,
     digest: str = "",
 ) -> Path:
-    """`train` on shapes with the template's vertices, validated on ``unseen`` ones or on more of the same, or on samples
-    without correspondence; returns the folder. The shapes' ``digest`` is that of `Lessons`.
+    """Train on shapes with the template's vertices (a `Source`), or on samples without correspondence; return the folder.
 
-    `InputError` of a single shape; `OptionError` if the model to start from has another template, network or kernel.
+    A source is validated on shapes drawn from ``unseen``, by default from the source itself. ``digest`` identifies the
+    shapes, see `TrainingData`.
+
+    `InputError` if there is only one shape; `OptionError` if the start model has another template, network or kernel.
     """
     checkpoint = (output := Path(output)) / CHECKPOINT
     name = facts.name or output.resolve().name
     facts = replace(facts, name=name, category=facts.category or name)
     record = recipe_record(recipe)
-    _card(template, recipe, facts, record)  # what a card could not hold is refused now, not at the end
+    _build_card(template, recipe, facts, record)  # fail now, not at the end, if a card cannot hold the facts
     make_folder(checkpoint.parent)
     config, kernel = recipe.train, recipe.kernel
-    if recipe.scan.sphere and getattr(source, "scale", "sphere") == "sphere":  # the paper's lengths are in it
+    if (
+        recipe.scan.sphere and getattr(source, "scale", "sphere") == "sphere"
+    ):  # the paper's loss is in units of the sphere
         reconstruction = config.loss.reconstruction / template_radius(template) ** 2
         config = replace(config, loss=replace(config.loss, reconstruction=reconstruction))
     points: Any
@@ -213,48 +227,48 @@ def train_model(
         data = replace(data, encoder=deepcopy(model.encoder).cpu())
         points = build_surface_points(template, kernel, model, source.template_landmarks)
         facts = replace(facts, frame=facts.frame or {"orientation": source.align, "scale": source.scale})
-        few: dict[str, Any] = {"shapes": min(32, 2 * len(source.points))}
+        validation_changes: dict[str, Any] = {"shapes": min(32, 2 * len(source.points))}
     else:
-        turned = {"orientation": "searched", "scale": "sphere"} if recipe.scan.sphere else None
-        facts = replace(facts, frame=facts.frame or turned)
+        default_frame = {"orientation": "searched", "scale": "sphere"} if recipe.scan.sphere else None
+        facts = replace(facts, frame=facts.frame or default_frame)
         points = build_loss_points(template, kernel, model)
         size = config.shapes, config.scans_per_shape, config.seed, config.steps
         data = build_dataset(template, source, model, recipe.scan, *size)
-        few = {"shapes": 32, "scans_per_shape": 1, "source": unseen or source}
+        validation_changes = {"shapes": 32, "scans_per_shape": 1, "source": unseen or source}
     resumed = resume and checkpoint.is_file()
     aligning = None if progress is None else progress.stage("orientations alone (once)")
     aligned = Aligned() if resumed else align(model, data, config, output / ALIGNER, resume, aligning)
-    held_out = replace(data, seed=VALIDATION_SEED, **few)[0]
+    held_out = replace(data, seed=VALIDATION_SEED, **validation_changes)[0]
     trainer = Trainer(model, points, config, digest, record | {"kernel": recipe.kernel})
     if resumed:
         trainer.load(checkpoint)
-        for name in ("encoder", "aligner"):  # what reads the batches are copies (see `build_dataset`)
-            if (reader := getattr(data, name, None)) is not None:
-                reader.load_state_dict(getattr(trainer.model, name).state_dict())
+        for name in ("encoder", "aligner"):  # the dataset has copies of them (see `build_dataset`)
+            if (feature_module := getattr(data, name, None)) is not None:
+                feature_module.load_state_dict(getattr(trainer.model, name).state_dict())
 
-    def error(_: Deformer) -> float:
-        """Of the averaged weights, which the model will have."""
+    def validation_error(_: Deformer) -> float:
+        """Validation error of the averaged weights, those that are exported."""
         with trainer.averaged():
             return held_out_error(trainer.model, held_out, trainer.points)
 
-    def keep(score: float | None) -> None:
+    def export_if_best(score: float | None) -> None:
         if score is not None and metrics.is_best(score):
             make_folder(output / BEST)
             export(trainer, template, output / BEST, recipe, facts, score)
 
     if trainer.rank == 0:
         metrics = Metrics(output / METRICS, trainer)
-        drawn = curves(output / CURVES, trainer.step) if tensorboard else None
-        report = in_turn(metrics, drawn, report, lambda now: keep(now.validation))
-    trainer.seconds += aligned.of_all
-    if not trainer.any_says(not aligned.done):
-        trainer.run(data, checkpoint, report, error, spent=aligned.seconds, progress=progress)
+        tensorboard_report = curves(output / CURVES, trainer.step) if tensorboard else None
+        report = combine_reports(metrics, tensorboard_report, report, lambda now: export_if_best(now.validation))
+    trainer.seconds += aligned.total_seconds
+    if not trainer.any_process(not aligned.done):
+        trainer.run(data, checkpoint, report, validation_error, spent=aligned.seconds, progress=progress)
         (output / ALIGNER).unlink(missing_ok=True)
     trainer.close()
     if trainer.rank == 0:
-        score = error(trainer.model)
+        score = validation_error(trainer.model)
         if (output / BEST).is_dir():
-            keep(score)
+            export_if_best(score)
         export(trainer, template, output, recipe, facts, score)
     return output
 
@@ -262,7 +276,10 @@ def train_model(
 def align(
     model: Deformer, data: Any, config: TrainConfig, checkpoint: Path, resume: bool, progress: Progress | None
 ) -> Aligned:
-    """The aligner alone, if a training begins with it."""
+    """Train the aligner on its own first, if the configuration asks for it.
+
+    ``checkpoint`` holds the state of an interrupted alignment; it is deleted unless ``resume`` is set.
+    """
     if not resume:
         checkpoint.unlink(missing_ok=True)
     if not config.align_steps or not isinstance(data, BatchDataset) or model.aligner is None:
@@ -273,14 +290,16 @@ def align(
 
 
 def check_encoder(model: Deformer, P: int) -> None:
-    """`ModelError` if an encoder of one's own fails on two clouds of P points: told before anything is learned, and without
-    a trace in what is."""
+    """Raise `ModelError` if a custom encoder fails on two clouds of P points.
+
+    It runs on a copy and leaves the random state unchanged, so training is not affected.
+    """
     with torch.random.fork_rng(devices=[]):
         deepcopy(model).train().code_of(0.3 * torch.randn(2, P, 3))
 
 
 def export(trainer: Trainer, template: Template, output: Path, recipe: Recipe, facts: CardFacts, score: float) -> None:
-    """Write the averaged weights as a model folder, with the validation error ``score``; the card comes last."""
+    """Write the averaged weights as a model folder, with the validation error ``score``; the card is written last."""
     (output / CARD).unlink(missing_ok=True)
     save_template(template, output / TEMPLATE)
     digest = save_weights(trainer.averaged_state(), output / WEIGHTS, storage=recipe.storage)
@@ -288,17 +307,21 @@ def export(trainer: Trainer, template: Template, output: Path, recipe: Recipe, f
     history |= {"processes": trainer.world} if trainer.world > 1 else {}
     settings = recipe_record(recipe) | {name: value for name, value in history.items() if value}
     if isinstance(facts.start, TrainedModel):
-        begun = facts.start.card
-        settings["start"] = {"model": begun.name, "weights_sha256": begun.weights_sha256, "steps": begun.steps}
+        start_card = facts.start.card
+        settings["start"] = {
+            "model": start_card.name,
+            "weights_sha256": start_card.weights_sha256,
+            "steps": start_card.steps,
+        }
     card = replace(
-        _card(template, recipe, facts, settings), steps=trainer.step, training_minutes=round(trainer.seconds / 60, 1),
+        _build_card(template, recipe, facts, settings), steps=trainer.step, training_minutes=round(trainer.seconds / 60, 1),
         metrics={"validation": {"distance": round(score, 5)}}, weights_sha256=digest,
     )  # fmt: skip
     write_card(card, output / CARD)
 
 
-def _card(template: Template, recipe: Recipe, facts: CardFacts, settings: dict[str, Any]) -> ModelCard:
-    """The card of a model that has learned nothing yet; `ModelError` of facts that no card can hold."""
+def _build_card(template: Template, recipe: Recipe, facts: CardFacts, settings: dict[str, Any]) -> ModelCard:
+    """Card of an untrained model; `ModelError` if the facts are invalid."""
     frame: dict[str, Any] = {} if facts.frame is None else {"frame": facts.frame}
     return ModelCard(
         name=facts.name, category=facts.category, template=template.name, template_hash=template.hash,
@@ -312,17 +335,17 @@ def _card(template: Template, recipe: Recipe, facts: CardFacts, settings: dict[s
 
 
 def fill_basis(points: Float[Tensor, "B P 3"], M: int, generator: torch.Generator) -> Float[Tensor, "M 3"]:
-    """Basis points spread where shapes of the category are: farthest points of jittered samples."""
+    """(M, 3) basis points spread over the region that shapes occupy: farthest points of jittered samples."""
     flat = points.flatten(0, 1)
     flat = flat[torch.randperm(len(flat), generator=generator)[:20_000]]
     jittered = flat + 0.06 * torch.randn(len(flat), 3, generator=generator)
-    # Farthest points run to the outliers of a set: leave out the outermost ones first.
+    # Farthest point sampling favors outliers: drop the outermost points first.
     jittered = jittered[jittered.norm(dim=1) < torch.quantile(jittered.norm(dim=1), 0.995)]
     return jittered[torch.from_numpy(farthest_points(jittered.double().numpy(), M))]
 
 
 def anchor_vertices(template: Template, A: int) -> Int[Ints, " A"]:
-    """Template vertices where corrections look at the scan; `TemplateError` if there are fewer than that."""
+    """Indices of A template vertices where the corrector compares template and scan; `TemplateError` if V < A."""
     if template.shape.V < A:
         problem = f"template {template.name} has {A} nodes but only {template.shape.V} vertices"
         raise TemplateError(problem, "prepare it with fewer nodes")
@@ -337,7 +360,7 @@ def build_deformer(
     kernel: Kernel,
     seed: int,
 ) -> Deformer:
-    """An untrained network for a template, its basis points laid where the source's shapes are."""
+    """Build an untrained network for a template; its basis points are sampled from the source's shapes."""
     basis = align_basis = torch.zeros(1, 3)
     if network.encoder != "point" or network.align_basis:
         if isinstance(source, CloudDataset):
@@ -347,9 +370,9 @@ def build_deformer(
         generator = torch.Generator().manual_seed(seed)
         basis = fill_basis(points, network.basis, generator)
         if network.align_basis:
-            turned = points - points.mean(1, keepdim=True)
-            direction = torch.nn.functional.normalize(torch.randn(turned.shape, generator=generator), dim=-1)
-            align_basis = fill_basis(turned.norm(dim=-1, keepdim=True) * direction, network.align_basis, generator)
+            centered = points - points.mean(1, keepdim=True)
+            direction = torch.nn.functional.normalize(torch.randn(centered.shape, generator=generator), dim=-1)
+            align_basis = fill_basis(centered.norm(dim=-1, keepdim=True) * direction, network.align_basis, generator)
     anchors = template.shape.verts[anchor_vertices(template, template.K)]
     phi = None
     if has_nodes(network.field):
@@ -364,7 +387,7 @@ def build_deformer(
 
 
 def loss_vertices(template: Template, M: int = 1000) -> Int[Ints, " M"]:
-    """Evenly spread template vertices that a loss is computed on."""
+    """Indices of at most M evenly spread template vertices, on which losses are computed."""
     return farthest_points(template.shape.verts, min(M, template.shape.V))
 
 
@@ -378,9 +401,10 @@ def build_dataset(
     seed: int,
     length: int = 1,
 ) -> BatchDataset:
-    """Batches of a source for a model, or for none as yet, supervised on evenly spread template vertices.
+    """Dataset of batches from a source, supervised on evenly spread template vertices.
 
-    It stays on the CPU, wherever the model goes: so it has its encoders' copies.
+    With a model, batches include the features of its encoder and aligner; the dataset has copies of both on the CPU,
+    whatever device the model is on.
     """
     verts = torch.from_numpy(np.array(template.shape.verts)).float()
     core = torch.from_numpy(template.core)
@@ -392,14 +416,14 @@ def build_dataset(
 
 
 def build_loss_points(template: Template, kernel: Kernel, model: Deformer, gradients: int = 400) -> LossPoints:
-    """The model's field at the supervised vertices; its gradient at the first ``gradients`` of them."""
+    """The supervised vertices with the model's field there; its gradient at the first ``gradients`` of them."""
     verts = template.shape.verts[loss_vertices(template)]
     field = model.field(verts, template.nodes, template.radius, kernel)
     return LossPoints(torch.from_numpy(verts).float(), field.for_training(gradients))
 
 
 def build_cloud_dataset(samples: ShapeSamples, config: TrainConfig, scan: ScanConfig) -> CloudDataset:
-    """Batches of a folder's samples, as yet without an encoder."""
+    """Dataset of batches from a folder's samples, without an encoder."""
     points, normals, known = map(torch.from_numpy, (samples.points, samples.normals, samples.landmarks))
     settings = scan, config.shapes, config.seed, config.steps
     return CloudDataset(points, normals, known, build_lattice(samples), None, *settings)
@@ -408,7 +432,7 @@ def build_cloud_dataset(samples: ShapeSamples, config: TrainConfig, scan: ScanCo
 def build_surface_points(
     template: Template, kernel: Kernel, model: Deformer, landmarks: Int[Ints, " L"], count: int = 1200
 ) -> SurfacePoints:
-    """Evenly spread template vertices, and the landmark vertices, with what a Chamfer distance needs of them."""
+    """Evenly spread template vertices with normals, and the landmark vertices, each with the model's field."""
     chosen = loss_vertices(template, count)
     at, M = np.concatenate([chosen, landmarks]).astype(np.int64), len(chosen)
     field = model.field(template.shape.verts[at], template.nodes, template.radius, kernel).for_training()

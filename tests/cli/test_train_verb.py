@@ -64,7 +64,7 @@ class Recorder:
 @pytest.fixture
 def stub(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     recorder = Recorder()
-    monkeypatch.setattr("meshmatch.training.lessons.people_source", recorder.people_source)
+    monkeypatch.setattr("meshmatch.training.load_data.people_source", recorder.people_source)
     monkeypatch.setattr(training, "train_model", recorder.train_model)
     monkeypatch.delenv("RANK", raising=False)
     return recorder

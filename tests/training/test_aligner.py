@@ -62,12 +62,12 @@ def test_it_stops_after_its_minutes_and_goes_on_exactly(tmp_path: Path) -> None:
     (whole, data), (stopped, again) = untrained(), untrained()
     checkpoint = tmp_path / "aligner.safetensors"
     found = train_aligner(whole, data, 3)
-    assert found.done and found.of_all == found.seconds > 0
+    assert found.done and found.total_seconds == found.seconds > 0
     seconds = 0.0
     for run in range(3):
         part = train_aligner(stopped, again, 3, None, "auto", 1e-9, checkpoint)
-        assert part.done == (run == 2) and part.of_all > seconds
-        seconds = part.of_all - 0.1  # it is written to a tenth
+        assert part.done == (run == 2) and part.total_seconds > seconds
+        seconds = part.total_seconds - 0.1  # it is written to a tenth
         stopped, again = (stopped, again) if part.done else untrained()  # as another process would begin
     for name, value in whole.state_dict().items():
         assert torch.equal(value, stopped.state_dict()[name]), name

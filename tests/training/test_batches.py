@@ -17,7 +17,7 @@ from meshmatch.generators.generator import Source, any_of, mixed, moved, source_
 from meshmatch.models.layers import nearest_index, nearest_of_all
 from meshmatch.templates.template import Template
 from meshmatch.training import recipes
-from meshmatch.training.batches import batches, drawing_on
+from meshmatch.training.batches import batches, on_device
 from meshmatch.training.datasets import BatchDataset, CloudDataset, deformed_source, registered_source, step_generator
 from meshmatch.training.loop import TrainConfig
 from tests.generators.stick import stick_figure
@@ -101,7 +101,7 @@ def test_drawing_waits_for_no_number_of_the_device(
 ) -> None:
     """On torch's meta device, which has shapes alone: whatever asks for a value fails, and so does a tensor left behind."""
     data = replace(data, scan=recipe().scan, source=deformed_source(eggs(egg)))
-    here = drawing_on(data, META)
+    here = on_device(data, META)
     with META:
         batch = here.batch(None)
     wanted = data[0]
@@ -110,7 +110,7 @@ def test_drawing_waits_for_no_number_of_the_device(
 
 
 def test_clouds_and_people_are_drawn_there_too(clouds: CloudDataset) -> None:
-    there = drawing_on(clouds, META)
+    there = on_device(clouds, META)
     people = source_on(partial(sample_bodies, stick_figure(3)), META)
     assert people is not None
     with META:

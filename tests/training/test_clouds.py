@@ -200,7 +200,7 @@ def test_it_learns(eggs: ShapeSamples, template: Template, data: CloudDataset) -
 def test_few_registered_shapes_are_deformed_at_every_drawing(
     template: Template, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(datasets, "_PLAIN", 0.5)
+    monkeypatch.setattr(datasets, "_UNDEFORMED_SHARE", 0.5)
     verts = torch.from_numpy(np.array(template.shape.verts)).float()
     shapes = torch.stack([verts, verts * torch.tensor([1.0, 1.2, 1.0])])
     generator = torch.Generator().manual_seed(0)

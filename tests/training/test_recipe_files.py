@@ -102,7 +102,7 @@ def test_a_loss_of_ones_own_is_named_and_never_loaded(tmp_path: Path) -> None:
     recipe: Recipe = replace(people(), train=replace(people().train, loss=Mine()))
     record = recipe_record(recipe)
     assert record["loss"].endswith("test_recipe_files.Mine") and record["train"]["loss"]["more"] == 1.0
-    with pytest.raises(InputError, match="a loss of somebody's own") as caught:
+    with pytest.raises(InputError, match="a custom loss") as caught:
         read_recipe(written(tmp_path, {"recipe": record}), people())
     assert "Python" in caught.value.hint
 
@@ -114,15 +114,15 @@ def test_a_loss_of_ones_own_is_named_and_never_loaded(tmp_path: Path) -> None:
     ({"recipe": {"train": {"steps": 0}}}, "steps must be 1 or more"),
     ({"recipe": {"scan": {"points": 10**9}}}, "64..100,000"),
     ({"recipe": {"train": {"rate": float("nan")}}}, "rate must be float"), ({"recipe": {"scan": {"noise": -1}}}, "0..9"),
-    ({"recipe": {"loss": ["x"]}}, "somebody's own"), ({"recipe": {"storage": "int2"}}, "storage"),
+    ({"recipe": {"loss": ["x"]}}, "a custom loss"), ({"recipe": {"storage": "int2"}}, "storage"),
     ({"recipe": {"train": {"loss": {"robust": 1}}}}, "robust must be bool"), ({"network": {"code": 10**9}}, "code must be"),
     ({"network": {"size": 1}}, "unknown network"), ({"field": {"kernel": {}}}, "kernel"), ({"recipe": {"tain": {}}}, "tain"),
     ({"recipe": {"scan": {"points": 1}}}, "64..100,000"), ({"recipe": {"train": {"momentum": 7}}}, "momentum"),
     ({"recipe": {"template": "../other"}}, "included template"),
-    ({"train": {"steps": 5}}, "train is unknown"), ({"steps": 5}, "nothing of a training"), ({}, "nothing of a training"),
+    ({"train": {"steps": 5}}, "train is unknown"), ({"steps": 5}, "no training settings"), ({}, "no training settings"),
 ])  # fmt: skip
 def test_what_is_no_recipe_is_told(record: Any, words: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no recipe") as caught:
+    with pytest.raises(InputError, match="not a recipe") as caught:
         read_recipe(written(tmp_path, record), people())
     assert words in caught.value.message and caught.value.hint and "\n" not in caught.value.message
 

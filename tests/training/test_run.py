@@ -34,7 +34,7 @@ from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepared_folder import RegisteredShapes, read_registered
 from meshmatch.templates.template import Template, read_template
 from meshmatch.training.datasets import registered_source
-from meshmatch.training.lessons import template_of
+from meshmatch.training.load_data import template_of
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.losses import CorrespondenceLoss
 from meshmatch.training.recipe_files import read_recipe
@@ -190,7 +190,7 @@ def test_another_folder_can_be_measured_on(prepared: Path, tmp_path: Path) -> No
     assert card.weights_sha256 == other.weights_sha256 and card.metrics != other.metrics
     told = [each.recipe["validation"] for each in (card, other)]
     assert told == ["the learned shapes, drawn anew", "1 fits of flat"]
-    with pytest.warns(MeshmatchWarning, match="5 of 5 shapes to be measured on are learned as well"):
+    with pytest.warns(MeshmatchWarning, match="5 of 5 validation shapes are also training shapes"):
         same = load_model(trained(prepared, tmp_path / "same", validation=prepared)).card
     assert same.weights_sha256 == card.weights_sha256
     assert read_recipe(tmp_path / "same" / "card.json", SMALL) == SMALL
@@ -422,7 +422,7 @@ def test_a_model_to_start_from_is_looked_at_before_shapes_are_made(
     kind: str, start: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Their networks and kernels are equal, their templates are not."""
-    monkeypatch.setattr("meshmatch.training.train.lessons", lambda *_: pytest.fail("shapes were made"))
+    monkeypatch.setattr("meshmatch.training.train.load_training_data", lambda *_: pytest.fail("shapes were made"))
     with pytest.raises(OptionError, match=f"model {start} has another template$"):
         train(tmp_path / "other", kind=kind, facts=CardFacts(start=start))
     assert not list(tmp_path.iterdir())
